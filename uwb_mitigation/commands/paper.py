@@ -34,7 +34,7 @@ SplitOption = Annotated[
         "or auto: paper for DeepUWB, otherwise configurations."
     ),
 ]
-ScalingOption = Annotated[str, typer.Option(help="max or preamble.")]
+ScalingOption = Annotated[str, typer.Option(help="Scaling of the CIR: max or preamble.")]
 WorkersOption = Annotated[
     int | None, typer.Option(help="Processes with one thread each; default: one per processor.")
 ]
@@ -47,10 +47,11 @@ def fetch(
         "deepuwb.pkl"
     ),
     url: Annotated[
-        str | None, typer.Option(metavar="MIRROR", help="Download from here, not from the DOI.")
+        str | None, typer.Option(metavar="MIRROR", help="Download from this URL instead of the DOI.")
     ] = None,
     sha256: Annotated[
-        str | None, typer.Option("--sha256", metavar="HEX", help="Expected checksum, instead of Zenodo's.")
+        str | None,
+        typer.Option("--sha256", metavar="HEX", help="Expected SHA-256 checksum; default: that of Zenodo."),
     ] = None,
     json: JsonOption = None,
 ) -> None:
@@ -78,11 +79,11 @@ def simulate(
     ],
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     ranges: Annotated[int, typer.Option(help="Number of ranges; default: that of DeepUWB.")] = 55_158,
-    exchanges: Annotated[int, typer.Option(help="Ranges of each placement.")] = 20,
+    exchanges: Annotated[int, typer.Option(help="Number of ranges of each placement.")] = 20,
     force: Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
-    """Simulate DeepUWB's rooms, obstacles and format, and write them to a bag.
+    """Simulate data with the rooms, obstacles and format of DeepUWB, and write it to a bag.
 
     The bag is marked as simulated. In a checkout, `make paper` runs the complete experiment on it.
     """
@@ -98,7 +99,7 @@ def protocol(
     data: DataOption,
     output: FolderOption,
     networks: Annotated[
-        str, typer.Option(help="Some of remnet, remnet_k5, mlp; separated by commas.")
+        str, typer.Option(help="Networks, separated by commas: remnet, remnet_k5, mlp.")
     ] = "remnet,mlp",
     windows: Annotated[
         str, typer.Option(help="Window lengths K, separated by commas.")
@@ -115,7 +116,7 @@ def protocol(
 
     Baselines (medians, and a line in the received power) are fitted on the same training part.
 
-    An interrupted run continues: networks already in DIR are not trained again.
+    An interrupted run can be continued: networks that are already in DIR are not trained again.
     """
     lengths = _lengths(windows)
     with needs_torch():
@@ -124,7 +125,9 @@ def protocol(
     wanted = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)
     options = replace(experiment.PAPER, epochs=epochs, learning_rate=learning_rate)
     if output.exists() and not output.is_dir():
-        raise ParameterError("not a folder", where=str(output), valid="a folder, or a new name")
+        raise ParameterError(
+            "not a folder", where=str(output), valid="a folder; it is created if it does not exist"
+        )
     parts = _parts(data, max(lengths), scaling, split)
     with console.share_bar(f"{len(wanted)} networks") as update:
         result = experiment.run(parts, output, wanted, options, _workers(workers), update, _command())
@@ -138,14 +141,17 @@ def report(
     output: FolderOption,
     models: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder of `paper protocol`, for Tables 1, 2 and Fig. 5."),
+        typer.Option(
+            metavar="DIR", help="Folder written by `paper protocol`, for Tables 1 and 2 and Fig. 5."
+        ),
     ] = None,
     firmware: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="JSON of `bench firmware`, for Table 3.")
+        Path | None,
+        typer.Option(metavar="FILE", help="JSON result of `python -m benchmarks firmware`, for Table 3."),
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Write one HTML page: the paper's tables and figures next to yours."""
+    """Write an HTML page with the tables and figures of the paper and of your data."""
     # Read everything before the work begins, so that a missing library or a wrong file is an early error.
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.paper import published, results
@@ -167,8 +173,8 @@ def report(
     lines = [
         f"{page}: {len(result.tables)} tables, {len(result.figures)} figures, {len(study.dataset)} measurements"
     ]
-    lines += [f"{name}: some values are not measured; the page names the command" for name in gaps]
-    lines += [f"{part}: left out. Run: {command}" for part, command in result.lacking.items()]
+    lines += [f"{name}: some values are not measured; the page contains the command" for name in gaps]
+    lines += [f"{part}: no results. Run: {command}" for part, command in result.lacking.items()]
     console.out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
@@ -224,7 +230,7 @@ def _show_experiment(result: ExperimentResults) -> None:
     # Omit the columns of the paper and networks that were not trained.
     rows = [row for row in table.rows if tables.MISSING not in row]
     show_table(
-        f"{result.data}, split {result.split}: {result.train} to train on, {result.test} to test, "
+        f"{result.data}, split {result.split}: {result.train} training and {result.test} test measurements, "
         f"{result.options.epochs} epochs; MAE in m, mean and standard deviation over seeds",
         (*table.columns[:2], *table.columns[6:]),
         [[cell.text for cell in (*row[:2], *row[6:])] for row in rows],

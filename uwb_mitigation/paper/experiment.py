@@ -54,7 +54,7 @@ CALIBRATIONS: Mapping[str, float | None] = dict(
 )
 """{name: percentile of `quantize`} to choose activation scales by."""
 
-CALIBRATION_INPUTS, CHECKED_INPUTS = 512, 1024
+CALIBRATION_INPUTS, CHECK_INPUTS = 512, 1024
 _BATCH = 1024
 
 
@@ -89,7 +89,7 @@ def list_tasks(networks: Sequence[str], windows: Sequence[int], seeds: int) -> l
         ParameterError: unknown network, or no seeds or windows.
     """
     if seeds < 1 or not windows:
-        raise ParameterError(f"{seeds} seeds, {len(windows)} windows", valid="1 or more of each")
+        raise ParameterError(f"{seeds} seeds, {len(windows)} windows", valid="at least 1 of each")
     return [
         Task(network, samples, seed)
         for network in networks
@@ -164,7 +164,7 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     start = time.perf_counter()
     fields: dict[str, Any] = {}
     weights = fitting.fit(architecture, train.inputs, train.error_m, options)
-    seconds = time.perf_counter() - start
+    training_s = time.perf_counter() - start
     files = {form: folder / f"{task.name}_{form}.onnx" for form in FORMS}
     card = make_card(task.name, architecture, parts, options)
     maes, best, integers = calibrate(weights, train.inputs, train.error_m, options.seed)
@@ -192,8 +192,8 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
         mae_raw=float(np.abs(test.error_m).mean()),
         float_errors=errors["float"],
         int8_errors=errors["int8"],
-        seconds=seconds,
-        samples_per_s=len(train) * options.epochs / max(seconds, 1e-9),
+        seconds=training_s,
+        samples_per_s=len(train) * options.epochs / max(training_s, 1e-9),
         **fields,
     )
 
@@ -210,14 +210,14 @@ def calibrate(
         DatasetError: fewer than two inputs. ModelError: see `quantize`.
     """
     if len(inputs) < 2:
-        raise DatasetError(f"{len(inputs)} inputs to calibrate and to check on", valid="at least 2")
+        raise DatasetError(f"{len(inputs)} inputs for calibration and check", valid="at least 2")
     order = np.random.default_rng(seed).permutation(len(inputs))
     count = min(CALIBRATION_INPUTS, len(inputs) // 2)
-    calibration, checked = inputs[order[:count]], order[count : count + CHECKED_INPUTS]
+    calibration, check_rows = inputs[order[:count]], order[count : count + CHECK_INPUTS]
     maes = {}
     for name, percentile in CALIBRATIONS.items():
         network = IntegerNetwork(quantize(weights, calibration, percentile, exact=False))
-        maes[name] = float(np.abs(targets[checked] - network.predict_m(inputs[checked])).mean())
+        maes[name] = float(np.abs(targets[check_rows] - network.predict_m(inputs[check_rows])).mean())
     best = min(maes, key=lambda name: maes[name])
     return maes, best, quantize(weights, calibration, CALIBRATIONS[best])
 
@@ -259,9 +259,9 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
 
     medians = {"los_median": baselines.los_median, "overall_median": baselines.overall_median}
     rows = [row(name, fit(train)(test)) for name, fit in medians.items()]
-    line, reason = LinearBiasModel(0.0), "the data has no received power"
+    line, reason = LinearBiasModel(0.0), "the data contains no received powers"
     if all(np.isfinite(part.rx_power_dbm - part.first_path_power_dbm).any() for part in (train, test)):
-        line, reason = fit_line(train), "too few configurations, or powers that are all alike"
+        line, reason = fit_line(train), "too few configurations, or almost equal powers"
     if not line.needs_power:
         return (*rows, Baseline(name="line", errors=None, reason=reason))
     return (*rows, row("line", np.nan_to_num(linear_bias_m(line, test))))

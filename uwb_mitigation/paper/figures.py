@@ -70,12 +70,12 @@ def samples(examples: Sequence[tuple[str, float, NDArray[np.floating]]]) -> str:
     with _drawing():
         figure = Figure(figsize=(7.2, 1.0 + 1.7 * len(examples)), layout="constrained")
         axes = np.atleast_1d(figure.subplots(len(examples), 1, sharex=True))
-        for place, (label, error_m, amplitudes), colour in zip(axes, examples, _COLOURS, strict=False):
+        for panel, (label, error_m, amplitudes), colour in zip(axes, examples, _COLOURS, strict=False):
             time_ns = (np.arange(len(amplitudes)) - WINDOW_LEAD) * SAMPLE_PERIOD_S * 1e9
-            place.plot(time_ns, amplitudes, color=colour, linewidth=1.4)
-            place.axvline(0, color="#555555", linestyle="--", linewidth=1)
-            place.set(ylim=(0, 1.08), ylabel="amplitude")
-            place.set_title(f"{label}: range error {error_m:+.3f} m", loc="left", fontsize=10)
+            panel.plot(time_ns, amplitudes, color=colour, linewidth=1.4)
+            panel.axvline(0, color="#555555", linestyle="--", linewidth=1)
+            panel.set(ylim=(0, 1.08), ylabel="amplitude")
+            panel.set_title(f"{label}: range error {error_m:+.3f} m", loc="left", fontsize=10)
         axes[-1].set_xlabel("time after the first path reported by the radio, ns")
         return _svg(figure)
 
@@ -89,10 +89,10 @@ def scatter(points: NDArray[np.floating], groups: NDArray[np.str_], title: str) 
     with _drawing():
         figure = Figure(figsize=(7.6, 4.6), dpi=150)
         for side, azimuth in enumerate((-60, 30)):
-            place: Any = figure.add_axes((0.02 + 0.51 * side, 0.16, 0.44, 0.77), projection="3d")
-            place.view_init(elev=22, azim=azimuth)
+            panel: Any = figure.add_axes((0.02 + 0.51 * side, 0.16, 0.44, 0.77), projection="3d")
+            panel.view_init(elev=22, azim=azimuth)
             for rank, group in enumerate(order):
-                place.scatter(
+                panel.scatter(
                     *points[index == group].T,
                     s=7,
                     alpha=0.65,
@@ -101,15 +101,15 @@ def scatter(points: NDArray[np.floating], groups: NDArray[np.str_], title: str) 
                     marker=_MARKERS[rank] if named else "o",
                     label=f" {names[group]}",
                 )
-            place.set(xlabel="component 1", ylabel="component 2", zlabel="component 3")
-            for axis in (place.xaxis, place.yaxis, place.zaxis):
+            panel.set(xlabel="component 1", ylabel="component 2", zlabel="component 3")
+            for axis in (panel.xaxis, panel.yaxis, panel.zaxis):
                 axis.labelpad = -7
-            place.tick_params(labelsize=7, pad=-3)
-            place.locator_params(nbins=5)
+            panel.tick_params(labelsize=7, pad=-3)
+            panel.locator_params(nbins=5)
         figure.suptitle(title, fontsize=11, y=0.985)
         if named:
             figure.legend(
-                *place.get_legend_handles_labels(), loc="lower center", ncols=4, fontsize=9, markerscale=2
+                *panel.get_legend_handles_labels(), loc="lower center", ncols=4, fontsize=9, markerscale=2
             )
         image = io.BytesIO()
         FigureCanvasAgg(figure)
@@ -119,7 +119,7 @@ def scatter(points: NDArray[np.floating], groups: NDArray[np.str_], title: str) 
 
 def over_k(
     boxes: Mapping[str, Box | None],
-    left: Mapping[int, Mapping[str, Spread]],
+    statistics: Mapping[int, Mapping[str, Spread]],
     paper_mae: Mapping[int, float],
     windows: Sequence[int],
 ) -> str:
@@ -127,16 +127,16 @@ def over_k(
 
     Args:
         boxes: {name: quantiles of errors, m}; None: not measured.
-        left: {K: {`los`, `nlos`, `sigma`: spread over seeds}}.
+        statistics: {K: {`los`, `nlos`, `sigma`: spread over seeds}}.
         paper_mae: {K: MAE, m}.
         windows: every K, in the order to show.
     """
     with _drawing():
         figure = Figure(figsize=(7.6, 7.0), layout="constrained")
-        above, below = figure.subplots(2, 1, height_ratios=(3, 2))
+        box_axes, bar_axes = figure.subplots(2, 1, height_ratios=(3, 2))
         shown = {position: box for position, box in enumerate(boxes.values()) if box is not None}
         keys = ("whislo", "q1", "med", "q3", "whishi")
-        drawn = above.bxp(
+        drawn = box_axes.bxp(
             [dict(zip(keys, box, strict=True)) for box in shown.values()],
             positions=list(shown),
             widths=0.6,
@@ -146,42 +146,46 @@ def over_k(
         )
         for name, patch in zip((list(boxes)[position] for position in shown), drawn["boxes"], strict=True):
             patch.set_facecolor("#bbbbbb" if name.startswith("raw") else "#56B4E9")
-        above.axhline(0, color="#555555", linewidth=1)
-        above.set(xlim=(-0.6, len(boxes) - 0.4), ylabel="range error, m")
-        above.set_xticks(range(len(boxes)), list(boxes))
-        above.set_title("Errors: median, quartiles, 5th and 95th percentile", loc="left", fontsize=10)
+        box_axes.axhline(0, color="#555555", linewidth=1)
+        box_axes.set(xlim=(-0.6, len(boxes) - 0.4), ylabel="range error, m")
+        box_axes.set_xticks(range(len(boxes)), list(boxes))
+        box_axes.set_title("Errors: median, quartiles, 5th and 95th percentile", loc="left", fontsize=10)
         kinds = {"los": ("LOS MAE", "//"), "nlos": ("NLOS MAE", ""), "sigma": ("σ, all", "..")}
         for number, (kind, (name, hatch)) in enumerate(kinds.items()):
-            found = {at: left[k][kind] for at, k in enumerate(windows) if kind in left.get(k, {})}
-            below.bar(
-                np.array(list(found)) + 0.25 * (number - 1),
-                [spread.mean for spread in found.values()],
+            means = {
+                index: statistics[k][kind] for index, k in enumerate(windows) if kind in statistics.get(k, {})
+            }
+            bar_axes.bar(
+                np.array(list(means)) + 0.25 * (number - 1),
+                [spread.mean for spread in means.values()],
                 0.23,
-                yerr=[spread.std or 0.0 for spread in found.values()],
+                yerr=[spread.std or 0.0 for spread in means.values()],
                 capsize=2,
                 color=_COLOURS[number],
                 hatch=hatch,
                 edgecolor="white",
                 label=name,
             )
-        marked = [(at, paper_mae[k]) for at, k in enumerate(windows) if k in paper_mae]
+        marked = [(index, paper_mae[k]) for index, k in enumerate(windows) if k in paper_mae]
         label = "paper: MAE of all, int8"
-        below.plot(*zip(*marked, strict=True), "_k", markersize=20, markeredgewidth=2, label=label)
-        below.legend(ncols=2, fontsize=8, loc="upper left", markerscale=0.6)
-        below.set(xlim=(-0.6, len(windows) - 0.4), ylim=(0, below.get_ylim()[1] * 1.5), ylabel="m")
-        below.set_xticks(range(len(windows)), [f"K = {k}" for k in windows])
-        below.set_title("After correction, mean and standard deviation over seeds", loc="left", fontsize=10)
-        for place, gaps in (
-            (above, [at for at in range(len(boxes)) if at not in shown]),
-            (below, [at for at, k in enumerate(windows) if k not in left]),
+        bar_axes.plot(*zip(*marked, strict=True), "_k", markersize=20, markeredgewidth=2, label=label)
+        bar_axes.legend(ncols=2, fontsize=8, loc="upper left", markerscale=0.6)
+        bar_axes.set(xlim=(-0.6, len(windows) - 0.4), ylim=(0, bar_axes.get_ylim()[1] * 1.5), ylabel="m")
+        bar_axes.set_xticks(range(len(windows)), [f"K = {k}" for k in windows])
+        bar_axes.set_title(
+            "After correction, mean and standard deviation over seeds", loc="left", fontsize=10
+        )
+        for panel, gaps in (
+            (box_axes, [index for index in range(len(boxes)) if index not in shown]),
+            (bar_axes, [index for index, k in enumerate(windows) if k not in statistics]),
         ):
-            for at in gaps:
-                across = place.get_xaxis_transform()
-                place.text(
-                    at,
+            for index in gaps:
+                transform = panel.get_xaxis_transform()
+                panel.text(
+                    index,
                     0.3,
                     "not measured",
-                    transform=across,
+                    transform=transform,
                     rotation=90,
                     ha="center",
                     va="center",

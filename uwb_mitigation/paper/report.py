@@ -144,7 +144,7 @@ def build(
         seeds = sorted({model.seed for model in trainings.models})
         trained = Provenance(
             trainings.data,
-            f"{trainings.split}; {trainings.train:,} measurements to train on, {trainings.test:,} to test on",
+            f"{trainings.split}; {trainings.train:,} training and {trainings.test:,} test measurements",
             f"{', '.join(map(str, seeds)) or 'none'}; {trainings.options.epochs} epochs each",
             trainings.command or train,
         )
@@ -152,7 +152,7 @@ def build(
         shown.append(tables.sizes(trainings, trained, train))
         pictures.append(_over_k(trainings, trained))
     if firmware:
-        random = "fixed, of the windows and of random weights; the cost depends on neither"
+        random = "fixed, for windows and random weights; the cost does not depend on them"
         windows, split = "windows that test every rounding", "none: no accuracy is measured"
         shown.append(tables.firmware(firmware, Provenance(windows, split, random, bench), bench))
     else:
@@ -169,11 +169,11 @@ def _notices(study: Study, trainings: ExperimentResults | None) -> tuple[str, ..
     notices = []
     rows = tuple(int((study.rooms == room).sum()) for room in ROOMS)
     if study.simulated:
-        notices.append(
-            "The data is simulated: no radio was involved. It does not show the accuracy at a real site."
-        )
+        notices.append("The data is simulated. It does not show the accuracy at a real site.")
     if study.simulated or not study.has_rooms or rows != ROOM_ROWS:
-        notices.append("The data is not the published DeepUWB: the paper's numbers are not a target for it.")
+        notices.append(
+            "The data is not the published DeepUWB: its results cannot be compared with the numbers of the paper."
+        )
     if trainings is not None:
         seeds = len({model.seed for model in trainings.models})
         lengths = len({model.samples for model in trainings.models} & set(published.WINDOWS))
@@ -185,7 +185,7 @@ def _notices(study: Study, trainings: ExperimentResults | None) -> tuple[str, ..
             )
     if study.dataset.skipped:
         reasons = ", ".join(f"{count:,} x {why}" for why, count in sorted(study.dataset.skipped.items()))
-        notices.append(f"Measurements left out: {reasons}.")
+        notices.append(f"Skipped measurements: {reasons}.")
     return tuple(notices)
 
 
@@ -282,7 +282,7 @@ def _components(study: Study, letter: str) -> Picture:
         f"fig4{letter}",
         f"Fig. 4{letter}. Principal components, by {kind}",
         f"Three-dimensional scatter plot of {len(selected)} channel impulse responses along their first three principal "
-        f"components, from two sides, coloured by {kind}: {len(names)} of them.",
+        f"components, from two sides, coloured by {kind} ({len(names)} groups).",
         f"{len(selected):,} of {len(points):,} windows of {study.dataset.inputs.shape[1]} amplitudes. "
         f"The components contain {share} % of the variance.",
         "the three indoor rooms lie close together, apart from outdoor and through-the-wall measurements."
@@ -291,7 +291,7 @@ def _components(study: Study, letter: str) -> Picture:
         "from plastic and wood.",
         figures.scatter(points[selected], groups[selected], f"By {kind}"),
         {"explained": explained.tolist(), "groups": numbers, "points": len(selected)},
-        study.provenance("0, of the points drawn" if len(selected) < len(points) else "none"),
+        study.provenance("0, for the choice of points" if len(selected) < len(points) else "none"),
     )
 
 
@@ -299,18 +299,20 @@ def _over_k(trainings: ExperimentResults, provenance: Provenance) -> Picture:
     spreads: dict[int, dict[str, Spread]] = {}
     boxes: dict[str, Box | None] = {}
     if trainings.models:
-        first = trainings.models[0].left
+        first = trainings.models[0].final_errors
         boxes = {f"raw\n{name}": getattr(first, name.lower()).box_raw for name in ("all", LOS, "NLOS")}
     for samples in published.WINDOWS:
         models = trainings.of("remnet", samples)
         values = {
-            "los": Spread.of([model.left.los.mae for model in models]),
-            "nlos": Spread.of([model.left.nlos.mae for model in models]),
-            "sigma": Spread.of([model.left.all.sigma for model in models]),
+            "los": Spread.of([model.final_errors.los.mae for model in models]),
+            "nlos": Spread.of([model.final_errors.nlos.mae for model in models]),
+            "sigma": Spread.of([model.final_errors.all.sigma for model in models]),
         }
         if models:
             spreads[samples] = {name: spread for name, spread in values.items() if spread is not None}
-        model_boxes = [model.left.all.box for model in models if model.left.all.box is not None]
+        model_boxes = [
+            model.final_errors.all.box for model in models if model.final_errors.all.box is not None
+        ]
         box = tuple(np.mean(model_boxes, axis=0).tolist()) if model_boxes else None
         boxes[f"K = {samples}"] = box
     paper_mae = {k: row.mae_m[2] for (network, k), row in published.MODELS.items() if network == "remnet"}

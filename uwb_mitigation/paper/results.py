@@ -44,20 +44,20 @@ class PartErrors(_Entry):
     box: Box | None = None
 
     @classmethod
-    def of(cls, raw_m: NDArray[np.floating], left_m: NDArray[np.floating]) -> PartErrors:
+    def of(cls, raw_m: NDArray[np.floating], residual_m: NDArray[np.floating]) -> PartErrors:
         """Return the statistics of errors, shape (n,), before and after correction."""
         if len(raw_m) == 0:
             return cls(n=0)
-        found: dict[str, Any] = {
+        statistics: dict[str, Any] = {
             f"{name}{suffix}": value
-            for suffix, error in (("_raw", raw_m), ("", left_m))
+            for suffix, error in (("_raw", raw_m), ("", residual_m))
             for name, value in (
                 ("mae", np.abs(error).mean()),
                 ("sigma", np.std(error)),
                 ("box", tuple(np.percentile(error, (5, 25, 50, 75, 95)).tolist())),
             )
         }
-        return cls(n=len(raw_m), **found)
+        return cls(n=len(raw_m), **statistics)
 
 
 class ErrorsByCondition(_Entry):
@@ -69,12 +69,12 @@ class ErrorsByCondition(_Entry):
 
     @classmethod
     def of(
-        cls, error_m: NDArray[np.floating], left_m: NDArray[np.floating], labels: NDArray[np.str_]
+        cls, error_m: NDArray[np.floating], residual_m: NDArray[np.floating], labels: NDArray[np.str_]
     ) -> ErrorsByCondition:
         """Return the statistics of errors, shape (n,), before and after correction."""
         los = labels == "LOS"
         parts = {"all": np.ones(len(labels), np.bool_), "los": los, "nlos": ~los & (labels != "")}
-        return cls(**{name: PartErrors.of(error_m[rows], left_m[rows]) for name, rows in parts.items()})
+        return cls(**{name: PartErrors.of(error_m[rows], residual_m[rows]) for name, rows in parts.items()})
 
 
 class TrainedModel(_Entry):
@@ -113,7 +113,7 @@ class TrainedModel(_Entry):
         return [getattr(self, f"{kind}_{form}") for form in FORMS]
 
     @property
-    def left(self) -> ErrorsByCondition:
+    def final_errors(self) -> ErrorsByCondition:
         """Errors of int8 if the network has this form, otherwise of float."""
         return self.int8_errors or self.float_errors
 
@@ -140,8 +140,8 @@ class ExperimentResults(_Entry):
 
     def of(self, network: str, samples: int) -> tuple[TrainedModel, ...]:
         """Return the trained models of a network in the order of seeds."""
-        found = [model for model in self.models if (model.network, model.samples) == (network, samples)]
-        return tuple(sorted(found, key=lambda model: model.seed))
+        statistics = [model for model in self.models if (model.network, model.samples) == (network, samples)]
+        return tuple(sorted(statistics, key=lambda model: model.seed))
 
 
 class FirmwareRow(_Entry):
@@ -204,8 +204,8 @@ class Spread:
     @classmethod
     def of(cls, values: list[float | None]) -> Spread | None:
         """Return the spread of the values that are not None; None if all are None."""
-        known = [value for value in values if value is not None]
-        if not known:
+        values_present = [value for value in values if value is not None]
+        if not values_present:
             return None
-        std = float(np.std(known, ddof=1)) if len(known) > 1 else None
-        return cls(float(np.mean(known)), std, len(known))
+        std = float(np.std(values_present, ddof=1)) if len(values_present) > 1 else None
+        return cls(float(np.mean(values_present)), std, len(values_present))

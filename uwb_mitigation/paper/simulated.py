@@ -29,7 +29,7 @@ from uwb_mitigation.sources.simulation.radio import Radio
 from uwb_mitigation.sources.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
 from uwb_mitigation.sources.simulation.scene import DirectPath
 
-LATE = "first path too late for a whole window"
+LATE_FIRST_PATH = "first path too late for a whole window"
 
 
 class SimulatedDeepUwb(Simulated):
@@ -61,21 +61,21 @@ class SimulatedDeepUwb(Simulated):
         super().__init__(f"simulated like DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
         self._seed = seed
         self._exchanges = exchanges
-        ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
-        self.rows: tuple[int, ...] = tuple(np.diff(ends, prepend=0).tolist())
+        row_ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
+        self.rows: tuple[int, ...] = tuple(np.diff(row_ends, prepend=0).tolist())
 
     def __iter__(self) -> Iterator[Record]:
         self.skipped = Counter()
         for room, rows in enumerate(self.rows):
             # The source is endless, because the number of lost frames is not known in advance.
             records = chain.from_iterable(self._records(*self._batch(room, batch)) for batch in counting())
-            yield from islice(self._shaped(records), rows)
+            yield from islice(self._like_deepuwb(records), rows)
 
-    def _shaped(self, records: Iterable[Record]) -> Iterator[Record]:
+    def _like_deepuwb(self, records: Iterable[Record]) -> Iterator[Record]:
         for record in records:
             cir, truth = _cut(record.measurement.cir), record.truth
             if cir is None or truth is None:
-                self.skipped[LATE] += 1
+                self.skipped[LATE_FIRST_PATH] += 1
                 continue
             # DeepUWB labels the obstacles, not the received path.
             label = "LOS" if truth.label == "LOS" else "NLOS"
@@ -89,15 +89,15 @@ class SimulatedDeepUwb(Simulated):
         environments = (room.los, room.nlos)
         fields = draw_fields(environments, placements, rng)
         anchor, tag = place(room.size, placements, rng)
-        chosen = [draw_obstacles(room, rng) for _ in range(placements)]
+        obstacles = [draw_obstacles(room, rng) for _ in range(placements)]
         path = DirectPath.joined(
-            [obstruct(a, b, between, rng) for a, b, between in zip(anchor, tag, chosen, strict=True)]
+            [obstruct(a, b, between, rng) for a, b, between in zip(anchor, tag, obstacles, strict=True)]
         )
-        of = np.repeat(np.arange(placements), self._exchanges)
+        placement_of_row = np.repeat(np.arange(placements), self._exchanges)
         names = [
-            f"simulated seed {self._seed}/{configuration_of(number, _digits(between))}"
+            f"simulated seed {self._seed}/{configuration_of(number, _obstacle_digits(between))}"
             f"/placement {batch * placements + k}"
-            for k, between in enumerate(chosen)
+            for k, between in enumerate(obstacles)
         ]
         # One day per room.
         sequence = round(number * 86_400 * SURVEY_RATE_HZ) + batch * size + np.arange(size)
@@ -107,15 +107,23 @@ class SimulatedDeepUwb(Simulated):
                 sequence,
                 (FIRST_ANCHOR_ID + number) * ids,
                 FIRST_TAG_ID * ids,
-                [names[k] for k in of.tolist()],
-                Links(anchor[of], tag[of], path.take(of), environments, fields, of, stationary=True),
+                [names[k] for k in placement_of_row.tolist()],
+                Links(
+                    anchor[placement_of_row],
+                    tag[placement_of_row],
+                    path.take(placement_of_row),
+                    environments,
+                    fields,
+                    placement_of_row,
+                    stationary=True,
+                ),
             ),
             rng,
         )
 
 
-def _digits(chosen: tuple[int, ...]) -> str:
-    return "".join("1" if number in chosen else "0" for number in range(len(OBSTACLES)))
+def _obstacle_digits(obstacles: tuple[int, ...]) -> str:
+    return "".join("1" if number in obstacles else "0" for number in range(len(OBSTACLES)))
 
 
 def _cut(cir: Cir) -> Cir | None:

@@ -95,22 +95,29 @@ def numbers(values: Iterable[float | None], form: str, kind: str) -> list[Cell]:
 def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str, measured: str) -> Table:
     """Return Table 1, MAE before and after graph optimisation and quantisation; `measured` heads our columns."""
     rows = []
-    for heads, parameters, models, printed in _networks(trainings):
+    for heads, parameters, models, published_row in _networks(trainings):
         paper = [NONE] * 4
-        if printed:
+        if published_row:
             paper = [
-                number(printed.parameters, "{:.0f}", "paper"),
-                *numbers(printed.mae_m, "{:.4f}", "paper"),
+                number(published_row.parameters, "{:.0f}", "paper"),
+                *numbers(published_row.mae_m, "{:.4f}", "paper"),
             ]
         rows.append((*heads, *paper, parameters, *_forms(models, "mae", 1.0, 4)))
-    known = {baseline.name: baseline for baseline in trainings.baselines}
-    left = {name: b.errors.all.mae if b.errors else None for name, b in known.items()}
-    left["raw"] = trainings.models[0].mae_raw if trainings.models else None
-    for name in dict.fromkeys(["raw", "los_median", "overall_median", "line", *known]):
-        cell = number(left[name], "{:.4f}", "measured") if name in left else MISSING
+    baselines_by_name = {baseline.name: baseline for baseline in trainings.baselines}
+    mae_by_name = {
+        name: baseline.errors.all.mae if baseline.errors else None
+        for name, baseline in baselines_by_name.items()
+    }
+    mae_by_name["raw"] = trainings.models[0].mae_raw if trainings.models else None
+    for name in dict.fromkeys(["raw", "los_median", "overall_median", "line", *baselines_by_name]):
+        cell = number(mae_by_name[name], "{:.4f}", "measured") if name in mae_by_name else MISSING
         head = Cell(NAMES.get(name, name), "head"), Cell("–", "head")
         rows.append((*head, *[NONE] * 5, cell, NONE, NONE))
-    reasons = [f" {NAMES.get(name, name)}: {b.reason}." for name, b in known.items() if b.reason]
+    reasons = [
+        f" {NAMES.get(name, name)}: {baseline.reason}."
+        for name, baseline in baselines_by_name.items()
+        if baseline.reason
+    ]
     return Table(
         "table1",
         "Table 1. Accuracy for each length of the CIR, before and after optimisation",
@@ -129,8 +136,8 @@ def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str,
 def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) -> Table:
     """Return Table 2, file sizes."""
     rows = []
-    for heads, parameters, models, printed in _networks(trainings):
-        paper = numbers(printed.size_kb if printed else [None] * 3, "{:.3f}", "paper")
+    for heads, parameters, models, published_row in _networks(trainings):
+        paper = numbers(published_row.size_kb if published_row else [None] * 3, "{:.3f}", "paper")
         rows.append((*heads, parameters, *paper, *_forms(models, "bytes", 1000.0, 3)))
     return Table(
         "table2",
@@ -147,22 +154,24 @@ def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) ->
 
 def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str) -> Table:
     """Return Table 3, rate and energy on the microcontroller."""
-    found = {(row.network, row.samples, row.first_kernel, row.kernels): row for row in bench}
-    wanted = [(network, samples, 3 if network == "remnet" else 0, "cortex_m4") for network, samples in _ROWS]
+    rows_by_key = {(row.network, row.samples, row.first_kernel, row.kernels): row for row in bench}
+    paper_keys = [
+        (network, samples, 3 if network == "remnet" else 0, "cortex_m4") for network, samples in _ROWS
+    ]
     rows = []
-    for key in dict.fromkeys([*wanted, *found]):
+    for key in dict.fromkeys([*paper_keys, *rows_by_key]):
         network, samples, first_kernel, kernels = key
-        printed, row = published.MODELS.get((network, samples)), found.get(key)
+        published_row, row = published.MODELS.get((network, samples)), rows_by_key.get(key)
         name = NAMES.get(network, network) + (f", k0 = {first_kernel}" if first_kernel not in (0, 3) else "")
         paper = [NONE] * 5
-        if printed:
+        if published_row:
             paper = [
-                *numbers(printed.board[:4], "{:.1f}", "paper"),
-                number(printed.board[4], "{:g}", "paper"),
+                *numbers(published_row.board[:4], "{:.1f}", "paper"),
+                number(published_row.board[4], "{:g}", "paper"),
             ]
-        own = [MISSING, MISSING if printed else NONE, *[MISSING] * 4]
+        measured_cells = [MISSING, MISSING if published_row else NONE, *[MISSING] * 4]
         if row is not None:
-            own = [
+            measured_cells = [
                 number(row.rate_hz, "≈ {:.1f}", "estimated"),
                 number(row.energy_mj, "≈ {:.3f}", "estimated"),
                 number(row.instructions, "{:,.0f}", "measured"),
@@ -170,7 +179,7 @@ def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str)
                 Cell(f"{row.mismatches} of {row.inputs:,}", "measured", row.mismatches, n=row.inputs),
             ]
         heads = [Cell(text, "head") for text in (name, str(samples), NAMES.get(kernels, kernels))]
-        rows.append((*heads, *paper, *own))
+        rows.append((*heads, *paper, *measured_cells))
     return Table(
         "table3",
         "Table 3. Real-time performance on the microcontroller",
@@ -203,8 +212,8 @@ def _networks(trainings: ExperimentResults) -> list[_Row]:
         # Counting parameters needs no training.
         shape = Mlp if network == "mlp" else Remnet
         count = models[0].parameters if models else shape(samples).parameters
-        printed = published.MODELS.get((network, samples))
-        rows.append((heads, number(count, "{}", "measured"), models, printed))
+        published_row = published.MODELS.get((network, samples))
+        rows.append((heads, number(count, "{}", "measured"), models, published_row))
     return rows
 
 
@@ -217,7 +226,7 @@ def _forms(models: Sequence[TrainedModel], kind: str, unit: float, digits: int) 
             cells.append(NONE)
             continue
         text = f"{spread.mean:.{digits}f}"
-        if spread.std and float(around := f"{spread.std:.{digits}f}"):
-            text += f" ± {around}"
+        if spread.std and float(rounded_std := f"{spread.std:.{digits}f}"):
+            text += f" ± {rounded_std}"
         cells.append(Cell(text, "measured", spread.mean, spread.std, spread.n))
     return cells or [MISSING] * len(FORMS)
