@@ -71,7 +71,7 @@ setup(
             "mappings/*.yaml",
             "evaluation/templates/*.j2",
             "paper/templates/*.j2",
-            "viewer/templates/*.j2",
+            "viewer/templates/*",
         ]
     },
     data_files=[

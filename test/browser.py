@@ -20,6 +20,13 @@ _OPTIONS = (
 )  # fmt: skip
 
 
+ROLES = {
+    "button": "button", "checkbox": "input", "combobox": "select", "searchbox": "input", "slider": "input",
+    "table": "table", "image": "[role=img]", "region": "section", "columnheader": "th", "heading": "h1, h2",
+}  # fmt: skip
+"""CSS selectors of the elements that can have a role."""
+
+
 class Browser:
     """A browser window."""
 
@@ -81,24 +88,45 @@ class Browser:
         """Return whether a Bokeh page is loaded and drawn."""
         return bool(self.run("return !!(window.Bokeh && Bokeh.documents[0]?.is_idle)"))
 
+    def find(self, role: str, name: str) -> Any:
+        """Return the element with an ARIA role and an accessible name; None if it does not exist."""
+        elements = self.driver.find_elements("css selector", ROLES[role])
+        return next((e for e in elements if e.aria_role == role and e.accessible_name == name), None)
+
+    def click(self, role: str, name: str) -> None:
+        """Click an element as soon as it exists."""
+        self.wait(f"{role} {name}", lambda: self.find(role, name)).click()
+
+    def table(self, name: str) -> list[dict[str, str]]:
+        """Return the rows of a table, {title of the column: text}."""
+        table = self.find("table", name)
+        if table is None:
+            return []
+        rows = self.run(
+            "return [...arguments[0].rows].map((row) => [...row.cells].map((cell) => cell.innerText.trim()))",
+            table,
+        )
+        return [dict(zip(rows[0], row, strict=True)) for row in rows[1:]]
+
+    def text(self) -> str:
+        """Return the visible text of the page."""
+        return self.run("return document.body.innerText")
+
+    def export(self, name: str) -> str:
+        """Return an exported file of the page as text, such as `Map as CSV`."""
+        self.run("window.exported = {}")
+        self.click("button", f"Export {name}")
+        self.wait("the file", lambda: self.run("return Object.keys(window.exported).length") == 1)
+        return self.run("return Object.values(window.exported)[0].text()")
+
     def column(self, model: str, name: str) -> list[Any]:
         """Return a column of the source of a named table or figure; empty before the page is loaded."""
         return self.run(
             "const m = window.Bokeh?.documents[0]?.get_model_by_name(arguments[0]);"
-            "const sources = !m ? [] : m.source ? [m.source] : m.renderers.map((r) => r.data_source);"
+            "const sources = !m ? [] : m.renderers ? m.renderers.map((r) => r.data_source) : [m];"
             "return Array.from(sources.find((s) => arguments[1] in s.data)?.data[arguments[1]] ?? [])",
             model,
             name,
-        )
-
-    def cell(self, text: str) -> Any:
-        """Return the element with a text, in any shadow tree; None if it does not exist."""
-        return self.run(
-            "const wanted = arguments[0], find = (root) => { for (const e of root.querySelectorAll('*')) {"
-            " if (e.children.length == 0 && e.textContent == wanted) return e;"
-            " if (e.shadowRoot) { const f = find(e.shadowRoot); if (f) return f; } } return null; };"
-            "return find(document)",
-            text,
         )
 
     def console_messages(self) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import webbrowser
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,12 +25,25 @@ def view(
             help="An MCAP bag or rosbag2 folder with ranges (raw or corrected), or the output of `track`.",
         ),
     ],
+    second: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[SECOND]", help="A bag of the same drive with another correction, to compare."
+        ),
+    ] = None,
     anchors: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
             help="Anchors file. Default: X.anchors.yaml next to BAG, else the markers in BAG.",
         ),
+    ] = None,
+    height: Annotated[
+        float | None,
+        typer.Option(help="Height of the tags, m, for tracks. Default: the true height, if BAG contains it."),
+    ] = None,
+    floor_plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Floor plan: the YAML file of a map of map_server.")
     ] = None,
     model: ModelOption = None,
     namespace: Annotated[
@@ -47,8 +61,8 @@ def view(
 ) -> None:
     """Show a recording in the browser: map, ranges, CIRs.
 
-    It serves the page of the node `viewer` with a slider for the time, without ROS. It plays in real time until
-    Ctrl-C.
+    It serves the page of the node `viewer` with a slider for the time, without ROS, until Ctrl-C. With two bags of one drive,
+    it compares their corrections.
 
         uwb-mitigation data simulate --like drive -o flat.mcap
 
@@ -56,25 +70,50 @@ def view(
     """
     from threading import Lock
 
+    from uwb_mitigation.positioning.geometry import Height
     from uwb_mitigation.sources.site import anchors_file, load_anchors
     from uwb_mitigation.viewer.feed import Feed
+    from uwb_mitigation.viewer.floor_plan import load_floor_plan
     from uwb_mitigation.viewer.page import View
     from uwb_mitigation.viewer.playback import BagPlayer
     from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.server import ViewerServer
 
-    scene, lock = Scene(), Lock()
-    feed = Feed(scene, lock)
-    player = BagPlayer(bag, feed, lambda: _backend(model, bag), namespace)
-    own = anchors_file(bag)
-    if anchors is not None or own.is_file():
-        feed.anchors(load_anchors(anchors or own))
-    if player.corrects:
-        console.err.print("The bag contains raw ranges only: they are corrected for display.", style="yellow")
-    shown = View(scene, lock, title=bag.resolve().name, player=player, missing=player.missing)
+    lock = Lock()
+    file = anchors or anchors_file(bag)
+    known = load_anchors(file) if anchors is not None or file.is_file() else None
+    players, scenes = [], []
+    for path in (bag, second):
+        if path is None:
+            continue
+        feed = Feed(Scene(), lock)
+        player = BagPlayer(path, feed, partial(_backend, model, path), namespace)
+        if known is not None:
+            feed.anchors(known)
+        if player.corrects:
+            console.err.print(
+                f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
+            )
+        player.index(known, None if height is None else Height(height))
+        players.append(player)
+        scenes.append(feed.scene)
+    first = players[0]
+    names = bag.resolve().name
+    if second is not None:
+        first.companion = players[1]
+        names += f" and {second.resolve().name}"
+    shown = View(
+        scenes[0],
+        lock,
+        title=names,
+        player=first,
+        compared=scenes[1] if second is not None else None,
+        plan=None if floor_plan is None else load_floor_plan(floor_plan),
+        missing=first.missing,
+    )
     with ViewerServer(shown, host, port, tuple(origins or ())) as server:
         console.out.print(f"{server.url} shows {bag}; Ctrl-C ends it.", markup=False, soft_wrap=True)
-        player.play(True)
+        first.play(True)
         if browser:
             webbrowser.open(server.url)
         while True:

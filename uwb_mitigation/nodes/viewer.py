@@ -30,6 +30,7 @@ from uwb_mitigation.nodes.replay import ReplayClock
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.sources.site import load_anchors
 from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, MissingData, Scene
 from uwb_mitigation.viewer.server import ViewerServer
@@ -104,6 +105,7 @@ class Viewer(ManagedNode):
             self._lock,
             title=f"UWB ranges {self.get_namespace().strip('/')}".strip(),
             window=self.value("window"),
+            plan=load_floor_plan(Path(plan).expanduser()) if (plan := self.value("floor_plan")) else None,
         )
         origins = tuple(origin.strip() for origin in self.value("origins").split(",") if origin.strip())
         self._server = ViewerServer(self._view, self.value("host"), self.value("port"), origins)

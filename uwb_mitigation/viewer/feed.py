@@ -16,8 +16,12 @@ from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_ra
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import PROTECTION
+from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
     MAX_ID_DIGITS,
+    MAX_TEXT,
     MAX_TRUTHS,
     MAX_WITHOUT_TRUTH,
     AnchorPosition,
@@ -34,18 +38,22 @@ Decoded = TypeVar("Decoded")
 CHI2_95 = 5.991
 """Squared radius of the 95 % ellipse in two dimensions."""
 
+MAX_HEADING_VARIANCE = 1.0
+"""If the variance of the heading is larger, rad^2, the heading is unknown."""
+
 
 class Feed:
     """Adds messages to a scene, with the lock that its pages hold while they draw.
 
     Attributes:
         malformed: number of messages that could not be decoded.
+        lock: held while the scene is changed.
     """
 
     def __init__(self, scene: Scene, lock: Lock) -> None:
         self.malformed = 0
         self.scene = scene
-        self._lock = lock
+        self.lock = lock
         self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
         self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
@@ -53,11 +61,11 @@ class Feed:
         """Remove everything except the anchors."""
         self._truths.clear()
         self._without_truth.clear()
-        with self._lock:
+        with self.lock:
             self.scene.clear()
 
     def report(self, name: str, report: NodeStatus) -> None:
-        with self._lock:
+        with self.lock:
             self.scene.set_node_status(name, report)
 
     def range_raw(self, data: bytes) -> None:
@@ -67,7 +75,7 @@ class Feed:
     def measurement(self, measurement: RangeMeasurement) -> None:
         trace = Trace.of(measurement.cir)
         if trace is not None:
-            with self._lock:
+            with self.lock:
                 self.scene.add_trace((measurement.anchor_id, measurement.tag_id), trace)
 
     def range_truth(self, data: bytes) -> None:
@@ -77,7 +85,7 @@ class Feed:
         if (sample := self._without_truth.pop(key, None)) is None:
             self._truths.add(key, truth)
             return
-        with self._lock:
+        with self.lock:
             self.scene.set_truth(sample, truth)
 
     def range_corrected(self, data: bytes) -> None:
@@ -87,8 +95,10 @@ class Feed:
     def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
         sample = Sample.of(key.stamp_ns / 1e9, corrected, truth)
-        with self._lock:
-            self.scene.add_sample((key.anchor_id, key.tag_id), sample)
+        with self.lock:
+            pair = key.anchor_id, key.tag_id
+            self.scene.add_sample(pair, sample)
+            self.scene.pairs[pair].count_lost(key.sequence)
             self.scene.count_error(sample)
         if truth is None:
             self._without_truth.add(key, sample)
@@ -99,35 +109,57 @@ class Feed:
         if not math.isfinite(position.x + position.y):
             self.malformed += 1
             return
-        covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)[:2, :2]
-        pose = Pose(position.x, position.y, position.z, _ellipse(covariance))
-        with self._lock:
+        covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
+        q, heading_rad = message.pose.pose.orientation, math.nan
+        if 0.0 < covariance[5, 5] < MAX_HEADING_VARIANCE:
+            heading_rad = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+        pose = Pose(position.x, position.y, position.z, *_bounds(covariance[:2, :2]), heading_rad)
+        with self.lock:
             self.scene.add_pose(tag, pose)
+
+    def estimate(self, tag: str, estimate: Estimate) -> None:
+        """Add a position that the viewer itself estimated."""
+        x, y, z = estimate.position.tolist()
+        with self.lock:
+            self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance[:2, :2])))
+
+    def smoothed(self, tag: str, message: Any) -> None:
+        """Add a smoothed geometry_msgs/PoseWithCovarianceStamped."""
+        self._position(tag, TrackKind.SMOOTHED, message)
 
     def true_position(self, message: Any) -> None:
         """Add a nav_msgs/Odometry whose child frame is the tag."""
+        self._position(str(message.child_frame_id), TrackKind.TRUE, message)
+
+    def _position(self, tag: str, kind: TrackKind, message: Any) -> None:
         position = message.pose.pose.position
         if math.isfinite(position.x + position.y):
-            with self._lock:
-                self.scene.add_true_position(str(message.child_frame_id), position.x, position.y)
+            with self.lock:
+                self.scene.add_position(tag, kind, position.x, position.y)
 
     def markers(self, message: Any) -> None:
-        """Add the anchors of a visualization_msgs/MarkerArray: namespace `anchors`; the text is the anchor's id."""
+        """Add the anchors of a visualization_msgs/MarkerArray.
+
+        A marker of the namespace `anchors` has the id of the anchor as its text, that of `names` with the same number its label.
+        """
         found: dict[int, AnchorPosition] = {}
+        labels = {marker.id: str(marker.text) for marker in message.markers if marker.ns == "names"}
         for marker in message.markers:
             position, text = marker.pose.position, marker.text
             if marker.ns != "anchors" or not math.isfinite(position.x + position.y):
                 continue
             if text.isascii() and text.isdigit() and len(text) <= MAX_ID_DIGITS:
-                found[int(text)] = AnchorPosition(position.x, position.y, position.z)
+                label = labels.get(marker.id, "")
+                name = label.partition(" (")[2].removesuffix(")")[:MAX_TEXT]
+                found[int(text)] = AnchorPosition(position.x, position.y, position.z, name)
         if found:
-            with self._lock:
+            with self.lock:
                 self.scene.set_anchors(found)
 
     def anchors(self, anchors: AnchorMap) -> None:
         """Set the anchors of an anchors file."""
         places = {anchor.id: AnchorPosition(*anchor.position, anchor.name) for anchor in anchors.anchors}
-        with self._lock:
+        with self.lock:
             self.scene.set_anchors(places)
 
     def diagnostics(self, message: Any) -> None:
@@ -145,12 +177,13 @@ class Feed:
             return None
 
 
-def _ellipse(covariance: np.ndarray[Any, Any]) -> tuple[float, float, float]:
-    """Return the 95 % ellipse of a 2 x 2 covariance: half axes and angle of the major axis; NaN if invalid."""
+def _bounds(covariance: np.ndarray[Any, Any]) -> tuple[tuple[float, float, float], float]:
+    """Return half axes and angle of the 95 % ellipse of a 2 x 2 covariance, and the protection level; NaN if invalid."""
     if not np.isfinite(covariance).all():
-        return math.nan, math.nan, math.nan
+        return (math.nan, math.nan, math.nan), math.nan
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     if values[0] < 0:
-        return math.nan, math.nan, math.nan
+        return (math.nan, math.nan, math.nan), math.nan
     minor, major = np.sqrt(CHI2_95 * values)
-    return float(major), float(minor), math.atan2(vectors[1, 1], vectors[0, 1])
+    ellipse = float(major), float(minor), math.atan2(vectors[1, 1], vectors[0, 1])
+    return ellipse, float(PROTECTION * math.sqrt(values[1]))

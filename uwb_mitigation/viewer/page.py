@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import math
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,54 +19,46 @@ from bokeh.models import ColumnDataSource
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.viewer.models import (
-    CORRECTED,
-    SMOOTHED,
-    TRACE_AFTER,
-    TRACE_BEFORE,
-    Models,
-    blank_waterfall,
-)
+from uwb_mitigation.viewer.floor_plan import FloorPlan
+from uwb_mitigation.viewer.models import COLUMNS, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
+from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, PAPER, STATUS_LOOKS, TrackKind
 from uwb_mitigation.viewer.scene import (
+    CELL_M,
     ERROR_EDGES_M,
     HISTORY_S,
     MAX_RANGE_M,
     NO_DATA_S,
+    SPEEDS,
     History,
     MissingData,
     Pair,
+    Sample,
     Scene,
     Trace,
 )
 
 if TYPE_CHECKING:
     from uwb_mitigation.viewer.playback import BagPlayer
+    from uwb_mitigation.viewer.timeline import Timeline
 
 REFRESH_S = 0.1
 FAST_PAGES = 3
 """Number of pages that are drawn every `REFRESH_S`; more pages are drawn less often."""
 
-COLOURS = {
-    Status.OK: "#15803d",
-    Status.NO_CIR: "#6b7280",
-    Status.BAD_CIR: "#b45309",
-    Status.OUT_OF_DISTRIBUTION: "#c2410c",
-    Status.MODEL_ERROR: "#b91c1c",
-}
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
-LEVEL_COLOURS = ("#15803d", "#b45309", "#b91c1c", "#6b7280")
+LEVEL_SYMBOLS = ("\u25cf", "\u25b2", "\u2716", "\u25a0")
 
-NO_DATA_COLOUR = "#9ca3af"
+TABLE_S = 0.5
+"""Minimum interval of updates of the table of pairs."""
+
+NO_DATA_COLOUR = GREY
 """Colour of pairs and tags without recent data."""
+
+HEADING_M = 1.0
+"""Length of the heading arrow."""
 
 MARGIN_M = 5.0
 """Margin around a tag on a map without anchors."""
-
-_NOTICE_STYLE = "background:#fef3c7;color:#78350f;padding:4px 10px;border-radius:4px;margin-bottom:4px"
-_DIAGNOSTICS_STYLE = (
-    "<style>td{padding:2px 10px 2px 4px;vertical-align:top;overflow-wrap:anywhere}"
-    "td:first-child{min-width:90px}</style>"
-)
 
 _TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
 
@@ -81,6 +71,8 @@ class View:
         lock: held while the scene is changed or drawn.
         window: number of samples that the network reads.
         player: player of a recording; None: live.
+        compared: scene of the second recording; None: there is only one.
+        plan: floor plan; None: unknown.
         missing: the reasons for an empty page.
         pages: number of open pages.
     """
@@ -90,6 +82,8 @@ class View:
     title: str = "UWB ranges"
     window: int = 157
     player: BagPlayer | None = None
+    compared: Scene | None = None
+    plan: FloorPlan | None = None
     missing: MissingData = field(default_factory=MissingData)
     pages: int = 0
 
@@ -104,29 +98,38 @@ class Page:
 
     def __init__(self, document: Document, view: View, nonce: str = "") -> None:
         self._view = view
-        self._fitted: tuple[bool, bool] = False, False
+        self._fitted = False, False, False
         self._selected: Pair | None = None
         self._rows: list[Pair] = []
         self._due_s = 0.0
         self._drawn: dict[str, object] = {}
-        self._models = models = Models(None if view.player is None else view.player.seconds)
+        self._paused = self._dark = False
+        self._table_due_s = 0.0
+        player = view.player
+        self._models = models = Models(
+            None if player is None else player.seconds, view.plan, view.compared is not None
+        )
         # Register before the model is added to the document: later registrations have no effect.
-        models.map_figure.on_event(Reset, self._on_reset)
+        models.figures["map"].on_event(Reset, self._on_reset)
         # Add all roots in one step: Bokeh searches for new models after each, half of the time to open a page.
         with document.models.freeze():
-            for model in models.roots.values():
+            for model in models.roots:
                 document.add_root(model)
         document.title = view.title
         document.template = _TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
-            page_title=view.title, recording=view.player is not None, nonce=nonce
+            page_title=view.title,
+            recording=player is not None,
+            compares=view.compared is not None,
+            nonce=nonce,
+            columns=[column for column in COLUMNS if column[0] != "compared" or view.compared is not None],
+            figures={name: FIGURES[name] for name in FIGURES if name in models.figures},
+            looks=STATUS_LOOKS,
+            speeds=SPEEDS,
         )
         document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
-        models.pairs.selected.on_change("indices", self._on_row)
         models.anchors.selected.on_change("indices", self._on_anchor)
-        models.pause.on_change("active", self._on_pause)
-        if models.slider is not None:
-            models.slider.on_change("value_throttled", self._on_slider)
+        models.controls.on_change("command", self._on_command)
         document.add_periodic_callback(self.tick, int(1000 * REFRESH_S))
         self.draw()
         # Register last: a session that could not be opened does not report its end.
@@ -138,7 +141,7 @@ class Page:
         now_s, player = time.monotonic(), self._view.player
         if player is not None:
             player.advance()
-        elif self._models.pause.active:
+        elif self._paused:
             return
         if now_s < self._due_s:
             return
@@ -160,52 +163,97 @@ class Page:
             self._draw_strip(scene, history)
             self._draw_trace(() if history is None else tuple(history.traces))
             self._draw_diagnostics(scene)
-            if self._changed("errors", scene.errors):
+            compared = self._view.compared
+            if self._changed("errors", (scene.errors, None if compared is None else compared.errors)):
                 raw, corrected = scene.error_counts.astype(float)
-                left, right = ERROR_EDGES_M[:-1], ERROR_EDGES_M[1:]
-                self._models.errors.data = {"left": left, "right": right, "raw": raw, "corrected": corrected}
+                columns = {
+                    "left": ERROR_EDGES_M[:-1],
+                    "right": ERROR_EDGES_M[1:],
+                    "raw": raw,
+                    "corrected": corrected,
+                }
+                second = np.zeros(len(raw)) if compared is None else compared.error_counts[1].astype(float)
+                self._models.errors.data = columns | {"compared": second}
 
     def select(self, pair: Pair) -> None:
-        """Show the CIR and the strip of a pair."""
+        """Show the CIR and the ranges of a pair."""
         self._selected = pair
+        self._table_due_s = 0.0
         self.draw()
 
     # Drawing --------------------------------------------------------------------------------------------------
 
     def _draw_player(self) -> None:
-        player, slider = self._view.player, self._models.slider
-        if player is None or slider is None:
-            return
-        if self._changed("position", position_s := min(round(player.position_s, 1), slider.end)):
-            # The page's script moves the handle, unless the user is dragging it.
-            slider.tags = [position_s]
-        if self._changed("playing", player.playing):
-            self._models.pause.active = not player.playing
-            self._models.pause.label = "Pause" if player.playing else "Play"
+        player, models = self._view.player, self._models
+        if player is None:
+            state: dict[str, object] = {"playing": not self._paused}
+        else:
+            position_s = round(player.position_s, 3)
+            state = {
+                "playing": player.playing, "position": position_s, "seconds": player.seconds, "speed": player.speed,
+            }  # fmt: skip
+            if self._changed("position", position_s):
+                models.position.data = {"time": [position_s], "low": [0.0], "high": [1.0]}
+            if player.timeline is not None and self._changed("timeline", True):
+                self._draw_timeline(player, player.timeline)
+            second = player.companion
+            if (
+                second is not None
+                and second.timeline is not None
+                and self._changed("compared_timeline", True)
+            ):
+                columns = second.timeline.mean_errors(second.seconds)
+                models.compared_timeline.data = {name: columns[name] for name in ("time", "corrected")}
+        if models.controls.player != state:
+            models.controls.player = state
+
+    def _draw_timeline(self, player: BagPlayer, timeline: Timeline) -> None:
+        self._models.timeline.data = timeline.mean_errors(player.seconds)
+        bad_s = np.unique(np.round(timeline.time_s[timeline.bad] / max(player.seconds, 1e-9), 3))
+        largest = timeline.largest_error()
+        self._models.controls.marks = {
+            "bad": bad_s.tolist(),
+            "largest": None
+            if largest is None
+            else float(timeline.time_s[largest] / max(player.seconds, 1e-9)),
+            "truth": bool(np.isfinite(timeline.true_m).any()),
+        }
 
     def _draw_pairs(self, scene: Scene) -> None:
+        self._rows = [pair for pair, _, _ in scene.latest()]
+        if self._selected is None and self._rows:
+            self._selected = self._rows[0]
+        selected = None if self._selected is None else [format_id(identity) for identity in self._selected]
+        if self._models.controls.selected != selected:
+            self._models.controls.selected = selected
+        if time.monotonic() < self._table_due_s:
+            self._drawn.pop("scene", None)
+            return
+        self._table_due_s = time.monotonic() + TABLE_S
         rows = []
         for pair, history, sample in scene.latest():
-            no_data = _no_data(scene, history)
+            no_data, look = _no_data(scene, history), STATUS_LOOKS[sample.status]
+            other = None if self._view.compared is None else self._view.compared.pairs.get(pair)
+            values = history.statistics()
             rows.append(
-                {
+                values
+                | {
                     "anchor": format_id(pair[0]),
                     "tag": format_id(pair[1]),
                     "rate": 0.0 if no_data else history.rate_hz(scene.age_s(history)),
                     "raw": sample.raw_m,
                     "range": sample.range_m,
+                    "compared": other.latest.range_m if other and other.latest else math.nan,
                     "sigma": sample.sigma_m,
-                    "correction": sample.raw_m - sample.range_m,
                     "status": no_data or sample.status.name,
-                    "colour": NO_DATA_COLOUR if no_data else COLOURS[sample.status],
-                    "row_colour": NO_DATA_COLOUR if no_data else "",
+                    "symbol": "\u25cb" if no_data else look.symbol,
+                    "colour": NO_DATA_COLOUR if no_data else look.colour or "",
+                    "no_data": bool(no_data),
+                    "not_ok": 100.0 * values["not_ok"],
+                    "nlos": 100.0 * values["nlos"],
                 }
             )
-        self._rows = [pair for pair, _, _ in scene.latest()]
-        if self._selected is None and self._rows:
-            self._selected = self._rows[0]
         _set_rows(self._models.pairs, rows)
-        _select_row(self._models.pairs, self._rows, self._selected)
 
     def _draw_summary(self, scene: Scene) -> None:
         """Show counts, the reason for an empty page, and the pairs and tags that have stopped."""
@@ -216,6 +264,8 @@ class Page:
         if scene.errors:
             raw_m, corrected_m = scene.error_sums_m / scene.errors
             parts.append(f"mean absolute error {raw_m:.3f} m raw, {corrected_m:.3f} m corrected")
+            if (other := self._view.compared) is not None and other.errors:
+                parts[-1] += f", {other.error_sums_m[1] / other.errors:.3f} m second recording"
         missing, lines = self._view.missing, []
         histories = [history for _, history, _ in scene.latest()]
         if not histories:
@@ -223,14 +273,11 @@ class Page:
         elif all(_no_data(scene, history) for history in histories):
             lines.append(f"No ranges for {min(map(scene.age_s, histories)):.0f} s.")
         lines += [missing.anchors] if not scene.anchors else []
-        lines += [missing.positions] if not scene.tags else []
-        notice = "".join(f'<div style="{_NOTICE_STYLE}">{html.escape(line)}</div>' for line in lines if line)
-        for div, text in (
-            (self._models.summary, html.escape(" · ".join(parts))),
-            (self._models.notice, notice),
-        ):
-            if div.text != text:
-                div.text = text
+        lines += [missing.positions] if not (scene.tags or scene.tracks) else []
+        lines = [line for line in lines if line]
+        for name, value in (("summary", " \u00b7 ".join(parts)), ("notice", lines)):
+            if getattr(self._models.controls, name) != value:
+                setattr(self._models.controls, name, value)
 
     def _draw_map(self, scene: Scene) -> None:
         models = self._models
@@ -243,10 +290,8 @@ class Page:
         _select_row(
             models.anchors, list(scene.anchors), None if self._selected is None else self._selected[0]
         )
-        tags, tracks = [], []
+        tags: list[dict[str, Any]] = []
         for name, tag in scene.tags.items():
-            colour = SMOOTHED if name.endswith(" smoothed") else CORRECTED
-            tracks.append(_line(tag.track) | {"colour": colour})
             if (pose := tag.pose) is None:
                 continue
             no_data = scene.age_s(tag) > NO_DATA_S
@@ -256,44 +301,85 @@ class Page:
                     "x": pose.x,
                     "y": pose.y,
                     "name": f"{name}: no data for {scene.age_s(tag):.0f} s" if no_data else name,
-                    "colour": NO_DATA_COLOUR if no_data else colour,
+                    "colour": NO_DATA_COLOUR if no_data else BLUE,
                     "width": _finite(_drawable(2 * major)),
                     "height": _finite(_drawable(2 * minor)),
                     "angle": _finite(angle),
+                    "protection": _finite(_drawable(pose.protection_m)),
+                    "heading": _finite(pose.heading_rad),
+                    "heading_size": HEADING_M if math.isfinite(pose.heading_rad) else math.nan,
                 }
             )
         _set_rows(models.tags, tags)
-        _set_rows(models.tracks, tracks)
-        _set_rows(models.true_tracks, [_line(track) for track in scene.true_tracks.values()])
-        fitted = bool(scene.anchors), bool(scene.anchors or scene.tags or scene.true_tracks)
+        self._draw_tracks(scene)
+        fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
         # The view is set for the first content and for the first anchors, and then only by the user.
         if fitted > self._fitted or not models.extent.data["x"]:
             self._fitted = fitted
             self._fit(scene)
-        self._draw_circles(scene)
+        self._draw_rays(scene)
+        for key, shown in (
+            ("ellipse", any(row["width"] > 0.0 for row in tags)),
+            ("protection", any(row["protection"] > 0.0 for row in tags)),
+            ("heat", bool(scene.heat) and models.heat_renderer.visible),
+        ):
+            models.show_legend(key, shown)
+
+    def _draw_tracks(self, scene: Scene) -> None:
+        models = self._models
+        for kind, source in models.tracks.items():
+            of, wanted = scene, kind
+            if kind is TrackKind.COMPARED:
+                if self._view.compared is None:
+                    continue
+                of, wanted = self._view.compared, TrackKind.CORRECTED
+            found = [tuple(track) for (_, own), track in of.tracks.items() if own is wanted]
+            if not self._changed(kind.value, [(len(track), track[-1]) for track in found if track]):
+                continue
+            # A NaN separates the tracks of two tags.
+            gap = ((math.nan, math.nan),)
+            points = np.array([point for track in found for point in (*track, *gap)] or gap, np.float32)
+            source.data = {"x": points[:, 0], "y": points[:, 1]}
+            models.show_legend(kind, bool(found))
+        if models.heat_renderer.visible and self._changed(
+            "heat", sum(entry[1] for entry in scene.heat.values())
+        ):
+            cells = np.array([(*cell, entry[0] / entry[1]) for cell, entry in scene.heat.items()], np.float32)
+            cells = cells.reshape(-1, 3)
+            x, y = ((cells[:, axis] + 0.5) * CELL_M for axis in (0, 1))
+            models.heat.data = {"x": x, "y": y, "mean": cells[:, 2]}
+            if len(cells):
+                models.heat_levels.update(low=float(cells[:, 2].min()), high=float(cells[:, 2].max()) + 1e-6)
 
     def _fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
         places = [(place.x, place.y) for place in scene.anchors.values()]
-        for track in (*(tag.track for tag in scene.tags.values()), *scene.true_tracks.values()):
+        for track in scene.tracks.values():
             places += track
+        if (player := self._view.player) is not None and player.timeline is not None:
+            for _, position in player.timeline.tracks.values():
+                places += np.percentile(position[:, :2], (2, 98), axis=0).tolist() if len(position) else []
         x, y = np.array(places or [(0.0, 0.0), (10.0, 10.0)]).T
         # Without anchors, leave a margin in which the tag can move.
         margin = 0.0 if scene.anchors or not places else MARGIN_M
         corners = {"x": [x.min() - margin, x.max() + margin], "y": [y.min() - margin, y.max() + margin]}
         self._models.extent.data = {name: [float(value) for value in ends] for name, ends in corners.items()}
 
-    def _draw_circles(self, scene: Scene) -> None:
-        """Draw circles and rays of the tag of the selected pair."""
+    def _draw_rays(self, scene: Scene) -> None:
+        """Draw rays, circles and statuses of the tag of the selected pair."""
         rows = []
+        symbols: dict[Status, list[dict[str, float]]] = {status: [] for status in Status}
         tag_id = None if self._selected is None else self._selected[1]
         tag = None if tag_id is None else scene.tag_of(tag_id)
         pose = None if tag is None else tag.pose
         for (anchor, other), history, sample in scene.latest():
             place = scene.anchors.get(anchor)
-            if other != tag_id or place is None or math.isnan(_drawable(sample.range_m)):
-                continue
-            if _no_data(scene, history):
+            if (
+                other != tag_id
+                or place is None
+                or math.isnan(_drawable(sample.range_m))
+                or _no_data(scene, history)
+            ):
                 continue
             height_m = 0.0 if pose is None else _finite(pose.z - place.z)
             raw_m, range_m = (
@@ -302,8 +388,17 @@ class Page:
             )
             x1, y1 = (place.x, place.y) if pose is None else (pose.x, pose.y)
             row = {"x": place.x, "y": place.y, "raw": raw_m, "range": range_m, "x1": x1, "y1": y1}
-            rows.append(row | {"colour": COLOURS[sample.status]})
+            rows.append(row | {"colour": self._colour(sample.status)})
+            if pose is not None:
+                symbols[sample.status].append({"x": (place.x + x1) / 2, "y": (place.y + y1) / 2})
         _set_rows(self._models.circles, rows)
+        for status, points in symbols.items():
+            if points or self._models.statuses[status].data["x"]:
+                _set_rows(self._models.statuses[status], points)
+                self._models.show_legend(status, bool(points))
+
+    def _colour(self, status: Status) -> str:
+        return STATUS_LOOKS[status].colour or (PAPER if self._dark else NIGHT)
 
     def _draw_strip(self, scene: Scene, history: History | None) -> None:
         # Also draw a pair without new data, because its ranges age.
@@ -318,13 +413,32 @@ class Page:
             "raw": [_drawable(sample.raw_m) for sample in samples],
             "range": [_drawable(sample.range_m) for sample in samples],
             "true": [_drawable(sample.true_m) for sample in samples],
+            "compared": self._compared_ranges(samples),
         }
         self._models.strip.data = {name: np.array(column, np.float32) for name, column in values.items()}
-        title = "no pair chosen"
-        if self._selected is not None:
-            title = f"anchor {format_id(self._selected[0])}, tag {format_id(self._selected[1])}"
-        self._models.strip_figure.title.text = f"Range: {title}"
-        self._models.cir_figure.title.text = f"CIR: {title}"
+        bad = [sample for sample in samples if sample.status is not Status.OK]
+        _set_rows(
+            self._models.bad,
+            [
+                {
+                    "age": sample.time_s - now_s,
+                    "range": _drawable(sample.range_m),
+                    "marker": STATUS_LOOKS[sample.status].marker,
+                    "colour": self._colour(sample.status),
+                }
+                for sample in bad
+            ],
+        )
+
+    def _compared_ranges(self, samples: list[Sample]) -> list[float]:
+        """Return the ranges of the second recording at the stamps of the first one."""
+        second = (
+            None if self._view.compared is None else self._view.compared.pairs.get(self._selected or (-1, -1))
+        )
+        known = (
+            {} if second is None else {round(sample.time_s, 6): sample.range_m for sample in second.samples}
+        )
+        return [_drawable(known.get(round(sample.time_s, 6), math.nan)) for sample in samples]
 
     def _draw_trace(self, traces: tuple[Trace, ...]) -> None:
         models = self._models
@@ -354,15 +468,9 @@ class Page:
     def _draw_diagnostics(self, scene: Scene) -> None:
         rows = [(name, report.at(scene.clock())) for name, report in sorted(scene.node_statuses.items())]
         if self._changed("node_statuses", rows):
-            # Escape these texts: they come from messages and may contain HTML.
-            cells = [
-                f"<tr><td>{html.escape(name)}</td>"
-                f"<td>{_level(report.level)}</td><td>{html.escape(report.message)}</td></tr>"
-                for name, report in rows
+            self._models.controls.nodes = [
+                [name, *_level(status.level), status.message] for name, status in rows
             ]
-            self._models.node_statuses.text = (
-                f"{_DIAGNOSTICS_STYLE}<table>{''.join(cells)}</table>" if cells else "none yet"
-            )
 
     def _changed(self, name: str, value: object) -> bool:
         if name in self._drawn and self._drawn[name] == value:
@@ -372,9 +480,50 @@ class Page:
 
     # Events ---------------------------------------------------------------------------------------------------
 
-    def _on_row(self, _attribute: str, _old: object, new: list[int]) -> None:
-        if new and new[0] < len(self._rows) and self._rows[new[0]] != self._selected:
-            self.select(self._rows[new[0]])
+    def _on_command(self, _attribute: str, _old: object, command: Any) -> None:
+        """Execute a command of the page; a browser may send anything."""
+        try:
+            name, arguments = str(command[0]), list(command[1])
+            if name == "dark":
+                self._dark = bool(arguments[0])
+                self._models.set_dark(self._dark)
+            elif name == "heat":
+                self._models.heat_renderer.visible = bool(arguments[0])
+                self._models.heat_scale.visible = bool(arguments[0])
+            elif name == "select":
+                pair = int(str(arguments[0]), 0), int(str(arguments[1]), 0)
+                if pair in self._view.scene.pairs:
+                    self.select(pair)
+            elif self._view.player is not None:
+                self._control_player(self._view.player, name, arguments)
+            elif name == "play":
+                self._paused = not bool(arguments[0])
+        except (LookupError, TypeError, ValueError, OverflowError):
+            return
+        self._drawn.pop("scene", None)
+        if not self._paused:
+            self.draw()
+        else:
+            self._draw_player()
+
+    def _control_player(self, player: BagPlayer, name: str, arguments: list[Any]) -> None:
+        timeline = player.timeline
+        pair = None
+        if name == "play":
+            player.play(bool(arguments[0]))
+        elif name == "seek" and math.isfinite(position_s := float(arguments[0])):
+            player.seek(position_s)
+        elif name == "speed" and float(arguments[0]) in SPEEDS:
+            player.speed = float(arguments[0])
+        elif name == "step":
+            player.step()
+        elif name == "next_bad" and timeline is not None:
+            pair = player.jump(timeline.next_bad(player.position_s))
+        elif name == "largest" and timeline is not None:
+            pair = player.jump(timeline.largest_error())
+        if pair is not None:
+            self._selected = pair
+        self._table_due_s = 0.0
 
     def _on_anchor(self, _attribute: str, _old: object, new: list[int]) -> None:
         """Select the pair of a clicked anchor with the selected tag, else its first pair."""
@@ -390,19 +539,6 @@ class Page:
     def _on_reset(self, _event: Reset) -> None:
         with self._view.lock:
             self._fit(self._view.scene)
-
-    def _on_pause(self, _attribute: str, _old: object, new: bool) -> None:
-        player = self._view.player
-        if player is None:
-            self._models.pause.label = "Resume" if new else "Pause"
-        elif player.playing is new:
-            player.play(not new)
-            self.draw()
-
-    def _on_slider(self, _attribute: str, _old: object, new: float) -> None:
-        if self._view.player is not None:
-            self._view.player.seek(new)
-            self.draw()
 
     def _on_closed(self, _context: Any) -> None:
         self._view.pages -= 1
@@ -438,15 +574,9 @@ def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.u
     return image
 
 
-def _level(level: int) -> str:
-    """Return the HTML of a diagnostic level, with its colour."""
-    if not 0 <= level < len(LEVELS):
-        return "?"
-    return f'<span style="color:{LEVEL_COLOURS[level]};font-weight:600;white-space:nowrap">{LEVELS[level]}</span>'
-
-
-def _line(track: Iterable[tuple[float, float]]) -> dict[str, Any]:
-    return {"xs": [x for x, _ in track], "ys": [y for _, y in track]}
+def _level(level: int) -> tuple[str, str]:
+    """Return name and symbol of a diagnostic level."""
+    return (LEVELS[level], LEVEL_SYMBOLS[level]) if 0 <= level < len(LEVELS) else ("?", "?")
 
 
 def _utc(time_s: float) -> str:

@@ -7,13 +7,17 @@ therefore opens quickly and needs little memory.
 from __future__ import annotations
 
 import contextlib
+import math
 import re
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from uwb_mitigation.bag import schemas
 from uwb_mitigation.bag.codec import decode_range, measurement_key
@@ -37,8 +41,20 @@ from uwb_mitigation.bag.topics import (
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.measurement import RangeMeasurement
 from uwb_mitigation.mitigation import Backend
+from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.viewer.feed import Feed
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, HISTORY_S, MAX_MESSAGES, MissingData, NodeStatus
+from uwb_mitigation.viewer.palette import TrackKind
+from uwb_mitigation.viewer.scene import (
+    DEFAULT_TAG,
+    HISTORY_S,
+    MAX_MESSAGES,
+    MAX_TRACK,
+    MissingData,
+    NodeStatus,
+    Pair,
+)
+from uwb_mitigation.viewer.timeline import Contents, Timeline
 
 DIAGNOSTICS = "/diagnostics"
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -71,7 +87,10 @@ class BagPlayer:
         seconds: duration of the recording.
         position_s: the current position.
         playing: whether `advance` changes the position.
+        speed: recorded seconds per second.
         corrects: whether the bag contains raw ranges only.
+        timeline: index of the recording; None: not ready.
+        companion: player of another recording of the same drive, which follows this one.
         missing: messages for the page on data that the bag does not contain.
 
     Raises:
@@ -97,15 +116,31 @@ class BagPlayer:
         self.seconds = (end_ns - self._start_ns) / 1e9
         self.position_s = 0.0
         self.playing = False
+        self.speed = 1.0
+        self.timeline: Timeline | None = None
+        self.companion: BagPlayer | None = None
         self.corrects = has_ranges and prefix + RANGE_CORRECTED not in topics
         self.missing = MissingData(
             ranges="No ranges up to this time."
             if has_ranges
             else "The recording contains tracks without ranges.",
             anchors="No anchor positions: set --anchors FILE.",
-            positions="" if positions else "No tag positions: `uwb-mitigation track` estimates them.",
+            positions=""
+            if positions
+            else "No tag positions: they need anchors, and --height if all anchors have one height.",
         )
+        self._new_backend = backend
         self._backend = backend() if self.corrects else None
+        kinds = {POSE_SMOOTHED: TrackKind.SMOOTHED}
+        self._contents = Contents(
+            path,
+            prefix,
+            self._start_ns,
+            {
+                topic: (_POSITION_TYPES[plain], tag, kinds.get(plain, TrackKind.CORRECTED))
+                for topic, (tag, plain) in positions.items()
+            },
+        )
         self._callbacks = self._callbacks_of(prefix, topics)
         self._uncorrected: list[tuple[float, RangeMeasurement]] = []
         self._next: RawMessage | None = None
@@ -122,6 +157,37 @@ class BagPlayer:
                     self._callbacks[topic](message.data)
         self.seek(0.0)
 
+    def index(self, anchors: AnchorMap | None, height: Height | None = None) -> threading.Thread:
+        """Index the recording in a thread, which is returned; `anchors` and `height` are used for tracks."""
+
+        def run() -> None:
+            self.timeline = self._contents.index(
+                anchors, height, self._new_backend() if self.corrects else None
+            )
+            with self._feed.lock:
+                self._feed.scene.heat = self.timeline.heat
+                self._feed.scene.is_indexed = True
+
+        thread = threading.Thread(target=run, name="index", daemon=True)
+        thread.start()
+        return thread
+
+    def step(self) -> None:
+        """Advance to the next range."""
+        if self.timeline is not None:
+            row = int(np.searchsorted(self.timeline.time_s, self.position_s + 1e-6))
+            if row < len(self.timeline.time_s):
+                self.playing = False
+                self._move(float(self.timeline.time_s[row]))
+
+    def jump(self, row: int | None) -> Pair | None:
+        """Pause at a row of the timeline, and return its pair."""
+        if self.timeline is None or row is None:
+            return None
+        self.playing = False
+        self.seek(float(self.timeline.time_s[row]) + 1e-6)
+        return self.timeline.pairs[row]
+
     def play(self, on: bool) -> None:
         """Play or pause; at the end, the recording starts again."""
         if on and self.position_s >= self.seconds:
@@ -133,20 +199,34 @@ class BagPlayer:
         """Show a position, with the minute before it."""
         self.position_s = min(max(position_s, 0.0), self.seconds)
         self._feed.clear()
+        self._shown: dict[tuple[str, TrackKind], int] = {}
         start_ns = self._start_ns + int((self.position_s - self._window_s) * 1e9)
         self._next = None
         self._messages = self._bag.messages(self._callbacks, max(start_ns, 0))
         self._read()
         self._advanced_s = time.monotonic()
+        if self.companion is not None:
+            self.companion.seek(self._companion_position())
 
     def advance(self) -> None:
         """Advance by the time since the last call."""
         now_s = time.monotonic()
         passed_s, self._advanced_s = min(now_s - self._advanced_s, MAX_STEP_S), now_s
         if self.playing:
-            self.position_s = min(self.position_s + passed_s, self.seconds)
-            self.playing = self.position_s < self.seconds
+            self.playing = self.position_s + self.speed * passed_s < self.seconds
+            self._move(self.position_s + self.speed * passed_s)
+        else:
+            self._read()
+
+    def _move(self, position_s: float) -> None:
+        self.position_s = min(max(position_s, 0.0), self.seconds)
         self._read()
+        if self.companion is not None:
+            self.companion._move(self._companion_position())
+
+    def _companion_position(self) -> float:
+        assert self.companion is not None
+        return self.position_s + (self._start_ns - self.companion._start_ns) / 1e9
 
     def _read(self) -> None:
         """Read up to the current position; at most `MAX_MESSAGES`, the rest at the next call."""
@@ -167,6 +247,21 @@ class BagPlayer:
             self._feed.report("recording", NodeStatus(2, f"{error.what}: nothing beyond can be shown"))
         self._correct()
         self._clock_s = self.position_s
+        if self.timeline is not None:
+            self._show_tracks(self.timeline)
+
+    def _show_tracks(self, timeline: Timeline) -> None:
+        """Show the tracks up to the current position."""
+        scene = self._feed.scene
+        for key, (time_s, position) in timeline.tracks.items():
+            count = int(np.searchsorted(time_s, self.position_s, side="right"))
+            if self._shown.get(key) != count:
+                self._shown[key] = count
+                step = max(1, math.ceil(count / MAX_TRACK))
+                with self._feed.lock:
+                    scene.set_track(*key, position[:count:step, :2].tolist())
+                if count and key[1] is TrackKind.CORRECTED and (estimates := timeline.estimates.get(key[0])):
+                    self._feed.estimate(key[0], estimates[count - 1])
 
     def _callbacks_of(self, prefix: str, topics: dict[str, str]) -> dict[str, Callable[[bytes], None]]:
         """Return the callback of each topic that is shown."""
@@ -182,8 +277,8 @@ class BagPlayer:
             DIAGNOSTICS: (DIAGNOSTICS_TYPE, feed.diagnostics),
         }
         for topic, (tag, plain) in _positions(prefix, topics).items():
-            name = f"{tag} smoothed" if plain == POSE_SMOOTHED else tag
-            standard[topic] = _POSITION_TYPES[plain], partial(feed.pose, name)
+            add = feed.smoothed if plain == POSE_SMOOTHED else feed.pose
+            standard[topic] = _POSITION_TYPES[plain], partial(add, tag)
         for topic, (kind, take) in standard.items():
             if topics.get(topic, "").replace("/msg/", "/") == kind.replace("/msg/", "/"):
                 callbacks[topic] = partial(self._standard, kind, take)

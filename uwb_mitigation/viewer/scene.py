@@ -18,14 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.bag.poses import tag_frame
-from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Status, Truth
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Cir, CorrectedRange, Encoding, Status, Truth
+from uwb_mitigation.viewer.palette import TrackKind
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_ANCHORS = 256, 64, 64, 256
 MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Maximum number of truths without corrected ranges, and of corrected ranges without truths."""
 MAX_SAMPLES, MAX_TRACK = 6000, 1200
-"""Maximum points of a strip chart (100 ranges per second for a minute) and of a tag's track."""
+"""Maximum points of a strip chart (100 ranges per second for a minute) and of a track."""
+MAX_CELLS = 4000
+"""Maximum number of cells of the heat map."""
 WATERFALL = 50
 """Maximum number of CIRs of each pair."""
 MAX_VALUES = 2 * 1016
@@ -53,6 +56,17 @@ STALE = 3
 
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
 """Bins of the error histogram; larger errors count in the outermost bins."""
+
+SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 50.0)
+"""Speeds of a player, recorded seconds per second."""
+STEP_M = 0.02
+"""Minimum distance of the points of a track."""
+CELL_M = 0.5
+"""Width of a cell of the heat map."""
+RAW_FIX_S, RAW_AGE_S = 0.2, 0.5
+"""Interval of the positions from raw ranges, and maximum age of their ranges."""
+STATISTICS = 100
+"""Number of latest ranges in the statistics of a pair."""
 
 Pair = tuple[int, int]
 """Anchor and tag."""
@@ -87,6 +101,7 @@ class Sample:
         time_s: stamp.
         raw_m, range_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
         true_m, label: true range and label; NaN and empty if unknown.
+        innovation_m: corrected range minus the distance of the anchor from the estimated position; NaN: unknown.
     """
 
     time_s: float
@@ -96,6 +111,7 @@ class Sample:
     status: Status
     true_m: float = math.nan
     label: str = ""
+    innovation_m: float = math.nan
 
     @classmethod
     def of(cls, time_s: float, corrected: CorrectedRange, truth: Truth | None) -> Sample:
@@ -152,9 +168,13 @@ class History:
 
     Attributes:
         received_s: time of the last range on the scene's clock.
+        lost: number of missing sequence numbers.
     """
 
     received_s: float = math.nan
+    lost: int = 0
+    _sequence: int = -1
+    _steps: deque[int] = field(default_factory=lambda: deque(maxlen=20))
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
     traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=WATERFALL))
 
@@ -163,6 +183,31 @@ class History:
         self.samples.append(sample)
         while self.samples[0].time_s < now_s - HISTORY_S:
             self.samples.popleft()
+
+    def count_lost(self, sequence: int) -> None:
+        """Count missing ranges. Anchors are polled in turn, so the usual step is the median of the latest steps."""
+        step = (sequence - self._sequence) & 0xFFFFFFFF
+        if self._sequence >= 0 and 0 < step < 1000:
+            self._steps.append(step)
+            self.lost += max(round(step / sorted(self._steps)[len(self._steps) // 2]) - 1, 0)
+        self._sequence = sequence
+
+    def statistics(self) -> dict[str, float]:
+        """Return means and shares of the latest ranges and CIRs; NaN: unknown."""
+        samples = list(islice(reversed(self.samples), STATISTICS))
+        cirs = [trace.cir for trace in self.traces]
+        gap_db = _known([cir.power_gap_db for cir in cirs])
+        correction_m = _known([sample.raw_m - sample.range_m for sample in samples])
+        return {
+            "lost": float(self.lost),
+            "not_ok": _mean(np.array([sample.status is not Status.OK for sample in samples], float)),
+            "nlos": _mean((gap_db >= LINE_OF_SIGHT_DB).astype(float)),
+            "correction": _mean(correction_m),
+            "spread": float(correction_m.std()) if len(correction_m) else math.nan,
+            "innovation": _mean(_known([sample.innovation_m for sample in samples])),
+            "rx": _mean(_known([cir.rx_power_dbm for cir in cirs])),
+            "fp": _mean(_known([cir.first_path_power_dbm for cir in cirs])),
+        }
 
     @property
     def latest(self) -> Sample | None:
@@ -194,21 +239,25 @@ class Pose:
 
     Attributes:
         ellipse: horizontal 95 % ellipse: half axes (m) and angle of the major axis (rad); NaN: unknown.
+        protection_m: horizontal protection level; NaN: unknown.
+        heading_rad: NaN: unknown.
     """
 
     x: float
     y: float
     z: float = math.nan
     ellipse: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    protection_m: float = math.nan
+    heading_rad: float = math.nan
 
 
 @dataclass(slots=True)
 class Tag:
-    """A tag's latest pose, its time of reception on the scene's clock, and its track."""
+    """A tag's latest pose, its time of reception on the scene's clock, and the stamp of its last raw fix."""
 
     pose: Pose | None = None
     received_s: float = math.nan
-    track: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_TRACK))
+    raw_fix_s: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +308,10 @@ class Scene:
         now_s: the latest stamp plus the time since then; NaN before any.
         ranges: number of ranges.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
-        tags, true_tracks, anchors, node_statuses: {id or name: ...}.
+        tags, anchors, node_statuses: {id or name: ...}.
+        tracks: {(name, kind): positions}.
+        heat: {cell: [sum of the corrections of the ranges in this cell, m, and their number]}.
+        is_indexed: tracks and heat map are those of the index of a recording; data does not change them.
         revision: increases with every change, so that a page draws only changes.
     """
 
@@ -269,7 +321,11 @@ class Scene:
         self.ranges = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
         self.tags: BoundedDict[str, Tag] = BoundedDict(MAX_TAGS)
-        self.true_tracks: BoundedDict[str, deque[tuple[float, float]]] = BoundedDict(MAX_TAGS)
+        self.tracks: BoundedDict[tuple[str, TrackKind], deque[tuple[float, float]]] = BoundedDict(
+            4 * MAX_TAGS
+        )
+        self.is_indexed = False
+        self.heat: BoundedDict[tuple[int, int], list[float]] = BoundedDict(MAX_CELLS)
         self.anchors: dict[int, AnchorPosition] = {}
         self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
@@ -306,6 +362,7 @@ class Scene:
         history = self.history(pair)
         history.add(sample, self._latest_s)
         history.received_s = self.clock()
+        self._compare_with_position(pair, sample)
 
     def count_error(self, sample: Sample) -> None:
         """Count a range in the histograms if its truth is known."""
@@ -330,15 +387,59 @@ class Scene:
         if _is_plausible(pose.x, pose.y):
             entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or Tag())
             entry.pose, entry.received_s = pose, self.clock()
-            entry.track.append((pose.x, pose.y))
-            self.revision += 1
+            self.add_position(tag, TrackKind.CORRECTED, pose.x, pose.y)
 
-    def add_true_position(self, tag: str, x: float, y: float) -> None:
-        """Add the true position of a tag; `tag` is its name in the truth."""
-        if _is_plausible(x, y):
-            track = self.true_tracks.get(tag[:MAX_TEXT]) or deque(maxlen=MAX_TRACK)
-            self.true_tracks.add(tag[:MAX_TEXT], track).append((x, y))
+    def add_position(self, tag: str, kind: TrackKind, x: float, y: float) -> None:
+        """Append a position to a track; `tag` is its name."""
+        if self.is_indexed:
             self.revision += 1
+            return
+        key = tag[:MAX_TEXT], kind
+        track = self.tracks.get(key)
+        if not _is_plausible(x, y) or (track and math.dist(track[-1], (x, y)) < STEP_M):
+            return
+        self.tracks.add(key, deque(maxlen=MAX_TRACK) if track is None else track).append((x, y))
+        self.revision += 1
+
+    def set_track(self, tag: str, kind: TrackKind, points: list[tuple[float, float]]) -> None:
+        """Replace a track."""
+        self.tracks.add((tag[:MAX_TEXT], kind), deque(points, maxlen=MAX_TRACK))
+        self.revision += 1
+
+    def _compare_with_position(self, pair: Pair, sample: Sample) -> None:
+        """Compute what a range and the position of its tag yield together: innovation, heat map, raw fix."""
+        anchor, tag = self.anchors.get(pair[0]), self.tag_of(pair[1])
+        pose = None if tag is None else tag.pose
+        if tag is None or pose is None or self.age_s(tag) > NO_DATA_S:
+            return
+        if not self.is_indexed and abs(correction_m := sample.raw_m - sample.range_m) < MAX_RANGE_M:
+            add_heat(self.heat, pose.x, pose.y, correction_m)
+        if anchor is None:
+            return
+        height_m = _finite_or_zero(pose.z - anchor.z)
+        sample.innovation_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
+        if sample.time_s >= tag.raw_fix_s + RAW_FIX_S or sample.time_s < tag.raw_fix_s:
+            tag.raw_fix_s = sample.time_s
+            self._add_raw_fix(pair[1], pose, sample.time_s)
+
+    def _add_raw_fix(self, tag_id: int, pose: Pose, time_s: float) -> None:
+        rows = []
+        for (anchor_id, other), history in self.pairs.items():
+            anchor, latest = self.anchors.get(anchor_id), history.latest
+            if other == tag_id and anchor and latest and abs(time_s - latest.time_s) <= RAW_AGE_S:
+                height_m = _finite_or_zero(pose.z - anchor.z)
+                rows.append((anchor.x, anchor.y, height_m, latest.raw_m))
+        known = np.array([row for row in rows if 0.0 <= row[3] < MAX_RANGE_M])
+        if len(known) < 3:
+            return
+        x = np.array([pose.x, pose.y])
+        for _ in range(5):
+            offset = x - known[:, :2]
+            distance = np.maximum(np.hypot(np.hypot(*offset.T), known[:, 2]), 1e-6)
+            step = np.linalg.lstsq(offset / distance[:, None], known[:, 3] - distance, rcond=0.05)[0]
+            x = x + step
+        name = tag_frame(tag_id)
+        self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, *x.tolist())
 
     def set_anchors(self, anchors: dict[int, AnchorPosition]) -> None:
         plausible = ((id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y))
@@ -356,7 +457,9 @@ class Scene:
             history.samples.clear()
             history.traces.clear()
         self.tags.clear()
-        self.true_tracks.clear()
+        self.tracks.clear()
+        if not self.is_indexed:
+            self.heat.clear()
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
@@ -380,6 +483,30 @@ class Scene:
         own = self.tags.get(tag_frame(tag_id))
         nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}
         return self.tags.get(DEFAULT_TAG) if own is None and nameless == {tag_id} else own
+
+
+def add_heat(
+    heat: BoundedDict[tuple[int, int], list[float]], x: float, y: float, correction_m: float
+) -> None:
+    """Add the correction of a range to the cell of its tag."""
+    cell = math.floor(x / CELL_M), math.floor(y / CELL_M)
+    entry = heat.add(cell, heat.get(cell) or [0.0, 0.0])
+    entry[0] += correction_m
+    entry[1] += 1.0
+
+
+def _known(values: list[float]) -> NDArray[np.float64]:
+    """Return the finite values, float64 (n,)."""
+    array = np.array(values, np.float64)
+    return array[np.abs(array) < MAX_RANGE_M]
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return float(values.mean()) if len(values) else math.nan
+
+
+def _finite_or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
 
 
 def _is_plausible(x: float, y: float) -> bool:

@@ -19,7 +19,7 @@ from bokeh.server.util import bind_sockets, check_allowlist, create_hosts_allowl
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.ioloop import IOLoop
-from tornado.web import OutputTransform, RequestHandler
+from tornado.web import GZipContentEncoding, OutputTransform, RequestHandler
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.viewer.page import Page, View
@@ -129,6 +129,7 @@ class _Application(BokehTornado):  # type: ignore[misc]
             check_unused_sessions_milliseconds=1000,
             unused_session_lifetime_milliseconds=2000,
         )
+        self.add_transform(GZipContentEncoding)
         self.add_transform(_SecurityPolicy)
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:

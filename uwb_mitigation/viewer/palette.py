@@ -1,0 +1,72 @@
+"""Colours and symbols of statuses and tracks, the same on the page, in RViz, in Foxglove and in reports.
+
+The colours are those of Okabe and Ito, which colour-blind people can distinguish. Their contrast is at least 3 : 1 on `PAPER`
+and on `NIGHT`, as WCAG 2.1 level AA requires of graphics. Every status also has its own symbol.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+from uwb_mitigation.measurement import Status
+
+BLUE, VERMILLION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+GREY = "#767676"
+PAPER, NIGHT = "#ffffff", "#111827"
+"""Backgrounds of the light and of the dark page; each is also the ink on the other one."""
+
+
+class Look(NamedTuple):
+    """Appearance of a status.
+
+    Attributes:
+        colour: None: the ink of the page, black or white.
+        marker: name of the marker in Bokeh. symbol: character of the same shape.
+        triangles: corners of the same shape within the unit circle, three for each triangle.
+    """
+
+    colour: str | None
+    marker: str
+    symbol: str
+    triangles: tuple[tuple[float, float], ...]
+
+
+_SQUARE = ((-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (0.8, 0.8), (-0.8, 0.8))
+_DIAMOND = ((-1.0, 0.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+_CROSS = (
+    (-1.0, -0.7), (-0.7, -1.0), (1.0, 0.7), (-1.0, -0.7), (1.0, 0.7), (0.7, 1.0),
+    (-1.0, 0.7), (0.7, -1.0), (1.0, -0.7), (-1.0, 0.7), (1.0, -0.7), (-0.7, 1.0),
+)  # fmt: skip
+_HEXAGON = ((1.0, 0.0), (0.5, 0.87), (-0.5, 0.87), (-1.0, 0.0), (-0.5, -0.87), (0.5, -0.87))
+_DISC = tuple(corner for n in range(1, 5) for corner in (_HEXAGON[0], _HEXAGON[n], _HEXAGON[n + 1]))
+
+STATUS_LOOKS = {
+    Status.OK: Look(BLUE, "circle", "\u25cf", _DISC),
+    Status.NO_CIR: Look(GREY, "square", "\u25a0", _SQUARE),
+    Status.BAD_CIR: Look(PURPLE, "diamond", "\u25c6", _DIAMOND),
+    Status.OUT_OF_DISTRIBUTION: Look(
+        VERMILLION, "inverted_triangle", "\u25bc", ((-1.0, 0.8), (0.0, -1.0), (1.0, 0.8))
+    ),
+    Status.MODEL_ERROR: Look(None, "x", "\u2716", _CROSS),
+}
+
+
+class TrackKind(Enum):
+    """Kinds of tracks; the value is the name in legends."""
+
+    RAW = "raw fixes"
+    CORRECTED = "corrected"
+    SMOOTHED = "smoothed"
+    COMPARED = "second"
+    TRUE = "ground truth"
+
+
+TRACK_COLOURS = {
+    TrackKind.RAW: VERMILLION,
+    TrackKind.CORRECTED: BLUE,
+    TrackKind.SMOOTHED: GREEN,
+    TrackKind.COMPARED: PURPLE,
+    TrackKind.TRUE: None,
+}
+"""None: the ink of the page."""
