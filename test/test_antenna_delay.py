@@ -37,8 +37,8 @@ def test_offset_is_divided_among_the_calibrated_radios(radios: int):
 @pytest.mark.parametrize(
     ("ranges", "gap_db", "says"),
     [
-        (around(5.0, 0.3), 3.0, "scatter"),
-        (np.where(np.arange(400) % 3 > 0, 5.0, 6.0), 3.0, "scatter"),
+        (around(5.0, 0.3), 3.0, "standard deviation"),
+        (np.where(np.arange(400) % 3 > 0, 5.0, 6.0), 3.0, "standard deviation"),
         (around(5.0, 0.02), 9.0, "line of sight"),
         (around(5.0, 0.02), float("nan"), "line of sight"),
         (around(200.0, 0.02), 3.0, "an antenna delay of"),

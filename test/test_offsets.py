@@ -229,5 +229,5 @@ def test_too_many_offsets_for_a_board_are_refused_with_both_numbers():
     pair = Pair(Offsets(anchors=dict.fromkeys(range(MAX_OFFSETS + 1), 0.1)))
     pair.turn()
     (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]
-    assert f"keeps {MAX_OFFSETS} offsets, and {MAX_OFFSETS + 1}" in refused.text
+    assert f"can store {MAX_OFFSETS} offsets, but {MAX_OFFSETS + 1}" in refused.text
     assert pair.range() == []

@@ -67,23 +67,23 @@ typedef struct {
     uint8_t version; /* PROTOCOL_VERSION */
     uint8_t type; /* MessageType */
     uint16_t flags; /* Flag */
-    uint32_t sequence; /* counts the sender's frames from 0 at its start; wraps */
-    uint64_t time_us; /* board's uptime at the event that the frame reports; 0 from the host */
+    uint32_t sequence; /* number of the frame since the start of the sender, from 0; wraps */
+    uint64_t time_us; /* uptime of the board at the reported event; 0 from the host */
 } uwb_header_t;
 UWB_STATIC_ASSERT(sizeof(uwb_header_t) == 16);
 
 typedef struct {
     uint64_t address; /* address of the anchor */
-    uint32_t tried; /* exchanges that began */
-    uint32_t ranged; /* exchanges that gave a range */
+    uint32_t tried; /* started exchanges */
+    uint32_t ranged; /* exchanges with a range */
     float rx_power; /* dBm, of its last frame; NaN = unknown */
-    uint32_t age_ms; /* since its last frame; 4294967295 = never */
+    uint32_t age_ms; /* time since its last frame; 4294967295 = never received */
 } uwb_radio_anchor_t;
 UWB_STATIC_ASSERT(sizeof(uwb_radio_anchor_t) == 24);
 
 typedef struct {
-    uint64_t tag_id; /* of no meaning for an anchor's */
-    uint64_t anchor_id; /* of no meaning for a tag's */
+    uint64_t tag_id; /* ignored for the offset of an anchor */
+    uint64_t anchor_id; /* ignored for the offset of a tag */
     float offset; /* m, -10 to 10 */
     uint8_t of; /* OffsetScope */
     uint8_t reserved[3];
@@ -92,17 +92,17 @@ UWB_STATIC_ASSERT(sizeof(uwb_offset_t) == 24);
 
 typedef struct {
     uint64_t board_id; /* identity of the board */
-    uint32_t model_id; /* identity of the board's model; 0 = it has none */
-    uint32_t boot_id; /* differs from one start of the firmware to the next */
+    uint32_t model_id; /* identity of the board's model; 0 = no model */
+    uint32_t boot_id; /* differs between two starts of the firmware */
     uint32_t request_sequence; /* with ANSWER: sequence of the host's frame answered */
-    uint16_t window; /* window length K of the board's model; 0 = it has none */
+    uint16_t window; /* window length K of the board's model; 0 = no model */
     uint16_t max_payload; /* longest payload that the board accepts, bytes */
     uint8_t firmware_major; /* firmware version */
     uint8_t firmware_minor;
     uint8_t firmware_patch;
-    uint8_t mode; /* Mode in force */
+    uint8_t mode; /* active Mode */
     uint8_t reserved[4];
-    char firmware_name[16]; /* UTF-8, filled up with zeros */
+    char firmware_name[16]; /* UTF-8, padded with zeros */
 } uwb_hello_t;
 UWB_STATIC_ASSERT(sizeof(uwb_hello_t) == 48);
 
@@ -110,8 +110,8 @@ typedef struct {
     uint64_t tag_id; /* identity of the tag */
     uint64_t anchor_id; /* identity of the anchor */
     uint64_t device_time; /* DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits */
-    uint32_t sequence; /* counts the exchanges; wraps */
-    float range; /* m, measured; NaN = the exchange gave none */
+    uint32_t sequence; /* number of the exchange; wraps */
+    float range; /* m, measured; NaN = no range */
     float sample_period; /* s */
     float first_path_index; /* accumulator index; NaN = unknown */
     float scale; /* accumulator units per count of samples */
@@ -121,7 +121,7 @@ typedef struct {
     uint16_t preamble_count; /* RXPACC; 0 = unknown */
     uint16_t noise_threshold; /* LDE_THRESH, accumulator units; 0 = unknown */
     uint16_t samples_offset; /* bytes from the payload's start to the samples; even */
-    uint16_t sample_count; /* int16 values: two for a complex sample */
+    uint16_t sample_count; /* int16 values: two per complex sample */
     uint8_t encoding; /* 0 = complex, interleaved re, im; 1 = magnitude */
     uint8_t channel; /* UWB channel; 0 = unknown */
     uint8_t prf; /* MHz: 16 or 64; 0 = unknown */
@@ -138,8 +138,8 @@ typedef struct {
     uint32_t model_id; /* identity of the model that corrected; 0 = none */
     float range; /* m, corrected; NaN = no valid range */
     float range_raw; /* m, as measured */
-    float correction; /* m, offset + predicted error; the offset alone when passed through */
-    float variance; /* m^2; infinite where the range is not valid */
+    float correction; /* m, offset + predicted error; only the offset if the range is passed through */
+    float variance; /* m^2; infinite if the range is invalid */
     uint32_t compute_us; /* time that the correction took on the board */
     uint8_t status; /* 0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR */
     uint8_t reserved[3];
@@ -159,7 +159,7 @@ typedef struct {
     uint32_t measurements; /* exchanges since the start */
     uint32_t measurements_lost; /* exchanges not sent because the link was full */
     float temperature; /* degrees Celsius; NaN = not measured */
-    uint8_t mode; /* Mode in force */
+    uint8_t mode; /* active Mode */
     uint8_t reserved[3];
 } uwb_status_t;
 UWB_STATIC_ASSERT(sizeof(uwb_status_t) == 24);
@@ -173,41 +173,41 @@ UWB_STATIC_ASSERT(sizeof(uwb_time_sync_reply_t) == 16);
 
 typedef struct {
     uint32_t request_sequence; /* with ANSWER: sequence of the host's frame answered */
-    uint8_t accepted; /* 0 = SET_RADIO was refused, and the text says why */
+    uint8_t accepted; /* 0 = SET_RADIO was refused; the text contains the reason */
     uint8_t reserved[3];
-    uint64_t address; /* address of the radio; 0 in SET_RADIO = the chip's own */
+    uint64_t address; /* address of the radio; 0 in SET_RADIO = that of the chip */
     uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
-    uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
-    uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
-    uint32_t timeout_us; /* how long a tag waits for an anchor's frames; 0 as above */
-    uint32_t interval_us; /* between the beginnings of two exchanges, at least */
+    uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value, or that of the manual */
+    uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = default of the firmware */
+    uint32_t timeout_us; /* timeout of a tag for the frames of an anchor; 0 in SET_RADIO = default of the firmware */
+    uint32_t interval_us; /* minimum time between the starts of two exchanges */
     uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */
     uint16_t preamble; /* symbols: 64 to 4096 */
-    uint16_t window; /* complex samples of a measurement; 0 = none, 1016 and more = all */
+    uint16_t window; /* complex samples per measurement; 0 = none, 1016 and more = all */
     uint8_t channel; /* 1 to 5, 7 */
     uint8_t prf; /* MHz: 16, 64 */
     uint8_t preamble_code; /* 0 = the first for channel and PRF */
     uint8_t decawave_sfd; /* 0 = the standard's start-of-frame delimiter, 1 = Decawave's */
     uint8_t role; /* Role */
-    uint8_t report; /* 1 = an anchor gives its ranges to its host too */
-    uint8_t bias_correction; /* 1 = ranges are corrected for the power received (APS011) */
-    uint8_t anchor_count; /* anchors that a tag is to poll; 0 = those that it finds */
-    uint8_t reserved_too[4];
+    uint8_t report; /* 1 = an anchor also sends its ranges to its host */
+    uint8_t bias_correction; /* 1 = ranges are corrected for the received power (APS011) */
+    uint8_t anchor_count; /* anchors that a tag polls; 0 = anchors found by broadcast */
+    uint8_t reserved_2[4];
     /* then anchor_count addresses, u64, then text, UTF-8, to the payload's end */
 } uwb_radio_t;
 UWB_STATIC_ASSERT(sizeof(uwb_radio_t) == 56);
 
 typedef struct {
-    uint32_t tried; /* exchanges that began; the sum of the seven that follow */
-    uint32_t ranged; /* exchanges that gave a range */
+    uint32_t tried; /* started exchanges; the sum of the seven following counts */
+    uint32_t ranged; /* exchanges with a range */
     uint32_t no_answer; /* lost: POLL was not answered */
     uint32_t late; /* lost: FINAL could not be sent in time */
-    uint32_t timeout; /* lost: FINAL or REPORT did not come */
-    uint32_t damaged; /* lost: what came was no intact frame */
-    uint32_t implausible; /* lost: stamps that no exchange can have */
-    uint32_t broken; /* lost: the chip was reset meanwhile, or its bus failed */
-    uint32_t refused; /* frames that belonged to no exchange of this radio */
+    uint32_t timeout; /* lost: FINAL or REPORT was not received */
+    uint32_t damaged; /* lost: the received data was no intact frame */
+    uint32_t implausible; /* lost: implausible timestamps */
+    uint32_t broken; /* lost: the chip was reset, or its bus failed */
+    uint32_t refused; /* frames that do not belong to an exchange of this radio */
     uint32_t restarts; /* restarts of the chip after the first */
     float temperature; /* degrees Celsius, in the chip; NaN = not measured */
     float voltage; /* V, supply of the chip; NaN = not measured */
@@ -227,37 +227,37 @@ typedef struct {
 UWB_STATIC_ASSERT(sizeof(uwb_offsets_t) == 8);
 
 typedef struct {
-    uint8_t mode; /* Mode wanted */
+    uint8_t mode; /* requested Mode */
     uint8_t reserved[7];
 } uwb_set_mode_t;
 UWB_STATIC_ASSERT(sizeof(uwb_set_mode_t) == 8);
 
 typedef struct {
-    uint64_t address; /* address of the radio; 0 in SET_RADIO = the chip's own */
+    uint64_t address; /* address of the radio; 0 in SET_RADIO = that of the chip */
     uint32_t antenna_delay; /* ticks, TX + RX; 0 = OTP value */
-    uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value or the manual's */
-    uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual */
-    uint32_t timeout_us; /* how long a tag waits for an anchor's frames; 0 as above */
-    uint32_t interval_us; /* between the beginnings of two exchanges, at least */
+    uint32_t tx_power; /* register TX_POWER in smart-power format; 0 = OTP value, or that of the manual */
+    uint32_t reply_us; /* from the reception of ANSWER to FINAL; 0 in SET_RADIO = default of the firmware */
+    uint32_t timeout_us; /* timeout of a tag for the frames of an anchor; 0 in SET_RADIO = default of the firmware */
+    uint32_t interval_us; /* minimum time between the starts of two exchanges */
     uint16_t pan; /* network; frames of other networks are ignored */
     uint16_t rate; /* kbit/s: 110, 850, 6800 */
     uint16_t preamble; /* symbols: 64 to 4096 */
-    uint16_t window; /* complex samples of a measurement; 0 = none, 1016 and more = all */
+    uint16_t window; /* complex samples per measurement; 0 = none, 1016 and more = all */
     uint8_t channel; /* 1 to 5, 7 */
     uint8_t prf; /* MHz: 16, 64 */
     uint8_t preamble_code; /* 0 = the first for channel and PRF */
     uint8_t decawave_sfd; /* 0 = the standard's start-of-frame delimiter, 1 = Decawave's */
     uint8_t role; /* Role */
-    uint8_t report; /* 1 = an anchor gives its ranges to its host too */
-    uint8_t bias_correction; /* 1 = ranges are corrected for the power received (APS011) */
-    uint8_t anchor_count; /* anchors that a tag is to poll; 0 = those that it finds */
-    uint8_t reserved_too[4];
+    uint8_t report; /* 1 = an anchor also sends its ranges to its host */
+    uint8_t bias_correction; /* 1 = ranges are corrected for the received power (APS011) */
+    uint8_t anchor_count; /* anchors that a tag polls; 0 = anchors found by broadcast */
+    uint8_t reserved_2[4];
     /* then anchor_count addresses, u64 */
 } uwb_set_radio_t;
 UWB_STATIC_ASSERT(sizeof(uwb_set_radio_t) == 48);
 
 typedef struct {
-    float default_offset; /* m, of pairs that nothing in the tail names, -10 to 10 */
+    float default_offset; /* m, for pairs without an offset in the tail, -10 to 10 */
     uint16_t count; /* offsets in the tail */
     uint8_t reserved[2];
     /* then count times OFFSET */

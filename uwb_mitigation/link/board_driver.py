@@ -125,7 +125,7 @@ class BoardDriver(Connection[Event]):
             if session.state is not LinkState.READY:
                 others = f"; the port is also open in {self._others}" if self._others else ""
                 return f"{session.state.value}{others}"
-            return "" if session.model_matches else "the board holds another model than the expected one"
+            return "" if session.model_matches else "the board has another model than the expected one"
 
     def _connect(self) -> None:
         port = self._address.open(self._baud, self._dtr)
@@ -161,7 +161,7 @@ class BoardDriver(Connection[Event]):
             with self._lock:
                 self._put(self._session.receive(data, now_ns, stamp_ns))
                 if self._session.idle_ns(now_ns) > REOPEN_TIMEOUT_NS:
-                    raise LinkError("is silent", where=str(self._address))
+                    raise LinkError("sends no data", where=str(self._address))
                 # While the port accepts no bytes, requests wait in the bounded queue of the session.
                 if not outgoing:
                     outgoing += self._session.outgoing()

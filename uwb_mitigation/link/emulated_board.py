@@ -48,7 +48,7 @@ class PseudoTerminal:
 
     def __init__(self, link: Path | None) -> None:
         if link is not None and link.exists() and not link.is_symlink():
-            raise ParameterError("the port's link would replace a file", where=str(link))
+            raise ParameterError("the symbolic link to the port would replace a file", where=str(link))
         self.port = ""
         self.fd: int | None = None
         self._link = link
@@ -287,4 +287,4 @@ def _repeat(source: Iterable[Record] | None) -> Iterator[RangeMeasurement]:
             empty = False
             yield record.measurement
         if empty:
-            raise RecordingError("the source holds no measurements")
+            raise RecordingError("the source contains no measurements")

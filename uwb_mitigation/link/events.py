@@ -17,15 +17,15 @@ class LinkState(enum.Enum):
 
     CONNECTING = "waiting for the board's HELLO"
     READY = "connected"
-    WRONG_VERSION = "the board speaks another version of the protocol"
+    WRONG_VERSION = "the board uses another protocol version"
 
 
 class Loss(enum.Enum):
     """Why a connection ended."""
 
-    TIMEOUT = "nothing intact was received for 3 s"
+    TIMEOUT = "no intact frame was received for 3 s"
     RESET = "the board restarted"
-    OUT_OF_SEQUENCE = "the board's frames are numbered out of order"
+    OUT_OF_SEQUENCE = "the sequence numbers of the board are out of order"
     CLOSED = "the port was closed"
 
 

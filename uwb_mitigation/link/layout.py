@@ -30,7 +30,7 @@ MAX_PAYLOAD_BYTES = 4224
 
 
 class MessageType(enum.IntEnum):
-    """The second byte of a frame. A type means one layout, whichever side sends it."""
+    """The second byte of a frame. A type has the same layout in both directions."""
 
     HELLO = 1
     RANGE_CIR = 2
@@ -50,10 +50,10 @@ class MessageType(enum.IntEnum):
 
 
 class Flag(enum.IntFlag):
-    """Bits of the header's flags; a receiver ignores those it does not know."""
+    """Bits of the header's flags; receivers ignore unknown bits."""
 
     ANSWER = 1
-    """The frame answers one from the host; without it the board spoke of its own accord."""
+    """The frame answers a frame of the host; without this bit it is unsolicited."""
 
 
 class Mode(enum.IntEnum):
@@ -66,12 +66,12 @@ class Mode(enum.IntEnum):
 
 
 class Role(enum.IntEnum):
-    """What a board's radio does."""
+    """Role of a board's radio."""
 
     TAG = 0
-    """Begins exchanges, with one anchor after the other."""
+    """Starts exchanges with one anchor after the other."""
     ANCHOR = 1
-    """Answers whoever begins one."""
+    """Answers the exchanges of tags."""
 
 
 class RadioState(enum.IntEnum):
@@ -79,19 +79,19 @@ class RadioState(enum.IntEnum):
 
     RUNNING = 0
     BUS = 1
-    """What joins it and the processor has failed."""
+    """The bus between chip and processor has failed."""
     ABSENT = 2
     """No DW1000 answers."""
     NO_CLOCK = 3
-    """Its clock PLL does not lock: the chip ignores SPI at full speed."""
+    """The clock PLL does not lock: the chip ignores SPI at full speed."""
     RESTARTED = 4
-    """It was reset, and is being set up again."""
+    """The chip was reset and is being configured again."""
     LOCK_UNCONFIRMED = 5
-    """It runs, but did not report the lock of its clock PLL (errata: the report is not reliable)."""
+    """The chip works, but did not report the lock of its clock PLL (errata: the report is not reliable)."""
 
 
 class OffsetScope(enum.IntEnum):
-    """What an offset belongs to."""
+    """Scope of an offset."""
 
     ANCHOR = 0
     TAG = 1
@@ -177,40 +177,44 @@ HEADER = Layout(
     Field("version", "B", "PROTOCOL_VERSION"),
     Field("type", "B", "MessageType"),
     Field("flags", "H", "Flag"),
-    Field("sequence", "I", "counts the sender's frames from 0 at its start; wraps"),
-    Field("time_us", "Q", "board's uptime at the event that the frame reports; 0 from the host"),
+    Field("sequence", "I", "number of the frame since the start of the sender, from 0; wraps"),
+    Field("time_us", "Q", "uptime of the board at the reported event; 0 from the host"),
 )
 
 _RADIO_SETTINGS = (
-    Field("address", "Q", "address of the radio; 0 in SET_RADIO = the chip's own"),
+    Field("address", "Q", "address of the radio; 0 in SET_RADIO = that of the chip"),
     Field("antenna_delay", "I", "ticks, TX + RX; 0 = OTP value"),
-    Field("tx_power", "I", "register TX_POWER in smart-power format; 0 = OTP value or the manual's"),
-    Field("reply_us", "I", "from the reception of ANSWER to FINAL; 0 in SET_RADIO = the firmware's usual"),
-    Field("timeout_us", "I", "how long a tag waits for an anchor's frames; 0 as above"),
-    Field("interval_us", "I", "between the beginnings of two exchanges, at least"),
+    Field("tx_power", "I", "register TX_POWER in smart-power format; 0 = OTP value, or that of the manual"),
+    Field("reply_us", "I", "from the reception of ANSWER to FINAL; 0 in SET_RADIO = default of the firmware"),
+    Field(
+        "timeout_us",
+        "I",
+        "timeout of a tag for the frames of an anchor; 0 in SET_RADIO = default of the firmware",
+    ),
+    Field("interval_us", "I", "minimum time between the starts of two exchanges"),
     Field("pan", "H", "network; frames of other networks are ignored"),
     Field("rate", "H", "kbit/s: 110, 850, 6800", "rate_kbps"),
     Field("preamble", "H", "symbols: 64 to 4096"),
-    Field("window", "H", "complex samples of a measurement; 0 = none, 1016 and more = all"),
+    Field("window", "H", "complex samples per measurement; 0 = none, 1016 and more = all"),
     Field("channel", "B", "1 to 5, 7"),
     Field("prf", "B", "MHz: 16, 64", "prf_mhz"),
     Field("preamble_code", "B", "0 = the first for channel and PRF"),
     Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's", kind=bool),
     Field("role", "B", "Role", kind=Role),
-    Field("report", "B", "1 = an anchor gives its ranges to its host too", kind=bool),
-    Field("bias_correction", "B", "1 = ranges are corrected for the power received (APS011)", kind=bool),
-    Field("anchor_count", "B", "anchors that a tag is to poll; 0 = those that it finds", computed=True),
-    Field("reserved_too", "4x", ""),
+    Field("report", "B", "1 = an anchor also sends its ranges to its host", kind=bool),
+    Field("bias_correction", "B", "1 = ranges are corrected for the received power (APS011)", kind=bool),
+    Field("anchor_count", "B", "anchors that a tag polls; 0 = anchors found by broadcast", computed=True),
+    Field("reserved_2", "4x", ""),
 )
 """Common fields of RADIO and SET_RADIO."""
 
 RADIO_ANCHOR = Layout(
     "RADIO_ANCHOR",
     Field("address", "Q", "address of the anchor"),
-    Field("tried", "I", "exchanges that began"),
-    Field("ranged", "I", "exchanges that gave a range"),
+    Field("tried", "I", "started exchanges"),
+    Field("ranged", "I", "exchanges with a range"),
     Field("rx_power", "f", "dBm, of its last frame; NaN = unknown"),
-    Field("age_ms", "I", "since its last frame; 4294967295 = never"),
+    Field("age_ms", "I", "time since its last frame; 4294967295 = never received"),
 )
 """One anchor in the tail of a RADIO_STATUS."""
 
@@ -219,8 +223,8 @@ MAX_ANCHORS = 32
 
 OFFSET = Layout(
     "OFFSET",
-    Field("tag_id", "Q", "of no meaning for an anchor's"),
-    Field("anchor_id", "Q", "of no meaning for a tag's"),
+    Field("tag_id", "Q", "ignored for the offset of an anchor"),
+    Field("anchor_id", "Q", "ignored for the offset of a tag"),
     Field("offset", "f", "m, -10 to 10"),
     Field("of", "B", "OffsetScope"),
     Field("reserved", "3x", ""),
@@ -234,17 +238,17 @@ _TABLES = (
     Layout(
         "HELLO",
         Field("board_id", "Q", "identity of the board"),
-        Field("model_id", "I", "identity of the board's model; 0 = it has none"),
-        Field("boot_id", "I", "differs from one start of the firmware to the next"),
+        Field("model_id", "I", "identity of the board's model; 0 = no model"),
+        Field("boot_id", "I", "differs between two starts of the firmware"),
         Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
-        Field("window", "H", "window length K of the board's model; 0 = it has none"),
+        Field("window", "H", "window length K of the board's model; 0 = no model"),
         Field("max_payload", "H", "longest payload that the board accepts, bytes"),
         Field("firmware_major", "B", "firmware version"),
         Field("firmware_minor", "B", ""),
         Field("firmware_patch", "B", ""),
-        Field("mode", "B", "Mode in force", kind=Mode),
+        Field("mode", "B", "active Mode", kind=Mode),
         Field("reserved", "4x", ""),
-        Field("firmware_name", "16s", "UTF-8, filled up with zeros"),
+        Field("firmware_name", "16s", "UTF-8, padded with zeros"),
     ),
     Layout(
         "RANGE_CIR",
@@ -256,8 +260,8 @@ _TABLES = (
             "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits",
             kind=device_time,
         ),
-        Field("sequence", "I", "counts the exchanges; wraps"),
-        Field("range", "f", "m, measured; NaN = the exchange gave none", "range_m"),
+        Field("sequence", "I", "number of the exchange; wraps"),
+        Field("range", "f", "m, measured; NaN = no range", "range_m"),
         Field("sample_period", "f", "s", "sample_period_s"),
         Field("first_path_index", "f", "accumulator index; NaN = unknown"),
         Field("scale", "f", "accumulator units per count of samples"),
@@ -267,7 +271,7 @@ _TABLES = (
         Field("preamble_count", "H", "RXPACC; 0 = unknown"),
         Field("noise_threshold", "H", "LDE_THRESH, accumulator units; 0 = unknown"),
         Field("samples_offset", "H", "bytes from the payload's start to the samples; even", computed=True),
-        Field("sample_count", "H", "int16 values: two for a complex sample", computed=True),
+        Field("sample_count", "H", "int16 values: two per complex sample", computed=True),
         Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude", kind=Encoding),
         Field("channel", "B", "UWB channel; 0 = unknown"),
         Field("prf", "B", "MHz: 16 or 64; 0 = unknown", "prf_mhz"),
@@ -286,10 +290,10 @@ _TABLES = (
         Field(
             "correction",
             "f",
-            "m, offset + predicted error; the offset alone when passed through",
+            "m, offset + predicted error; only the offset if the range is passed through",
             "correction_m",
         ),
-        Field("variance", "f", "m^2; infinite where the range is not valid", "variance_m2"),
+        Field("variance", "f", "m^2; infinite if the range is invalid", "variance_m2"),
         Field("compute_us", "I", "time that the correction took on the board"),
         Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR", kind=Status),
         Field("reserved", "3x", ""),
@@ -307,7 +311,7 @@ _TABLES = (
         Field("measurements", "I", "exchanges since the start"),
         Field("measurements_lost", "I", "exchanges not sent because the link was full"),
         Field("temperature", "f", "degrees Celsius; NaN = not measured", "temperature_c"),
-        Field("mode", "B", "Mode in force", kind=Mode),
+        Field("mode", "B", "active Mode", kind=Mode),
         Field("reserved", "3x", ""),
     ),
     Layout(
@@ -319,22 +323,22 @@ _TABLES = (
     Layout(
         "RADIO",
         Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
-        Field("accepted", "B", "0 = SET_RADIO was refused, and the text says why", kind=bool),
+        Field("accepted", "B", "0 = SET_RADIO was refused; the text contains the reason", kind=bool),
         Field("reserved", "3x", ""),
         *_RADIO_SETTINGS,
         tail="anchor_count addresses, u64, then text, UTF-8, to the payload's end",
     ),
     Layout(
         "RADIO_STATUS",
-        Field("tried", "I", "exchanges that began; the sum of the seven that follow"),
-        Field("ranged", "I", "exchanges that gave a range"),
+        Field("tried", "I", "started exchanges; the sum of the seven following counts"),
+        Field("ranged", "I", "exchanges with a range"),
         Field("no_answer", "I", "lost: POLL was not answered"),
         Field("late", "I", "lost: FINAL could not be sent in time"),
-        Field("timeout", "I", "lost: FINAL or REPORT did not come"),
-        Field("damaged", "I", "lost: what came was no intact frame"),
-        Field("implausible", "I", "lost: stamps that no exchange can have"),
-        Field("broken", "I", "lost: the chip was reset meanwhile, or its bus failed"),
-        Field("refused", "I", "frames that belonged to no exchange of this radio"),
+        Field("timeout", "I", "lost: FINAL or REPORT was not received"),
+        Field("damaged", "I", "lost: the received data was no intact frame"),
+        Field("implausible", "I", "lost: implausible timestamps"),
+        Field("broken", "I", "lost: the chip was reset, or its bus failed"),
+        Field("refused", "I", "frames that do not belong to an exchange of this radio"),
         Field("restarts", "I", "restarts of the chip after the first"),
         Field("temperature", "f", "degrees Celsius, in the chip; NaN = not measured", "temperature_c"),
         Field("voltage", "f", "V, supply of the chip; NaN = not measured"),
@@ -351,13 +355,13 @@ _TABLES = (
         Field("reserved", "1x", ""),
     ),
     Layout("GET_INFO"),
-    Layout("SET_MODE", Field("mode", "B", "Mode wanted", kind=Mode), Field("reserved", "7x", "")),
+    Layout("SET_MODE", Field("mode", "B", "requested Mode", kind=Mode), Field("reserved", "7x", "")),
     Layout("TIME_SYNC"),
     Layout("GET_RADIO"),
     Layout("SET_RADIO", *_RADIO_SETTINGS, tail="anchor_count addresses, u64"),
     Layout(
         "SET_OFFSETS",
-        Field("default_offset", "f", "m, of pairs that nothing in the tail names, -10 to 10", "default"),
+        Field("default_offset", "f", "m, for pairs without an offset in the tail, -10 to 10", "default"),
         Field("count", "H", "offsets in the tail", computed=True),
         Field("reserved", "2x", ""),
         tail="count times OFFSET",

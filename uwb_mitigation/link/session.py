@@ -95,7 +95,7 @@ class _Request:
         self.sent.clear()
 
     def repeat(self, message: messages.Message | None) -> None:
-        """Request `message` from now on; None = nothing."""
+        """Request `message` from now on; None = no request."""
         self.message, self.pending, self.tries = message, message is not None, 0
 
     def is_answered_by(self, sequence: int) -> bool:
@@ -141,10 +141,10 @@ class BoardSession:
         self._mode = mode
         self._mode_request = _Request()
         self._radio_request = _Request(
-            "its firmware has no radio settings: flash a newer version, or set none"
+            "its firmware does not support radio settings: flash a newer version, or do not set any"
         )
         self._offsets_request = _Request(
-            "its firmware has no offsets: flash a newer version, or correct on the host"
+            "its firmware does not support offsets: flash a newer version, or correct on the host"
         )
         self._offsets_confirmed = False
         self._boot_key: tuple[int, int] | None = None
@@ -353,7 +353,7 @@ class BoardSession:
             self.counts.unsolicited += 1
             return []
         self._offsets_confirmed = answer.accepted
-        text = f"it keeps {answer.slots} offsets, and {len(self._offsets)} were requested"
+        text = f"it can store {answer.slots} offsets, but {len(self._offsets)} were requested"
         return [] if answer.accepted else [OffsetsRefused(text)]
 
     def _handle_radio(self, radio: Radio, answer: bool) -> list[Event]:

@@ -76,21 +76,21 @@ def delay_from_ranges(
     spread = (high - low) / 2
     if not spread <= MAX_SD_M:
         raise UwbMitigationError(
-            f"the ranges scatter by {spread:.3f} m",
-            valid=f"at most {MAX_SD_M} m: let nothing move, and nothing stand near the straight line",
+            f"the standard deviation of the ranges is {spread:.3f} m",
+            valid=f"at most {MAX_SD_M} m: keep the radios and the area between them free of motion and objects",
         )
     gap = float(np.median(np.asarray(power_gap_db, np.float64)))
     if not gap <= MAX_POWER_GAP_DB:
         raise UwbMitigationError(
-            f"this is no line of sight: the first path is {gap:.1f} dB below all that is received",
-            valid=f"at most {MAX_POWER_GAP_DB} dB: let the antennas see each other, high above the floor",
+            f"NLOS: the first path is {gap:.1f} dB below the received power",
+            valid=f"at most {MAX_POWER_GAP_DB} dB: place the antennas in line of sight, high above the floor",
         )
     offset = middle - distance_m
     found = round(float(np.mean(before)) + offset / (M_PER_TICK * len(before)))
     if abs(found - NOMINAL_TICKS) > MAX_FROM_NOMINAL_TICKS:
         raise UwbMitigationError(
-            f"ranges are off by {offset:.2f} m: an antenna delay of {found} ticks",
-            valid=f"{NOMINAL_TICKS} +- {MAX_FROM_NOMINAL_TICKS}: is it the distance, and are these the radios?",
+            f"the range error is {offset:.2f} m: an antenna delay of {found} ticks",
+            valid=f"{NOMINAL_TICKS} +- {MAX_FROM_NOMINAL_TICKS}: check the distance and the ports",
         )
     return AntennaDelay(found, float(np.mean(before)), offset, spread, gap, len(ranges))
 
@@ -140,7 +140,7 @@ def _measure(
             if len(anchors) > 1:
                 raise UwbMitigationError(
                     f"anchors {', '.join(f'0x{anchor:016x}' for anchor in sorted(anchors))} answer",
-                    valid="one: name it with --anchor",
+                    valid="one anchor: select it with --anchor",
                 )
             ranges.append((event.range_m, event.cir.rx_power_dbm - event.cir.first_path_power_dbm))
             until = time.monotonic() + TIMEOUT_S
@@ -148,12 +148,12 @@ def _measure(
         elif time.monotonic() > until:
             problems = [report.problem for report in (port.report() for port in ports) if report.problem]
             raise UwbMitigationError(
-                f"{len(ranges)} ranges of {exchanges}, and none for {TIMEOUT_S:g} s",
-                valid="; ".join(problems) or "an anchor in reach, with the same channel, PRF, rate and PAN",
+                f"only {len(ranges)} of {exchanges} ranges, and no range for {TIMEOUT_S:g} s",
+                valid="; ".join(problems) or "an anchor in range with the same channel, PRF, rate and PAN",
             )
     before = [settings.antenna_delay for port in ports if (settings := port.report().settings) is not None]
     if len(before) < len(ports):
-        raise UwbMitigationError("a radio was lost at the end", valid="try again")
+        raise UwbMitigationError("a radio was lost at the end of the measurement", valid="try again")
     measured, gaps = zip(*ranges, strict=True)
     return delay_from_ranges(measured, gaps, distance_m, before)
 

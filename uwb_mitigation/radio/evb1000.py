@@ -26,9 +26,7 @@ MAX_READ_BYTES = 4093
 _START, _END = 0x02, 0x03
 _WRITE, _FAST = 1, 2
 _HEADER = struct.Struct("<BBHH")
-_REMEDY = (
-    "DIP switch S1-3 off (TREK1000: S1-4 to S1-7 on), then power the board up again: it shows USB to SPI"
-)
+_REMEDY = "DIP switch S1-3 off (TREK1000: S1-4 to S1-7 on), then power the board on again: the display shows USB to SPI"
 
 
 class Evb1000Bus:
@@ -101,8 +99,8 @@ class Evb1000Bus:
         if text.startswith("y"):
             return text[1:]
         if text.startswith("n"):
-            raise self._error("the board ranges by itself")
-        problem = f"the board answers deca? with {text!r}" if text else "no answer to deca?"
+            raise self._error("the board is in ranging mode")
+        problem = f"the board answers {text!r} to deca?" if text else "the board does not answer deca?"
         raise self._error(problem, f"an EVB1000; {_REMEDY}")
 
     def _query(self) -> str:
@@ -130,7 +128,7 @@ class Evb1000Bus:
             while data:
                 _, writable, _ = select.select([], [fd], [], max(0.0, until - time.monotonic()))
                 if not writable:
-                    raise self._error("the board takes nothing")
+                    raise self._error("the board does not accept data")
                 data = data[os.write(fd, data) :]
         except OSError as error:
             raise self._lost(error.strerror or str(error)) from error
@@ -141,7 +139,7 @@ class Evb1000Bus:
         while len(answer) < count:
             piece = self._read_some(until - time.monotonic())
             if not piece:
-                raise self._error(f"{len(answer)} octets of {count} within {ANSWER_TIMEOUT_S} s")
+                raise self._error(f"received {len(answer)} of {count} octets within {ANSWER_TIMEOUT_S} s")
             answer += piece
         return answer[:count]
 

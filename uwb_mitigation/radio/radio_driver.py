@@ -74,7 +74,7 @@ class RadioDriver(Connection[RadioEvent]):
         *,
         stamp_clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        super().__init__("radio", "it has not been reached yet")
+        super().__init__("radio", "the radio was not opened yet")
         settings.check()
         load()
         self._open_bus = open_bus

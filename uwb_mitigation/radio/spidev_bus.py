@@ -76,7 +76,7 @@ class SpidevBus:
             answer = self._spi.xfer2(list(header + (bytes(count) if out is None else out)))
         except OSError as error:
             raise LinkError(
-                f"was lost: {error.strerror}", where=self.name, valid="look at the wiring"
+                f"was lost: {error.strerror}", where=self.name, valid="check the wiring"
             ) from error
         return bytes(answer[len(header) :])
 
@@ -123,7 +123,5 @@ class SpidevBus:
             finally:
                 os.close(chip)
         except OSError as error:
-            raise LinkError(
-                f"line {line}: {error.strerror}", where=path, valid="a GPIO that is free"
-            ) from error
+            raise LinkError(f"line {line}: {error.strerror}", where=path, valid="an unused GPIO") from error
         return int(_REQUEST.unpack(request)[-1])
