@@ -172,6 +172,14 @@ def test_schema_with_other_fields_is_detected(change: tuple[str, str], excerpt: 
     assert re.search(excerpt, schemas.difference(text.replace(*change), RANGE_CIR_TYPE) or "")
 
 
+def test_schema_of_an_earlier_version_is_accepted() -> None:
+    text = schemas.definition(RANGE_CIR_TYPE)
+    old = re.sub("uint8 (radio|segment) .*\n", "", text)
+    assert len(old.splitlines()) == len(text.splitlines()) - 2
+    assert schemas.difference(old, RANGE_CIR_TYPE) is None
+    assert schemas.difference(re.sub("uint8 prf .*\n", "", old), RANGE_CIR_TYPE)
+
+
 @pytest.mark.parametrize("type_name", TYPES)
 def test_comments_and_constants_do_not_change_a_schema(type_name: str) -> None:
     bare, _ = schemas.typestore().generate_msgdef(type_name, ros_version=2)

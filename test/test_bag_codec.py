@@ -24,7 +24,9 @@ from uwb_mitigation.measurement import (
     CorrectedRange,
     Encoding,
     Origin,
+    RadioType,
     RangeMeasurement,
+    Segment,
     Status,
     Truth,
 )
@@ -49,6 +51,8 @@ cirs = st.builds(
     first_path_power_dbm=float32,
     channel=st.integers(0, 255),
     prf_mhz=st.integers(0, 255),
+    radio=st.sampled_from(RadioType),
+    segment=st.sampled_from(Segment),
 )
 measurements = st.builds(
     RangeMeasurement,
@@ -96,10 +100,25 @@ def test_messages_equal_those_of_the_rosbags_library(
         assert repr(decoded) == repr(expected)
 
 
+@given(measurements, st.integers(0, 3))
+def test_message_of_an_earlier_version_has_no_radio(measurement: RangeMeasurement, padding: int) -> None:
+    old = codec.encode_range(measurement)[:-2] + bytes(padding)
+    expected = replace(measurement.cir, radio=RadioType.UNKNOWN, segment=Segment.UNKNOWN)
+    decoded = codec.decode_range(old)
+    assert repr(decoded) == repr(replace(measurement, cir=expected))
+
+
+def test_message_of_a_later_radio_is_refused() -> None:
+    data = codec.encode_range(record(0).measurement)
+    with pytest.raises(RecordingError, match="unknown radio"):
+        codec.decode_range(data[:-2] + b"\x09\x00")
+
+
 @given(measurements, st.data())
 def test_truncated_message_is_refused(measurement: RangeMeasurement, data: st.DataObject) -> None:
     complete = codec.encode_range(measurement)
-    cut = data.draw(st.integers(0, len(complete) - 1))
+    # Messages of earlier versions end without the last two bytes, radio and segment.
+    cut = data.draw(st.integers(0, len(complete) - 3))
     with pytest.raises(RecordingError, match="ends early"):
         codec.decode_range(complete[:cut])
 

@@ -6,6 +6,7 @@ import json
 import random
 import zlib
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from model_material import bundle, card, random_int8, random_weights, windows
 
 from uwb_mitigation.errors import ModelError
+from uwb_mitigation.measurement import RadioType, Segment
 from uwb_mitigation.model import bundle as bundles
 from uwb_mitigation.model import floating, graph
 from uwb_mitigation.model.architecture import Remnet
@@ -60,6 +62,18 @@ def test_saved_bundle_is_loaded_unchanged(saved):
     assert loaded.card == saved.card
     assert loaded.model_id == saved.model_id
     assert loaded.model == saved.path.read_bytes()
+
+
+def test_radios_of_a_card_read_back_and_the_default_is_not_stored(saved, tmp_path):
+    assert b"radios" not in saved.model
+    sources = {"radios": (RadioType.DW3000, RadioType.QM35), "segments": (Segment.STS,)}
+    weights = random_weights(SHAPE)
+    other = replace(card(SHAPE, quantised=False), **sources)
+    model = load_bundle(save_bundle(tmp_path / "sts.onnx", graph.float_model(weights), other).path)
+    assert (model.card.radios, model.card.segments) == tuple(sources.values())
+    assert model.card.fits(RadioType.QM35, Segment.STS, True)
+    assert not model.card.fits(RadioType.DW3000, Segment.IPATOV, True)
+    assert not model.card.fits(RadioType.UNKNOWN, Segment.UNKNOWN, True)
 
 
 def test_float32_numbers_read_back_to_the_bit(tmp_path):

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from model_material import LINE, bundle, measurement, window_of
 
-from uwb_mitigation.measurement import Encoding, Origin, Status
+from uwb_mitigation.measurement import Encoding, Origin, RadioType, Segment, Status
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.offsets import Offsets
+from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.preprocessing import Preprocessing
 
 
@@ -50,6 +50,26 @@ BAD = [
     ({}, 1e300, Status.OUT_OF_DISTRIBUTION),
     ({"samples": np.zeros(0, np.int16)}, math.nan, Status.NO_CIR),
 ]
+
+
+def test_cir_of_another_radio_is_passed_through_minus_the_offset(mitigation):
+    known = measurement(3.0)
+    expected = mitigation.correct([known])[0]
+    cirs = [replace(known.cir, radio=radio, segment=segment) for radio in RadioType for segment in Segment]
+    mitigation.offsets = Offsets(0.25)
+    try:
+        results = mitigation.correct([replace(known, cir=cir) for cir in cirs])
+    finally:
+        mitigation.offsets = NO_OFFSETS
+    for cir, result in zip(cirs, results, strict=True):
+        if (cir.radio, cir.segment) in ((0, 0), (RadioType.DW1000, Segment.IPATOV)):
+            assert result.status is expected.status is Status.OK
+        else:
+            assert (result.status, result.correction_m, result.range_m) == (
+                Status.OUT_OF_DISTRIBUTION,
+                0.25,
+                2.75,
+            )
 
 
 def test_correction_is_linear_bias_plus_network_in_float32(mitigation):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from benchmarks.uci_board import FIRST_PATH, UciBoardModel, UciFaults, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterError, RecordingError
 from uwb_mitigation.link.layout import Role
-from uwb_mitigation.measurement import Radio, RangeMeasurement, Segment
+from uwb_mitigation.measurement import RadioType, RangeMeasurement, Segment
 from uwb_mitigation.radio.uci import messages
 from uwb_mitigation.radio.uci.capture import FIRST_LINE, CaptureWriter, UciCapture
 from uwb_mitigation.radio.uci.cir import read_cir
@@ -107,7 +107,12 @@ def test_the_cir_has_the_taps_of_the_exchange():
     assert (measured.tag_id, measured.anchor_id, measured.sequence, measured.range_m) == (1, 2, 2, 3.0)
     assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 157, 5))
     assert (cir.start_index, cir.first_path_index) == (FIRST_PATH - 5, FIRST_PATH + 2 / 64)
-    assert (cir.radio, cir.segment, cir.rx_power_dbm, cir.channel) == (Radio.DW3000, Segment.STS, -80.5, 9)
+    assert (cir.radio, cir.segment, cir.rx_power_dbm, cir.channel) == (
+        RadioType.DW3000,
+        Segment.STS,
+        -80.5,
+        9,
+    )
 
 
 @pytest.mark.parametrize("tap_bytes", [4, 6, 8])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import ros_harness
 from ros_harness import diagnostic_values
-from uwb_mitigation_msgs.msg import RangeCir
+from uwb_mitigation_msgs.msg import Cir, RangeCir, RangeCorrected
 
 from benchmarks.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.errors import ParameterError
@@ -31,6 +31,8 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     ros: ros_harness.Ros, boards: EmulatedUciBoards, tmp_path: Path
 ):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    ros.start("mitigator", "offsets:=0.5")
     ports = ",".join(str(tmp_path / f"uci{number}") for number in range(3))
     capture = tmp_path / "capture.txt"
     node = ros.start("driver", "source:=uci", f"port:={ports}", "radio.window:=16", f"capture:={capture}")
@@ -40,6 +42,13 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
 
     status = ros.diagnosis("driver", lambda status: "ranging" in status.message)
     assert diagnostic_values(status)["board 0: CIR taps"] == "16"
+
+    status = ros.diagnosis("mitigator", lambda status: "DW3000 STS" in status.message)
+    assert "trained for DW1000 IPATOV" in status.message
+    ros.spin_until(lambda: len(corrected) > 20)
+    assert {m.status for m in corrected} == {RangeCorrected.OUT_OF_DISTRIBUTION}
+    assert all(m.range == pytest.approx(m.range_raw - 0.5) for m in corrected)
+    assert {(m.cir.radio, m.cir.segment) for m in raw} == {(Cir.DW3000, Cir.STS)}
 
     boards.unplug(1)
     ros.diagnosis("driver", lambda status: "uci1" in status.message)

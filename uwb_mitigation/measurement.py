@@ -37,7 +37,7 @@ class Encoding(enum.IntEnum):
     MAGNITUDE = 1
 
 
-class Radio(enum.IntEnum):
+class RadioType(enum.IntEnum):
     """Type of the radio that measured a CIR; the values of `Cir.msg`."""
 
     UNKNOWN = 0
@@ -107,7 +107,7 @@ class Cir:
     first_path_power_dbm: float = math.nan
     channel: int = 0
     prf_mhz: int = 0
-    radio: Radio = Radio.UNKNOWN
+    radio: RadioType = RadioType.UNKNOWN
     segment: Segment = Segment.UNKNOWN
 
     def __len__(self) -> int:
@@ -203,7 +203,7 @@ class CorrectedRange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeColumns:
-    """Columns of n exchanges whose CIRs have the same encoding and length: the inputs of the correction.
+    """Columns of n exchanges whose CIRs have the same encoding, length, radio and segment: inputs of the correction.
 
     Attributes:
         tag_id, anchor_id: uint64 (n,).
@@ -212,6 +212,7 @@ class RangeColumns:
         samples: int16 (n, m).
         start_index, preamble_count: integer or float64 (n,).
         first_path_index, scale, rx_power_dbm, first_path_power_dbm: float (n,), of the type of `range_m`.
+        radio, segment: those of all CIRs.
     """
 
     tag_id: NDArray[np.uint64]
@@ -225,13 +226,17 @@ class RangeColumns:
     preamble_count: NDArray[Any]
     rx_power_dbm: NDArray[Any]
     first_path_power_dbm: NDArray[Any]
+    radio: RadioType = RadioType.UNKNOWN
+    segment: Segment = Segment.UNKNOWN
 
     @staticmethod
     def grouped(measurements: Sequence[RangeMeasurement]) -> Iterator[tuple[list[int], RangeColumns]]:
-        """Yield columns of measurements whose CIRs have the same encoding and length, with their indices."""
-        groups: dict[tuple[int, int], list[int]] = {}
+        """Yield columns of measurements whose CIRs have the same form and source, with their indices."""
+        groups: dict[tuple[int, ...], list[int]] = {}
         for index, measurement in enumerate(measurements):
-            groups.setdefault((measurement.cir.encoding, len(measurement.cir.samples)), []).append(index)
+            cir = measurement.cir
+            form = (cir.encoding, len(cir.samples), cir.radio, cir.segment)
+            groups.setdefault(form, []).append(index)
         for indices in groups.values():
             members = [measurements[index] for index in indices]
             cirs = [measurement.cir for measurement in members]
@@ -264,6 +269,8 @@ class RangeColumns:
                     preamble_count,
                     rx_power,
                     first_path_power,
+                    cirs[0].radio,
+                    cirs[0].segment,
                 ),
             )
 

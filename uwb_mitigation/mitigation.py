@@ -140,6 +140,23 @@ def pass_through(
     return CorrectedColumns(range_m, offset_m, variance, status, Origin.HOST, bundle.model_id)
 
 
+def pass_other_radio(
+    bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32]
+) -> CorrectedColumns | None:
+    """Return the raw ranges minus the offsets if the bundle was trained for another radio or segment, otherwise None.
+
+    Args:
+        bundle: the model.
+        ranges: n measured ranges.
+        offset_m: offset of the radios of each range, m, float32 (n,).
+    """
+    has_cir = ranges.samples.shape[1] > 0
+    if bundle.card.fits(ranges.radio, ranges.segment, has_cir):
+        return None
+    status = _OUT_OF_DISTRIBUTION if has_cir else _NO_CIR
+    return pass_through(bundle, ranges, offset_m, np.full(len(ranges), status, np.uint8))
+
+
 class Mitigation(Backend):
     """Corrects ranges with one bundle, by ONNX Runtime. Not thread-safe.
 
@@ -148,9 +165,9 @@ class Mitigation(Backend):
     minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
     through with a status that gives the reason and a larger variance:
 
-    NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: the range minus
-    offset is negative or not finite, the predicted error is outside the bundle's limits, or the OOD score is 1 or
-    more. MODEL_ERROR: the network failed, or its output is not finite.
+    NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: the bundle was
+    trained for another radio or segment, the range minus offset is negative or not finite, the predicted error is outside
+    the bundle's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
 
     The further a measurement is outside the bundle's training data (`Card.ood_bands`), the more its correction shrinks
     from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
@@ -173,6 +190,8 @@ class Mitigation(Backend):
         """See `Backend`."""
         linear_bias, n = self.bundle.linear_bias, len(ranges)
         offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
+        if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
+            return passed
         range_m = _subtract_offset(ranges.range_m, offset)
         valid = _is_valid_range(range_m)
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)

@@ -20,7 +20,9 @@ from uwb_mitigation.measurement import (
     CorrectedRange,
     Encoding,
     Origin,
+    RadioType,
     RangeMeasurement,
+    Segment,
     Status,
     Truth,
 )
@@ -33,12 +35,17 @@ _NANOSECONDS = 1_000_000_000
 _PREFIX = struct.Struct("<4siII")  # encapsulation, seconds, nanoseconds, length of frame_id
 _RANGE_CIR = struct.Struct("<QQI4xQffifB3xfI")  # tag, anchor, sequence, ticks, range, Cir to sample count
 _CIR_COUNTS = struct.Struct("<HH")
-_CIR_POWERS = struct.Struct("<ffBB")
+_CIR_POWERS = struct.Struct("<ffBBBB")
+_CIR_SOURCE_BYTES = 2
+"""Size of the last fields of `_CIR_POWERS`, radio and segment, which bags of earlier versions do not contain."""
+
 _TRUTH = struct.Struct("<QQIf")
 _CORRECTED = struct.Struct("<QQIffffBB2xI")
 _LENGTH = struct.Struct("<I")
 
 
+_RADIOS = {int(radio): radio for radio in RadioType}
+_SEGMENTS = {int(segment): segment for segment in Segment}
 _ENCODINGS = {int(encoding): encoding for encoding in Encoding}
 _STATUSES = {int(status): status for status in Status}
 _ORIGINS = {int(origin): origin for origin in Origin}
@@ -92,7 +99,14 @@ def encode_range(measurement: RangeMeasurement) -> bytes:
                 samples.astype("<i2", copy=False).tobytes(),
                 _CIR_COUNTS.pack(cir.preamble_count, cir.noise_threshold),
                 b"\0\0" if len(samples) % 2 else b"",
-                _CIR_POWERS.pack(cir.rx_power_dbm, cir.first_path_power_dbm, cir.channel, cir.prf_mhz),
+                _CIR_POWERS.pack(
+                    cir.rx_power_dbm,
+                    cir.first_path_power_dbm,
+                    cir.channel,
+                    cir.prf_mhz,
+                    cir.radio,
+                    cir.segment,
+                ),
             )
         )
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
@@ -154,9 +168,17 @@ def decode_range(data: bytes) -> RangeMeasurement:
         raise RecordingError("message with an unknown CIR encoding", where=f"encoding {encoding}")
     at += _RANGE_CIR.size
     powers_at = at + 2 * count + _CIR_COUNTS.size + 2 * (count % 2)
+    missing = powers_at + _CIR_POWERS.size - len(data)
+    if 0 < missing <= _CIR_SOURCE_BYTES:
+        # Padding of an earlier version is zero, too: UNKNOWN.
+        data += bytes(missing)
     _require_end(data, powers_at + _CIR_POWERS.size)
     preamble_count, noise_threshold = _CIR_COUNTS.unpack_from(data, at + 2 * count)
-    rx_power, first_path_power, channel, prf = _CIR_POWERS.unpack_from(data, powers_at)
+    rx_power, first_path_power, channel, prf, radio, segment = _CIR_POWERS.unpack_from(data, powers_at)
+    if radio not in _RADIOS or segment not in _SEGMENTS:
+        raise RecordingError(
+            "message with an unknown radio or segment", where=f"radio {radio}, segment {segment}"
+        )
     return RangeMeasurement(
         stamp_ns,
         tag_id,
@@ -177,6 +199,8 @@ def decode_range(data: bytes) -> RangeMeasurement:
             first_path_power,
             channel,
             prf,
+            _RADIOS[radio],
+            _SEGMENTS[segment],
         ),
         frame_id,
     )

@@ -25,6 +25,9 @@ _NESTED = {
     RANGE_CORRECTED_TYPE: (),
 }
 
+_OPTIONAL = {(f"{PACKAGE}/Cir", "radio"), (f"{PACKAGE}/Cir", "segment")}
+"""Section and name of fields that bags of earlier versions do not contain."""
+
 Layout = dict[str, list[tuple[str, str]]]
 """Fields of a message and of its nested messages: {section: [(type, name), ...]}."""
 
@@ -74,6 +77,8 @@ def difference(schema: str, type_name: str) -> str | None:
             return f"{place} is not defined"
         for number, wanted in enumerate(fields):
             have = found[section][number] if number < len(found[section]) else None
+            if have is None and (section, wanted[1]) in _OPTIONAL:
+                continue
             if have != wanted:
                 shown = " ".join(have) if have else "nothing"
                 return f"field {number + 1} of {place} is {shown!r}, expected {' '.join(wanted)!r}"

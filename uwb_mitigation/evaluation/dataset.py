@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.measurement import Record
+from uwb_mitigation.measurement import RadioType, Record, Segment
 from uwb_mitigation.preprocessing import CirFault, Preprocessing
 
 _BATCH = 256
@@ -40,6 +40,7 @@ class Dataset:
         refused: {reason: number of measurements that were not used}.
         headers: float32 (n, 2), preamble count and noise threshold; None = not kept.
         tags, anchors: ids, int (n,), for splits by location; None = not kept.
+        radios, segments: known sources of the CIRs.
     """
 
     preprocessing: Preprocessing
@@ -54,6 +55,8 @@ class Dataset:
     headers: NDArray[np.float32] | None = None
     tags: NDArray[np.uint64] | None = None
     anchors: NDArray[np.uint64] | None = None
+    radios: tuple[RadioType, ...] = (RadioType.DW1000,)
+    segments: tuple[Segment, ...] = (Segment.IPATOV,)
 
     def __len__(self) -> int:
         return len(self.error_m)
@@ -97,6 +100,7 @@ def build_dataset(
     """
     skipped: Counter[str] = Counter()
     inputs, values, headers, ids, configurations, labels = [], [], [], [], [], []
+    sources: set[tuple[RadioType, Segment]] = set()
     for record, fault, window in _preprocessed(records, preprocessing, on_record):
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
@@ -109,6 +113,7 @@ def build_dataset(
             skipped[CirFault(fault).text] += 1
             continue
         inputs.append(window)
+        sources.add((measurement.cir.radio or RadioType.DW1000, measurement.cir.segment or Segment.IPATOV))
         values.append(
             (
                 measurement.cir.rx_power_dbm,
@@ -125,6 +130,7 @@ def build_dataset(
         reasons = ", ".join(f"{count} x {reason}" for reason, count in skipped.items()) or "no measurements"
         raise DatasetError(f"no labelled measurement that can be used: {reasons}")
     rx_power, first_path_power, range_m, error_m = np.array(values, np.float64).T
+    tags, anchors = np.array(ids, np.uint64).T
     return Dataset(
         preprocessing,
         np.stack(inputs),
@@ -136,7 +142,10 @@ def build_dataset(
         np.array(labels),
         dict(skipped),
         np.array(headers, np.float32),
-        *np.array(ids, np.uint64).T,
+        tags=tags,
+        anchors=anchors,
+        radios=tuple(sorted({radio for radio, _ in sources})),
+        segments=tuple(sorted({segment for _, segment in sources})),
     )
 
 

@@ -25,7 +25,7 @@ from uwb_mitigation.firmware_export.compiling import (
 )
 from uwb_mitigation.firmware_export.export import export_bundle
 from uwb_mitigation.measurement import Cir, CorrectedColumns, RangeColumns, Status
-from uwb_mitigation.mitigation import Backend, pass_through
+from uwb_mitigation.mitigation import Backend, pass_other_radio, pass_through
 from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.offsets import NO_OFFSETS, Offsets
 
@@ -163,6 +163,8 @@ class FirmwareMitigation(Backend):
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """See `Backend`."""
         offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
+        if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
+            return passed
         *values, status = zip(
             *(
                 self._firmware.correct(float(ranges.range_m[row]), _cir(ranges, row), float(offset[row]))

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import read_bounded, write_atomically
+from uwb_mitigation.measurement import RadioType, Segment
 from uwb_mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.ood import Band, OodBands
@@ -56,6 +57,7 @@ class Card:
         variance_per_m2: increase of the variance per squared predicted error, without unit.
         interval95_sigmas: number of standard deviations that cover 95 % of the errors on unseen configurations.
         ood_bands: bands outside of which a measurement is out of distribution; None = unknown.
+        radios, segments: sources of the CIRs that the network was trained for.
         needs_cir: False = the network predicts 0, so that the linear bias model also corrects ranges without a CIR.
     """
 
@@ -72,6 +74,20 @@ class Card:
     interval95_sigmas: float = 1.96
     ood_bands: OodBands | None = None
     needs_cir: bool = True
+    radios: tuple[RadioType, ...] = (RadioType.DW1000,)
+    segments: tuple[Segment, ...] = (Segment.IPATOV,)
+
+    def fits(self, radio: RadioType, segment: Segment, has_cir: bool) -> bool:
+        """Return whether the network was trained for CIRs of a radio and a segment."""
+        if radio is RadioType.UNKNOWN and segment is Segment.UNKNOWN:
+            # Recordings of earlier versions and of other programs contain only the DW1000's preamble.
+            radio, segment = RadioType.DW1000, Segment.IPATOV
+        return radio in self.radios and (segment in self.segments or not has_cir)
+
+    @property
+    def source(self) -> str:
+        """Radios and segments of the training data, human-readable."""
+        return " ".join("/".join(each.name for each in names) for names in (self.radios, self.segments))
 
     @property
     def origin(self) -> str:
@@ -284,6 +300,11 @@ def assemble_bundle(graph: bytes, card: Card) -> bytes:
     if card.needs_cir:
         # Older bundles do not have this field.
         del fields["needs_cir"]
+    for name in ("radios", "segments"):
+        fields[name] = [each.name for each in getattr(card, name)]
+        if fields[name] in (["DW1000"], ["IPATOV"]):
+            # Older bundles do not have these fields.
+            del fields[name]
     if card.ood_bands is not None and card.ood_bands.lead_level_db is None:
         del fields["familiarity"]["lead_level_db"]
     metadata = fields | {
@@ -339,6 +360,8 @@ def _card(metadata: dict[str, Any]) -> Card:
         interval95_sigmas=float(metadata.get("interval95_sigmas", 1.96)),
         ood_bands=_ood_bands(metadata.get("familiarity")),
         needs_cir=metadata.get("needs_cir", True) is not False,
+        radios=tuple(RadioType[str(name)] for name in metadata.get("radios", ("DW1000",))),
+        segments=tuple(Segment[str(name)] for name in metadata.get("segments", ("IPATOV",))),
     )
 
 

@@ -136,6 +136,7 @@ class MitigatorHealth:
         loss_counter: counts the lost ranges and those dropped by the subscription's queue.
         malformed: messages that could not be decoded.
         without_preamble_count: ranges whose CIR lacks the preamble count that the model needs, in this period.
+        other_source: radio and segment of a CIR that the model was not trained for, in this period.
         los_m: predicted errors of the latest LOS ranges without the offsets of the radios.
         excludes_offset: whether the predicted errors do not contain the radios' offset, so that the median of `los_m`
             is near 0.
@@ -149,6 +150,7 @@ class MitigatorHealth:
         self.loss_counter = LossCounter(publishers)
         self.malformed = 0
         self.without_preamble_count = 0
+        self.other_source = ""
         self.los_m: deque[float] = deque(maxlen=MAX_LOS)
         self.excludes_offset = False
         self._processing_ns: deque[int] = deque(maxlen=MAX_LATENCIES)

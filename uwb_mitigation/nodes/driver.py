@@ -31,7 +31,7 @@ from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Mode
 from uwb_mitigation.link.messages import Correction
 from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.diagnostics import Description
 from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
@@ -257,7 +257,11 @@ class Driver(ManagedNode):
         self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=recorded_ns).to_msg()))
 
     def _publish_range(self, measurement: RangeMeasurement) -> None:
-        self._publish_measurements([replace(measurement, frame_id=self._frame_id)])
+        cir = measurement.cir
+        if cir.radio is RadioType.UNKNOWN:
+            # The protocols of boards and local radios are those of the DW1000.
+            cir = replace(cir, radio=RadioType.DW1000, segment=Segment.IPATOV)
+        self._publish_measurements([replace(measurement, cir=cir, frame_id=self._frame_id)])
 
     def _publish_measurements(self, measurements: Sequence[RangeMeasurement]) -> None:
         if self._consumer is not None:

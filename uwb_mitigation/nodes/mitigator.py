@@ -19,7 +19,14 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import LINE_OF_SIGHT_DB, Encoding, RangeMeasurement, Status
+from uwb_mitigation.measurement import (
+    LINE_OF_SIGHT_DB,
+    Encoding,
+    RadioType,
+    RangeMeasurement,
+    Segment,
+    Status,
+)
 from uwb_mitigation.mitigation import Backend, Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.linear_bias import LinearBiasModel
@@ -36,6 +43,7 @@ if importlib.util.find_spec("onnxruntime") is None:
     raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
 
 BATCH = 16
+_PASSED_THROUGH = (Status.OUT_OF_DISTRIBUTION, Status.NO_CIR)
 """Maximum batch size: correcting queued ranges in a batch takes half the time of single ranges."""
 
 
@@ -129,6 +137,11 @@ class Mitigator(ManagedNode):
             self.health.statuses[corrected.status] += 1
             if needs_count and corrected.status is Status.BAD_CIR and measurement.cir.preamble_count <= 0:
                 self.health.without_preamble_count += 1
+            cir = measurement.cir
+            if corrected.status in _PASSED_THROUGH and not mitigation.bundle.card.fits(
+                cir.radio, cir.segment, len(cir) > 0
+            ):
+                self.health.other_source = f"{cir.radio.name} {cir.segment.name}"
             if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
                 (offset_m,) = offsets.of([measurement.tag_id], [measurement.anchor_id])
                 self.health.los_m.append(corrected.correction_m - float(offset_m))
@@ -151,6 +164,13 @@ class Mitigator(ManagedNode):
         if failed:
             level, text = diagnostics.ERROR, "the model fails on some ranges"
         entries |= self._meter.entries()
+        other, self.health.other_source = self.health.other_source, ""
+        if other and (mitigation := self._mitigation) is not None and not failed:
+            card = mitigation.bundle.card
+            level, text = diagnostics.WARN, (
+                f"ranges are not corrected: their CIRs are of {other}, and model {card.name} was trained for "
+                f"{card.source}; only offsets are subtracted"
+            )  # fmt: skip
         if (mitigation := self._mitigation) is not None:
             entries |= {
                 "model": mitigation.bundle.name,
@@ -184,8 +204,14 @@ class Mitigator(ManagedNode):
         # rclpy may be able to decode another byte order, and the range next to an encoding of a later version.
         try:
             message = deserialize_message(data, RangeCir)
-            if message.cir.encoding not in tuple(Encoding):
-                message.cir.encoding, message.cir.samples = int(Encoding.COMPLEX_INT16), array("h")
+            cir = message.cir
+            if (
+                cir.encoding not in tuple(Encoding)
+                or cir.radio not in tuple(RadioType)
+                or cir.segment not in tuple(Segment)
+            ):
+                cir.encoding, cir.samples = int(Encoding.COMPLEX_INT16), array("h")
+                cir.radio = cir.segment = 0
             return decode_range(serialize_message(message))
         except Exception as error:  # rclpy raises various types, and no message may end the node.
             self.health.malformed += 1

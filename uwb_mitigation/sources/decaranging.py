@@ -22,7 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Cir, RangeMeasurement, Record, Truth
+from uwb_mitigation.measurement import (
+    DEVICE_TICK_HZ,
+    DEVICE_TIME_WRAP,
+    Cir,
+    RadioType,
+    RangeMeasurement,
+    Record,
+    Segment,
+    Truth,
+)
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.sources.csv_rows import id_cell, number_cell, read_rows
 from uwb_mitigation.sources.source import Source
@@ -191,7 +200,9 @@ class DecaRangingLog(Source):
                     frames[cir_owner] = time, self._with_samples(cir, match["pairs"])
                 cir_owner = None
             elif kind == "range":
-                empty = Cir(_NO_SAMPLES, channel=channel, prf_mhz=prf)
+                empty = Cir(
+                    _NO_SAMPLES, channel=channel, prf_mhz=prf, radio=RadioType.DW1000, segment=Segment.IPATOV
+                )
                 time, cir = frames.get(self._cir_frame, (latest or 0, empty))
                 if len(cir) == 0:
                     self._count(Anomaly.NO_CIR)
@@ -218,6 +229,8 @@ class DecaRangingLog(Source):
             first_path_power_dbm=first,
             channel=channel,
             prf_mhz=prf,
+            radio=RadioType.DW1000,
+            segment=Segment.IPATOV,
         )
 
     def _with_samples(self, cir: Cir, pairs: bytes) -> Cir:

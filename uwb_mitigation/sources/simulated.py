@@ -20,8 +20,10 @@ from uwb_mitigation.measurement import (
     DEVICE_TICK_HZ,
     DEVICE_TIME_WRAP,
     Cir,
+    RadioType,
     RangeMeasurement,
     Record,
+    Segment,
     Truth,
 )
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
@@ -351,6 +353,8 @@ def _cir(reception: Reception, i: int) -> Cir:
         first_path_power_dbm=float(reception.first_path_power_dbm[i]),
         channel=2,
         prf_mhz=64,
+        radio=RadioType.DW1000,
+        segment=Segment.IPATOV,
     )
 
 

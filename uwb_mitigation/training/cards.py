@@ -62,6 +62,8 @@ def card_of(
         variance_per_m2=corrected.variance_per_m2,
         interval95_sigmas=corrected.sigmas95,
         ood_bands=ood_bands,
+        radios=dataset.radios,
+        segments=dataset.segments,
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_mitigation.measurement import Cir, Radio, Segment
+from uwb_mitigation.measurement import Cir, RadioType, Segment
 from uwb_mitigation.radio.uci.messages import CirBlock, Diagnostics, Frame, FrameReport, SegmentMetrics
 
 _PEAK_SHARE = 0.5
@@ -51,12 +51,12 @@ def read_cir(diagnostics: Diagnostics | None, channel: int, rssi_dbm: float) -> 
     with_cir = [frame for frame in frames if any(len(block.taps) for block in frame.cirs)]
     chosen = (with_cir or [frame for frame in frames if frame.metrics] or frames)[-1:]
     if not chosen:
-        return Reading(_cir(Radio.DW3000, channel, rssi_dbm))
+        return Reading(_cir(RadioType.DW3000, channel, rssi_dbm))
     return _read(chosen[0], channel, rssi_dbm)
 
 
 def _read(frame: FrameReport, channel: int, rssi_dbm: float) -> Reading:
-    radio = Radio.QM35 if frame.confidence else Radio.DW3000
+    radio = RadioType.QM35 if frame.confidence else RadioType.DW3000
     blocks = sorted((block for block in frame.cirs if len(block.taps)), key=lambda block: not block.primary)
     if not blocks:
         metrics = next(iter(sorted(frame.metrics, key=lambda each: not each.primary)), None)
@@ -103,7 +103,7 @@ def _samples(block: CirBlock) -> tuple[np.ndarray, float]:
 
 
 def _cir(
-    radio: Radio,
+    radio: RadioType,
     channel: int,
     rssi_dbm: float,
     metrics: SegmentMetrics | None = None,
