@@ -25,6 +25,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
 from uwb_mitigation.bag.poses import encode_true_position
+from uwb_mitigation.bag.topics import RANGE_RAW
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.link.board_driver import BoardDriver
 from uwb_mitigation.link.connection import PortAddress
@@ -38,6 +39,7 @@ from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.live_feeds import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.nodes.replay import ReplayFeed
+from uwb_mitigation.nodes.topic_feed import TopicFeed
 from uwb_mitigation.nodes.uci_feed import UciFeed, uci_settings
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.sources.source import Source
@@ -70,7 +72,7 @@ def open_source(value: Callable[[str], Any]) -> Source:
     if value("source") == "mcap":
         from uwb_mitigation.sources.mcap import McapRecording
 
-        return McapRecording(path, topic=value("topic"))
+        return McapRecording(path, topic=value("topic") or RANGE_RAW)
     from uwb_mitigation.sources.decaranging import CirFrame, open_decaranging
 
     return open_decaranging(path, cir=CirFrame(value("cir")))
@@ -130,6 +132,7 @@ class Driver(ManagedNode):
             "serial": self._prepare_board,
             "evb1000": self._prepare_radios,
             "spi": self._prepare_radios,
+            "topic": self._prepare_topics,
         }
         if not self.value("path"):
             prepare["uci"] = self._prepare_uci
@@ -192,6 +195,10 @@ class Driver(ManagedNode):
     def _prepare_uci(self) -> Callable[[], Feed]:
         uci_settings(self.value)
         return lambda: UciFeed(self.value, self._publish_range, self.now_ns, self.get_logger())
+
+    def _prepare_topics(self) -> Callable[[], Feed]:
+        feed = TopicFeed(self, self.value("map"), self.value("topic"), self._publish_topic_range, self.now_ns)
+        return lambda: feed
 
     def _prepare_replay(self) -> Callable[[], Feed]:
         source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
@@ -262,6 +269,10 @@ class Driver(ManagedNode):
             # The protocols of boards and local radios are those of the DW1000.
             cir = replace(cir, radio=RadioType.DW1000, segment=Segment.IPATOV)
         self._publish_measurements([replace(measurement, cir=cir, frame_id=self._frame_id)])
+
+    def _publish_topic_range(self, measurement: RangeMeasurement) -> None:
+        if self.is_active:
+            self._publish_range(measurement)
 
     def _publish_measurements(self, measurements: Sequence[RangeMeasurement]) -> None:
         if self._consumer is not None:

@@ -171,6 +171,7 @@ def check_driver(values: Mapping[str, Any]) -> None:
         "spi": ("port", "/dev/spidev0.0"),
         "mcap": ("path", "FILE"),
         "decaranging": ("path", "FILE"),
+        "topic": ("map", "nlink_nodeframe2"),
     }
     source = values.get("source")
     name, example = needed.get(str(source), ("", ""))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Collection
@@ -20,20 +21,24 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
-from uwb_mitigation_msgs.msg import RangeCorrected
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from uwb_mitigation.bag.codec import decode_corrected
+from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_range, measurement_key
 from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_of_frame
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
+from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement, Status
 from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
+from uwb_mitigation.nodes.topic_feed import TopicRanges
+from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.sources.mapping import load_mapping, shipped_mappings
 from uwb_mitigation.sources.site import load_anchors
 
 BATCH = 64
@@ -84,6 +89,8 @@ class Locator(ManagedNode):
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None
         self._make_tf: Callable[[list[Any]], Any] = list
+        self._decode: Callable[[bytes], tuple[MeasurementKey, CorrectedRange]] = decode_corrected
+        self._make_estimator: Callable[[AnchorMap], MultiTagEstimator]
         self._outputs: dict[int, _Outputs] = {}
         self._timer: Timer | None = None
         self._malformed = self._lost = 0
@@ -100,12 +107,15 @@ class Locator(ManagedNode):
             raise ParameterError(
                 "parameter anchors is empty", valid="anchors:=FILE, as docs/background/positioning.md shows"
             )
-        anchors = load_anchors(Path(path).expanduser())
         model = NoiseModel(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
-        self._estimator = MultiTagEstimator(
-            EstimatorConfig(anchors, model, height, Area.parse(self.value("area")))
+        area = Area.parse(self.value("area"))
+        self._make_estimator = lambda anchors: MultiTagEstimator(
+            EstimatorConfig(anchors, model, height, area)
         )
+        kind, _, topic = path.partition(":")
+        if kind not in markers.ANCHOR_TYPES:
+            self._estimator = self._make_estimator(load_anchors(Path(path).expanduser()))
         self._period_ns = round(_NANOSECONDS / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * _NANOSECONDS)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
@@ -118,16 +128,19 @@ class Locator(ManagedNode):
         if self.value("publish_tf"):
             self._open_tf()
         self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
-        ranges = topics.create_raw_subscription(
-            self, RangeCorrected, topics.RANGE_CORRECTED, self._on_range, self._on_lost
-        )
-        self._ranges = self.destroy_at_close(ranges, self.destroy_subscription)
+        if kind in markers.ANCHOR_TYPES:
+            # Some publishers send the anchors once for late subscribers, others repeatedly.
+            for qos in (topics.LATCHED, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)):
+                sent = self.create_subscription(markers.ANCHOR_TYPES[kind], topic, self._on_anchors, qos)
+                self.destroy_at_close(sent, self.destroy_subscription)
+        self._subscribe_to_ranges(self.value("ranges"))
         if topic := self.value("height_topic"):
             heights = topics.create_subscription(
                 self, PoseWithCovarianceStamped, topic, self._on_height, ReliabilityPolicy.BEST_EFFORT
             )
             self.destroy_at_close(heights, self.destroy_subscription)
-        self.get_logger().info(f"{len(anchors)} anchors from {path}")
+        if self._estimator is not None:
+            self.get_logger().info(f"{len(self._estimator.anchors)} anchors from {path}")
 
     def begin(self) -> None:
         self._show_anchors()
@@ -170,6 +183,33 @@ class Locator(ManagedNode):
         self._tf = self.publisher(TFMessage, topics.TF, QoSProfile(depth=100))
         self._make_tf = lambda transforms: TFMessage(transforms=transforms)
 
+    def _subscribe_to_ranges(self, source: str) -> None:
+        if source in shipped_mappings() or source.endswith((".yaml", ".yml")):
+            mapping = load_mapping(source)
+            variance_m2 = mapping.range_sd**2 or math.nan
+
+            def on_range(measurement: RangeMeasurement) -> None:
+                if self._estimator is not None and self.is_active:
+                    self._add(self._estimator, *_uncorrected(measurement, variance_m2))
+
+            source_topics = TopicRanges(self, mapping, "", on_range, self.now_ns)
+            self.destroy_at_close(source_topics, TopicRanges.close).open()
+            return
+        kind, name = (RangeCir, source) if source else (RangeCorrected, topics.RANGE_CORRECTED)
+        self._decode = (
+            (lambda data: _uncorrected(decode_range(data), math.nan)) if source else decode_corrected
+        )
+        ranges = topics.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
+        self._ranges = self.destroy_at_close(ranges, self.destroy_subscription)
+
+    def _on_anchors(self, message: Any) -> None:
+        """Use the first anchors that a topic sends."""
+        if self._estimator is None and (anchors := markers.anchors_in(message)) is not None:
+            self._estimator = self._make_estimator(anchors)
+            self.get_logger().info(f"{len(anchors)} anchors from {self.value('anchors')}")
+            if self.is_active:
+                self._show_anchors()
+
     def _on_lost(self, info: Any) -> None:
         self._lost += info.total_count_change
 
@@ -181,13 +221,16 @@ class Locator(ManagedNode):
                 self._take(self._estimator, each)
 
     def _take(self, estimator: MultiTagEstimator, data: bytes) -> None:
-        began_ns = time.perf_counter_ns()
         try:
-            key, corrected = decode_corrected(data)
+            key, corrected = self._decode(data)
         except RecordingError as error:
             self._malformed += 1
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return
+        self._add(estimator, key, corrected)
+
+    def _add(self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange) -> None:
+        began_ns = time.perf_counter_ns()
         stamp_ns = key.stamp_ns + self._offset_ns
         found = estimator.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
         if found is None:
@@ -283,6 +326,13 @@ class Locator(ManagedNode):
         if self._estimator is not None and len(self._estimator.tags) == 1:
             (tag,) = self._estimator.tags.values()
             tag.add_height(float(message.pose.pose.position.z), float(message.pose.covariance[14]))
+
+
+def _uncorrected(measurement: RangeMeasurement, variance_m2: float) -> tuple[MeasurementKey, CorrectedRange]:
+    """Return a raw range as a corrected one; a variance of NaN is replaced by `range_sd`."""
+    range_m = measurement.range_m
+    corrected = CorrectedRange(range_m, range_m, 0.0, variance_m2, Status.NO_CIR, Origin.HOST, 0)
+    return measurement_key(measurement), corrected
 
 
 def make_nodes(stop: threading.Event) -> list[Node]:

@@ -6,13 +6,13 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
+from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.nodes import topics
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.positioning.tracks import Estimate
 
 TRAIL = 400
@@ -23,6 +23,22 @@ _BLUE = ColorRGBA(r=0.0, g=0.45, b=0.7, a=1.0)
 _ORANGE = ColorRGBA(r=0.9, g=0.62, b=0.0, a=0.9)
 _GREY = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.7)
 _SKY = ColorRGBA(r=0.34, g=0.71, b=0.91, a=0.35)
+
+
+ANCHOR_TYPES = {"markers": MarkerArray, "poses": PoseArray}
+"""{prefix of the parameter `anchors`: type of a topic with anchors}."""
+
+
+def anchors_in(message: Any) -> AnchorMap | None:
+    """Return the anchors of a MarkerArray (by marker id) or a PoseArray (by index); None: it has none."""
+    if isinstance(message, PoseArray):
+        points = {number: pose.position for number, pose in enumerate(message.poses)}
+    else:
+        added = [each for each in message.markers if each.action == Marker.ADD and each.id >= 0]
+        points = {each.id: each.pose.position for each in reversed(added)}
+    found = [Anchor(number, (point.x, point.y, point.z)) for number, point in sorted(points.items())]
+    found = [each for each in found if np.isfinite(each.position).all()]
+    return AnchorMap(found[:MAX_ANCHORS], "anchors") if found else None
 
 
 class TagPicture:

@@ -125,9 +125,11 @@ RADIO = (
 
 DRIVER = (
     Parameter("source", "simulated", "Source of the measurements.",
-              choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi", "uci"), filed=False),
+              choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi", "uci", "topic"), filed=False),
     Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging), or a capture (uci)."),
-    Parameter("topic", "/uwb/range_raw", "Topic of the ranges inside the bag (mcap)."),
+    Parameter("topic", "", "Topic of the ranges inside the bag, empty: /uwb/range_raw (mcap); or topics instead of those "
+              "of the mapping, separated by commas (topic)."),
+    Parameter("map", "", "Mapping file for messages of other software, or name of a shipped mapping (topic)."),
     Parameter("cir", "final", "Frame whose CIR belongs to a range (decaranging).",
               choices=("final", "poll")),
     Parameter("seed", 1, "Seed of the simulated measurements.", low=0, high=2**31 - 1),
@@ -191,7 +193,10 @@ MITIGATOR = (
 )  # fmt: skip
 
 LOCATOR = (
-    Parameter("anchors", "", "File with the positions of the anchors (format: docs/background/positioning.md). Required."),
+    Parameter("anchors", "", "File with the positions of the anchors (format: docs/background/positioning.md), or a topic: "
+              "markers:/TOPIC (MarkerArray, marker id = anchor id) or poses:/TOPIC (PoseArray, index = anchor id). Required."),
+    Parameter("ranges", "", "Topic of raw ranges (RangeCir) to use without a mitigator, such as uwb/range_raw; or a mapping "
+              "file, or the name of a shipped mapping, for messages of other software. Empty: uwb/range_corrected."),
     Parameter("tag", 0, "Number of the tag whose topics have the plain names; others use uwb/tag_N/pose and "
               "so on. 0: the first received tag.", low=0, high=2**63 - 1),
     Parameter("level", False, "The antenna of the tag has the constant height `height`."),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
-from uwb_mitigation.sources.mapping import INDEX, LENGTH, LIST_INDEX, TIME, Mapping, Point, Value
+from uwb_mitigation.sources.mapping import INDEX, LENGTH, LIST_INDEX, TIME, Drop, Mapping, Point, Value
 from uwb_mitigation.sources.tables import LOG_TIME, TOPIC, Chunk, series
 
 _MISSING = frozenset(("", "-", "nan", "none", "null", "n/a", "na"))
@@ -369,3 +370,31 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
     exact = largest <= 32767 and bool(np.all(flat == np.rint(flat)))
     scale = 1.0 if exact or largest == 0.0 else largest / 32767
     return np.rint(flat / scale).astype(np.int16), encoding, scale
+
+
+def kept_rows(rules: list[Drop], chunk: Chunk, dropped: Counter[str], prefix: str = "") -> NDArray[np.bool_]:
+    """Return which rows no rule drops, and count the others by rule."""
+    kept = np.ones(chunk.count, bool)
+    for rule in rules:
+        raw = np.asarray(chunk.columns[rule.column])
+        bad = np.zeros(chunk.count, bool)
+        for wanted, opposite in ((rule.equals, False), (rule.differs, True)):
+            if wanted is not None:
+                listed = wanted if isinstance(wanted, list) else [wanted]
+                texts = {f"{each:g}" if isinstance(each, float) else each for each in listed}
+                values = [each for each in listed if not isinstance(each, str)]
+                same = np.isin(raw.astype(str), list(texts)) | (
+                    np.isin(raw, values) if raw.dtype.kind in "iuf" else False
+                )
+                bad |= ~same if opposite else same
+        if rule.below is not None or rule.above is not None or rule.from_median is not None:
+            found = read_numbers(Value(column=rule.column), chunk, rule.column, "")
+            bad |= found < (-np.inf if rule.below is None else rule.below)
+            bad |= found > (np.inf if rule.above is None else rule.above)
+            if rule.from_median is not None:
+                bad |= np.abs(found - np.nanmedian(found)) > rule.from_median
+        count = int(np.count_nonzero(bad & kept))
+        if count:
+            dropped[f"{prefix}{rule}"] += count
+        kept &= ~bad
+    return kept

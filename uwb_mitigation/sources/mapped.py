@@ -21,11 +21,12 @@ from uwb_mitigation.sources.conversion import (
     NO_SAMPLES,
     Columns,
     Converter,
+    kept_rows,
     read_numbers,
     read_stamps,
     samples_of,
 )
-from uwb_mitigation.sources.mapping import CirSource, Drop, Mapping, Motion, Poses, Table, Value
+from uwb_mitigation.sources.mapping import CirSource, Mapping, Motion, Poses, Table, Value
 from uwb_mitigation.sources.source import Source
 from uwb_mitigation.sources.tables import UNREADABLE, Chunk, find_files, read_chunks, series
 
@@ -159,7 +160,7 @@ class MappedRecording(Source):
                 if self._rows_read > MAX_RANGES:
                     raise RecordingError(f"more than {MAX_RANGES} rows", where=str(file))
                 chunk = replace(chunk, before=before)
-                chunk = chunk.take(_kept(mapping.drop, chunk, self.dropped))
+                chunk = chunk.take(kept_rows(mapping.drop, chunk, self.dropped))
                 part = converter.convert(chunk, name)
                 part.numbers["cir"] = self._cirs_of(chunk) if other is None else other.rows(chunk)
                 self._note_anchors(part, file)
@@ -271,7 +272,7 @@ class MappedRecording(Source):
         )
         converter, found = Converter(plain, anchors=self._converter.anchors), {}
         for chunk in read_chunks(source, path, converter.columns, converter.optional):
-            part = converter.convert(chunk.take(_kept(source.drop, chunk, Counter())))
+            part = converter.convert(chunk.take(kept_rows(source.drop, chunk, Counter())))
             for row in range(len(part)):
                 x, y, z = (float(part.numbers[f"anchor {axis}"][row]) for axis in "xyz")
                 found[int(part.anchor_id[row])] = Anchor(int(part.anchor_id[row]), (x, y, z), source.sd)
@@ -343,7 +344,7 @@ class MappedRecording(Source):
         stamps, places, turns = [np.zeros(0, np.int64)], [np.zeros((0, 3))], [np.zeros((0, 4))]
         for path in paths:
             for chunk in read_chunks(poses, path, needed):
-                chunk = chunk.take(_kept(poses.drop, chunk, self.dropped, "pose "))
+                chunk = chunk.take(kept_rows(poses.drop, chunk, self.dropped, "pose "))
                 stamps.append(read_stamps(poses.stamp, chunk, path.name))
                 places.append(_points(poses.position, chunk))
                 if poses.orientation:
@@ -544,7 +545,7 @@ def _read_motion(source: Motion, ranges: Path) -> Odometry:
     stamps, twists = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     for path in _beside(source, ranges):
         for chunk in read_chunks(source, path, needed):
-            chunk = chunk.take(_kept(source.drop, chunk, Counter()))
+            chunk = chunk.take(kept_rows(source.drop, chunk, Counter()))
             stamps.append(read_stamps(source.stamp, chunk, path.name))
             twists.append(_points(values, chunk))
     stamp, twist = np.concatenate(stamps), np.concatenate(twists)
@@ -569,31 +570,3 @@ def _turned(quaternions: NDArray[np.float64], arm: NDArray[np.float64]) -> NDArr
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_quat(quaternions).apply(arm))
-
-
-def _kept(rules: list[Drop], chunk: Chunk, dropped: Counter[str], prefix: str = "") -> NDArray[np.bool_]:
-    """Return which rows no rule drops, and count the others by rule."""
-    kept = np.ones(chunk.count, bool)
-    for rule in rules:
-        raw = np.asarray(chunk.columns[rule.column])
-        bad = np.zeros(chunk.count, bool)
-        for wanted, opposite in ((rule.equals, False), (rule.differs, True)):
-            if wanted is not None:
-                listed = wanted if isinstance(wanted, list) else [wanted]
-                texts = {str(each) for each in listed}
-                values = [each for each in listed if not isinstance(each, str)]
-                same = np.isin(raw.astype(str), list(texts)) | (
-                    np.isin(raw, values) if raw.dtype.kind in "iuf" else False
-                )
-                bad |= ~same if opposite else same
-        if rule.below is not None or rule.above is not None or rule.from_median is not None:
-            found = read_numbers(Value(column=rule.column), chunk, rule.column, "")
-            bad |= found < (-np.inf if rule.below is None else rule.below)
-            bad |= found > (np.inf if rule.above is None else rule.above)
-            if rule.from_median is not None:
-                bad |= np.abs(found - np.nanmedian(found)) > rule.from_median
-        count = int(np.count_nonzero(bad & kept))
-        if count:
-            dropped[f"{prefix}{rule}"] += count
-        kept &= ~bad
-    return kept

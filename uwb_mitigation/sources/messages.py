@@ -17,6 +17,7 @@ MAX_ROWS = 4096
 """Largest number of ranges in one message."""
 
 MAX_TEXT = 1 << 20
+_COMMAND = re.compile(r"^\s*AT\+\w+[=:]")
 _PAIRS = re.compile(r"(\w+)\s*[:=]\s*(\([^()]*\)|\[[^\[\]]*\]|[^,\s()\[\]]+)")
 
 
@@ -67,7 +68,7 @@ class MessageRows:
                 return json.loads(text)
             except (ValueError, RecursionError) as error:
                 raise RecordingError(f"not JSON: {text!r:.60}") from error
-        return {name: _items(value) for name, value in _PAIRS.findall(text)}
+        return {name: _items(value) for name, value in _PAIRS.findall(_COMMAND.sub("", text))}
 
 
 def _items(text: str) -> Any:

@@ -53,14 +53,14 @@ class Chunk:
     Attributes:
         columns: {name: array or list}.
         count: number of rows.
-        path: the file.
+        path: the file, or the topic.
         rows: int64 (count,), numbers of the rows in the file, from 0.
         before: number of rows in the files before.
     """
 
     columns: Mapping[str, Any]
     count: int
-    path: Path
+    path: Path | str
     rows: NDArray[np.int64]
     before: int = 0
 

@@ -1,0 +1,255 @@
+"""Ranges on topics of other software: driver and locator over real DDS, and the shipped mappings for messages."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections import Counter
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseWithCovarianceStamped
+from message_package import build
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_harness import Ros, diagnostic_values
+from sensor_msgs.msg import Range
+from std_msgs.msg import String
+from test_mapping import FRAME2, NODE2
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+from visualization_msgs.msg import Marker, MarkerArray
+
+from uwb_mitigation.errors import MissingDependencyError, ParameterError
+from uwb_mitigation.measurement import RangeMeasurement
+from uwb_mitigation.nodes.topic_feed import TopicRanges, message_type
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
+from uwb_mitigation.sources.mapping import Mapping, load_mapping
+
+CORNERS = {0: (0.0, 0.0, 2.0), 1: (8.0, 0.0, 2.0), 2: (8.0, 6.0, 2.0), 3: (0.0, 6.0, 2.0)}
+TAG = (3.0, 2.0, 0.4)
+LEVEL = ("level:=true", f"height:={TAG[2]}")
+
+PUBLISHER = f"""
+import math, time
+import rclpy
+from nlink_parser.msg import LinktrackNode2, LinktrackNodeframe2
+rclpy.init()
+node = rclpy.create_node("linktrack")
+publisher = node.create_publisher(LinktrackNodeframe2, "/nlink_linktrack_nodeframe2", 10)
+corners = {CORNERS}
+while True:
+    nodes = [LinktrackNode2(role=1, id=n, dis=math.dist({TAG}, corner), fp_rssi=-85.0, rx_rssi=-80.5) for n, corner in corners.items()]
+    nodes.append(LinktrackNode2(role=1, id=7, dis=0.0))
+    publisher.publish(LinktrackNodeframe2(role=2, id=9, nodes=nodes))
+    time.sleep(0.05)
+"""
+
+
+@pytest.fixture(scope="module")
+def nlink(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    messages = {"LinktrackNode2": NODE2, "LinktrackNodeframe2": FRAME2}
+    return build("nlink_parser", messages, tmp_path_factory.mktemp("nlink"))
+
+
+@pytest.fixture
+def publisher(nlink: dict[str, str], monkeypatch: pytest.MonkeyPatch, ros: Ros) -> Ros:
+    for name, value in nlink.items():
+        monkeypatch.setenv(name, value)
+    ros.run([sys.executable, "-c", PUBLISHER])
+    return ros
+
+
+@pytest.fixture
+def anchors(tmp_path: Path) -> Path:
+    path = tmp_path / "anchors.yaml"
+    path.write_text(dump_anchors(AnchorMap([Anchor(key, place) for key, place in CORNERS.items()])))
+    return path
+
+
+def wait_for_position(ros: Ros, poses: list[PoseWithCovarianceStamped]) -> None:
+    def arrived() -> bool:
+        point = poses[-1].pose.pose.position if poses else Point(x=math.nan)
+        return math.dist((point.x, point.y), TAG[:2]) < 0.1
+
+    ros.spin_until(arrived)
+
+
+@pytest.mark.ros
+def test_ranges_of_linktrack_give_poses_and_pass_the_mitigator(publisher: Ros, anchors: Path):
+    ros = publisher
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    raw, corrected = (
+        ros.collect(RangeCir, "/uwb/range_raw"),
+        ros.collect(RangeCorrected, "/uwb/range_corrected"),
+    )
+    ros.start("driver", "source:=topic", "map:=nlink_nodeframe2")
+    ros.start("mitigator", "offsets:=0.25")
+    ros.start("locator", "ranges:=uwb/range_raw", f"anchors:={anchors}", *LEVEL)
+    wait_for_position(ros, poses)
+    ros.spin_until(lambda: len(raw) > 40 and len(corrected) > 0)
+    assert {(message.tag_id, message.anchor_id) for message in raw} == {(9, corner) for corner in CORNERS}
+    (one,) = [message for message in raw if message.anchor_id == 2][:1]
+    assert one.range == pytest.approx(math.dist(TAG, CORNERS[2]), abs=1e-4)
+    assert (one.cir.rx_power, one.cir.first_path_power) == pytest.approx((-80.5, -85.0))
+    assert corrected[0].status == RangeCorrected.NO_CIR
+    assert corrected[0].range == pytest.approx(
+        math.dist(TAG, CORNERS[corrected[0].anchor_id]) - 0.25, abs=1e-4
+    )
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("kind", ["markers", "poses"])
+def test_locator_takes_a_mapping_and_anchors_from_a_topic(publisher: Ros, kind: str):
+    ros = publisher
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    ros.start("locator", "ranges:=nlink_nodeframe2", f"anchors:={kind}:/site/anchors", *LEVEL)
+    places = [Pose(position=Point(x=x, y=y, z=z)) for x, y, z in CORNERS.values()]
+    markers = MarkerArray(markers=[Marker(id=number, pose=place) for number, place in enumerate(places)])
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    sender = ros.node.create_publisher(
+        MarkerArray if kind == "markers" else PoseArray, "/site/anchors", latched
+    )
+    sender.publish(markers if kind == "markers" else PoseArray(poses=places))
+    wait_for_position(ros, poses)
+
+
+@pytest.mark.ros
+def test_driver_reports_a_type_that_is_not_installed(ros: Ros):
+    driver = ros.start("driver", "source:=topic", "map:=gtec_ranging")
+    driver.wait_for_output("the message type gtec_msgs/msg/Ranging is not installed")
+
+
+@pytest.mark.ros
+def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
+    received, diagnostics = (
+        ros.collect(RangeCir, "/uwb/range_raw"),
+        ros.collect(DiagnosticArray, "/diagnostics"),
+    )
+    ros.start("driver", "source:=topic", "map:=string_json")
+    sender = ros.node.create_publisher(String, "/uwb/json", QoSProfile(depth=100))
+    texts = ["{", '{"tag": 7}', '{"tag": -1, "ranges": [{"anchor": 1, "range_m": 4.5}]}']
+    texts.append('{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.5}, {"anchor": 2, "range_m": null}]}')
+
+    def sent() -> bool:
+        for text in texts:
+            sender.publish(String(data=text))
+        return len(received) > 2
+
+    ros.spin_until(sent)
+    assert {(message.tag_id, message.anchor_id, message.range) for message in received} == {(7, 1, 4.5)}
+
+    def counted() -> dict[str, str]:
+        statuses = [status for message in diagnostics for status in message.status if "driver" in status.name]
+        return diagnostic_values(statuses[-1]) if statuses else {}
+
+    ros.spin_until(lambda: int(counted().get("range is not a number", 0)) > 0)
+    assert int(counted()["message that cannot be used"]) > 2
+
+
+# The mappings ----------------------------------------------------------------------------------------------------
+
+
+class Convert:
+    """Passes messages of a shipped mapping to `TopicRanges` without DDS."""
+
+    def __init__(self, mapping: str | Mapping) -> None:
+        self.found: list[RangeMeasurement] = []
+        node: Any = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None))
+        used = load_mapping(mapping) if isinstance(mapping, str) else mapping
+        self.ranges = TopicRanges(node, used, "", self.found.append, lambda: 5_000)
+
+    def take(self, message: Any, topic: str = "/x") -> list[tuple[int, int, float]]:
+        self.ranges.take(message, topic)
+        return [(one.tag_id, one.anchor_id, round(one.range_m, 4)) for one in self.found]
+
+
+@pytest.fixture
+def types(monkeypatch: pytest.MonkeyPatch) -> None:
+    for package, names in {
+        "gtec_msgs": ("Ranging", "UWBRanging", "PozyxRangingWithCir"),
+        "nlink_parser": ("LinktrackNodeframe3", "LinktrackTagframe0"),
+    }.items():
+        module = ModuleType(f"{package}.msg")
+        for name in names:
+            setattr(module, name, SimpleNamespace)
+        monkeypatch.setitem(sys.modules, package, ModuleType(package))
+        monkeypatch.setitem(sys.modules, f"{package}.msg", module)
+
+
+def test_linktrack_frames(types: None):
+    tagframe = SimpleNamespace(id=5, dis_arr=np.array([1.5, 0, 2.5, 0, 0, 0, 0, 0], np.float32))
+    assert Convert("nlink_tagframe0").take(tagframe) == [(5, 0, 1.5), (5, 2, 2.5)]
+    nodes = [SimpleNamespace(id=3, dis=4.25, rx_rssi=-80.0, fp_rssi=-82.0)]
+    convert = Convert("nlink_nodeframe3")
+    assert convert.take(SimpleNamespace(id=5, nodes=nodes)) == [(5, 3, 4.25)]
+    assert convert.take(SimpleNamespace(id=5, nodes=[])) == [(5, 3, 4.25)]
+    assert (convert.found[0].cir.first_path_power_dbm, convert.found[0].stamp_ns) == (-82.0, 5_000)
+
+
+def test_gtec_messages(types: None):
+    convert = Convert("gtec_ranging")
+    message = SimpleNamespace(anchorId=2, tagId=7, range=4310, seq=12, rss=-81.5, errorEstimation=0.0)
+    assert convert.take(message) == [(7, 2, 4.31)]
+    assert (convert.found[0].sequence, convert.found[0].cir.rx_power_dbm) == (12, -81.5)
+    convert = Convert("gtec_uwbranging")
+    registers = {"firstPathAmp1": 4889, "firstPathAmp2": 13876, "firstPathAmp3": 10464, "maxGrowthCIR": 9048}
+    message = SimpleNamespace(
+        anchorId=2, tagId=7, range=4310, seq=1, firstPath=749 * 64 + 32, rxPreamCount=1024, channel=5.0, prf=64, **registers
+    )  # fmt: skip
+    assert convert.take(message) == [(7, 2, 4.31)]
+    cir = convert.found[0].cir
+    assert (cir.first_path_index, cir.preamble_count, cir.channel) == (749.5, 1024, 5)
+    assert cir.rx_power_dbm == pytest.approx(-91.2, abs=0.1)
+    convert = Convert("gtec_pozyx_cir")
+    message = SimpleNamespace(
+        originId=0x6A40, destinationId=0x6A41, range=2500, seq=1, rxPower=-79.0, channel=5.0, cir=np.array([1, -2, 3, 4], np.int16)
+    )  # fmt: skip
+    assert convert.take(message) == [(0x6A40, 0x6A41, 2.5)]
+    assert convert.found[0].cir.samples.tolist() == [1, -2, 3, 4]
+
+
+def test_standard_messages():
+    convert = Convert("sensor_range")
+    message = Range(range=3.5)
+    message.header.stamp.sec, message.header.stamp.nanosec = 17, 5
+    assert convert.take(message, "/uwb/range_12") == [(1, 12, 3.5)]
+    assert convert.found[0].stamp_ns == 17_000_000_005
+    line = "AT+RANGE=tid:4,mask:05,seq:218,range:(72,0,131,0,0,0,0,0),rssi:(-77.60,0.00,-75.13,0.00,0.00,0.00,0.00,0.00)"
+    convert = Convert("string_at")
+    assert convert.take(String(data=line)) == [(4, 0, 0.72), (4, 2, 1.31)]
+    assert [one.cir.rx_power_dbm for one in convert.found] == [-77.6, -75.13]
+    assert Convert("string_json").take(
+        String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
+    ) == [(1, 2, 3.0)]
+
+
+def test_hostile_texts_are_counted():
+    convert = Convert("string_json")
+    for text in (
+        "[" * 100_000,
+        '{"ranges": 5, "tag": 1}',
+        '{"tag": 1, "ranges": "abc"}',
+        "9" * 5000,
+        "null",
+        "[]",
+    ):
+        convert.take(String(data=text))
+    many = '{"tag": 1, "ranges": [' + ",".join(['{"anchor": 1, "range_m": 2}'] * 5000) + "]}"
+    assert convert.take(String(data=many)) == []
+    assert convert.ranges.counts == Counter({"message that cannot be used": 7})
+
+
+def test_types_and_mappings_that_cannot_be_used_are_errors():
+    assert message_type("sensor_msgs/msg/Range") is Range
+    with pytest.raises(MissingDependencyError, match="nowhere_msgs/msg/X is not installed"):
+        message_type("nowhere_msgs/msg/X")
+    with pytest.raises(ParameterError, match="PACKAGE/msg/NAME"):
+        message_type("os; rm/x")
+    with pytest.raises(ParameterError, match="eWINE is for recordings"):
+        Convert("ewine")
