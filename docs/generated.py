@@ -192,7 +192,7 @@ def wire_layout(table: Layout) -> str:
         return f"{number}no payload."
     tail = f", then {table.tail}" if table.tail else ""
     lines = [
-        f"{number}{table.packing().size} bytes{tail}.",
+        f"{number}{table.as_struct().size} bytes{tail}.",
         "",
         "| byte | type | field | meaning |",
         "|---|---|---|---|",
@@ -200,7 +200,7 @@ def wire_layout(table: Layout) -> str:
     for field in table.fields:
         if field.name in table.offsets():
             kind = _WIRE_TYPES.get(field.code) or f"{field.code[:-1]} bytes"
-            lines.append(f"| {table.offsets()[field.name]} | {kind} | `{field.name}` | {field.meaning} |")
+            lines.append(f"| {table.offsets()[field.name]} | {kind} | `{field.name}` | {field.description} |")
     return "\n".join(lines)
 
 
@@ -307,11 +307,11 @@ def _c_struct(table: Layout) -> list[str]:
             member = f"{element} {field.name}[{field.code[:-1]}];"
         else:
             member = f"{_C_TYPES[field.code]} {field.name};"
-        lines.append(f"    {member} /* {field.meaning} */" if field.meaning else f"    {member}")
+        lines.append(f"    {member} /* {field.description} */" if field.description else f"    {member}")
     if table.tail:
         lines.append(f"    /* then {table.tail} */")
     # The size is the sum of the sizes of the fields: no padding, so that the offsets are right as well.
-    return [*lines, f"}} {name};", f"UWB_STATIC_ASSERT(sizeof({name}) == {table.packing().size});", ""]
+    return [*lines, f"}} {name};", f"UWB_STATIC_ASSERT(sizeof({name}) == {table.as_struct().size});", ""]
 
 
 PARTS = {

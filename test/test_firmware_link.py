@@ -104,12 +104,12 @@ def decode(library: ctypes.CDLL, wire: bytes) -> tuple[Frame | None, dict[str, i
     counted = dict(zip(KINDS, counts, strict=True))
     if length < 0:
         return None, counted
-    _, *fields = HEADER.packing().unpack(header.raw)
+    _, *fields = HEADER.as_struct().unpack(header.raw)
     return Frame(*fields, payload.raw[:length]), counted
 
 
 def encode(library: ctypes.CDLL, frame: Frame) -> bytes:
-    header = HEADER.packing().pack(1, *frame[:4])
+    header = HEADER.as_struct().pack(1, *frame[:4])
     wire = ctypes.create_string_buffer(8192)
     count = library.native_encode(header, frame.payload, len(frame.payload), wire)
     return wire.raw[:count]

@@ -73,7 +73,7 @@ def test_samples_are_found_after_fields_of_a_later_revision():
 
 @pytest.mark.parametrize("kind", [kind for kind in MessageType if layout.PAYLOADS[kind].fields])
 def test_payload_that_is_too_short_is_an_error_that_names_the_type(kind):
-    size = layout.PAYLOADS[kind].packing().size
+    size = layout.PAYLOADS[kind].as_struct().size
 
     with pytest.raises(LinkError, match=rf"{kind.name}: .*{size - 1} bytes.*at least {size}"):
         messages.decode(kind, bytes(size - 1))
@@ -151,7 +151,7 @@ def test_every_field_is_aligned_and_every_fixed_part_is_a_multiple_of_8(table):
         code = codes[name]
         size = 1 if code.endswith("s") else struct.calcsize("<" + code)
         assert offset % size == 0, name
-    assert table.packing().size % 8 == 0
+    assert table.as_struct().size % 8 == 0
 
 
 @pytest.mark.parametrize(("compiler", "language"), [("cc", "c"), ("c++", "c++")])

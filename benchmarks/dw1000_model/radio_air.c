@@ -50,8 +50,7 @@ struct radio_air {
     dw1000_air *air;
     radio_board *boards[MAX_BOARDS];
     int count;
-    int keep_samples;
-    uint32_t results_count, results_lost, store_used;
+    uint32_t results_count, store_used;
     radio_result results[MAX_RESULTS];
     int16_t *store;
     size_t store_values;
@@ -84,11 +83,11 @@ static void send_pending(radio_board *board) {
 static int transfer(void *context, const uint8_t *header, size_t header_bytes, const uint8_t *out, uint8_t *in,
                     size_t bytes) {
     radio_board *const board = context;
-    const size_t whole = header_bytes + bytes;
-    if (whole > sizeof board->sent) {
+    const size_t total = header_bytes + bytes;
+    if (total > sizeof board->sent) {
         return -1;
     }
-    memset(board->sent, 0, whole);
+    memset(board->sent, 0, total);
     memcpy(board->sent, header, header_bytes);
     if (out != NULL) {
         memcpy(board->sent + header_bytes, out, bytes);
@@ -96,7 +95,7 @@ static int transfer(void *context, const uint8_t *header, size_t header_bytes, c
     if (board->overhead_s > 0) {
         dw1000_delay(board->chip, board->overhead_s);
     }
-    dw1000_spi(board->chip, board->sent, board->received, whole, board->spi_hz);
+    dw1000_spi(board->chip, board->sent, board->received, total, board->spi_hz);
     if (out == NULL) {
         memcpy(in, board->received + header_bytes, bytes);
     }
@@ -131,7 +130,6 @@ static void store_range(radio_board *board) {
     uwb_range_cir_t fields;
     memcpy(&fields, board->measurement, sizeof fields);
     if (air->results_count == MAX_RESULTS) {
-        air->results_lost++;
         return;
     }
     radio_result *const result = &air->results[air->results_count++];

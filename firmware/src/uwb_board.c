@@ -39,13 +39,13 @@ static float offset_of_m(const uwb_board *board, uint64_t tag_id, uint64_t ancho
         const uwb_offset_t *const entry = &board->offsets[i];
         const int tag = entry->tag_id == tag_id;
         const int anchor = entry->anchor_id == anchor_id;
-        if (entry->of == UWB_OFFSET_SCOPE_PAIR && tag && anchor) {
+        if (entry->scope == UWB_OFFSET_SCOPE_PAIR && tag && anchor) {
             return entry->offset;
         }
-        if (entry->of == UWB_OFFSET_SCOPE_ANCHOR && anchor) {
+        if (entry->scope == UWB_OFFSET_SCOPE_ANCHOR && anchor) {
             anchor_m = entry->offset;
             found = 1;
-        } else if (entry->of == UWB_OFFSET_SCOPE_TAG && tag) {
+        } else if (entry->scope == UWB_OFFSET_SCOPE_TAG && tag) {
             tag_m = entry->offset;
             found = 1;
         }
@@ -100,7 +100,7 @@ static int set_offsets(uwb_board *board, const uint8_t *payload, size_t payload_
     for (size_t i = 0; i < fixed.count; i++) {
         uwb_offset_t entry;
         memcpy(&entry, payload + sizeof fixed + i * sizeof entry, sizeof entry);
-        if (!is_valid_offset(entry.offset) || entry.of > UWB_OFFSET_SCOPE_PAIR) {
+        if (!is_valid_offset(entry.offset) || entry.scope > UWB_OFFSET_SCOPE_PAIR) {
             return 0;
         }
     }

@@ -85,7 +85,7 @@ typedef struct {
     uint64_t tag_id; /* ignored for the offset of an anchor */
     uint64_t anchor_id; /* ignored for the offset of a tag */
     float offset; /* m, -10 to 10 */
-    uint8_t of; /* OffsetScope */
+    uint8_t scope; /* OffsetScope */
     uint8_t reserved[3];
 } uwb_offset_t;
 UWB_STATIC_ASSERT(sizeof(uwb_offset_t) == 24);

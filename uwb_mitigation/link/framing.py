@@ -33,7 +33,7 @@ _CRC_RESIDUE = 0x2144DF1C
 _SLICE_BYTES = 1 << 16
 
 _MIN_FRAME_BYTES = HEADER_BYTES + CRC_BYTES
-_header = HEADER.packing()
+_header = HEADER.as_struct()
 
 
 class Frame(NamedTuple):

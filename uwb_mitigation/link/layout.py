@@ -114,17 +114,17 @@ class Field:
     Attributes:
         name: name in the protocol and in C.
         code: format of `struct`; reserved bytes are `nx`.
-        meaning: description, with the unit.
+        description: description, with the unit.
         attribute: attribute of the message or of an object in it, such as a CIR; empty = `name`.
-        kind: converter of the decoded number, such as an enumeration; raises ValueError for invalid numbers.
+        convert: converter of the decoded number, such as an enumeration; raises ValueError for invalid numbers.
         computed: the field describes the tail (a length or a position) and is no attribute.
     """
 
     name: str
     code: str
-    meaning: str
+    description: str
     attribute: str = ""
-    kind: Callable[[int], Any] | None = None
+    convert: Callable[[int], Any] | None = None
     computed: bool = False
 
     @property
@@ -145,20 +145,24 @@ class Layout:
     def __init__(self, name: str, *fields: Field, tail: str = "") -> None:
         self.name, self.fields, self.tail = name, fields, tail
 
-    def packing(self) -> struct.Struct:
+    def as_struct(self) -> struct.Struct:
         """Return the fixed part as a `struct.Struct`; reserved bytes have no value."""
         return struct.Struct("<" + "".join(field.code for field in self.fields))
 
     @property
-    def used(self) -> tuple[Field, ...]:
-        """The fields without reserved bytes: those with a value in `packing`."""
+    def value_fields(self) -> tuple[Field, ...]:
+        """The fields without reserved bytes: those with a value in `as_struct`."""
         return tuple(field for field in self.fields if not field.code.endswith("x"))
 
     def offsets(self) -> dict[str, int]:
         """Return {field name: byte offset}, without reserved bytes."""
         sizes = [struct.calcsize("<" + field.code) for field in self.fields]
         starts = itertools.accumulate(sizes, initial=0)
-        return {field.name: at for field, at in zip(self.fields, starts, strict=False) if field in self.used}
+        return {
+            field.name: at
+            for field, at in zip(self.fields, starts, strict=False)
+            if field in self.value_fields
+        }
 
 
 def device_time(ticks: int) -> int:
@@ -199,10 +203,10 @@ _RADIO_SETTINGS = (
     Field("channel", "B", "1 to 5, 7"),
     Field("prf", "B", "MHz: 16, 64", "prf_mhz"),
     Field("preamble_code", "B", "0 = the first for channel and PRF"),
-    Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's", kind=bool),
-    Field("role", "B", "Role", kind=Role),
-    Field("report", "B", "1 = an anchor also sends its ranges to its host", kind=bool),
-    Field("bias_correction", "B", "1 = ranges are corrected for the received power (APS011)", kind=bool),
+    Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's", convert=bool),
+    Field("role", "B", "Role", convert=Role),
+    Field("report", "B", "1 = an anchor also sends its ranges to its host", convert=bool),
+    Field("bias_correction", "B", "1 = ranges are corrected for the received power (APS011)", convert=bool),
     Field("anchor_count", "B", "anchors that a tag polls; 0 = anchors found by broadcast", computed=True),
     Field("reserved_2", "4x", ""),
 )
@@ -226,7 +230,7 @@ OFFSET = Layout(
     Field("tag_id", "Q", "ignored for the offset of an anchor"),
     Field("anchor_id", "Q", "ignored for the offset of a tag"),
     Field("offset", "f", "m, -10 to 10"),
-    Field("of", "B", "OffsetScope"),
+    Field("scope", "B", "OffsetScope"),
     Field("reserved", "3x", ""),
 )
 """One offset in the tail of a SET_OFFSETS."""
@@ -246,7 +250,7 @@ _TABLES = (
         Field("firmware_major", "B", "firmware version"),
         Field("firmware_minor", "B", ""),
         Field("firmware_patch", "B", ""),
-        Field("mode", "B", "active Mode", kind=Mode),
+        Field("mode", "B", "active Mode", convert=Mode),
         Field("reserved", "4x", ""),
         Field("firmware_name", "16s", "UTF-8, padded with zeros"),
     ),
@@ -258,7 +262,7 @@ _TABLES = (
             "device_time",
             "Q",
             "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits",
-            kind=device_time,
+            convert=device_time,
         ),
         Field("sequence", "I", "number of the exchange; wraps"),
         Field("range", "f", "m, measured; NaN = no range", "range_m"),
@@ -272,7 +276,7 @@ _TABLES = (
         Field("noise_threshold", "H", "LDE_THRESH, accumulator units; 0 = unknown"),
         Field("samples_offset", "H", "bytes from the payload's start to the samples; even", computed=True),
         Field("sample_count", "H", "int16 values: two per complex sample", computed=True),
-        Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude", kind=Encoding),
+        Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude", convert=Encoding),
         Field("channel", "B", "UWB channel; 0 = unknown"),
         Field("prf", "B", "MHz: 16 or 64; 0 = unknown", "prf_mhz"),
         Field("reserved", "5x", ""),
@@ -282,7 +286,7 @@ _TABLES = (
         "RANGE_CORRECTED",
         Field("tag_id", "Q", "as in the measurement"),
         Field("anchor_id", "Q", "as in the measurement"),
-        Field("device_time", "Q", "as in the measurement, 40 bits", kind=device_time),
+        Field("device_time", "Q", "as in the measurement, 40 bits", convert=device_time),
         Field("sequence", "I", "as in the measurement"),
         Field("model_id", "I", "identity of the model that corrected; 0 = none"),
         Field("range", "f", "m, corrected; NaN = no valid range", "range_m"),
@@ -295,12 +299,14 @@ _TABLES = (
         ),
         Field("variance", "f", "m^2; infinite if the range is invalid", "variance_m2"),
         Field("compute_us", "I", "time that the correction took on the board"),
-        Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR", kind=Status),
+        Field(
+            "status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR", convert=Status
+        ),
         Field("reserved", "3x", ""),
     ),
     Layout(
         "LOG",
-        Field("level", "B", "LogLevel", kind=LogLevel),
+        Field("level", "B", "LogLevel", convert=LogLevel),
         Field("reserved", "7x", ""),
         tail="text, UTF-8, to the payload's end",
     ),
@@ -311,7 +317,7 @@ _TABLES = (
         Field("measurements", "I", "exchanges since the start"),
         Field("measurements_lost", "I", "exchanges not sent because the link was full"),
         Field("temperature", "f", "degrees Celsius; NaN = not measured", "temperature_c"),
-        Field("mode", "B", "active Mode", kind=Mode),
+        Field("mode", "B", "active Mode", convert=Mode),
         Field("reserved", "3x", ""),
     ),
     Layout(
@@ -323,7 +329,7 @@ _TABLES = (
     Layout(
         "RADIO",
         Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
-        Field("accepted", "B", "0 = SET_RADIO was refused; the text contains the reason", kind=bool),
+        Field("accepted", "B", "0 = SET_RADIO was refused; the text contains the reason", convert=bool),
         Field("reserved", "3x", ""),
         *_RADIO_SETTINGS,
         tail="anchor_count addresses, u64, then text, UTF-8, to the payload's end",
@@ -342,7 +348,7 @@ _TABLES = (
         Field("restarts", "I", "restarts of the chip after the first"),
         Field("temperature", "f", "degrees Celsius, in the chip; NaN = not measured", "temperature_c"),
         Field("voltage", "f", "V, supply of the chip; NaN = not measured"),
-        Field("state", "B", "RadioState", kind=RadioState),
+        Field("state", "B", "RadioState", convert=RadioState),
         Field("anchor_count", "B", "anchors in the tail", computed=True),
         Field("reserved", "6x", ""),
         tail="anchor_count times RADIO_ANCHOR",
@@ -351,11 +357,11 @@ _TABLES = (
         "OFFSETS",
         Field("request_sequence", "I", "sequence of the SET_OFFSETS answered"),
         Field("slots", "H", "offsets that the board can store in addition to the default"),
-        Field("accepted", "B", "0 = too many: the previous offsets stay in use", kind=bool),
+        Field("accepted", "B", "0 = too many: the previous offsets stay in use", convert=bool),
         Field("reserved", "1x", ""),
     ),
     Layout("GET_INFO"),
-    Layout("SET_MODE", Field("mode", "B", "requested Mode", kind=Mode), Field("reserved", "7x", "")),
+    Layout("SET_MODE", Field("mode", "B", "requested Mode", convert=Mode), Field("reserved", "7x", "")),
     Layout("TIME_SYNC"),
     Layout("GET_RADIO"),
     Layout("SET_RADIO", *_RADIO_SETTINGS, tail="anchor_count addresses, u64"),
@@ -370,7 +376,7 @@ _TABLES = (
 PAYLOADS = {MessageType[table.name]: table for table in _TABLES}
 """Every message type and its payload. A payload may be longer than its layout, never shorter."""
 
-HEADER_BYTES = HEADER.packing().size
+HEADER_BYTES = HEADER.as_struct().size
 MAX_FRAME_BYTES = HEADER_BYTES + MAX_PAYLOAD_BYTES + CRC_BYTES
 MAX_ENCODED_BYTES = MAX_FRAME_BYTES + -(-MAX_FRAME_BYTES // 254)
 """COBS adds one byte for each 254 begun; the delimiters are not counted."""

@@ -282,7 +282,7 @@ class _Samples(_Tail):
         return {"samples": np.frombuffer(payload, "<i2", count, at)}
 
 
-def _anchors(has_text: bool) -> _Tail:
+def _anchors_tail(has_text: bool) -> _Tail:
     return _Tail(
         struct.Struct("<Q"),
         rows=lambda message: ((address,) for address in message.settings.anchors),
@@ -291,14 +291,14 @@ def _anchors(has_text: bool) -> _Tail:
     )
 
 
-def _offset_rows(message: SetOffsets) -> Iterator[tuple[int, int, float, OffsetScope]]:
+def _offsets_to_rows(message: SetOffsets) -> Iterator[tuple[int, int, float, OffsetScope]]:
     offsets = message.offsets
     yield from ((tag, anchor, m, OffsetScope.PAIR) for (tag, anchor), m in offsets.pairs.items())
     yield from ((0, anchor, m, OffsetScope.ANCHOR) for anchor, m in offsets.anchors.items())
     yield from ((tag, 0, m, OffsetScope.TAG) for tag, m in offsets.tags.items())
 
 
-def _offsets_in(rows: Iterable[tuple[Any, ...]]) -> Values:
+def _decode_offsets(rows: Iterable[tuple[Any, ...]]) -> Values:
     found: dict[str, dict[Any, float]] = {"anchors": {}, "tags": {}, "pairs": {}}
     for tag, anchor, offset_m, kind in rows:
         if kind not in set(OffsetScope):
@@ -312,7 +312,8 @@ class _Codec:
     """Encodes and decodes the payloads of one type of message.
 
     Args:
-        kind, make: its type and class.
+        kind: type of the message.
+        message_class: class of the message.
         inner: name and class of an attribute whose own attributes are fields of the payload.
         tail: tail after the fixed part.
 
@@ -323,38 +324,40 @@ class _Codec:
     def __init__(
         self,
         kind: MessageType,
-        make: type,
+        message_class: type,
         inner: tuple[str, Callable[..., Any]] = ("", dict),
         tail: _Tail | None = None,
     ) -> None:
         table = layout.PAYLOADS[kind]
         self.kind = kind
-        self.make, self._inner, self._tail = make, inner, tail or _Tail()
-        self._own = {attribute.name for attribute in dataclasses.fields(make)}
-        self._packing = table.packing()
-        self.size = self._packing.size
-        self._names = [field.attribute or field.name for field in table.used]
-        self._getters = [(field.name, self._getter(field)) for field in table.used]
+        self.message_class, self._inner, self._tail = message_class, inner, tail or _Tail()
+        self._class_attributes = {attribute.name for attribute in dataclasses.fields(message_class)}
+        self._struct = table.as_struct()
+        self.size = self._struct.size
+        self._names = [field.attribute or field.name for field in table.value_fields]
+        self._getters = [(field.name, self._getter(field)) for field in table.value_fields]
         self._converted = [
             (field.attribute or field.name, field)
-            for field in table.used
-            if field.kind is not None or field.is_text
+            for field in table.value_fields
+            if field.convert is not None or field.is_text
         ]
-        self._computed = [field.name for field in table.used if field.computed]
-        self._inner_names = [name for name in self._names if name not in (*self._own, *self._computed)]
+        self._computed = [field.name for field in table.value_fields if field.computed]
+        self._inner_names = [
+            name for name in self._names if name not in (*self._class_attributes, *self._computed)
+        ]
 
     def _getter(self, field: Field) -> Callable[[Any], Any] | None:
         if field.computed:
             return None
         name = field.attribute or field.name
-        get = attrgetter(name if name in self._own else f"{self._inner[0]}.{name}")
+        get = attrgetter(name if name in self._class_attributes else f"{self._inner[0]}.{name}")
         return (lambda message: _truncate_utf8(get(message), int(field.code[:-1]))) if field.is_text else get
 
     def encode(self, message: Any) -> bytes:
         """Return the payload; raise struct.error or OverflowError if a value does not fit its field."""
         computed, tail = self._tail.encode(message)
         values = [computed[name] if get is None else get(message) for name, get in self._getters]
-        return self._packing.pack(*values) + tail
+        return self._struct.pack(*values) + tail
 
     def decode(self, payload: bytes, stamp_ns: int) -> Message:
         """Return the message in `payload`; raise LinkError if it contains none."""
@@ -362,33 +365,33 @@ class _Codec:
             raise LinkError(
                 f"a payload of {len(payload)} bytes", where=self.kind.name, valid=f"at least {self.size}"
             )
-        values: Values = dict(zip(self._names, self._packing.unpack_from(payload), strict=True))
+        values: Values = dict(zip(self._names, self._struct.unpack_from(payload), strict=True))
         for name, field in self._converted:
             values[name] = self._convert(field, values[name])
         computed = {name: values.pop(name) for name in self._computed}
-        if "stamp_ns" in self._own:
+        if "stamp_ns" in self._class_attributes:
             values["stamp_ns"] = stamp_ns
         try:
             tail = self._tail.decode(payload, self.size, computed)
-            attribute, make_inner = self._inner
+            attribute, inner_class = self._inner
             if attribute:
                 inner = {name: values.pop(name) for name in self._inner_names}
-                inner |= {name: tail.pop(name) for name in [*tail] if name not in self._own}
-                values[attribute] = make_inner(**inner)
-            message: Message = self.make(**values, **tail)
+                inner |= {name: tail.pop(name) for name in [*tail] if name not in self._class_attributes}
+                values[attribute] = inner_class(**inner)
+            message: Message = self.message_class(**values, **tail)
         except (LinkError, ParameterError) as error:
             raise LinkError(error.what, where=self.kind.name, valid=error.valid) from error
         return message
 
     def _convert(self, field: Field, value: Any) -> Any:
-        if field.kind is None:
+        if field.convert is None:
             return value.rstrip(b"\0").decode("utf-8", "replace")
         try:
-            return field.kind(value)
+            return field.convert(value)
         except ValueError as error:
             valid = str(error)
-            if isinstance(field.kind, type(enum.IntEnum)):
-                valid = ", ".join(f"{number} {name}" for name, number in field.kind.__members__.items())
+            if isinstance(field.convert, type(enum.IntEnum)):
+                valid = ", ".join(f"{number} {name}" for name, number in field.convert.__members__.items())
             where = f"{self.kind.name} {field.name}"
             raise LinkError(f"the value {value}", where=where, valid=valid) from None
 
@@ -402,12 +405,12 @@ _CODECS = (
     _Codec(MessageType.LOG, Log, tail=_Tail(has_text=True)),
     _Codec(MessageType.STATUS, BoardStatus),
     _Codec(MessageType.TIME_SYNC_REPLY, TimeSyncReply),
-    _Codec(MessageType.RADIO, Radio, ("settings", RadioSettings), _anchors(has_text=True)),
+    _Codec(MessageType.RADIO, Radio, ("settings", RadioSettings), _anchors_tail(has_text=True)),
     _Codec(
         MessageType.RADIO_STATUS,
         RadioStatus,
         tail=_Tail(
-            layout.RADIO_ANCHOR.packing(),
+            layout.RADIO_ANCHOR.as_struct(),
             rows=lambda status: map(dataclasses.astuple, status.anchors),
             attributes=lambda rows: {"anchors": tuple(AnchorStatus(*row) for row in rows)},
         ),
@@ -417,16 +420,16 @@ _CODECS = (
     _Codec(MessageType.SET_MODE, SetMode),
     _Codec(MessageType.TIME_SYNC, TimeSync),
     _Codec(MessageType.GET_RADIO, GetRadio),
-    _Codec(MessageType.SET_RADIO, SetRadio, ("settings", RadioSettings), _anchors(has_text=False)),
+    _Codec(MessageType.SET_RADIO, SetRadio, ("settings", RadioSettings), _anchors_tail(has_text=False)),
     _Codec(
         MessageType.SET_OFFSETS,
         SetOffsets,
         ("offsets", Offsets),
-        _Tail(layout.OFFSET.packing(), "count", 0xFFFF, _offset_rows, _offsets_in),
+        _Tail(layout.OFFSET.as_struct(), "count", 0xFFFF, _offsets_to_rows, _decode_offsets),
     ),
 )
 _by_type: dict[int, _Codec] = {codec.kind: codec for codec in _CODECS}
-_by_class = {codec.make: codec for codec in _CODECS}
+_by_class = {codec.message_class: codec for codec in _CODECS}
 
 
 def _truncate_utf8(text: str, size: int) -> bytes:
