@@ -86,6 +86,7 @@ setup(
         (f"share/{PACKAGE}/params", files("params", "*.yaml")),
         (f"share/{PACKAGE}/rviz", files("rviz", "*.rviz")),
         (f"share/{PACKAGE}/foxglove", files("foxglove", "*.json")),
+        (f"share/{PACKAGE}/plotjuggler", files("plotjuggler", "*.xml")),
         (f"share/{PACKAGE}/udev", files("udev", "*.rules")),
         (f"share/{PACKAGE}/models", files("models", "*.onnx", "*.md")),
         # Sources that `backend:=firmware` compiles; the boards and the sketch need a checkout.

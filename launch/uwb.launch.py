@@ -4,10 +4,11 @@
     ros2 launch uwb_mitigation uwb.launch.py source:=mcap path:=recording.mcap
     ros2 launch uwb_mitigation uwb.launch.py params:=robot.yaml             # sets the source
 
-`locate:=true anchors:=anchors.yaml` also starts a locator, `viewer:=true` a page at http://localhost:5006; without a
-source, only these start. Every parameter of these nodes is an argument; `--show-args` lists them. For several
-boards give each a namespace, such as `namespace:=board1`, or see `boards.launch.py`. `one_process:=true` runs driver
-and mitigator in one process, which needs less CPU and publishes no CIR unless there is a subscriber.
+`locate:=true anchors:=anchors.yaml` also starts a locator, `viewer:=true` a page at http://localhost:5006, `rviz:=true`
+RViz and `foxglove:=true` foxglove_bridge; without a source, only these start. Every parameter of these nodes is an
+argument; `--show-args` lists them. For several boards give each a namespace, such as `namespace:=board1`, or see
+`boards.launch.py`. `one_process:=true` runs driver and mitigator in one process, which needs less CPU and publishes
+no CIR unless there is a subscriber.
 """
 
 from launch import LaunchDescription
@@ -27,6 +28,8 @@ OWN = {
     "one_process": ("false", "Run driver and mitigator in one process: true or false."),
     "locate": ("false", "Start a locator too: true or false."),
     "viewer": ("false", "Start a viewer too, which serves a page: true or false."),
+    "rviz": ("false", "Start RViz with the configuration of this package too: true or false."),
+    "foxglove": ("false", "Start foxglove_bridge too, for Foxglove at ws://localhost:8765: true or false."),
     "use_sim_time": ("false", "Take the time from /clock: true or false."),
     "log_level": ("info", f"Log level of every node: {', '.join(launching.LOG_LEVELS)}."),
     "respawn": ("true", "Restart a node that crashes, but not after the end of a recording: true or false."),
@@ -38,7 +41,7 @@ FILES = tuple(f"{node}_params" for node in NODES)
 def nodes_of(context):
     launching.check_names(getattr(context, "argv", ()), {*PARAMETERS, *OWN, *FILES})
     texts = {name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, *OWN, *FILES)}
-    flag_names = ("one_process", "locate", "viewer", "use_sim_time", "respawn")
+    flag_names = ("one_process", "locate", "viewer", "rviz", "foxglove", "use_sim_time", "respawn")
     flag_names = {name: launching.choice(name, texts[name]) == "true" for name in flag_names}
     level = launching.choice("log_level", texts["log_level"], launching.LOG_LEVELS)
     files = {node: [texts[f"{node}_params"], *filter(None, [texts["params"]])] for node in NODES}
@@ -48,7 +51,7 @@ def nodes_of(context):
     source = texts["source"] or file_values["driver"].get("source")
     if source:
         started = ["driver", "mitigator", *started]
-    elif not started:
+    elif not (started or flag_names["rviz"] or flag_names["foxglove"]):
         raise ParameterError(
             "no source of ranges",
             valid="source:=serial port:=/dev/ttyACM0, source:=mcap path:=FILE, source:=decaranging path:=FILE, or "
@@ -74,7 +77,27 @@ def nodes_of(context):
         settings = {"pipeline": both} | {node: settings[node] for node in started if node in wanted}
     ends = source in ("mcap", "decaranging")
     kept = launching.kept_parameters()
-    return [
+    displays = []
+    for name, package, arguments in (
+        (
+            "rviz",
+            "rviz2",
+            ["-d", PathJoinSubstitution([FindPackageShare("uwb_mitigation"), "rviz", "uwb.rviz"])],
+        ),
+        ("foxglove", "foxglove_bridge", []),
+    ):
+        if flag_names[name]:
+            launching.check_package(name, package)
+            displays.append(
+                Node(
+                    package=package,
+                    executable=package,
+                    arguments=arguments,
+                    parameters=[common],
+                    output="screen",
+                )
+            )
+    return displays + [
         Node(
             package="uwb_mitigation",
             executable=name,

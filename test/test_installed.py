@@ -57,7 +57,9 @@ def files_below(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
-@pytest.mark.parametrize("folder", ["launch", "params", "config", "models", "udev", "rviz", "foxglove"])
+@pytest.mark.parametrize(
+    "folder", ["launch", "params", "config", "models", "udev", "rviz", "foxglove", "plotjuggler"]
+)
 def test_shared_files_are_those_of_the_sources(share: Path, folder: str):
     assert files_below(share / folder) == files_below(REPOSITORY / folder)
 

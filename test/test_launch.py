@@ -125,6 +125,19 @@ def test_viewer_starts_if_requested(generate):
     assert "viewer" not in [node.executable for node in nodes]
 
 
+def test_displays_start_if_they_are_installed(generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    with pytest.raises(RuntimeError, match=r"rviz:=true needs rviz2.*ros-jazzy-rviz2"):
+        launch(generate, "uwb.launch.py", rviz="true")
+    for package in ("rviz2", "foxglove_bridge"):
+        share = tmp_path / "share" / package
+        share.mkdir(parents=True)
+        (share / "package.xml").touch()
+    rviz, bridge = launch(generate, "uwb.launch.py", rviz="true", foxglove="true")
+    assert (rviz.executable, bridge.executable) == ("rviz2", "foxglove_bridge")
+    assert rviz.arguments == ["-d", ["share/uwb_mitigation", "rviz", "uwb.rviz"]]
+
+
 @pytest.mark.parametrize("one_process", ["false", "true"])
 def test_finished_recording_is_not_replayed(generate, one_process: str):
     given = {"source": "mcap", "path": "a.mcap", "one_process": one_process}

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import json
 import re
+from xml.etree import ElementTree
 
+import numpy as np
+import pytest
 import yaml
+from browser import Browser
 from conftest import REPOSITORY
 
 from uwb_mitigation.bag import schemas, topics
+from uwb_mitigation.measurement import Status
+from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.viewer import palette
 
 TYPES = {
     topics.RANGE_RAW: topics.RANGE_CIR_TYPE,
@@ -27,9 +35,7 @@ DISPLAYS = {
     "rviz_default_plugins/Odometry": topics.ODOMETRY_TYPE,
 }
 LATCHED = {topics.ANCHORS}
-PATH = re.compile(
-    r"(?P<topic>/[\w/]+)(?P<filter>\{(?P<by>\w+)==\$(?P<variable>\w+)\})?(?P<fields>(\.\w+(\[:\])?)*)"
-)
+PATH = re.compile(r"(?P<topic>/[\w/]+)(?P<fields>(\.\w+(\[:\])?)*)")
 
 
 def has(type_name: str, fields: str) -> bool:
@@ -72,11 +78,82 @@ def test_foxglove_layout_uses_existing_topics_and_fields():
     ]
     paths += list(panels["3D!site"]["topics"])
     assert len(paths) > 8
+    outputs = {
+        re.search(r'output = "(.*)"', script["sourceCode"])[1]: dict(
+            re.findall(r"(\w+): ([\w\[\]]+)", re.search(r"type Output = \{(.*)\}", script["sourceCode"])[1])
+        )
+        for script in layout["userNodes"].values()
+    }
     for path in paths:
         found = PATH.fullmatch(path)
         assert found is not None, path
-        kind = TYPES[found["topic"]]
-        assert not found["fields"] or has(kind, found["fields"]), path
-        if found["filter"]:
-            assert has(kind, f".{found['by']}"), path
-            assert found["variable"] in layout["globalVariables"], path
+        topic, field = found["topic"], found["fields"].removeprefix(".")
+        if topic in outputs:
+            is_array = outputs[topic][field.removesuffix("[:]")].endswith("[]") if field else False
+            assert is_array == field.endswith("[:]"), path
+        else:
+            assert not field or has(TYPES[topic], found["fields"]), path
+
+
+def test_foxglove_scripts_filter_64_bit_ids_and_compute_magnitudes(browser: Browser):
+    layout = json.loads((REPOSITORY / "foxglove" / "uwb.json").read_text())
+
+    def run(name: str, topic: str, message: str, **variables: str) -> object:
+        source = layout["userNodes"][name]["sourceCode"]
+        assert f'"{topic}"' in re.search(r"inputs = (.*)", source)[1]
+        source = re.sub(r"type Output.*|: any\b|: Output \| undefined|export default |export ", "", source)
+        event = f"{{topic: '{topic}', message: {message}}}"
+        return browser.run(f"{source}; return script({event}, arguments[0]) ?? null", variables)
+
+    big = str(2**64 - 1)
+    cir = f"{{anchor_id: {big}n, tag_id: 7n, cir: {{encoding: 0, scale: 2, samples: new Int16Array([3, 4, 0, 1]),"
+    cir += " start_index: 730, first_path_index: 731.5}}"
+    shown = run("uwb-cir", "/uwb/range_raw", cir, anchor=big, tag="")
+    assert shown == {"anchor": big, "tag": "7", "magnitude": [10, 2], "first_path": [0, 10]}
+    assert run("uwb-cir", "/uwb/range_raw", cir, anchor=str(2**64 - 2), tag="") is None
+    assert run("uwb-cir", "/uwb/range_raw", cir, anchor="", tag="8") is None
+    ranges = f"{{anchor_id: {big}n, tag_id: 7n, range: 4.5, range_raw: 5, status: 0}}"
+    shown = run("uwb-range", "/uwb/range_corrected", ranges, anchor=big, tag="7")
+    assert (shown["raw"], shown["corrected"]) == (5, 4.5)
+    assert run("uwb-range", "/uwb/range_truth", ranges)["truth"] == 4.5
+
+
+def test_layouts_use_the_colours_of_the_page():
+    known = {look.colour for look in palette.STATUS_LOOKS.values()} | set(palette.TRACK_COLOURS.values())
+    known |= {palette.PAPER, palette.NIGHT, palette.GREY}
+    texts = [(REPOSITORY / path).read_text() for path in ("foxglove/uwb.json", "plotjuggler/uwb.xml")]
+    used = {colour[:7] for text in texts for colour in re.findall(r"#[0-9a-f]{6}", text)}
+    rviz = (REPOSITORY / "rviz" / "uwb.rviz").read_text()
+    used |= {
+        "#" + "".join(f"{int(part):02x}" for part in parts)
+        for parts in re.findall(r"Color: (\d+); (\d+); (\d+)", rviz)
+    }
+    assert len(used) > 4
+    assert used <= known
+
+
+def test_plotjuggler_shows_fields_of_the_topics():
+    root = ElementTree.parse(REPOSITORY / "plotjuggler" / "uwb.xml").getroot()
+    functions = {snippet.get("name") for snippet in root.iter("snippet")}
+    names = {curve.get("name") for curve in root.iter("curve")} - functions
+    names |= {element.text for tag in ("linked_source", "v1") for element in root.iter(tag)}
+    assert len(names) > 5
+    for name in names:
+        topic = next(topic for topic in TYPES if name.startswith(f"{topic}/"))
+        assert has(TYPES[topic], name.removeprefix(topic).replace("/", ".")), name
+
+
+def test_markers_have_the_colours_and_symbols_of_the_page():
+    markers = pytest.importorskip("uwb_mitigation.nodes.markers")
+    anchors = AnchorMap([Anchor(id_, (4.0 * id_, 0.0, 2.0)) for id_ in range(len(Status))])
+    picture = markers.TagPicture("tag_7")
+    picture.add(Estimate(0, np.array([1.0, 2.0, 0.0]), np.zeros(3), np.eye(6)))
+    picture.statuses = dict(enumerate(Status))
+    shown = {m.ns: m for m in markers.tag_markers(picture, list(picture.statuses), anchors, "map", 0, 0)}
+    assert set(shown) == {"rays", "statuses", "tags", "tag_names", "ellipses", "trails"}
+    assert shown["tag_names"].text == "tag_7"
+    looks = palette.STATUS_LOOKS
+    assert len(shown["statuses"].points) == sum(len(look.triangles) for look in looks.values())
+    for status, colour in zip(Status, shown["rays"].colors[::2], strict=True):
+        code = "#" + "".join(f"{round(255 * part):02x}" for part in (colour.r, colour.g, colour.b))
+        assert code == (looks[status].colour or palette.NIGHT)

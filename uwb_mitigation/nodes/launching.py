@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import functools
 import json
+import os
 import re
 import shutil
 import sys
@@ -160,6 +161,25 @@ def check_names(words: Sequence[str], known: Collection[str]) -> None:
         name, separator, _ = word.partition(":=")
         if separator:
             check_name("argument", name, known, valid="--show-args lists them")
+
+
+def check_package(argument: str, package: str) -> None:
+    """Check that a ROS package is installed.
+
+    Args:
+        argument: launch argument that needs it.
+        package: its name.
+
+    Raises:
+        ParameterError: it is not in any prefix of AMENT_PREFIX_PATH.
+    """
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    if not any(Path(prefix, "share", package, "package.xml").is_file() for prefix in prefixes):
+        name = package.replace("_", "-")
+        raise ParameterError(
+            f"{argument}:=true needs {package}, which is not installed",
+            valid=f"sudo apt install ros-jazzy-{name}",
+        )
 
 
 def check_driver(values: Mapping[str, Any]) -> None:

@@ -65,7 +65,7 @@ class _Outputs:
         self.odometry = publisher(Odometry, topics.ODOMETRY)
         self.smoothed = publisher(PoseWithCovarianceStamped, topics.POSE_SMOOTHED)
         self.frame = frame
-        self.picture = markers.TagPicture()
+        self.picture = markers.TagPicture(frame)
         self.published_ns = self.smoothed_ns = self.transform_ns = -(1 << 62)
 
     def all(self) -> tuple[Publisher, ...]:

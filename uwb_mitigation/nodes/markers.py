@@ -14,15 +14,20 @@ from uwb_mitigation.measurement import Status
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.positioning.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.viewer import palette
+from uwb_mitigation.viewer.palette import STATUS_LOOKS
 
 TRAIL = 400
 _ELLIPSE95 = 2.448  # square root of the 95th percentile of chi-squared with two degrees of freedom
 
-# Colour-blind safe palette of Okabe and Ito.
-_BLUE = ColorRGBA(r=0.0, g=0.45, b=0.7, a=1.0)
-_ORANGE = ColorRGBA(r=0.9, g=0.62, b=0.0, a=0.9)
-_GREY = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.7)
-_SKY = ColorRGBA(r=0.34, g=0.71, b=0.91, a=0.35)
+SYMBOL_M = 0.12
+"""Radius of the symbol of a status."""
+
+
+def _colour(code: str | None, alpha: float = 1.0) -> ColorRGBA:
+    """Convert a colour of the palette; None: the ink of a light background."""
+    r, g, b = (int((code or palette.NIGHT)[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    return ColorRGBA(r=r, g=g, b=b, a=alpha)
 
 
 ANCHOR_TYPES = {"markers": MarkerArray, "poses": PoseArray}
@@ -44,12 +49,16 @@ def anchors_in(message: Any) -> AnchorMap | None:
 class TagPicture:
     """State of one tag for its markers.
 
+    Args:
+        name: frame of the tag.
+
     Attributes:
         estimate: the latest estimate. trail: earlier positions.
         statuses: status of the latest range of each anchor, {row: status}.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.estimate: Estimate | None = None
         self.trail: deque[tuple[float, float, float]] = deque(maxlen=TRAIL)
         self.statuses: dict[int, Status] = {}
@@ -66,11 +75,11 @@ def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
     for row, anchor in enumerate(anchors.anchors):
         pose = Pose(position=_point(anchor.position), orientation=Quaternion(w=1.0))
         size = max(0.2, 2.0 * anchor.sd)
-        ball = _marker("anchors", row, Marker.SPHERE, frame, stamp_ns, _BLUE)
+        ball = _marker("anchors", row, Marker.SPHERE, frame, stamp_ns, _colour(None))
         ball.pose, ball.scale = pose, Vector3(x=size, y=size, z=size)
         # RViz does not draw this text; programs read the id of the anchor from it.
         ball.text = str(anchor.id)
-        text = _marker("names", row, Marker.TEXT_VIEW_FACING, frame, stamp_ns, _GREY)
+        text = _marker("names", row, Marker.TEXT_VIEW_FACING, frame, stamp_ns, _colour(None))
         x, y, z = anchor.position
         text.pose = Pose(position=_point((x, y, z + 0.3)), orientation=Quaternion(w=1.0))
         text.scale, text.text = Vector3(z=0.25), str(anchor)
@@ -81,28 +90,50 @@ def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
 def tag_markers(
     picture: TagPicture, received: list[int], anchors: AnchorMap, frame: str, number: int, stamp_ns: int
 ) -> list[Any]:
-    """Return rays to the ranged anchors (blue: corrected range), the 95 % ellipse and the trail."""
+    """Return position, name, rays to the received anchors with statuses, 95 % ellipse and track."""
     estimate = picture.estimate
     if estimate is None:
         return []
-    rays = _marker("rays", number, Marker.LINE_LIST, frame, stamp_ns, _GREY)
+
+    def marker(namespace: str, kind: int, colour: ColorRGBA) -> Any:
+        return _marker(namespace, number, kind, frame, stamp_ns, colour)
+
+    rays = marker("rays", Marker.LINE_LIST, _colour(palette.GREY))
     rays.scale.x = 0.02
-    here = _point(estimate.position.tolist())
+    symbols = marker("statuses", Marker.TRIANGLE_LIST, _colour(palette.GREY))
+    symbols.scale = Vector3(x=1.0, y=1.0, z=1.0)
+    x, y, z = estimate.position.tolist()
+    here = _point((x, y, z))
     for row in received:
-        colour = _BLUE if picture.statuses.get(row) is Status.OK else _ORANGE
-        rays.points += [_point(anchors.anchors[row].position), here]
-        rays.colors += [colour, colour]
+        if (status := picture.statuses.get(row)) is None:
+            continue
+        look, anchor = STATUS_LOOKS[status], anchors.anchors[row].position
+        rays.points += [_point(anchor), here]
+        rays.colors += [_colour(look.colour)] * 2
+        at = ((anchor[0] + x) / 2, (anchor[1] + y) / 2, (anchor[2] + z) / 2)
+        symbols.points += [
+            _point((at[0] + SYMBOL_M * u, at[1] + SYMBOL_M * v, at[2])) for u, v in look.triangles
+        ]
+        symbols.colors += [_colour(look.colour)] * len(look.triangles)
+    if not symbols.points:
+        # RViz reports a list without triangles as an error.
+        symbols.action = Marker.DELETE
+    tag = marker("tags", Marker.SPHERE, _colour(palette.BLUE))
+    tag.pose.position, tag.scale = here, Vector3(x=0.2, y=0.2, z=0.2)
+    name = marker("tag_names", Marker.TEXT_VIEW_FACING, _colour(None))
+    name.pose.position = _point((x, y, z + 0.3))
+    name.scale, name.text = Vector3(z=0.25), picture.name
     values, vectors = np.linalg.eigh(estimate.covariance[:2, :2])
     small, large = 2.0 * _ELLIPSE95 * np.sqrt(np.maximum(values, 1e-6))
     angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
-    ellipse = _marker("ellipses", number, Marker.CYLINDER, frame, stamp_ns, _SKY)
+    ellipse = marker("ellipses", Marker.CYLINDER, _colour(palette.BLUE, 0.3))
     turned = Quaternion(z=float(np.sin(angle / 2)), w=float(np.cos(angle / 2)))
     ellipse.pose = Pose(position=here, orientation=turned)
     ellipse.scale = Vector3(x=float(large), y=float(small), z=0.02)
-    trail = _marker("trails", number, Marker.LINE_STRIP, frame, stamp_ns, _GREY)
+    trail = marker("trails", Marker.LINE_STRIP, _colour(palette.BLUE))
     trail.scale.x = 0.03
     trail.points = [_point(place) for place in picture.trail]
-    return [rays, ellipse, trail]
+    return [rays, symbols, tag, name, ellipse, trail]
 
 
 def _marker(namespace: str, number: int, kind: int, frame: str, stamp_ns: int, colour: ColorRGBA) -> Any:
