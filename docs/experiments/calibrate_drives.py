@@ -51,7 +51,7 @@ UNSEEN = 7_000_000
 """Added to the seed of a building: the seeds of the universal model begin at 0 and at 1 000 003."""
 
 RATE_HZ = 40.0
-LAG_S, LEVER_M = 0.3, (0.4, 0.0, 0.0)
+TIME_OFFSET_S, LEVER_M = 0.3, (0.4, 0.0, 0.0)
 
 
 class Drive:
@@ -149,7 +149,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
         quaternion = np.stack(
             [np.zeros_like(heading), np.zeros_like(heading), np.sin(heading / 2), np.cos(heading / 2)], axis=1
         )
-        path = PosePath(stamps + round(LAG_S * 1e9), frame + noise, quaternion)
+        path = PosePath(stamps + round(TIME_OFFSET_S * 1e9), frame + noise, quaternion)
         solution = site_solution.solve_with_truth(
             site, universal, [[path]], "/odom", time_offset_s=None, estimate_lever_arm=True
         )
@@ -188,7 +188,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             "sd": float(sd.mean()),
         }
         if found.solution.alignment is not None:
-            row["time_offset_error"] = found.solution.alignment.time_offset_s - LAG_S
+            row["time_offset_error"] = found.solution.alignment.time_offset_s - TIME_OFFSET_S
             row["lever_error"] = (found.solution.alignment.lever_arm_m[0] - LEVER_M).tolist()
             row["time_offset_sd"] = found.solution.alignment.time_offset_sd_s
             row["lever_sd"] = found.solution.alignment.lever_arm_sd_m[0].tolist()

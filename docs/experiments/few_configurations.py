@@ -29,22 +29,26 @@ draws = int(sys.argv[2]) if len(sys.argv) > 2 else 60
 for count in (6, 9, 12, 15, 18, 21):
     generator, maes = np.random.default_rng(count), []
     for _ in range(draws):
-        seen = np.isin(data.configurations, generator.permutation(data.names)[:count])
-        train, test, names = data.rows(seen), data.rows(~seen), data.configurations[seen]
+        is_train = np.isin(data.configurations, generator.permutation(data.names)[:count])
+        train, test, names = data.rows(is_train), data.rows(~is_train), data.configurations[is_train]
         constant = linear_fit.fit_constant(names, train.error_m).offset_m
         own_line = linear_bias_m(candidates.fit_line(train), test)
-        network = network_m[~seen] + linear_fit.fit_constant(names, train.error_m - network_m[seen]).offset_m
+        network = (
+            network_m[~is_train]
+            + linear_fit.fit_constant(names, train.error_m - network_m[is_train]).offset_m
+        )
         predicted = (constant, own_line, network, (own_line + network) / 2)
         maes.append([np.abs(test.error_m - values).mean() for values in predicted])
     table = np.array(maes)
     print(count, *table.mean(axis=0).round(3), f"{np.mean(table[:, 3] < table[:, 1]):.0%}")
 
 # The candidates of `train` without networks that are trained on the logs, with 6 folds of placements.
-plain = [item for item in candidates.new_models(Recipe(Remnet(), FitOptions())) if not item.trains]
-offered = candidates.with_cold_start(plain, data, load_bundle(default_model_path()))
-choice = selection.select_nested(data, offered, 6, 0)
-print({name: round(mae, 3) for name, mae in choice.mae().items()})
+untrained = [item for item in candidates.new_models(Recipe(Remnet(), FitOptions())) if not item.trains]
+all_candidates = candidates.with_cold_start(untrained, data, load_bundle(default_model_path()))
+selected = selection.select_nested(data, all_candidates, 6, 0)
+print({name: round(mae, 3) for name, mae in selected.mae().items()})
 is_27 = data.configurations == "evk1000_apartment/27"
 print(
-    {name: round(float(np.abs(left[~is_27]).mean()), 3) for name, left in choice.errors.items()}, "without 27"
+    {name: round(float(np.abs(errors[~is_27]).mean()), 3) for name, errors in selected.errors.items()},
+    "without 27",
 )

@@ -22,17 +22,17 @@ from uwb_mitigation.sources.decaranging import CirFrame, DecaRangingFolder
 
 def features(data):
     """Return candidate columns in addition to 1 and RSL. Energies are in dB, from magnitudes, which are squared inputs."""
-    energy, of_cir = data.inputs.astype(float) ** 4, baselines.features(data, header=False)
+    energy, cir_features = data.inputs.astype(float) ** 4, baselines.features(data, header=False)
     level = [
         10 * np.log10(energy[:, taps].sum(1) + 1e-12)
         for taps in (slice(0, 5), slice(5, 15), slice(6, 9), slice(None))
     ]
     gap = data.rx_power_dbm - data.first_path_power_dbm
-    beside = {
+    candidate_columns = {
         "log of the range": np.log(data.range_m.clip(0.1)),
-        "mean delay": of_cir[:, 5],
-        "delay spread": of_cir[:, 6],
-        "kurtosis": of_cir[:, 7],
+        "mean delay": cir_features[:, 5],
+        "delay spread": cir_features[:, 6],
+        "kurtosis": cir_features[:, 7],
         "noise threshold": np.log(data.headers[:, 1]),
     }
     return {
@@ -41,7 +41,7 @@ def features(data):
         "early, gap": [level[1] - level[3], gap],
         "before the first path": [level[0]],
         "first path": [level[2]],
-        **{f"gap, {name}": [gap, column] for name, column in beside.items()},
+        **{f"gap, {name}": [gap, column] for name, column in candidate_columns.items()},
     }
 
 
@@ -54,12 +54,14 @@ def predicted(data, columns, train, test):
 
 
 def inner_error(data, columns, train):
-    left = []
+    errors = []
     for seed in range(3):
         for split in splits.by_configuration(data.configurations[train], 5, seed):
-            fitted, held_out = train[split.train], train[split.test]
-            left.append(np.abs(data.error_m[held_out] - predicted(data, columns, fitted, held_out)).sum())
-    return sum(left)
+            train_rows, held_out = train[split.train], train[split.test]
+            errors.append(
+                np.abs(data.error_m[held_out] - predicted(data, columns, train_rows, held_out)).sum()
+            )
+    return sum(errors)
 
 
 def last_ten(values, names):
@@ -75,19 +77,23 @@ final, poll = (
     build_dataset(DecaRangingFolder(Path(sys.argv[1]), cir=cir), Preprocessing())
     for cir in (CirFrame.FINAL, CirFrame.POLL)
 )
-known = np.isfinite([data.rx_power_dbm - data.first_path_power_dbm for data in (final, poll)]).all(axis=0)
-final, poll = final.rows(known), poll.rows(known)
-beside, error, names = features(final), final.error_m, final.configurations
+has_powers = np.isfinite([data.rx_power_dbm - data.first_path_power_dbm for data in (final, poll)]).all(
+    axis=0
+)
+final, poll = final.rows(has_powers), poll.rows(has_powers)
+candidate_columns, error, names = features(final), final.error_m, final.configurations
 splits_by_configuration = int(sys.argv[2]) if len(sys.argv) > 2 else 10
 for group, seeds in (("configuration", splits_by_configuration), ("tag", 1), ("half", 1)):
-    maes, chosen = [], []
+    maes, selected = [], []
     for seed in range(seeds):
-        left = {}
+        errors_by_name = {}
         for split in splits.by_group(final, splits.Group(group), 6, seed):
             train, test = split.train, split.test
-            found = {name: predicted(final, columns, train, test) for name, columns in beside.items()}
-            best = min(("gap", "early"), key=lambda name: inner_error(final, beside[name], train))
-            chosen.append(best)
+            found = {
+                name: predicted(final, columns, train, test) for name, columns in candidate_columns.items()
+            }
+            best = min(("gap", "early"), key=lambda name: inner_error(final, candidate_columns[name], train))
+            selected.append(best)
             found["gap or early, chosen"] = found[best]
             found["poll"] = predicted(poll, features(poll)["gap"], train, test)
             found["mean of poll and final"] = (found["gap"] + found["poll"]) / 2
@@ -96,8 +102,8 @@ for group, seeds in (("configuration", splits_by_configuration), ("tag", 1), ("h
                 error[test] - found["gap"], names[test]
             )
             for name, values in found.items():
-                left.setdefault(name, []).append(np.abs(error[test] - values))
-        maes.append([np.concatenate(values).mean() for values in left.values()])
-    print(group, f"early energy in {chosen.count('early')} of {len(chosen)} choices")
-    for name, mae in zip(left, np.mean(maes, axis=0), strict=True):
+                errors_by_name.setdefault(name, []).append(np.abs(error[test] - values))
+        maes.append([np.concatenate(values).mean() for values in errors_by_name.values()])
+    print(group, f"early energy in {selected.count('early')} of {len(selected)} choices")
+    for name, mae in zip(errors_by_name, np.mean(maes, axis=0), strict=True):
         print(f"  {name:28} {mae:.3f}")

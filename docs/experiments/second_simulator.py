@@ -145,8 +145,8 @@ def _paths(
     tail = 120
     mean_free = 2.0 * np.prod(size, axis=1) / (size[:, :2].sum(1) * size[:, 2] + size[:, 0] * size[:, 1])
     decay_m = rng.uniform(1.0, 2.5, n) * mean_free
-    behind = rng.uniform(0.0, 5.0, (n, tail)) * decay_m[:, None]
-    power = np.exp(-behind / decay_m[:, None]) * 5.0 / tail * (10 ** rng.uniform(-2.2, -0.7, n))[:, None]
+    excess_m = rng.uniform(0.0, 5.0, (n, tail)) * decay_m[:, None]
+    power = np.exp(-excess_m / decay_m[:, None]) * 5.0 / tail * (10 ** rng.uniform(-2.2, -0.7, n))[:, None]
     reverberant = np.sqrt(power / 2.0) * rng.standard_normal((n, tail))
 
     # An obstacle: the direct path goes through it or around its edge; other paths are sometimes shadowed.
@@ -157,7 +157,7 @@ def _paths(
     gain[:, 0] *= 10 ** (-loss_db / 20)
     shadowed = nlos[:, None] & (rng.random((n, len(order) - 1)) < 0.5)
     gain[:, 1:] *= np.where(shadowed, 10 ** (-loss_db[:, None] / 40), 1.0)
-    delay = np.concatenate([length, legs[0] + legs[1], distance[:, None] + behind], axis=1)
+    delay = np.concatenate([length, legs[0] + legs[1], distance[:, None] + excess_m], axis=1)
     field = np.concatenate([gain, scattered, reverberant], axis=1) * WAVELENGTH_M / (4.0 * np.pi)
     return delay, field * np.exp(-2j * np.pi * delay / WAVELENGTH_M), distance
 
@@ -179,7 +179,7 @@ def _pulse(taps: Array) -> Array:
 
 
 def _receive(
-    behind_m: Array, gain: NDArray[np.complex128], phase: Array, rng: np.random.Generator
+    excess_m: Array, gain: NDArray[np.complex128], phase: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int16], Array, Array, tuple[Array, Array]]:
     """Return accumulators (n, 2 TAPS), preamble counts, first-path indices and levels in dBm.
 
@@ -190,8 +190,8 @@ def _receive(
     sent_db = -14.3 + rng.uniform(-5.0, 5.0, n) + POWER_CONSTANT_DB
     symbol = np.zeros((n, TAPS), np.complex128)
     for path in range(gain.shape[1]):
-        place = ORIGIN + phase + behind_m[:, path] / LIGHT_M_PER_TAP
-        symbol += gain[:, path, None] * _pulse(grid - place[:, None])
+        position = ORIGIN + phase + excess_m[:, path] / LIGHT_M_PER_TAP
+        symbol += gain[:, path, None] * _pulse(grid - position[:, None])
     symbol *= 10 ** (sent_db / 20)[:, None]
     power_dbm = 10 * np.log10((np.abs(symbol) ** 2).sum(1)) - POWER_CONSTANT_DB
     # Above -82 dBm the gain control removes two thirds of the excess.
@@ -226,8 +226,10 @@ def _leading_edge(accumulator: NDArray[np.complex128]) -> Array:
     quiet = fine[:, 4 * OVERSAMPLING : NOISE_TAPS * OVERSAMPLING]
     threshold = np.maximum(quiet.mean(1) + 7.0 * quiet.std(1), fine.max(1) / 16.0)
     index = np.full(len(fine), np.nan)
-    for row, (values, least) in enumerate(zip(fine, threshold, strict=True)):
-        above = np.flatnonzero(values[NOISE_TAPS * OVERSAMPLING :] > least) + NOISE_TAPS * OVERSAMPLING
+    for row, (values, row_threshold) in enumerate(zip(fine, threshold, strict=True)):
+        above = (
+            np.flatnonzero(values[NOISE_TAPS * OVERSAMPLING :] > row_threshold) + NOISE_TAPS * OVERSAMPLING
+        )
         if len(above):
             top = int(above[0])
             while values[top + 1] > values[top]:
@@ -247,8 +249,8 @@ _EDGE_LEAD_TAPS = float(np.interp(-0.4, -_pulse(_LEAD), _LEAD))
 
 def relative_mae(model: Mitigation, columns: RangeColumns, error: Array, nlos: NDArray[np.bool_]) -> float:
     """Return the MAE of corrected ranges divided by that of a constant offset."""
-    answers = model.correct_columns(columns)
-    correction = np.where(answers.status == Status.OK, answers.correction_m, 0.0)
+    corrected = model.correct_columns(columns)
+    correction = np.where(corrected.status == Status.OK, corrected.correction_m, 0.0)
     remaining, constant = (
         np.abs(values - np.median(values[~nlos])).mean() for values in (error - correction, error)
     )

@@ -21,10 +21,10 @@ SITES = ("flat", "office")
 """Types of buildings, with equal probability."""
 
 SIDE_M = (6.0, 20.0)
-HEARD = 0.75
+MIN_RECEIVED_SHARE = 0.75
 """Minimum share of the reachable positions at which each anchor receives a tag."""
 
-GOES = 0.5
+MIN_REACHABLE_SHARE = 0.5
 """Minimum share of the plan that a tag can reach through doorways."""
 
 BEFORE_WALL_M = 0.3
@@ -77,14 +77,14 @@ def draw_site(anchors: int, rng: np.random.Generator) -> Site:
     kind = next(one for one in KINDS if one.name == name)
     while True:
         plan = draw_plan(kind, rng)
-        places = _along_walls(plan.size, anchors, rng)
+        positions = _along_walls(plan.size, anchors, rng)
         if not plan.walls or not all(SIDE_M[0] <= side <= SIDE_M[1] for side in plan.size):
             continue
         cells, ways = _free(plan)
-        if len(cells) * CELL_M**2 < GOES * math.prod(plan.size):
+        if len(cells) * CELL_M**2 < MIN_REACHABLE_SHARE * math.prod(plan.size):
             continue
-        if all(_heard(plan, place, cells) >= HEARD for place in places):
-            return Site(plan, places, cells, ways)
+        if all(_received_share(plan, position, cells) >= MIN_RECEIVED_SHARE for position in positions):
+            return Site(plan, positions, cells, ways)
 
 
 def _along_walls(size: Point, count: int, rng: np.random.Generator) -> tuple[Point, ...]:
@@ -93,8 +93,8 @@ def _along_walls(size: Point, count: int, rng: np.random.Generator) -> tuple[Poi
     corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y], [0.0, 0.0]]) + BEFORE_WALL_M
     reached = np.array([0.0, x, x + y, 2.0 * x + y, 2.0 * (x + y)])
     along = (np.arange(count) + rng.uniform()) / count * reached[-1]
-    places = np.stack([np.interp(along, reached, axis) for axis in corners.T], axis=1)
-    return tuple((float(a), float(b)) for a, b in places)
+    positions = np.stack([np.interp(along, reached, axis) for axis in corners.T], axis=1)
+    return tuple((float(a), float(b)) for a, b in positions)
 
 
 def _free(plan: FloorPlan) -> tuple[NDArray[np.float64], csr_array]:
@@ -139,7 +139,7 @@ def _away(
     return away
 
 
-def _heard(plan: FloorPlan, anchor: Point, cells: NDArray[np.float64]) -> float:
+def _received_share(plan: FloorPlan, anchor: Point, cells: NDArray[np.float64]) -> float:
     """Return the share of positions from which a frame is received according to its mean level."""
     n = len(cells)
     boards = Boards(np.zeros(n), np.full(n, RADIO.noise_figure_db), np.full(n, float(RADIO.preamble_symbols)))

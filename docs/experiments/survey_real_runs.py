@@ -32,10 +32,10 @@ for folder in sorted(Path(sys.argv[1]).glob("*_*")):
             continue
         off = displacements(found.anchors.position, anchors.position)
         plan = np.sqrt((off[:, :2] ** 2).sum(axis=1).mean())
-        said = float(np.mean(found.anchors.sd))
+        reported_sd_m = float(np.mean(found.anchors.sd))
         names = [(anchors.anchors[a].id, anchors.anchors[b].id) for a, b in found.swapped]
         print(
             f"{folder.name:8} guess {seed}: {before:.2f} m off in plan, found {plan:.2f} m, loss {found.loss:.2f},"
-            f" says {said:.2f}; swapped {names or 'none'}",
+            f" reported {reported_sd_m:.2f}; swapped {names or 'none'}",
             flush=True,
         )

@@ -34,19 +34,23 @@ for path in map(Path, sys.argv[2:]):
     bundle = load_bundle(path)
     data = build_dataset(records, bundle.preprocessing)
     found = zero_shot.run(data, bundle)
-    print(f"{path.name}, model {bundle.model_id:08x}, {found.passed.mean():.1%} passed through")
+    print(f"{path.name}, model {bundle.model_id:08x}, {found.passed_through.mean():.1%} passed through")
     is_los = data.labels == zero_shot.LOS
     offset = median_of_placements(data, is_los if is_los.any() else np.ones(len(data), bool))
     rows = {"raw": data.error_m, "raw less LOS offset": data.error_m - offset, **found.errors}
     rows["less raw LOS offset"] = found.errors["universal"] - offset
-    for name, left in rows.items():
-        low, high = bootstrap_interval(left, data.configurations)
+    for name, residuals in rows.items():
+        low, high = bootstrap_interval(residuals, data.configurations)
         labels = np.unique(data.labels)
-        told = ", ".join(f"{label} {np.abs(left[data.labels == label]).mean():.3f}" for label in labels)
-        print(f"  {name:22}{np.abs(left).mean():.3f} ({low:.3f} to {high:.3f}); {told}")
-    left = found.errors["universal_los_offset"]
+        by_label_text = ", ".join(
+            f"{label} {np.abs(residuals[data.labels == label]).mean():.3f}" for label in labels
+        )
+        print(f"  {name:22}{np.abs(residuals).mean():.3f} ({low:.3f} to {high:.3f}); {by_label_text}")
+    residuals = found.errors["universal_los_offset"]
     for label in ("", *np.unique(data.labels)):
-        these = (data.labels == label) | (label == "")
-        variance = found.variance_m2[these]
-        narrow, wide = (coverage(left[these], variance, sigmas) for sigmas in (1.0, found.sigmas95))
-        print(f"  intervals cover, {label or 'all':10}{narrow:.1%} and {wide:.1%}")
+        label_rows = (data.labels == label) | (label == "")
+        variance = found.variance_m2[label_rows]
+        coverage68, coverage95 = (
+            coverage(residuals[label_rows], variance, sigmas) for sigmas in (1.0, found.sigmas95)
+        )
+        print(f"  intervals cover, {label or 'all':10}{coverage68:.1%} and {coverage95:.1%}")

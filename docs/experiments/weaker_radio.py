@@ -30,22 +30,22 @@ for record in records:
 offset_m = np.median([np.mean(values) for values in errors.values()])
 
 
-def heard(record, level, less_m):
+def with_level(record, level, subtracted_m):
     """Return the record of a radio that receives `level` dB more, with an offset subtracted from its range."""
     cir = record.measurement.cir
     powers = {
         "rx_power_dbm": cir.rx_power_dbm + level,
         "first_path_power_dbm": cir.first_path_power_dbm + level,
     }
-    louder = replace(cir, scale=10 ** (level / 20), **powers)
-    range_m = record.measurement.range_m - less_m
-    return replace(record, measurement=replace(record.measurement, cir=louder, range_m=range_m))
+    changed_cir = replace(cir, scale=10 ** (level / 20), **powers)
+    range_m = record.measurement.range_m - subtracted_m
+    return replace(record, measurement=replace(record.measurement, cir=changed_cir, range_m=range_m))
 
 
 for name in sys.argv[3:]:
     mitigation = Mitigation(load_bundle(model_path(name)))
-    less_m = offset_m if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else 0.0
+    subtracted_m = offset_m if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else 0.0
     print(name)
     for level in (-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20):
-        found = evaluate(mitigation, (heard(record, level, less_m) for record in records))
+        found = evaluate(mitigation, (with_level(record, level, subtracted_m) for record in records))
         print(f"{level:5} {found.corrected.mae / found.raw.mae:.3f}", found.statuses)

@@ -109,63 +109,69 @@ def solve_without_truth(
             implausible.
     """
     on_progress("estimating track and offsets", 0.1)
-    known = regressors(site, universal)
-    found = self_calibrate(
+    extra_regressors = regressors(site, universal)
+    calibration = self_calibrate(
         site.anchors,
         site.tags,
-        known,
+        extra_regressors,
         height=height,
         area=area,
         heights_m=site.height_m,
         height_sd_m=height_sd_m,
     )
     on_progress("estimating track and offsets", 1.0)
-    track, ids = found.segments, [anchor.id for anchor in site.anchors.anchors]
-    of_range = site.first_rows[track.tag] + track.row
-    is_known = np.isfinite(found.pseudo_m) & (found.pseudo_sd_m <= MAX_TRUTH_SD_M)
-    is_known, outliers = _without_outliers(track.ranges.range_m - found.pseudo_m, is_known)
-    notes = list(found.notes)
+    track, ids = calibration.segments, [anchor.id for anchor in site.anchors.anchors]
+    site_rows = site.first_rows[track.tag] + track.row
+    is_known = np.isfinite(calibration.pseudo_m) & (calibration.pseudo_sd_m <= MAX_TRUTH_SD_M)
+    is_known, outliers = _without_outliers(track.ranges.range_m - calibration.pseudo_m, is_known)
+    notes = list(calibration.notes)
     if (unknown := int((~is_known).sum()) - outliers) > 0:
         notes.append(
             f"{unknown} of {len(is_known)} ranges are not used for the fit: the other anchors do not determine the tag position"
         )
-    used = np.flatnonzero(is_known & usable_ranges(site)[of_range])
-    pairs = {(found.tag_ids[tag], ids[row]): found.applied(tag, row) for tag, row in found.pairs()}
-    common = found.mean()[0] if found.mean_is_significant else 0.0
+    used = np.flatnonzero(is_known & usable_ranges(site)[site_rows])
+    pairs = {
+        (calibration.tag_ids[tag], ids[row]): calibration.applied(tag, row)
+        for tag, row in calibration.pairs()
+    }
+    common = calibration.mean()[0] if calibration.mean_is_significant else 0.0
     offsets = Offsets(common)
-    if found.level == "pair":
+    if calibration.level == "pair":
         offsets = _pair_offsets(common, pairs)
-    elif found.level == "anchor":
-        own = {ids[row]: found.applied(tag, row)[0] for tag, row in found.pairs()}
-        offsets = Offsets(common, anchors=own)
+    elif calibration.level == "anchor":
+        anchor_offsets = {ids[row]: calibration.applied(tag, row)[0] for tag, row in calibration.pairs()}
+        offsets = Offsets(common, anchors=anchor_offsets)
 
     def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
-        again = found.without_ranges(_whole_segments(used[held_out], used, track.of))
+        recalibrated = calibration.without_ranges(_whole_segments(used[held_out], used, track.of))
         return {
-            (found.tag_ids[tag], ids[row]): again.pair(tag, row)[0] - found.pair(tag, row)[0]
-            for tag, row in found.pairs()
-            if found.applied(tag, row)[0] != 0.0
+            (calibration.tag_ids[tag], ids[row]): recalibrated.pair(tag, row)[0]
+            - calibration.pair(tag, row)[0]
+            for tag, row in calibration.pairs()
+            if calibration.applied(tag, row)[0] != 0.0
         }
 
     return SiteSolution(
-        rows=of_range[used],
-        true_m=found.pseudo_m[used],
-        antenna_position=found.fit.position[found.fit.observations.knot[found.fit.observations.of]][used],
+        rows=site_rows[used],
+        true_m=calibration.pseudo_m[used],
+        antenna_position=calibration.fit.position[
+            calibration.fit.observations.knot[calibration.fit.observations.of]
+        ][used],
         segment=track.of[used],
         stationary=track.is_stationary,
         pairs=pairs,
         offsets=offsets,
-        offset_level=found.level,
+        offset_level=calibration.level,
         outliers=outliers,
         notes=tuple(notes),
         offset_changes_without=offset_changes_without,
-        track=found.fit.position,
-        track_of=found.fit.observations.knot_segment,
-        stationary_positions=_stationary_positions(found),
-        network_sd=found.value(NETWORK)[1],
-        line=found.value(LEVEL),
-        common_sd_m=found.mean()[1],
-        position_scatter_m=found.position_scatter_m,
+        track=calibration.fit.position,
+        track_of=calibration.fit.observations.knot_segment,
+        stationary_positions=_stationary_positions(calibration),
+        network_sd=calibration.value(NETWORK)[1],
+        line=calibration.value(LEVEL),
+        common_sd_m=calibration.mean()[1],
+        position_scatter_m=calibration.position_scatter_m,
     )
 
 
@@ -197,60 +203,60 @@ def solve_with_truth(
     """
     on_progress("estimating time offset and lever arm", 0.1)
     joined = [
-        PosePath.joined([path.shifted(by) for path, by in zip(own, site.shift_ns, strict=True)])
-        for own in paths
+        PosePath.joined([path.shifted(by) for path, by in zip(tag_paths, site.shift_ns, strict=True)])
+        for tag_paths in paths
     ]
-    known = regressors(site, universal)
-    found = align_poses(
+    extra_regressors = regressors(site, universal)
+    alignment = align_poses(
         site.anchors,
         site.tags,
         joined,
-        known,
+        extra_regressors,
         time_offset_s=time_offset_s,
         lever_arms_m=lever_arms_m,
         estimate_lever_arm=estimate_lever_arm,
     )
     on_progress("estimating time offset and lever arm", 1.0)
-    error = site.ranges.range_m - found.distance_m
-    kept, outliers = _without_outliers(error, np.isfinite(error))
-    rows = np.flatnonzero(kept & usable_ranges(site))
-    check_anchors(site, found.position, kept)
+    error = site.ranges.range_m - alignment.distance_m
+    is_used, outliers = _without_outliers(error, np.isfinite(error))
+    rows = np.flatnonzero(is_used & usable_ranges(site))
+    check_anchors(site, alignment.position, is_used)
     ids = [anchor.id for anchor in site.anchors.anchors]
     pairs = {
-        (site.tags[tag].tag_id, ids[row]): found.pair(tag, row, float(site.anchors.sd[row]))
-        for tag, row in found.pairs
+        (site.tags[tag].tag_id, ids[row]): alignment.pair(tag, row, float(site.anchors.sd[row]))
+        for tag, row in alignment.pairs
     }
     common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
-    spread = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
+    scatter_m = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
     # With few ranges, the other pairs determine the offset of a pair better than its own ranges.
-    few = common, math.hypot(MAX_TRUTH_SD_M, spread)
-    pairs = {pair: few if own[1] > MAX_TRUTH_SD_M else own for pair, own in pairs.items()}
+    typical_offset = common, math.hypot(MAX_TRUTH_SD_M, scatter_m)
+    pairs = {pair: typical_offset if value[1] > MAX_TRUTH_SD_M else value for pair, value in pairs.items()}
     tag = site.tag
 
     def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
-        rest = np.setdiff1d(rows, rows[held_out])
-        own = [rest[tag[rest] == number] for number in range(len(site.tags))]
-        again = align_poses(
+        remaining = np.setdiff1d(rows, rows[held_out])
+        rows_of_tags = [remaining[tag[remaining] == number] for number in range(len(site.tags))]
+        realigned = align_poses(
             site.anchors,
             [
                 ranges.take(rows_of_tag - begin)
-                for ranges, rows_of_tag, begin in zip(site.tags, own, site.first_rows, strict=True)
+                for ranges, rows_of_tag, begin in zip(site.tags, rows_of_tags, site.first_rows, strict=True)
             ],
             joined,
-            known.take(rest),
-            time_offset_s=found.time_offset_s,
-            lever_arms_m=found.lever_arm_m,
+            extra_regressors.take(remaining),
+            time_offset_s=alignment.time_offset_s,
+            lever_arms_m=alignment.lever_arm_m,
         )
         return {
-            (site.tags[number].tag_id, ids[row]): again.pair(number, row, 0.0)[0]
-            - found.pair(number, row, 0.0)[0]
-            for number, row in again.pairs
+            (site.tags[number].tag_id, ids[row]): realigned.pair(number, row, 0.0)[0]
+            - alignment.pair(number, row, 0.0)[0]
+            for number, row in realigned.pairs
         }
 
     return SiteSolution(
         rows=rows,
-        true_m=found.distance_m[rows],
-        antenna_position=found.position[rows],
+        true_m=alignment.distance_m[rows],
+        antenna_position=alignment.position[rows],
         segment=tag[rows],
         stationary=np.zeros(len(site.tags), np.bool_),
         pairs=pairs,
@@ -260,8 +266,8 @@ def solve_with_truth(
         notes=(),
         offset_changes_without=offset_changes_without,
         truth=topic,
-        alignment=found,
-        track=found.position[rows],
+        alignment=alignment,
+        track=alignment.position[rows],
         track_of=tag[rows],
         stationary_positions={},
     )
@@ -285,10 +291,10 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
     return Regressors.one(LEVEL, np.where(known, power - np.median(power[known]), 0.0), 0.0, SLOPE_SD)
 
 
-def _stationary_positions(found: SelfCalibration) -> dict[str, tuple[float, float, float]]:
+def _stationary_positions(calibration: SelfCalibration) -> dict[str, tuple[float, float, float]]:
     """Return the positions of stationary tags, see `SiteSolution.stationary_positions`."""
-    stationary = np.flatnonzero(found.fit.observations.is_stationary).tolist()
-    tag_of = dict(zip(found.segments.of.tolist(), found.segments.tag.tolist(), strict=True))
+    stationary = np.flatnonzero(calibration.fit.observations.is_stationary).tolist()
+    tag_of = dict(zip(calibration.segments.of.tolist(), calibration.segments.tag.tolist(), strict=True))
     positions = Counter(tag_of[segment] for segment in stationary)
     number: Counter[int] = Counter()
     named = {}
@@ -296,8 +302,8 @@ def _stationary_positions(found: SelfCalibration) -> dict[str, tuple[float, floa
         tag = tag_of[segment]
         number[tag] += 1
         suffix = f" #{number[tag]}" if positions[tag] > 1 else ""
-        x, y, z = found.fit.position[found.fit.observations.knot_segment == segment][0].tolist()
-        named[f"{found.tag_ids[tag]}{suffix}"] = (x, y, z)
+        x, y, z = calibration.fit.position[calibration.fit.observations.knot_segment == segment][0].tolist()
+        named[f"{calibration.tag_ids[tag]}{suffix}"] = (x, y, z)
     return named
 
 
@@ -312,10 +318,10 @@ def _without_outliers(
     """Return the mask of `known` errors that are not outliers, bool (n,), and the number of outliers."""
     if not known.any():
         return known, 0
-    away = np.abs(error_m - np.median(error_m[known]))
-    limit = max(OUTLIER_M, OUTLIER_SDS * MAD_TO_SD * float(np.median(away[known])))
-    kept = known & (away <= limit)
-    return kept, int(known.sum() - kept.sum())
+    distance_m = np.abs(error_m - np.median(error_m[known]))
+    limit = max(OUTLIER_M, OUTLIER_SDS * MAD_TO_SD * float(np.median(distance_m[known])))
+    is_used = known & (distance_m <= limit)
+    return is_used, int(known.sum() - is_used.sum())
 
 
 def _whole_segments(
@@ -328,12 +334,12 @@ def _whole_segments(
         labelled: sorted indices of the ranges with a known true range.
         segment: int (r,), segment of each range, in the order of time.
     """
-    every = np.arange(len(segment))
-    before = np.maximum(np.searchsorted(labelled, every, side="right") - 1, 0)
+    rows = np.arange(len(segment))
+    before = np.maximum(np.searchsorted(labelled, rows, side="right") - 1, 0)
     after = np.minimum(before + 1, len(labelled) - 1)
     nearest = np.where(segment[labelled[before]] == segment, labelled[before], labelled[after])
-    found: NDArray[np.bool_] = np.isin(nearest, held_out) & (segment[nearest] == segment)
-    return found
+    is_held_out: NDArray[np.bool_] = np.isin(nearest, held_out) & (segment[nearest] == segment)
+    return is_held_out
 
 
 def usable_ranges(site: SiteData) -> NDArray[np.bool_]:
