@@ -385,8 +385,8 @@ def load_mapping(name: str) -> Mapping:
     if name in known:
         path = Path(str(_folder() / f"{name}.yaml"))
     elif not path.exists():
-        valid = did_you_mean(name, known) or f"a file, or one of {', '.join(known)}"
-        raise ParameterError(f"no mapping {name!r}", valid=valid)
+        valid, suggestion = f"a file, or one of {', '.join(known)}", did_you_mean(name, known)
+        raise ParameterError(f"no mapping {name!r}", valid=valid, suggestion=suggestion)
     try:
         document = yaml.safe_load(read_bounded(path, MAX_BYTES, ParameterError))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -395,20 +395,18 @@ def load_mapping(name: str) -> Mapping:
     try:
         return Mapping.model_validate(document)
     except ValidationError as error:
-        problem = error.errors()[0]
+        # An unknown field is often the reason for a missing one.
+        problem = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
         where = ".".join(str(part) for part in problem["loc"])
         known_keys = _keys_at(problem["loc"][:-1])
         last = str(problem["loc"][-1]) if problem["loc"] else ""
-        hint = did_you_mean(last, known_keys) if problem["type"] == "extra_forbidden" else ""
-        what = (
-            "unknown field"
-            if problem["type"] == "extra_forbidden"
-            else problem["msg"].removeprefix("Value error, ")
-        )
+        unknown = problem["type"] == "extra_forbidden"
+        what = "unknown field" if unknown else problem["msg"].removeprefix("Value error, ")
         raise ParameterError(
             f"{where}: {what}" if where else what,
             where=str(path),
-            valid=hint or ", ".join(known_keys) if problem["type"] == "extra_forbidden" else "",
+            valid=", ".join(known_keys) if unknown else "",
+            suggestion=did_you_mean(last, known_keys) if unknown else "",
         ) from error
 
 

@@ -104,5 +104,8 @@ def _step(value: Any, name: str, column: str) -> Any:
             str(each).lstrip("_")
             for each in getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
         ]
-    hint = did_you_mean(name, known) or f"the message has {', '.join(known[:30]) or 'no fields'}"
-    raise RecordingError(f"no field {name} for column {column}", valid=hint)
+    raise RecordingError(
+        f"no field {name} for column {column}",
+        valid=f"the message has {', '.join(known[:30]) or 'no fields'}",
+        suggestion=did_you_mean(name, known),
+    )

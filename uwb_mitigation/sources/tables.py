@@ -160,10 +160,11 @@ def _chosen(known: Sequence[str], columns: Sequence[str], optional: Sequence[str
     """Return the columns that exist; raise RecordingError if a required one is missing."""
     for name in columns:
         if name not in known and name not in optional:
-            hint = did_you_mean(name, known) or f"columns: {', '.join(known[:40])}"
+            valid = f"columns: {', '.join(known[:40])}"
             if len(known) == 1 and (other := next((mark for mark in ";\t|," if mark in known[0]), "")):
-                hint = f"there is one column {known[0]!r:.60}; set separator: {other!r}"
-            raise RecordingError(f"no column {name}", where=str(path), valid=hint)
+                valid = f"there is one column {known[0]!r:.60}; set separator: {other!r}"
+            suggestion = did_you_mean(name, known)
+            raise RecordingError(f"no column {name}", where=str(path), valid=valid, suggestion=suggestion)
     return [name for name in columns if name in known]
 
 
