@@ -30,9 +30,9 @@ from uwb_mitigation.positioning.anchors import dump_anchors  # noqa: E402
 from uwb_mitigation.positioning.geometry import Height  # noqa: E402
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig  # noqa: E402
 from uwb_mitigation.processing.tracking import track_tag  # noqa: E402
+from uwb_mitigation.sources.anchors_file import load_anchors  # noqa: E402
 from uwb_mitigation.sources.recorded_ranges import read_ranges  # noqa: E402
 from uwb_mitigation.sources.simulated import SimulatedSource  # noqa: E402
-from uwb_mitigation.sources.site import load_anchors  # noqa: E402
 
 PICTURES = REPOSITORY / "docs" / "pictures"
 SIMULATED_HZ = 40.0

@@ -21,8 +21,8 @@ from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.offsets import read_offsets
 from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.sources.anchors_file import save_anchors
 from uwb_mitigation.sources.simulated import SimulatedSource
-from uwb_mitigation.sources.site import save_anchors
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 OWN = np.array([0.3, 0.1, 0.25, 0.05, 0.2])

@@ -80,13 +80,13 @@ def test_plans_match_their_kind(kind: buildings.Kind) -> None:
 def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
     blocks = [block_of(7, number, wide=True)[0] for number in range(40)]
     crossings = {
-        kind: np.concatenate([block.links.path.crossings for block in blocks if block.kind == kind])
+        kind: np.concatenate([block.pairs.path.crossings for block in blocks if block.kind == kind])
         for kind in ("open", "flat")
     }
     # A block contains a third of each condition, if the site has enough.
     assert np.mean(crossings["open"] == 0) > 0.45 > 0.4 > np.mean(crossings["flat"] == 0)
     # In LOS only a tilted antenna attenuates the direct path.
-    loss = [block.links.path.loss_db[block.links.path.crossings == 0] for block in blocks]
+    loss = [block.pairs.path.loss_db[block.pairs.path.crossings == 0] for block in blocks]
     tilted = [values.max() > 0.0 for values in loss if len(values)]
     assert 0.1 < np.mean(tilted) < 0.5
 
@@ -96,12 +96,12 @@ def test_nlos_delay_grows_with_the_distance(
     distance_m: tuple[float, float],
 ) -> None:
     blocks = [block_of(5, number)[0] for number in range(12)]
-    distance = np.concatenate([block.links.distance_m for block in blocks])
-    first = np.concatenate([block.links.fields[1].delay_ns[:, 0] for block in blocks])
+    distance = np.concatenate([block.pairs.distance_m for block in blocks])
+    first = np.concatenate([block.pairs.fields[1].delay_ns[:, 0] for block in blocks])
     here = (distance >= distance_m[0]) & (distance < distance_m[1])
     # The delay of the environments is 2.7 ns at 4 m and at most three times as long.
     expected = 2.7 * np.minimum(distance[here] / 4.0, 3.0)
     assert here.sum() > 100
     assert np.mean(first[here] / expected) == pytest.approx(1.0, abs=4.0 / np.sqrt(here.sum()))
-    los = np.concatenate([block.links.fields[0].delay_ns[:, 0] for block in blocks])
+    los = np.concatenate([block.pairs.fields[0].delay_ns[:, 0] for block in blocks])
     assert (los == 0.0).all()

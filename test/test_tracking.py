@@ -27,10 +27,10 @@ from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimat
 from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
 from uwb_mitigation.processing import tracking
 from uwb_mitigation.processing.tracking import held_out, track_tag
+from uwb_mitigation.sources.anchors_file import anchors_path
 from uwb_mitigation.sources.mapped import MappedRecording
 from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.recorded_ranges import TagRecording
-from uwb_mitigation.sources.site import anchors_file
 
 
 def write_drive(bag: Path, ranges: Ranges, truth: TruePath, too_long_m: float = 0.0) -> Path:
@@ -51,7 +51,7 @@ def write_drive(bag: Path, ranges: Ranges, truth: TruePath, too_long_m: float = 
                 height = Estimate(stamp, at * (0, 0, 1), np.zeros(3), np.eye(6) * 0.0004)
                 writer.write_message("/height", POSE_TYPE, encode_pose(height), stamp)
         writer.write(Record(RangeMeasurement(stamp, 7, 99, len(ranges), 0, 1.0, empty)))
-    anchors_file(bag).write_text(dump_anchors(HALL))
+    anchors_path(bag).write_text(dump_anchors(HALL))
     return bag
 
 
@@ -80,7 +80,7 @@ def test_track_is_written_evaluated_and_read_by_evo(hall: Path, tmp_path: Path):
     for one in excerpt["held_out"]:
         assert one["corrected_m"] < 0.3
         assert one["raw_m"] > 0.4, "they are 0.6 m too long"
-    assert anchors_file(out).read_text() == dump_anchors(HALL, "anchors of the track of hall.mcap")
+    assert anchors_path(out).read_text() == dump_anchors(HALL, "anchors of the track of hall.mcap")
     (live,), (truth,) = (read_truth(out, topic).items() for topic in (ODOMETRY, ODOMETRY_TRUTH))
     assert (live[0], truth[0]) == (7, 7)
     live = live[1]

@@ -41,7 +41,7 @@ from uwb_mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.anchors import dump_anchors
 from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.processing.job import Job, process_bag
-from uwb_mitigation.sources.site import anchors_file, load_anchors
+from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
 from uwb_mitigation.viewer import playback
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.palette import TrackKind
@@ -159,7 +159,7 @@ def test_output_of_track_is_shown(tmp_path: Path):
             for tag in (7, 0x1122334455667788):
                 cir = Cir(np.zeros(0, np.int16))
                 out.write(Record(RangeMeasurement(stamp_ns, tag, anchor, i, 0, range_m, cir)))
-    anchors_file(bag).write_text(dump_anchors(HALL))
+    anchors_path(bag).write_text(dump_anchors(HALL))
     done = run("track", bag, "-o", track, "--height", "1.0", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     player, scene = open_bag(track)
@@ -171,7 +171,7 @@ def test_output_of_track_is_shown(tmp_path: Path):
     for points in scene.tracks.values():
         assert points[-1] == pytest.approx(truth.position[-1, :2], abs=0.5)
     assert "without ranges" in player.missing.ranges
-    assert load_anchors(anchors_file(track)).anchors == HALL.anchors
+    assert load_anchors(anchors_path(track)).anchors == HALL.anchors
 
 
 def test_ages_use_the_time_of_the_recording(tmp_path: Path):
@@ -252,7 +252,7 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
     done = run("data", "simulate", "--like", "drive", "--ranges", "400", "-o", bag, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     player, scene = open_bag(bag)
-    player.index(load_anchors(anchors_file(bag))).join()
+    player.index(load_anchors(anchors_path(bag))).join()
     timeline = player.timeline
     assert timeline is not None
     assert len(timeline.time_s) == len(timeline.pairs) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))

@@ -120,7 +120,7 @@ def calibrate(
         uwb-mitigation process other.mcap --model site.onnx --offsets site.offsets.yaml -o corrected.mcap
     """
     from uwb_mitigation.commands.bundles import bundle_for
-    from uwb_mitigation.sources.site import anchors_file, load_anchors
+    from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
     from uwb_mitigation.training import site_calibration, site_solution
 
     check_output(output)
@@ -143,7 +143,7 @@ def calibrate(
         area_of(area),
         _lever_arm(lever_arm),
     )
-    anchor_map = load_anchors(anchors or anchors_file(bags[0]))
+    anchor_map = load_anchors(anchors or anchors_path(bags[0]))
     source = bundle_for(None, bags[0])
     try:
         site = _gather(bags, anchor_map, source, stamp_offset, height_topic, height_sd)

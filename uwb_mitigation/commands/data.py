@@ -300,10 +300,10 @@ def info(
 
 
 def _save_anchors(source: Source, bag: Path) -> None:
-    from uwb_mitigation.sources.site import HasAnchors, anchors_file, save_anchors
+    from uwb_mitigation.sources.anchors_file import HasAnchors, anchors_path, save_anchors
 
     if isinstance(source, HasAnchors):
-        path = anchors_file(bag)
+        path = anchors_path(bag)
         # An existing bag was already refused, unless `--force` is given.
         save_anchors(path, source.anchors, f"anchors of {source.name}", force=True)
         print_line(f"Wrote {len(source.anchors)} anchors to {path}.")

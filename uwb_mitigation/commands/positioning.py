@@ -114,7 +114,7 @@ def track(
     from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.processing.tracking import held_out, track_tag, tum_file, write_tracks
     from uwb_mitigation.processing.tracking import tum as tum_text
-    from uwb_mitigation.sources.site import anchors_file, save_anchors
+    from uwb_mitigation.sources.anchors_file import anchors_path, save_anchors
 
     model = NoiseModel(acceleration=acceleration)
     place, box = height_of(height, height_sd), area_of(area)
@@ -132,8 +132,8 @@ def track(
             tracks.append(track_tag(tag, config))
             bar.advance(task)
         write_tracks(out, tracks)
-    if force or not anchors_file(output).exists():
-        save_anchors(anchors_file(output), known, f"anchors of the track of {bag.name}", force=True)
+    if force or not anchors_path(output).exists():
+        save_anchors(anchors_path(output), known, f"anchors of the track of {bag.name}", force=True)
     _show_tracks(tracks, known)
     residuals = held_out(tracks, config)
     _show_residuals(residuals, known)
@@ -177,7 +177,7 @@ def survey(
     from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.survey import survey as find
     from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
-    from uwb_mitigation.sources.site import save_anchors
+    from uwb_mitigation.sources.anchors_file import save_anchors
 
     if not 0.0 < off <= 100.0:
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
@@ -208,14 +208,14 @@ def survey(
 
 
 def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorMap, RecordedRanges]:
+    from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
     from uwb_mitigation.sources.recorded_ranges import read_ranges
-    from uwb_mitigation.sources.site import anchors_file, load_anchors
 
     if not abs(stamp_offset) <= 3600.0:
         raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
     if not bag.exists():
         raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
-    known = load_anchors(anchors or anchors_file(bag))
+    known = load_anchors(anchors or anchors_path(bag))
     with console.progress() as bar:
         bar.add_task("reading", total=None)
         recorded = read_ranges(bag, known, stamp_offset)

@@ -71,7 +71,7 @@ def view(
     from threading import Lock
 
     from uwb_mitigation.positioning.geometry import Height
-    from uwb_mitigation.sources.site import anchors_file, load_anchors
+    from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
     from uwb_mitigation.viewer.feed import Feed
     from uwb_mitigation.viewer.floor_plan import load_floor_plan
     from uwb_mitigation.viewer.page import View
@@ -80,7 +80,7 @@ def view(
     from uwb_mitigation.viewer.server import ViewerServer
 
     lock = Lock()
-    file = anchors or anchors_file(bag)
+    file = anchors or anchors_path(bag)
     known = load_anchors(file) if anchors is not None or file.is_file() else None
     players, scenes = [], []
     for path in (bag, second):

@@ -28,7 +28,7 @@ _FLOAT = re.compile(r"[-+]?(\.\d+|\d+\.\d*|\d+(\.\d*)?[eE][-+]?\d+|\.\d+[eE][-+]
 """Floats of YAML 1.2; PyYAML reads YAML 1.1, in which 1e-1 is a string."""
 
 _LAUNCH_FILES = (".launch.py", ".launch.xml", ".launch.yaml", ".launch.yml")
-_LAUNCH_FILES_OF_PACKAGE = ("uwb.launch.py", "boards.launch.py")
+_OWN_LAUNCH_FILES = ("uwb.launch.py", "boards.launch.py")
 
 
 def report_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
@@ -153,9 +153,7 @@ def check_names(words: Sequence[str], known: Collection[str]) -> None:
         known: the declared arguments.
     """
     # A launch file that includes this one may declare further arguments.
-    if any(
-        word.endswith(_LAUNCH_FILES) and Path(word).name not in _LAUNCH_FILES_OF_PACKAGE for word in sys.argv
-    ):
+    if any(word.endswith(_LAUNCH_FILES) and Path(word).name not in _OWN_LAUNCH_FILES for word in sys.argv):
         return
     for word in words:
         name, separator, _ = word.partition(":=")

@@ -38,8 +38,8 @@ from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.sources.anchors_file import load_anchors
 from uwb_mitigation.sources.mapping import load_mapping, shipped_mappings
-from uwb_mitigation.sources.site import load_anchors
 
 BATCH = 64
 """Maximum number of queued ranges that one callback processes."""

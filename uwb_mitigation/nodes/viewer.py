@@ -28,7 +28,7 @@ from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import VIEWER
 from uwb_mitigation.nodes.replay import ReplayClock
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.sources.site import load_anchors
+from uwb_mitigation.sources.anchors_file import load_anchors
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.page import View

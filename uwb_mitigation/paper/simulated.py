@@ -23,8 +23,8 @@ from uwb_mitigation.sources.simulated import (
     Simulated,
     check_seed,
 )
+from uwb_mitigation.sources.simulation.antenna_pairs import AntennaPairs, draw_fields, place
 from uwb_mitigation.sources.simulation.channel import check_range
-from uwb_mitigation.sources.simulation.links import Links, draw_fields, place
 from uwb_mitigation.sources.simulation.radio import Radio
 from uwb_mitigation.sources.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
 from uwb_mitigation.sources.simulation.scene import DirectPath
@@ -108,7 +108,7 @@ class SimulatedDeepUwb(Simulated):
                 (FIRST_ANCHOR_ID + number) * ids,
                 FIRST_TAG_ID * ids,
                 [names[k] for k in placement_of_row.tolist()],
-                Links(
+                AntennaPairs(
                     anchor[placement_of_row],
                     tag[placement_of_row],
                     path.take(placement_of_row),

@@ -27,6 +27,7 @@ from uwb_mitigation.measurement import (
     Truth,
 )
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.sources.simulation.antenna_pairs import AntennaPairs, draw_fields, label, place
 from uwb_mitigation.sources.simulation.buildings import PLACEMENTS, block_of
 from uwb_mitigation.sources.simulation.buildings import RADIO as BUILDINGS_RADIO
 from uwb_mitigation.sources.simulation.channel import (
@@ -35,7 +36,6 @@ from uwb_mitigation.sources.simulation.channel import (
     DiffuseField,
     check_range,
 )
-from uwb_mitigation.sources.simulation.links import Links, draw_fields, label, place
 from uwb_mitigation.sources.simulation.odometry import RobotMotion, simulate_motion, yaw_along_route
 from uwb_mitigation.sources.simulation.radio import Boards, Radio, Reception
 from uwb_mitigation.sources.simulation.scene import (
@@ -66,13 +66,13 @@ SURVEY_RATE_HZ = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Exchanges:
-    """n exchanges before the radio model: their numbers, ids, configurations and links, and headings of moving tags."""
+    """n exchanges before the radio model: their numbers, ids, configurations and pairs, and headings of moving tags."""
 
     sequence: NDArray[np.int64]
     anchor_id: NDArray[np.int64]
     tag_id: NDArray[np.int64]
     configuration: list[str]
-    links: Links
+    pairs: AntennaPairs
     boards: Boards | None = None
     tag_yaw: NDArray[np.float64] | None = None
 
@@ -100,9 +100,9 @@ class Simulated(Source):
             yield from self._records(exchanges, rng)
 
     def _records(self, exchanges: Exchanges, rng: np.random.Generator) -> Iterator[Record]:
-        links = exchanges.links
-        distance = links.distance_m
-        reception = self._radio.receive(links.multipath(rng), rng, exchanges.boards)
+        pairs = exchanges.pairs
+        distance = pairs.distance_m
+        reception = self._radio.receive(pairs.multipath(rng), rng, exchanges.boards)
         for i, sequence in enumerate(exchanges.sequence.tolist()):
             # Always simulate a complete batch: its random numbers must not depend on `count`.
             if self._count and sequence >= self._count:
@@ -122,11 +122,11 @@ class Simulated(Source):
                 cir=_cir(reception, i),
                 frame_id=f"simulated_anchor_{anchor_id}",
             )
-            condition = label(bool(links.path.crossings[i]), bool(reception.direct_above_threshold[i]))
+            condition = label(bool(pairs.path.crossings[i]), bool(reception.direct_above_threshold[i]))
             truth = Truth(float(distance[i]), condition, exchanges.configuration[i])
-            x, y = links.tag[i].tolist()
+            x, y = pairs.tag[i].tolist()
             yaw = None if exchanges.tag_yaw is None else float(exchanges.tag_yaw[i])
-            yield Record(measurement, truth, None if links.stationary else (x, y, 0.0), yaw)
+            yield Record(measurement, truth, None if pairs.stationary else (x, y, 0.0), yaw)
 
 
 class SimulatedSource(Simulated):
@@ -223,7 +223,7 @@ class SimulatedSource(Simulated):
             anchor_id,
             tag_id,
             names,
-            Links(anchors, positions, path, RESIDENTIAL, fields, pair, stationary=False),
+            AntennaPairs(anchors, positions, path, RESIDENTIAL, fields, pair, stationary=False),
             tag_yaw=yaw_along_route(self._route, travelled),
         )
 
@@ -290,7 +290,7 @@ class SimulatedSurvey(Simulated):
                     ids,
                     FIRST_TAG_ID * ids,
                     names,
-                    Links(anchor[of], tag[of], path, RESIDENTIAL, fields, of, stationary=True),
+                    AntennaPairs(anchor[of], tag[of], path, RESIDENTIAL, fields, of, stationary=True),
                 ),
                 rng,
             )
@@ -328,7 +328,7 @@ class SimulatedBuildings(Simulated):
             for first in range(0, PLACEMENTS, together):
                 rows = np.arange(first, min(first + together, PLACEMENTS))
                 of = np.repeat(np.arange(len(rows)), each)
-                links = block.links.take(rows, of)
+                pairs = block.pairs.take(rows, of)
                 names = [block.configuration(self._seed, number, k) for k in rows.tolist()]
                 ids = np.ones(len(of), np.int64)
                 sequence = (number * PLACEMENTS + first) * each + np.arange(len(of))
@@ -337,7 +337,7 @@ class SimulatedBuildings(Simulated):
                     ids,
                     FIRST_TAG_ID * ids,
                     [names[k] for k in of.tolist()],
-                    links,
+                    pairs,
                     block.boards.take(rows[of]),
                 )
                 yield exchanges, rng

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from uwb_mitigation.evaluation.dataset import Dataset
 from uwb_mitigation.measurement import Encoding, RangeColumns
 from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.sources.simulation.antenna_pairs import label
 from uwb_mitigation.sources.simulation.buildings import RADIO, block_of
-from uwb_mitigation.sources.simulation.links import label
 from uwb_mitigation.sources.simulation.radio import Reception
 
 
@@ -43,12 +43,12 @@ def building_dataset(
 
 def _block(seed: int, preprocessing: Preprocessing, wide: bool, number: int) -> Dataset:
     block, rng = block_of(seed, number, wide=wide)
-    reception = RADIO.receive(block.links.multipath(rng), rng, block.boards)
-    distance = block.links.distance_m
+    reception = RADIO.receive(block.pairs.multipath(rng), rng, block.boards)
+    distance = block.pairs.distance_m
     received = np.flatnonzero(np.isfinite(reception.first_path_index))
     faults, inputs = preprocessing.apply(_columns(reception, distance, received))
     rows = received[faults == 0]
-    is_blocked, is_direct = block.links.path.crossings > 0, reception.direct_above_threshold
+    is_blocked, is_direct = block.pairs.path.crossings > 0, reception.direct_above_threshold
     return Dataset(
         preprocessing,
         inputs,

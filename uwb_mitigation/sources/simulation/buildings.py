@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.sources.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, place
 from uwb_mitigation.sources.simulation.channel import (
     INDUSTRIAL_LOS,
     INDUSTRIAL_NLOS,
@@ -24,7 +25,6 @@ from uwb_mitigation.sources.simulation.channel import (
     Environment,
     direct_power_db,
 )
-from uwb_mitigation.sources.simulation.links import Environments, Links, draw_fields, place
 from uwb_mitigation.sources.simulation.radio import Boards, Radio
 from uwb_mitigation.sources.simulation.scene import (
     BRICK,
@@ -220,7 +220,7 @@ class Block:
 
     kind: str
     building: NDArray[np.int64]
-    links: Links
+    pairs: AntennaPairs
     boards: Boards
 
     def configuration(self, seed: int, number: int, placement: int) -> str:
@@ -244,8 +244,8 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
     rng = np.random.default_rng([seed, number])
     kinds = WIDE_KINDS if wide else KINDS
     kind = kinds[int(rng.choice(len(kinds), p=[kind.share for kind in kinds]))]
-    pairs, shares = zip(*kind.environments, strict=True)
-    environments = pairs[int(rng.choice(len(pairs), p=shares))]
+    environment_pairs, shares = zip(*kind.environments, strict=True)
+    environments = environment_pairs[int(rng.choice(len(environment_pairs), p=shares))]
     each = CANDIDATES * PLACEMENTS // BUILDINGS
     plans = [draw_plan(kind, rng) for _ in range(BUILDINGS)]
     places = [place(plan.size, each, rng) for plan in plans]
@@ -261,7 +261,7 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
     anchor, tag = anchor[chosen], tag[chosen]
     delay_factor = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, MAX_DELAY_FACTOR)
     fields = draw_fields(environments, PLACEMENTS, rng, delay_factor)
-    links = Links(
+    pairs = AntennaPairs(
         anchor,
         tag,
         path.take(chosen),
@@ -270,7 +270,7 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
         np.arange(PLACEMENTS),
         stationary=True,
     )
-    return Block(kind.name, chosen // each, links, boards.take(chosen)), rng
+    return Block(kind.name, chosen // each, pairs, boards.take(chosen)), rng
 
 
 LOS, NLOS, NDP_NLOS, WEAK = range(4)
@@ -299,7 +299,7 @@ def mean_level_dbm(
     path: DirectPath,
     boards: Boards,
 ) -> NDArray[np.float64]:
-    """Return the mean receive level, dBm (n,), of links between antennas at float64 (n, 2) in m with obstacles `path`."""
+    """Return the mean receive level, dBm (n,), of pairs between antennas at float64 (n, 2) in m with obstacles `path`."""
     powers = _mean_powers_db(environments, anchor, tag, path)
     level: NDArray[np.float64] = (
         RADIO.tx_power_dbm

@@ -286,7 +286,7 @@ def draw_diffuse_field(
 
 @dataclass(frozen=True, slots=True)
 class Multipath:
-    """Received paths of n links for 1 mW transmit power.
+    """Received paths of n pairs for 1 mW transmit power.
 
     Attributes:
         delay_ns: float64 (n, paths), relative to a straight line through air; the direct path is first.
@@ -311,7 +311,7 @@ def propagate(
     fading: NDArray[np.complex128],
     rng: np.random.Generator,
 ) -> Multipath:
-    """Join the direct path and the diffuse field of n links.
+    """Join the direct path and the diffuse field of n pairs.
 
     For LOS, the environment's path loss gives the power of all paths, so the diffuse field has this power minus
     that of the direct path, but at least a twentieth (at short distances the direct path can have all of it). For
@@ -321,8 +321,8 @@ def propagate(
         distance_m: straight-line distance, float64 (n,).
         loss_db: loss of the direct path (`simulation.scene`), float64 (n,).
         excess_m: extra optical length of the direct path, float64 (n,).
-        environment: environment of all links.
-        field: diffuse fields of n links; see `draw_diffuse_field`.
+        environment: environment of all pairs.
+        field: diffuse fields of n pairs; see `draw_diffuse_field`.
         fading: gains of the rays, complex128 (n, rays).
         rng: source of the phase of the direct path.
 

@@ -113,7 +113,7 @@ class Reception:
 
 @dataclass(frozen=True, slots=True)
 class Boards:
-    """Board properties of n links (both ends) that differ between boards with the same chip: float64 (n,) each.
+    """Board properties of n pairs (both ends) that differ between boards with the same chip: float64 (n,) each.
 
     Attributes:
         gain_db: transmit power and both antennas, relative to the `Radio`.
@@ -125,7 +125,7 @@ class Boards:
     preamble_symbols: NDArray[np.float64]
 
     def take(self, index: NDArray[np.intp]) -> Boards:
-        """Return the links at `index`, in that order."""
+        """Return the pairs at `index`, in that order."""
         return Boards(self.gain_db[index], self.noise_figure_db[index], self.preamble_symbols[index])
 
 
@@ -177,7 +177,7 @@ class Radio:
         check_range("radio", "preamble_symbols", self.preamble_symbols, 16, 4096, whole=True)
 
     def boards(self, n: int) -> Boards:
-        """Return the properties of n links between identical boards."""
+        """Return the properties of n pairs between identical boards."""
         return Boards(np.zeros(n), np.full(n, self.noise_figure_db), np.full(n, float(self.preamble_symbols)))
 
     @staticmethod
@@ -229,7 +229,7 @@ class Radio:
     def receive(
         self, multipath: Multipath, rng: np.random.Generator, boards: Boards | None = None
     ) -> Reception:
-        """Receive n frames over n links, each with its own sampling phase and noise.
+        """Receive n frames over n pairs, each with its own sampling phase and noise.
 
         Amplitudes are scaled so that the sum of squares over the taps, divided by the square of the
         preamble count, is the received power by the manual's formula.

@@ -21,7 +21,7 @@ class HasAnchors(Protocol):
     anchors: AnchorMap
 
 
-def anchors_file(bag: Path) -> Path:
+def anchors_path(bag: Path) -> Path:
     """Return the path of a bag's anchors file: `X.anchors.yaml` in the folder of `X.mcap`."""
     return bag.with_name(bag.name.removesuffix(".mcap") + ".anchors.yaml")
 

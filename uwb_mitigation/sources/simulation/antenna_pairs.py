@@ -1,4 +1,4 @@
-"""Links between antennas at given positions: obstacles, and shared diffuse fields."""
+"""Antenna pairs at given positions: obstacles, and shared diffuse fields."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ Environments = tuple[Environment, Environment]
 
 
 @dataclass(frozen=True, slots=True)
-class Links:
-    """n links before the radio model.
+class AntennaPairs:
+    """n antenna pairs before the radio model.
 
     Attributes:
         anchor, tag: float64 (n, 2), m.
@@ -49,13 +49,13 @@ class Links:
         distance: NDArray[np.float64] = np.hypot(*(self.tag - self.anchor).T)
         return distance
 
-    def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> Links:
-        """Return links over some of the fields, with new row numbers in `field_of`; field k is that of link k here."""
-        links, (los, nlos) = fields[field_of], self.fields
-        return Links(
-            self.anchor[links],
-            self.tag[links],
-            self.path.take(links),
+    def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> AntennaPairs:
+        """Return pairs over some of the fields, with new row numbers in `field_of`; field k is that of link k here."""
+        pairs, (los, nlos) = fields[field_of], self.fields
+        return AntennaPairs(
+            self.anchor[pairs],
+            self.tag[pairs],
+            self.path.take(pairs),
             self.environments,
             (los.take(fields), nlos.take(fields)),
             field_of,
