@@ -241,6 +241,15 @@ def decode_corrected(data: bytes) -> tuple[MeasurementKey, CorrectedRange]:
     )
 
 
+def decode_frame_id(data: bytes) -> str:
+    """Decode the frame_id from the CDR of a message that starts with a header.
+
+    Raises:
+        RecordingError: the bytes are no such message.
+    """
+    return _decode_header(data)[1]
+
+
 def first_field_offset(end: int) -> int:
     """Return the position of the first 8-byte field of a message whose frame_id ends at `end`."""
     return end + (4 - end) % 8

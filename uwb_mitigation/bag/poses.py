@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import dataclass
 
 import numpy as np
 
 from uwb_mitigation.bag.codec import LITTLE_ENDIAN
 from uwb_mitigation.bag.topics import ODOMETRY_TYPE
 from uwb_mitigation.errors import RecordingError, format_id
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.positioning.tracks import Estimate, Heading
 
 MAP = "map"
 """The anchors' frame (REP-105)."""
@@ -68,22 +69,51 @@ def encode_pose(estimate: Estimate, frame_id: str = MAP) -> bytes:
     return data + _pose(estimate)
 
 
-def encode_odometry(
-    estimate: Estimate, frame_id: str = MAP, child_frame_id: str = UWB_TAG, yaw: float | None = None
-) -> bytes:
-    """Return `nav_msgs/Odometry` in CDR. The child frame has the axes of `frame_id`, and so has the velocity.
+@dataclass(frozen=True, slots=True)
+class BodyTwist:
+    """Velocity in the axes of the child frame.
 
-    With a `yaw` (rad, exact), the orientation is this heading.
+    Attributes:
+        vx, vy, yaw_rate: m/s and rad/s.
+        speed_variance, yaw_rate_variance: of vx and vy, and of the yaw rate.
+    """
+
+    vx: float = 0.0
+    vy: float = 0.0
+    yaw_rate: float = 0.0
+    speed_variance: float = UNOBSERVED
+    yaw_rate_variance: float = UNOBSERVED
+
+
+def encode_odometry(
+    estimate: Estimate,
+    frame_id: str = MAP,
+    child_frame_id: str = UWB_TAG,
+    twist: BodyTwist | None = None,
+) -> bytes:
+    """Return `nav_msgs/Odometry` in CDR.
+
+    Args:
+        estimate: the pose.
+        frame_id: of the pose.
+        child_frame_id: of the tag or the robot.
+        twist: in the axes of the child frame; None: the child frame has the axes of `frame_id`, and the velocity of the
+            estimate is used.
     """
     data = _header(estimate.stamp_ns, frame_id)
     child = child_frame_id.encode() + b"\0"
     data += bytes(-len(data) % 4) + _LENGTH.pack(len(child)) + child
     data += bytes((4 - len(data)) % 8)
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = estimate.covariance[3:, 3:]
-    covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
-    twist = _TWIST.pack(*estimate.velocity, 0.0, 0.0, 0.0, *covariance.reshape(-1))
-    return data + _pose(estimate, yaw) + twist
+    if twist is None:
+        velocity = (*estimate.velocity, 0.0, 0.0, 0.0)
+        covariance[:3, :3] = estimate.covariance[3:, 3:]
+        covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
+    else:
+        velocity = (twist.vx, twist.vy, 0.0, 0.0, 0.0, twist.yaw_rate)
+        variances = (twist.speed_variance, twist.speed_variance, *[UNOBSERVED] * 3, twist.yaw_rate_variance)
+        np.fill_diagonal(covariance, variances)
+    return data + _pose(estimate) + _TWIST.pack(*velocity, *covariance.reshape(-1))
 
 
 def encode_true_position(
@@ -97,8 +127,9 @@ def encode_true_position(
         stamp_ns: time of the position.
         yaw: true heading, rad; None: unknown, the variance is `UNOBSERVED`.
     """
-    place = Estimate(stamp_ns, np.array(position), np.zeros(3), np.zeros((6, 6)))
-    return encode_odometry(place, child_frame_id=tag_frame(tag_id), yaw=yaw)
+    heading = None if yaw is None else Heading(yaw, np.zeros(4))
+    pose = Estimate(stamp_ns, np.array(position), np.zeros(3), np.zeros((6, 6)), heading)
+    return encode_odometry(pose, child_frame_id=tag_frame(tag_id))
 
 
 def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, float], float | None] | None:
@@ -138,11 +169,13 @@ def _header(stamp_ns: int, frame_id: str) -> bytes:
     return _PREFIX.pack(LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame)) + frame
 
 
-def _pose(estimate: Estimate, yaw: float | None = None) -> bytes:
+def _pose(estimate: Estimate) -> bytes:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = estimate.covariance[:3, :3]
     covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
-    if yaw is not None:
-        covariance[3:, 3:] = 0.0
-    turn = (0.0, 0.0, math.sin((yaw or 0.0) / 2.0), math.cos((yaw or 0.0) / 2.0))
-    return _POSE.pack(*estimate.position, *turn, *covariance.reshape(-1))
+    sine, cosine = 0.0, 1.0
+    if (heading := estimate.heading) is not None:
+        sine, cosine = math.sin(heading.yaw / 2.0), math.cos(heading.yaw / 2.0)
+        rows = [0, 1, 2, 5]
+        covariance[5, rows] = covariance[rows, 5] = heading.covariance
+    return _POSE.pack(*estimate.position, 0.0, 0.0, sine, cosine, *covariance.reshape(-1))

@@ -24,20 +24,28 @@ from rclpy.timer import Timer
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_range, measurement_key
+from uwb_mitigation.bag.codec import (
+    MeasurementKey,
+    decode_corrected,
+    decode_frame_id,
+    decode_range,
+    measurement_key,
+)
 from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_of_frame
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement, Status
 from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
+from uwb_mitigation.nodes.robot_motion import RobotMotion, check_frames, transform_type
 from uwb_mitigation.nodes.topic_feed import TopicRanges
 from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.tracks import Estimate, Heading
 from uwb_mitigation.sources.anchors_file import load_anchors
 from uwb_mitigation.sources.mapping import load_mapping, shipped_mappings
 
@@ -93,6 +101,8 @@ class Locator(ManagedNode):
         self._make_estimator: Callable[[AnchorMap], MultiTagEstimator]
         self._outputs: dict[int, _Outputs] = {}
         self._timer: Timer | None = None
+        self._robot: RobotMotion | None = None
+        self.lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._malformed = self._lost = 0
         self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
@@ -110,8 +120,12 @@ class Locator(ManagedNode):
         model = NoiseModel(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
         area = Area.parse(self.value("area"))
+        x, y, z = (float(self.value(f"lever_arm_{axis}")) for axis in "xyz")
+        self.lever_arm = x, y, z
+        robot = RobotData(lever_arm=self.lever_arm) if self.value("odometry") else None
+        path_of_base = DeadReckoning()
         self._make_estimator = lambda anchors: MultiTagEstimator(
-            EstimatorConfig(anchors, model, height, area)
+            EstimatorConfig(anchors, model, height, area, robot=robot), self.value("tag"), path_of_base
         )
         kind, _, topic = path.partition(":")
         if kind not in markers.ANCHOR_TYPES:
@@ -124,9 +138,12 @@ class Locator(ManagedNode):
                 f"parameter tag_frame = {self._plain_frame!r} is the frame of another tag or of the map",
                 valid="a name of its own, such as uwb_tag",
             )
-        self._lever = np.array([self.value(f"lever_arm_{axis}") for axis in "xyz"])
+        self._tolerance_ns = round(self.value("transform_tolerance") * _NANOSECONDS)
         if self.value("publish_tf"):
             self._open_tf()
+        if robot is not None:
+            check_frames(self)
+            self._robot = RobotMotion(self, path_of_base)
         self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
         if kind in markers.ANCHOR_TYPES:
             # Some publishers send the anchors once for late subscribers, others repeatedly.
@@ -157,6 +174,7 @@ class Locator(ManagedNode):
     def close(self) -> None:
         super().close()
         self._outputs, self._anchors_out, self._tf, self._estimator, self._ranges = {}, None, None, None, None
+        self._robot = None
 
     def describe(self) -> diagnostics.Description:
         estimator = self._estimator
@@ -173,15 +191,14 @@ class Locator(ManagedNode):
         return "host", level, text, facts
 
     def _open_tf(self) -> None:
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError as error:
+        message = transform_type()
+        if message is None:
             raise MissingDependencyError(
                 "publish_tf needs tf2_msgs, which is not installed",
                 valid="apt install ros-jazzy-tf2-msgs, or publish_tf:=false",
-            ) from error
-        self._tf = self.publisher(TFMessage, topics.TF, QoSProfile(depth=100))
-        self._make_tf = lambda transforms: TFMessage(transforms=transforms)
+            )
+        self._tf = self.publisher(message, topics.TF, QoSProfile(depth=100))
+        self._make_tf = lambda transforms: message(transforms=transforms)
 
     def _subscribe_to_ranges(self, source: str) -> None:
         if source in shipped_mappings() or source.endswith((".yaml", ".yml")):
@@ -190,6 +207,7 @@ class Locator(ManagedNode):
 
             def on_range(measurement: RangeMeasurement) -> None:
                 if self._estimator is not None and self.is_active:
+                    self._update_lever_arm(self._estimator, measurement.tag_id, lambda: measurement.frame_id)
                     self._add(self._estimator, *_uncorrected(measurement, variance_m2))
 
             source_topics = TopicRanges(self, mapping, "", on_range, self.now_ns)
@@ -227,6 +245,7 @@ class Locator(ManagedNode):
             self._malformed += 1
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return
+        self._update_lever_arm(estimator, key.tag_id, lambda: decode_frame_id(data))
         self._add(estimator, key, corrected)
 
     def _add(self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange) -> None:
@@ -245,7 +264,7 @@ class Locator(ManagedNode):
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
         if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
             outputs.published_ns = stamp_ns
-            self._publish_estimate(outputs, estimate)
+            self._publish_estimate(outputs, estimate, of_robot=tag.estimator is estimator.robot)
         now_ns = time.perf_counter_ns()
         if len(self._processing_ns) < 20_000:
             self._processing_ns.append(now_ns - began_ns)
@@ -266,29 +285,63 @@ class Locator(ManagedNode):
             self.get_logger().info(f"tag {format_id(tag.tag_id)} on {outputs.pose.topic_name}")
         return outputs
 
-    def _publish_estimate(self, outputs: _Outputs, estimate: Estimate) -> None:
+    def _update_lever_arm(self, estimator: MultiTagEstimator, tag_id: int, frame: Callable[[], str]) -> None:
+        """Set the lever arm of the robot's antenna when the frame of its ranges is known on /tf_static."""
+        if self._robot is None or estimator.robot is None or self._robot.lever_arm_is_set:
+            return
+        tag = estimator.tags.get(tag_id)
+        is_of_robot = tag is not None and tag.estimator is estimator.robot
+        if is_of_robot and (arm := self._robot.lever_arm(frame())) is not None:
+            estimator.robot.lever_arm = self.lever_arm = arm
+            self._robot.lever_arm_is_set = True
+            self.get_logger().info(f"lever arm of the antenna: {arm[0]:.3f}, {arm[1]:.3f}, {arm[2]:.3f} m")
+
+    def _publish_estimate(self, outputs: _Outputs, estimate: Estimate, *, of_robot: bool) -> None:
         outputs.picture.add(estimate)
-        outputs.pose.publish(encode_pose(self._at_base(estimate), self._map))
-        outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
+        base, robot = self._at_base(estimate), self._robot if of_robot else None
+        outputs.pose.publish(encode_pose(base, self._map))
+        if robot is None:
+            outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
+        else:
+            twist = robot.twist(estimate.stamp_ns)
+            outputs.odometry.publish(encode_odometry(base, self._map, robot.base_frame or "base_link", twist))
         # tf warns of a repeated stamp.
-        if self._tf is not None and estimate.stamp_ns > outputs.transform_ns:
-            outputs.transform_ns = estimate.stamp_ns
+        if self._tf is None or estimate.stamp_ns <= outputs.transform_ns:
+            return
+        if robot is None:
             x, y, z = estimate.position.tolist()
             transform = TransformStamped(
                 header=topics.header(estimate.stamp_ns, self._map),
                 child_frame_id=outputs.frame,
                 transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
             )
-            self._tf.publish(self._make_tf([transform]))
+        elif (transform := robot.map_to_odom(base, self._tolerance_ns)) is None:
+            return
+        outputs.transform_ns = estimate.stamp_ns
+        self._tf.publish(self._make_tf([transform]))
 
     def _at_base(self, estimate: Estimate) -> Estimate:
-        """Return the estimate of the robot's origin. Its heading is unknown, so a horizontal lever arm may point anywhere."""
-        x, y, z = self._lever.tolist()
+        """Return the estimate of the robot's origin. With an unknown heading, a horizontal lever arm may point anywhere."""
+        x, y, z = self.lever_arm
         if not (x or y or z):
             return estimate
-        covariance = estimate.covariance.copy()
-        covariance[[0, 1], [0, 1]] += (x * x + y * y) / 2.0
-        return replace(estimate, position=estimate.position - (0.0, 0.0, z), covariance=covariance)
+        covariance, heading = estimate.covariance.copy(), estimate.heading
+        if heading is None:
+            covariance[[0, 1], [0, 1]] += (x * x + y * y) / 2.0
+            return replace(estimate, position=estimate.position - (0.0, 0.0, z), covariance=covariance)
+        cosine, sine = math.cos(heading.yaw), math.sin(heading.yaw)
+        arm_x, arm_y = cosine * x - sine * y, sine * x + cosine * y
+        to_base = np.eye(4)
+        to_base[:2, 3] = arm_y, -arm_x
+        pose = np.zeros((4, 4))
+        pose[:3, :3] = covariance[:3, :3]
+        pose[3] = pose[:, 3] = heading.covariance
+        pose = to_base @ pose @ to_base.T
+        covariance[:3, :3] = pose[:3, :3]
+        position = estimate.position - (arm_x, arm_y, z)
+        return replace(
+            estimate, position=position, covariance=covariance, heading=Heading(heading.yaw, pose[3])
+        )
 
     def _on_timer(self) -> None:
         estimator, now_ns = self._estimator, self.now_ns()
@@ -300,7 +353,7 @@ class Locator(ManagedNode):
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
                 ahead = tag.estimator.at(now_ns + self._offset_ns)
                 if ahead is not None:
-                    self._publish_estimate(outputs, ahead)
+                    self._publish_estimate(outputs, ahead, of_robot=tag.estimator is estimator.robot)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
                 outputs.smoothed_ns = tag.latest_ns
                 smoothed = tag.smoother.estimate()

@@ -219,12 +219,23 @@ LOCATOR = (
               "of the node is prepended. Do not use a frame of the robot such as base_link: its heading is unknown here, and a "
               "frame has only one parent in tf."),
     Parameter("lever_arm_x", 0.0, "Position of the antenna in the robot's frame, x. With a lever arm, uwb/pose and "
-              "uwb/pose_smoothed are the position of the robot's origin. The heading is unknown: a horizontal arm only "
-              "widens the covariance.", low=-100.0, high=100.0, unit="m"),
+              "uwb/pose_smoothed are the position of the robot's origin. While the heading is unknown, a horizontal arm "
+              "only widens the covariance. With `odometry`, an arm of 0 in all axes is read from /tf_static.", low=-100.0, high=100.0, unit="m"),
     Parameter("lever_arm_y", 0.0, "The same in y.", low=-100.0, high=100.0, unit="m"),
     Parameter("lever_arm_z", 0.0, "The same in z; subtracted from the height.", low=-100.0, high=100.0, unit="m"),
+    Parameter("odometry", "", "Topic of the robot's odometry (nav_msgs/Odometry): pose increments or twists, with "
+              "covariances. The locator then estimates the heading of the robot with the tag with the plain topic names. "
+              "Empty = ranges only."),
+    Parameter("imu", "", "Topic of the robot's IMU (sensor_msgs/Imu, z axis up); its yaw rate replaces that of "
+              "`odometry`. Empty = none."),
+    Parameter("imu_orientation", False, "Use differences of the IMU's orientation instead of its yaw rate."),
+    Parameter("base_frame", "", "Frame of the robot: child frame of uwb/odometry with `odometry`. Empty = child frame of "
+              "the odometry."),
+    Parameter("transform_tolerance", 1.0, "With `odometry`, map to odom is valid for this time after the stamp of the "
+              "estimate, as in AMCL.", low=0.0, high=60.0, unit="s"),
     Parameter("publish_tf", False, "Publish map_frame to the frame of each tag on /tf, for display and lookups. The "
-              "frame is a leaf without heading: it never replaces odom to base_link or map to odom of the robot."),
+              "frame is a leaf without heading. With `odometry`, publish map_frame to the frame of the odometry (odom) "
+              "for the robot's tag instead, once the heading is known."),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 

@@ -59,6 +59,8 @@ class _Sample(NamedTuple):
     point: PathPoint
     rates: tuple[float, ...]
     """Change of each value of the point per second."""
+    pose: Sequence[float] | None
+    """Pose of the message; None: unknown."""
 
 
 class DeadReckoning:
@@ -79,7 +81,6 @@ class DeadReckoning:
         self.twist_variance = (SPEED_SD**2, YAW_RATE_SD**2)
         self._samples: deque[_Sample] = deque(maxlen=_NUM_SAMPLES)
         self._part = 0
-        self._pose: Sequence[float] | None = None
         self._imu: tuple[int, float, float, float] | None = None
         self._imu_yaw: float | None = None
 
@@ -115,12 +116,12 @@ class DeadReckoning:
         if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
             self._part += 1
             self._samples.clear()
-            self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 7))
-            self._pose, self._imu_yaw = pose, imu_yaw
+            self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 7, pose))
+            self._imu_yaw = imu_yaw
             return
         dt = gap_ns / _SECOND_NS
-        if pose is not None and self._pose is not None:
-            moved = _relative(self._pose, pose)
+        if pose is not None and last.pose is not None:
+            moved = _relative(last.pose, pose)
             poses = (moved[0] / dt, moved[1] / dt, moved[2] / dt)
             if (
                 math.hypot(poses[0], poses[1]) <= 2.0 * speed + JUMP_SPEED
@@ -141,7 +142,7 @@ class DeadReckoning:
         if imu_yaw is not None and self._imu_yaw is not None and self._imu is not None:
             yaw_rate, of_yaw_rate = (imu_yaw - self._imu_yaw) / dt, self._imu[2]
             drift, yaw_density = GYRO_DRIFT, of_yaw_rate * dt
-        self._pose, self._imu_yaw = pose, imu_yaw
+        self._imu_yaw = imu_yaw
         self.twist, self.twist_variance = (vx, vy, yaw_rate), (of_speed, of_yaw_rate)
         middle = last.point.yaw + 0.5 * yaw_rate * dt
         cosine, sine = math.cos(middle), math.sin(middle)
@@ -154,7 +155,7 @@ class DeadReckoning:
             of_speed * dt + share * speed**2,
             yaw_density,
         )
-        self._samples.append(_Sample(stamp_ns, _moved(last.point, rates, dt), rates))
+        self._samples.append(_Sample(stamp_ns, _moved(last.point, rates, dt), rates, pose))
 
     def add_yaw_rate(self, stamp_ns: int, yaw_rate: float, variance: float = 0.0) -> None:
         """Add a yaw rate of an IMU, rad/s, and its variance (0: unknown); an invalid one is rejected."""
@@ -182,17 +183,40 @@ class DeadReckoning:
         known = 0.0 < variance < _MAX_VARIANCE
         self._imu = stamp_ns, yaw_rate, variance if known else YAW_RATE_SD**2, yaw
 
+    def is_available(self, stamp_ns: int) -> bool:
+        """Return whether the motion at a time is known."""
+        return self._before(stamp_ns) is not None
+
     def at(self, stamp_ns: int) -> PathPoint | None:
         """Return the path at a time, by interpolation, or by extrapolation of the latest motion; None: unknown."""
+        found = self._before(stamp_ns)
+        return None if found is None else _moved(found[0].point, found[1], found[2])
+
+    def pose_at(self, stamp_ns: int) -> tuple[float, float, float] | None:
+        """Return x, y and yaw in the frame of the odometry at a time; None: unknown, or messages without a pose."""
+        found = self._before(stamp_ns)
+        if found is None:
+            return None
+        sample, rates, dt = found
+        if sample.pose is None:
+            return None
+        x, y, yaw = sample.pose
+        # The frame of the path is another one.
+        turn = yaw - sample.point.yaw
+        cosine, sine = math.cos(turn), math.sin(turn)
+        dx, dy = rates[0] * dt, rates[1] * dt
+        return x + cosine * dx - sine * dy, y + sine * dx + cosine * dy, yaw + rates[2] * dt
+
+    def _before(self, stamp_ns: int) -> tuple[_Sample, tuple[float, ...], float] | None:
+        """Return the latest sample before a time, the rates after it, and the time since, s."""
         samples = self._samples
         if not samples or stamp_ns > samples[-1].stamp_ns + ODOMETRY_TIMEOUT_S * _SECOND_NS:
             return None
-        later: _Sample | None = None
+        rates = samples[-1].rates
         for sample in reversed(samples):
             if sample.stamp_ns <= stamp_ns:
-                rates = samples[-1].rates if later is None else later.rates
-                return _moved(sample.point, rates, (stamp_ns - sample.stamp_ns) / _SECOND_NS)
-            later = sample
+                return sample, rates, (stamp_ns - sample.stamp_ns) / _SECOND_NS
+            rates = sample.rates
         return None
 
     def _yaw_of_imu(self, stamp_ns: int) -> float | None:

@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError, format_id
+from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.geometry import Shape, protection_levels, shape
+from uwb_mitigation.positioning.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
 from uwb_mitigation.positioning.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
@@ -37,7 +39,7 @@ class FixedLagSmoother:
     def __init__(self, config: EstimatorConfig) -> None:
         # The filter has no offsets of single anchors, and 1.5 s do not determine them.
         self._config = replace(config, model=replace(config.model, pair_sd=0.0))
-        self._states: deque[tuple[int, RangeFilter]] = deque()
+        self._states: deque[tuple[int, RangeFilter, Estimate]] = deque()
         self._ranges: deque[tuple[int, int, float, float]] = deque()
         self._heights: deque[tuple[int, float, float]] = deque(maxlen=_MAX_RANGES)
 
@@ -46,13 +48,21 @@ class FixedLagSmoother:
         if self._ranges:
             self._heights.append((self._ranges[-1][0], height_m, variance_m2))
 
-    def add(self, known: RangeFilter, stamp_ns: int, anchor: int, range_m: float, variance_m2: float) -> None:
-        """Add a range, and the filter after it."""
+    def add(
+        self,
+        known: RangeFilter,
+        stamp_ns: int,
+        anchor: int,
+        range_m: float,
+        variance_m2: float,
+        estimate: Estimate,
+    ) -> None:
+        """Add a range, and the filter and the estimate after it."""
         if self._ranges and stamp_ns < self._ranges[-1][0]:
             self.clear()
         self._ranges.append((stamp_ns, anchor, range_m, variance_m2))
         if not self._states or stamp_ns - self._states[-1][0] >= _EVERY_S * _SECOND_NS:
-            self._states.append((stamp_ns, known.copy()))
+            self._states.append((stamp_ns, known.copy(), estimate))
         oldest = stamp_ns - round((LAG_S + _BEFORE_S + _EVERY_S) * _SECOND_NS)
         for kept in (self._states, self._ranges, self._heights):
             while kept and kept[0][0] < oldest:
@@ -68,7 +78,7 @@ class FixedLagSmoother:
         """Return the position `LAG_S` before the latest range; None: it is not known for that long."""
         if not self._states or len(self._ranges) < 2:
             return None
-        config, (start_ns, known) = self._config, self._states[0]
+        config, (start_ns, known, _) = self._config, self._states[0]
         wanted_ns = self._ranges[-1][0] - round(LAG_S * _SECOND_NS)
         after = [row for row in self._ranges if row[0] > start_ns]
         if start_ns > wanted_ns or len(after) < 2:
@@ -79,7 +89,7 @@ class FixedLagSmoother:
         ranges = Ranges(stamp, anchor, range_m, variance, np.full(len(after), np.nan))
         first = known.copy()
         first.predict(first.time_s + (int(stamp[0]) - start_ns) / _SECOND_NS)
-        states = [(at, one) for at, one in self._states if at > start_ns] or [(int(stamp[0]), first)]
+        states = [(at, one) for at, one, _ in self._states if at > start_ns] or [(int(stamp[0]), first)]
         initial = Track.of([one.estimate(at) for at, one in states])
         if self._heights:
             columns = zip(*self._heights, strict=True)
@@ -91,12 +101,18 @@ class FixedLagSmoother:
         at = int(np.abs(track.stamp_ns - wanted_ns).argmin())
         batch = track.take(slice(at, at + 1))
         batch.position[:] += (wanted_ns - int(track.stamp_ns[at])) / _SECOND_NS * batch.velocity
-        live_ns, live = [state for state in self._states if state[0] <= wanted_ns][-1]
-        live = live.copy()
-        live.predict(live.time_s + (wanted_ns - live_ns) / _SECOND_NS)
-        state, covariance, spread = fused_with_batch(live.x[None, :6], live.P[None, :6, :6], batch)
+        live_ns, live, estimate = [state for state in self._states if state[0] <= wanted_ns][-1]
+        after_s = (wanted_ns - live_ns) / _SECOND_NS
+        if estimate.heading is None:
+            live = live.copy()
+            live.predict(live.time_s + after_s)
+            mean, own = live.x[:6], live.P[:6, :6]
+        else:
+            moved = estimate.position + after_s * estimate.velocity
+            mean, own = np.concatenate([moved, estimate.velocity]), estimate.covariance
+        state, covariance, spread = fused_with_batch(mean[None], own[None], batch)
         position = state[0, :3] if config.area is None else config.area.clip(state[0, :3])
-        return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0])
+        return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0], estimate.heading)
 
 
 @dataclass(slots=True)
@@ -132,9 +148,21 @@ class MultiTagEstimator:
         tags: {tag id: tag}, in the order of their first ranges.
         unknown_anchors: number of ranges from anchors that are not on the map, {anchor id: count}.
         invalid: ranges that were not finite, or negative.
+        odometry: motion of the robot of the config; add its messages.
+        robot: estimator of the tag that this robot carries; None: it was not received yet.
+
+    Args:
+        config: `robot` set: one of the tags is on a robot with odometry.
+        robot_tag: its id; 0: the first tag that is received.
+        odometry: shared with the caller; None: of its own.
     """
 
-    def __init__(self, config: EstimatorConfig) -> None:
+    def __init__(
+        self, config: EstimatorConfig, robot_tag: int = 0, odometry: DeadReckoning | None = None
+    ) -> None:
+        self.odometry = odometry or DeadReckoning()
+        self.robot: RobotEstimator | None = None
+        self._robot_tag = robot_tag
         self.anchors = config.anchors
         self.tags: dict[int, Tag] = {}
         self.unknown_anchors: Counter[int] = Counter()
@@ -162,15 +190,23 @@ class MultiTagEstimator:
             if len(self.tags) >= MAX_TAGS:
                 self.invalid += 1
                 return None
-            tag = self.tags[tag_id] = Tag(tag_id, TagEstimator(self._config), FixedLagSmoother(self._config))
+            tag = self.tags[tag_id] = Tag(
+                tag_id, self._make_estimator(tag_id), FixedLagSmoother(self._config)
+            )
         estimate = tag.estimator.add(stamp_ns, row, range_m, variance_m2)
         tag.latest_ns = stamp_ns
         known = tag.estimator.filter
         if known is None:
             tag.smoother.clear()
         elif estimate is not None:
-            tag.smoother.add(known, stamp_ns, row, range_m, variance_m2)
+            tag.smoother.add(known, stamp_ns, row, range_m, variance_m2, estimate)
         return tag, estimate
+
+    def _make_estimator(self, tag_id: int) -> TagEstimator:
+        if self._config.robot is None or self.robot is not None or self._robot_tag not in (0, tag_id):
+            return TagEstimator(self._config)
+        self.robot = RobotEstimator(self._config, self.odometry)
+        return self.robot
 
     def warnings(self) -> list[str]:
         """Return warnings for the diagnostics; empty: none."""
@@ -180,8 +216,10 @@ class MultiTagEstimator:
             found.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
-            if estimator.filter is None:
+            if not estimator.is_known:
                 found.append(f"{name}: {self._unknown_reason(estimator)}")
+            if isinstance(estimator, RobotEstimator) and not estimator.odometry.is_available(tag.latest_ns):
+                found.append(f"{name}: no odometry at the times of the ranges: estimated from ranges only")
             odd = [self.anchors.anchors[row] for row in estimator.disagreeing()]
             found += [
                 f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
@@ -222,6 +260,14 @@ class MultiTagEstimator:
                 f"{name} innovation mean": f"{estimator.innovation_mean:.2f}",
                 f"{name} innovation square": f"{estimator.innovation_square:.2f}",
             }
+            if isinstance(estimator, RobotEstimator):
+                found |= {
+                    f"{name} heading": _heading_text(estimator),
+                    f"{name} heading found, odometry missing, wrong": ", ".join(
+                        str(counts[key]) for key in ("heading found", "odometry missing", "odometry wrong")
+                    ),
+                    "odometry rejected": estimator.odometry.rejected,
+                }
             geometry = estimator.geometry()
             if geometry is not None and known is not None:
                 levels = protection_levels(known.P)
@@ -231,3 +277,8 @@ class MultiTagEstimator:
                     f"{name} protection level m": ", ".join(f"{level:.2f}" for level in levels),
                 }
         return found
+
+
+def _heading_text(estimator: RobotEstimator) -> str:
+    count = estimator.yaw_hypotheses
+    return "known" if count == 1 else f"{count} hypotheses" if count else "unknown"

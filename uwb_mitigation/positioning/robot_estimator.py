@@ -49,12 +49,16 @@ class _Hypothesis:
 class RobotEstimator(TagEstimator):
     """Locates one tag on a robot. `counts` also has `heading found`, `odometry missing` and `odometry wrong`.
 
+    Args:
+        config: with the recorded motion of the robot, if any.
+        odometry: shared with the caller; None: of its own.
+
     Attributes:
-        odometry: add messages to it in the order of time, before ranges with later stamps.
+        odometry: add live messages to it in the order of time.
     """
 
-    def __init__(self, config: EstimatorConfig) -> None:
-        self.odometry = DeadReckoning()
+    def __init__(self, config: EstimatorConfig, odometry: DeadReckoning | None = None) -> None:
+        self.odometry = odometry or DeadReckoning()
         self._robot = config.robot or RobotData()
         self._known: OdometryFilter | None = None
         self._yaws: list[_Hypothesis] = []
@@ -67,6 +71,22 @@ class RobotEstimator(TagEstimator):
                 self._recorded.extend((stamp, kind, row) for row, stamp in enumerate(data.stamp_ns.tolist()))
         self._recorded = deque(sorted(self._recorded))
         super().__init__(config)
+
+    @property
+    def lever_arm(self) -> tuple[float, float, float]:
+        """The antenna in the frame of the base, m; a change restarts the search for the heading."""
+        return self._robot.lever_arm
+
+    @lever_arm.setter
+    def lever_arm(self, lever_arm: tuple[float, float, float]) -> None:
+        if lever_arm != self._robot.lever_arm:
+            self._robot = replace(self._robot, lever_arm=lever_arm)
+            self._forget(None)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the position is known, with or without a heading."""
+        return self._known is not None or super().is_known
 
     @property
     def yaw_hypotheses(self) -> int:

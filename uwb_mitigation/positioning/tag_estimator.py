@@ -142,6 +142,11 @@ class TagEstimator:
         self.restart()
 
     @property
+    def is_known(self) -> bool:
+        """Whether the position is known."""
+        return self.filter is not None
+
+    @property
     def candidates(self) -> int:
         """The number of plausible positions; 1: the tag is followed, 0: there are too few ranges."""
         return 1 if self.filter is not None else len(self._hypotheses) + len(self._ambiguous_with)

@@ -1,0 +1,254 @@
+"""The node `locator` with odometry as a real process over real DDS: ranges only, with odometry, and odometry lost."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from drives import HALL, NANOSECONDS, Robot, wrapped
+from geometry_msgs.msg import (
+    PoseWithCovarianceStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    TwistWithCovariance,
+    Vector3,
+)
+from nav_msgs.msg import Odometry
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_harness import Ros, diagnostic_values
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from uwb_mitigation.bag.odometry import yaw_of
+from uwb_mitigation.positioning.anchors import dump_anchors
+
+pytestmark = pytest.mark.ros
+
+UNKNOWN_YAW = math.pi**2 / 3.0
+"""Variance of a uniform distribution over all yaws, rad^2."""
+
+LEVER = (0.3, 0.1, 0.2)
+CHUNK_S = 0.2
+
+
+def stamp_ns(header: Header) -> int:
+    return header.stamp.sec * NANOSECONDS + header.stamp.nanosec
+
+
+class LiveRobot:
+    """Publishes ranges and odometry of a robot in chunks, and waits until the locator has processed each."""
+
+    def __init__(self, ros: Ros, *, seconds: float = 40.0, lever=LEVER, imu: bool = False) -> None:
+        self.robot = Robot(lever=lever, facing=0.7, seconds=seconds)
+        self.ranges = self.robot.ranges(seconds=seconds)
+        # So long ago that the locator does not predict poses at the current time.
+        self.start_ns = ros.node.get_clock().now().nanoseconds - round((seconds + 40.0) * NANOSECONDS)
+        self._ros, self._at_s, self._uses_imu = ros, 0.0, imu
+        qos = QoSProfile(depth=1000)
+        self._ranges_out = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", qos)
+        self._odometry_out = ros.node.create_publisher(Odometry, "/odom", qos)
+        self._imu_out = ros.node.create_publisher(Imu, "/imu", qos)
+        self.poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+        self.odometry = ros.collect(Odometry, "/uwb/odometry")
+        self.transforms = ros.collect(TFMessage, "/tf")
+        self.diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
+
+    def wait(self) -> None:
+        self._ros.wait_for_subscribers("/uwb/range_corrected", 1)
+        self._ros.wait_for_subscribers("/odom", 1)
+
+    def header(self, stamp: int, frame: str = "") -> Header:
+        stamp += self.start_ns
+        return Header(stamp=Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS), frame_id=frame)
+
+    def play(self, until_s: float, *, odometry: bool = True) -> None:
+        while self._at_s < until_s - CHUNK_S / 2:
+            begin, end = (round(s * NANOSECONDS) for s in (self._at_s, self._at_s + CHUNK_S))
+            self._at_s += CHUNK_S
+            if odometry:
+                self._send_odometry(begin, end)
+            stamps = self.ranges.stamp_ns
+            rows = np.flatnonzero((stamps >= begin) & (stamps < end)).tolist()
+            for i in rows:
+                self._ranges_out.publish(
+                    RangeCorrected(
+                        header=self.header(int(stamps[i]), "uwb_antenna"),
+                        tag_id=7,
+                        anchor_id=HALL.anchors[self.ranges.anchor[i]].id,
+                        sequence=i,
+                        range=float(self.ranges.range_m[i]),
+                        variance=0.01,
+                    )
+                )
+            last_ns = self.start_ns + int(stamps[rows[-1]])
+            if self._at_s > 1.0:
+                self._ros.spin_until(
+                    lambda last_ns=last_ns: bool(self.poses) and stamp_ns(self.poses[-1].header) >= last_ns
+                )
+
+    def _send_odometry(self, begin: int, end: int) -> None:
+        measured = self.robot.odometry
+        for i in np.flatnonzero((measured.stamp_ns >= begin) & (measured.stamp_ns < end)).tolist():
+            header = self.header(int(measured.stamp_ns[i]), "odom")
+            x, y, yaw = measured.pose[i].tolist()
+            vx, vy, rate = measured.twist[i].tolist()
+            message = Odometry(header=header, child_frame_id="base_link")
+            message.pose.pose.position.x, message.pose.pose.position.y = x, y
+            message.pose.pose.orientation = Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+            twist = TwistWithCovariance()
+            twist.twist.linear.x, twist.twist.linear.y, twist.twist.angular.z = vx, vy, rate
+            twist.covariance[0] = twist.covariance[7] = twist.covariance[35] = 4e-4
+            message.twist = twist
+            self._odometry_out.publish(message)
+            if self._uses_imu:
+                imu = Imu(header=header, angular_velocity=Vector3(z=rate / 1.02))
+                imu.angular_velocity_covariance[8] = 1e-6
+                self._imu_out.publish(imu)
+
+    def values(self) -> dict[str, str]:
+        for array in reversed(self.diagnostics):
+            for status in array.status:
+                if status.name.startswith("locator"):
+                    return diagnostic_values(status) | {"": status.message}
+        return {}
+
+    def poses_between(self, begin_s: float, end_s: float) -> list[PoseWithCovarianceStamped]:
+        limits = [self.start_ns + round(s * NANOSECONDS) for s in (begin_s, end_s)]
+        return [pose for pose in self.poses if limits[0] <= stamp_ns(pose.header) < limits[1]]
+
+    def errors(self, poses: list) -> tuple[np.ndarray, np.ndarray]:
+        """Return horizontal and yaw errors of poses of the base."""
+        time_s = (np.array([stamp_ns(pose.header) for pose in poses]) - self.start_ns) / NANOSECONDS
+        position = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in poses])
+        yaw = np.array([yaw_of(pose.pose.pose.orientation) for pose in poses])
+        away = position - self.robot.base(time_s)[:, :2]
+        return np.hypot(*away.T), wrapped(yaw - self.robot.yaw(time_s))
+
+
+@pytest.fixture
+def anchors(tmp_path: Path) -> Path:
+    path = tmp_path / "anchors.yaml"
+    path.write_text(dump_anchors(HALL))
+    return path
+
+
+def start(ros: Ros, anchors: Path, *parameters: str):
+    height = f"height:={1.0 + LEVER[2]}"
+    return ros.start(
+        "locator", f"anchors:={anchors}", "rate:=0.0", "level:=true", height, "odometry:=/odom", *parameters
+    )
+
+
+def test_three_modes_ranges_only_odometry_and_odometry_lost(ros: Ros, anchors: Path):
+    static = ros.node.create_publisher(
+        TFMessage, "/tf_static", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    )
+    # The antenna is on a mast that is turned by 90 degrees.
+    mast = TransformStamped(child_frame_id="mast", header=Header(frame_id="base_link"))
+    mast.transform = Transform(
+        translation=Vector3(x=0.1), rotation=Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5))
+    )
+    antenna = TransformStamped(child_frame_id="uwb_antenna", header=Header(frame_id="mast"))
+    antenna.transform = Transform(translation=Vector3(x=0.1, y=-0.2, z=0.2), rotation=Quaternion(w=1.0))
+    static.publish(TFMessage(transforms=[antenna, mast]))
+    locator = start(ros, anchors, "publish_tf:=true", "transform_tolerance:=1.0")
+    locator.wait_for_output("locating")
+    live = LiveRobot(ros)
+    live.wait()
+    ros.spin_until(lambda: static.get_subscription_count() == 1)
+
+    live.play(3.0, odometry=False)
+    assert all(pose.pose.covariance[35] >= UNKNOWN_YAW for pose in live.poses)
+    assert {message.child_frame_id for message in live.odometry} == {"base_link"}
+    assert min(message.twist.covariance[0] for message in live.odometry) >= 1e5
+    assert not live.transforms
+
+    live.play(24.0)
+    assert "lever arm of the antenna: 0.300, 0.100, 0.200" in locator.output
+    with_heading = live.poses_between(16.0, 24.0)
+    distance, of_yaw = live.errors(with_heading)
+    sd = np.sqrt([pose.pose.covariance[35] for pose in with_heading])
+    assert np.sqrt(np.mean(distance**2)) < 0.2
+    assert np.sqrt(np.mean(of_yaw**2)) < math.radians(4.0)
+    assert np.mean(np.abs(of_yaw) < 3.0 * sd) > 0.95
+    last = live.odometry[-1]
+    row = np.searchsorted(live.robot.odometry.stamp_ns, stamp_ns(last.header) - live.start_ns)
+    twist = last.twist
+    assert twist.twist.linear.x == pytest.approx(live.robot.odometry.twist[row, 0], abs=0.05)
+    assert twist.covariance[0] < 0.01
+
+    transforms = [one for message in live.transforms for one in message.transforms]
+    assert {(one.header.frame_id, one.child_frame_id) for one in transforms} == {("map", "odom")}
+    _check_lookups(live, transforms)
+
+    live.play(30.0, odometry=False)
+    lost = live.poses_between(25.0, 30.0)
+    assert all(pose.pose.covariance[35] >= UNKNOWN_YAW for pose in lost)
+    assert np.sqrt(np.mean(live.errors(lost)[0] ** 2)) < 0.6
+    ros.spin_until(lambda: "no odometry" in live.values()[""])
+    # The last transform is repeated with new stamps.
+    last_ns = stamp_ns(live.poses[-1].header) + NANOSECONDS
+    ros.spin_until(lambda: stamp_ns(live.transforms[-1].transforms[0].header) == last_ns)
+
+    live.play(40.0)
+    distance, of_yaw = live.errors(live.poses_between(38.0, 40.0))
+    assert np.sqrt(np.mean(of_yaw**2)) < math.radians(6.0)
+    ros.spin_until(lambda: live.values().get("tag 7 heading") == "known")
+
+
+def _check_lookups(live: LiveRobot, transforms: list[TransformStamped]) -> None:
+    """Look up map to base_link at each stamp of the odometry, as tf2 does: by interpolation, without extrapolation."""
+    stamps = [stamp_ns(one.header) for one in transforms]
+    assert stamps == sorted(set(stamps))
+    measured = live.robot.odometry
+    # From the first transform on; the last range is up to 25 ms older than the odometry.
+    first_s = (stamps[0] - live.start_ns) / NANOSECONDS
+    rows = np.flatnonzero(
+        (measured.stamp_ns / NANOSECONDS > first_s) & (measured.stamp_ns < 24 * NANOSECONDS)
+    )
+    assert len(rows) > 500
+    failed, of_yaw = 0, []
+    for i in rows.tolist():
+        at = live.start_ns + int(measured.stamp_ns[i])
+        after = bisect(stamps, at)
+        if after == 0 or after == len(stamps):
+            failed += 1
+            continue
+        near = min(transforms[after - 1 : after + 1], key=lambda one: abs(stamp_ns(one.header) - at))
+        yaw = yaw_of(near.transform.rotation) + measured.pose[i, 2]
+        of_yaw.append(wrapped(yaw - live.robot.yaw(measured.stamp_ns[i : i + 1] / NANOSECONDS))[0])
+    assert failed == 0
+    # Transforms are stamped a second late, as those of AMCL: the odometry drifts little in this time.
+    late = np.array(of_yaw[len(of_yaw) // 2 :])
+    assert np.sqrt(np.mean(late**2)) < math.radians(5.0)
+
+
+def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: Path):
+    arm = [f"lever_arm_{axis}:={value}" for axis, value in zip("xyz", LEVER, strict=True)]
+    locator = start(ros, anchors, *arm, "imu:=/imu", "base_frame:=base_footprint")
+    locator.wait_for_output("locating")
+    live = LiveRobot(ros, seconds=20.0, imu=True)
+    live.wait()
+    live.play(20.0)
+    distance, of_yaw = live.errors(live.poses_between(12.0, 20.0))
+    assert np.sqrt(np.mean(distance**2)) < 0.2
+    assert np.sqrt(np.mean(of_yaw**2)) < math.radians(4.0)
+    assert live.odometry[-1].child_frame_id == "base_footprint"
+    assert not live.transforms
+
+
+def test_base_frame_that_is_the_map_is_refused(ros: Ros, anchors: Path):
+    locator = start(ros, anchors, "base_frame:=map")
+    locator.wait_for_output("base_frame = 'map'")
+    assert locator.exit_code() is None

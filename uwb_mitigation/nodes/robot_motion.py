@@ -1,0 +1,181 @@
+"""Odometry, IMU and transforms of the robot that carries a tag, for the locator."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+
+from uwb_mitigation.bag.odometry import yaw_of
+from uwb_mitigation.bag.poses import BodyTwist
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.nodes import topics
+from uwb_mitigation.nodes.lifecycle import ManagedNode
+from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
+from uwb_mitigation.positioning.tracks import Estimate
+
+Vector = tuple[float, float, float]
+
+HOLD_S = 30.0
+"""The last map to odom is repeated for this time: odometry alone is useful for as long."""
+
+_MAX_FRAMES = 1000
+_NANOSECONDS = 1_000_000_000
+
+
+class RobotMotion:
+    """Subscribes to the topics of the parameters `odometry` and `imu`, and to /tf_static.
+
+    Args:
+        node: the locator, while it is configured.
+        path: integrates the messages.
+
+    Attributes:
+        odom_frame: frame of the odometry; empty before its first message.
+        base_frame: the parameter, or else the child frame of the odometry.
+        lever_arm_is_set: it is a parameter, or was found.
+    """
+
+    def __init__(self, node: ManagedNode, path: DeadReckoning) -> None:
+        self.path, self.odom_frame, self.base_frame = path, "", node.value("base_frame")
+        self._map, self._log = node.value("map_frame"), node.get_logger()
+        self._uses_orientation = node.value("imu_orientation")
+        self._last: TransformStamped | None = None
+        self._last_ns = 0
+        self.lever_arm_is_set = any(node.value(f"lever_arm_{axis}") for axis in "xyz")
+        # {child frame: (parent frame, translation, quaternion x y z w)} of static transforms.
+        self._static: dict[str, tuple[str, Vector, tuple[float, float, float, float]]] = {}
+
+        def subscribe(kind: type, topic: str, callback: Any) -> None:
+            received = topics.create_subscription(node, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT)
+            node.destroy_at_close(received, node.destroy_subscription)
+
+        subscribe(Odometry, node.value("odometry"), self._on_odometry)
+        if node.value("imu"):
+            subscribe(Imu, node.value("imu"), self._on_imu)
+        message = transform_type()
+        if not self.lever_arm_is_set and message is not None:
+            qos = QoSProfile(
+                depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+            )
+            static = node.create_subscription(message, "/tf_static", self._on_static, qos)
+            node.destroy_at_close(static, node.destroy_subscription)
+
+    def lever_arm(self, frame: str) -> Vector | None:
+        """Return the position of a range's frame in the frame of the base, from /tf_static; None: unknown."""
+        point: Vector = (0.0, 0.0, 0.0)
+        for _ in range(len(self._static) + 1):
+            if frame == self.base_frame:
+                return point
+            if frame not in self._static:
+                return None
+            frame, (x, y, z), rotation = self._static[frame]
+            dx, dy, dz = _rotate(rotation, point)
+            point = x + dx, y + dy, z + dz
+        return None
+
+    def twist(self, stamp_ns: int) -> BodyTwist:
+        """Return the velocity of the base at a time; unobserved without odometry."""
+        if not self.path.is_available(stamp_ns):
+            return BodyTwist()
+        return BodyTwist(*self.path.twist, *self.path.twist_variance)
+
+    def map_to_odom(self, base: Estimate, tolerance_ns: int) -> TransformStamped | None:
+        """Return the transform from map to odom for an estimate of the base, valid for `tolerance_ns` longer.
+
+        While the heading is unknown again, the last transform is repeated for `HOLD_S`. None: there is none.
+        """
+        pose, stamp_ns = self.path.pose_at(base.stamp_ns), base.stamp_ns + tolerance_ns
+        if pose is None or base.heading is None or not self.odom_frame:
+            last = self._last
+            if last is None or not 0 <= base.stamp_ns - self._last_ns <= HOLD_S * _NANOSECONDS:
+                return None
+            last.header = topics.header(stamp_ns, self._map)
+            return last
+        odom_x, odom_y, odom_yaw = pose
+        yaw = base.heading.yaw - odom_yaw
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        x, y, z = base.position.tolist()
+        translation = Vector3(
+            x=x - cosine * odom_x + sine * odom_y, y=y - sine * odom_x - cosine * odom_y, z=z
+        )
+        self._last_ns = base.stamp_ns
+        self._last = TransformStamped(
+            header=topics.header(stamp_ns, self._map),
+            child_frame_id=self.odom_frame,
+            transform=Transform(
+                translation=translation,
+                rotation=Quaternion(z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0)),
+            ),
+        )
+        return self._last
+
+    def _on_odometry(self, message: Odometry) -> None:
+        pose, twist, covariance = message.pose.pose, message.twist.twist, message.twist.covariance
+        frame = message.header.frame_id
+        if not self.odom_frame and frame:
+            if frame == self._map:
+                self._log.error(f"the odometry is in the frame {frame} of the anchors: it must be in odom")
+                return
+            self.odom_frame = frame
+            self.base_frame = self.base_frame or message.child_frame_id
+            self._log.info(f"odometry of {self.base_frame} in {frame}")
+        self.path.add(
+            _stamp_ns(message),
+            (pose.position.x, pose.position.y, yaw_of(pose.orientation)),
+            (twist.linear.x, twist.linear.y, twist.angular.z),
+            (covariance[0], covariance[7], covariance[35]),
+        )
+
+    def _on_imu(self, message: Imu) -> None:
+        rate, variance = message.angular_velocity.z, message.angular_velocity_covariance[8]
+        if self._uses_orientation:
+            self.path.add_imu_yaw(_stamp_ns(message), yaw_of(message.orientation), rate, variance)
+        else:
+            self.path.add_yaw_rate(_stamp_ns(message), rate, variance)
+
+    def _on_static(self, message: Any) -> None:
+        for one in message.transforms:
+            t, r = one.transform.translation, one.transform.rotation
+            if len(self._static) < _MAX_FRAMES and all(
+                map(math.isfinite, (t.x, t.y, t.z, r.x, r.y, r.z, r.w))
+            ):
+                self._static[one.child_frame_id] = one.header.frame_id, (t.x, t.y, t.z), (r.x, r.y, r.z, r.w)
+
+
+def transform_type() -> Any:
+    """Return the type of messages on /tf; None: tf2_msgs is not installed."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        return None
+    return TFMessage
+
+
+def check_frames(node: ManagedNode) -> None:
+    """Raise ParameterError if the frames of the robot and the map are equal."""
+    if node.value("base_frame") == node.value("map_frame"):
+        raise ParameterError(
+            f"parameter base_frame = {node.value('base_frame')!r} is the frame of the map",
+            valid="the robot's frame, such as base_link",
+        )
+
+
+def _rotate(q: tuple[float, float, float, float], v: Vector) -> Vector:
+    """Return a vector rotated by a quaternion."""
+    x, y, z, w = q
+    # v + 2 w (q x v) + 2 q x (q x v)
+    cx, cy, cz = y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0]
+    return (
+        v[0] + 2.0 * (w * cx + y * cz - z * cy),
+        v[1] + 2.0 * (w * cy + z * cx - x * cz),
+        v[2] + 2.0 * (w * cz + x * cy - y * cx),
+    )
+
+
+def _stamp_ns(message: Any) -> int:
+    return int(message.header.stamp.sec) * _NANOSECONDS + int(message.header.stamp.nanosec)
