@@ -149,8 +149,8 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     return accepted ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
 }
 
-/* Subtract the predicted error, weighted by the OOD score: the higher the score, the smaller the weight. As in mitigation.py, every product and
- * every sum is rounded: volatile prevents the compiler from fusing them. */
+/* Subtract the predicted error, weighted by the OOD score: the higher the score, the smaller the weight. As in
+ * mitigation.py, every product and every sum is rounded: volatile prevents the compiler from fusing them. */
 static void write_corrected(const uwb_model *model, float range_m, float offset_m, float error_m, float score,
                   uwb_corrected *corrected) {
     const volatile float square = error_m * error_m;

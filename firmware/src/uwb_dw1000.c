@@ -84,7 +84,8 @@ static int is_valid_code(const uwb_dw1000_settings *settings, size_t channel) {
 
 int uwb_dw1000_settings_valid(const uwb_dw1000_settings *settings) {
     const size_t channel = channel_index(settings);
-    return channel < COUNT(channels) && preamble_index(settings) < COUNT(preambles) && rate_index(settings) < COUNT(rates) &&
+    return channel < COUNT(channels) && preamble_index(settings) < COUNT(preambles) &&
+           rate_index(settings) < COUNT(rates) &&
            (settings->prf_mhz == 16 || settings->prf_mhz == 64) && settings->decawave_sfd <= 1 &&
            settings->antenna_delay <= 0x1FFFEu && is_valid_code(settings, channel);
 }

@@ -2,7 +2,7 @@
 
 enum { WRITE = 0x80, SUB_ADDRESS = 0x40, EXTENDED = 0x80 };
 
-/* The header of a transaction: 1 to 3 octets (User Manual, 2.2.1). */
+/* Encode the header of a transaction, 1 to 3 octets (User Manual, 2.2.1); returns its length. */
 static size_t encode_header(uint32_t at, uint8_t write, uint8_t *header) {
     const uint32_t sub = at & 0xFFFFu;
     header[0] = (uint8_t)(write | at >> 16);

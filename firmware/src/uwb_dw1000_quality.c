@@ -2,10 +2,10 @@
 
 #include "uwb_dw1000_registers.h"
 
-/* PMSC_CTRL0: FACE with RXCLKS in the first octet, in the second AMCE and what start leaves there. */
+/* PMSC_CTRL0: FACE and RXCLKS in the first octet; AMCE and the value after the start in the second. */
 enum { RX_CLOCK_PLL = 0x48, AMCE = 0x80, CTRL0_DEFAULT = 0x02 };
 
-/* The manual says 2.5 us, but that is too short while the PLL clocks the chip. */
+/* The 2.5 us of the manual are too short while the PLL clocks the chip. */
 enum { SENSORS_US = 1000 };
 
 /* Symbols of the SFD that RXPACC contains if it is not saturated (User Manual, table 18). */
@@ -56,8 +56,10 @@ uwb_dw1000_status uwb_dw1000_read_cir(uwb_dw1000 *chip, size_t first, size_t cou
     if (count > samples || first > samples - count) {
         return UWB_DW1000_BAD_ARGUMENT;
     }
-    /* Octet by octet: the chip may hang if both change together. Without these clocks it reads as zeros or noise. */
-    static const uwb_dw1000_entry on[] = {{PMSC_CTRL0, 1, RX_CLOCK_PLL}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT | AMCE}, {0, 0, 0}};
+    /* Written octet by octet, because the chip may hang if both change together. Without these clocks the accumulator reads
+     * as zeros or noise. */
+    static const uwb_dw1000_entry on[] = {
+        {PMSC_CTRL0, 1, RX_CLOCK_PLL}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT | AMCE}, {0, 0, 0}};
     static const uwb_dw1000_entry off[] = {{PMSC_CTRL0, 1, 0}, {PMSC_CTRL0 + 1, 1, CTRL0_DEFAULT}, {0, 0, 0}};
     DW1000_TRY(uwb_dw1000_write_list(chip, on));
     DW1000_TRY(uwb_dw1000_read(chip, ACC_MEM | (uint32_t)(4 * first), octets, 1 + 4 * count));

@@ -4,7 +4,7 @@ enum { TX_CLOCK_PLL = 2 << 4, POLL_US = 100, MAX_TIMEOUT_US = 60000, SMART_POWER
 static const double WAIT_UNIT_US = 512 / 499.2;
 
 uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip) {
-    /* The interrupts are masked, since one may be raised between TRXOFF and the clearing of what it left. */
+    /* The interrupts are masked, because an event may occur between TRXOFF and the clearing of the status. */
     static const uwb_dw1000_entry entries[] = {
         {SYS_MASK, 4, 0},
         {SYS_CTRL, 4, TRXOFF},
@@ -12,7 +12,7 @@ uwb_dw1000_status uwb_dw1000_idle(uwb_dw1000 *chip) {
         {SYS_MASK, 4, UWB_DW1000_INTERRUPTS},
         {0, 0, 0},
     };
-    /* The manual wants it after most errors (4.1.6): stamps would be wrong from then on. One may just have happened. */
+    /* The manual requires it after most errors (4.1.6), because timestamps would be wrong. An error may just have occurred. */
     static const uwb_dw1000_entry reset_receiver[] = {{PMSC_SOFTRESET, 1, 0xE0}, {PMSC_SOFTRESET, 1, 0xF0}, {0, 0, 0}};
     DW1000_TRY(uwb_dw1000_write_list(chip, entries));
     if (chip->listening) {
@@ -57,6 +57,7 @@ static uwb_dw1000_status set_timeout(uwb_dw1000 *chip, uint32_t for_us) {
     return UWB_DW1000_OK;
 }
 
+/* Write frame and length to the chip, and set the timeout of the answer. */
 static uwb_dw1000_status prepare_frame(uwb_dw1000 *chip, const uint8_t *octets, size_t bytes, uint32_t answer_us) {
     if (bytes + 2 > UWB_DW1000_MAX_FRAME_BYTES) {
         return UWB_DW1000_BAD_ARGUMENT;
@@ -126,7 +127,7 @@ uwb_dw1000_status uwb_dw1000_await_sent(uwb_dw1000 *chip, uint64_t until_us, uin
     if ((chip->sys_cfg & DIS_STXP) == 0) {
         chip->next_send_us = chip->io.now_us(chip->io.context) + SMART_POWER_US;
     }
-    /* A delayed frame would leave TXFRS set until it starts, and it would pass for that frame's. */
+    /* Clear TXFRS: while a delayed frame waits, the flag of the previous frame would stay set. */
     DW1000_TRY(uwb_dw1000_set(chip, SYS_STATUS, 4, TX_BITS));
     return stamp != NULL ? uwb_dw1000_get(chip, TX_TIME, 5, stamp) : UWB_DW1000_OK;
 }
@@ -141,6 +142,7 @@ uwb_dw1000_status uwb_dw1000_listen(uwb_dw1000 *chip, uint32_t for_us) {
     return UWB_DW1000_OK;
 }
 
+/* Read contents, timestamp and first path of the received frame. */
 static uwb_dw1000_status read_frame(uwb_dw1000 *chip, uwb_dw1000_frame *frame) {
     uint64_t info;
     uint8_t time[9];
@@ -163,7 +165,6 @@ static uwb_dw1000_status read_frame(uwb_dw1000 *chip, uwb_dw1000_frame *frame) {
     return uwb_dw1000_set(chip, SYS_STATUS, 4, RX_BITS);
 }
 
-/* TIMEOUT with the receiver still on if nothing happens by `until_us`. */
 uwb_dw1000_status uwb_dw1000_receive_keep_on(uwb_dw1000 *chip, uwb_dw1000_frame *frame, uint64_t until_us) {
     for (;;) {
         uint64_t status;

@@ -1,4 +1,4 @@
-/* Registers of the DW1000 by the names of the User Manual, and how they are reached. Internal. */
+/* Registers of the DW1000 with the names of the User Manual, and functions to access them. Internal. */
 #ifndef UWB_DW1000_REGISTERS_H
 #define UWB_DW1000_REGISTERS_H
 
@@ -82,7 +82,7 @@ enum {
 #define WAIT4RESP (1u << 7)
 #define RXENAB (1u << 8)
 
-/* SYS_STATUS, whose fifth octet is here above bit 31 */
+/* SYS_STATUS; the fifth octet is bits 32 to 39 */
 #define CPLOCK ((uint64_t)1 << 1)
 #define TXFRS ((uint64_t)1 << 7)
 #define LDEDONE ((uint64_t)1 << 10)
@@ -108,18 +108,18 @@ enum {
 /* Events that raise the IRQ line: a received frame, or an error. */
 #define UWB_DW1000_INTERRUPTS ((uint32_t)(RXFCG | RX_ERRORS | RX_TIMEOUTS))
 
-/* In PANADR, which nothing else uses since frames are filtered by the exchange: after a reset it reads as ones. */
+/* Value of PANADR, which is otherwise unused because the exchange filters frames: after a reset it reads as ones. */
 #define UWB_DW1000_CANARY 0x5542A55Au
 
 /* Read or write `bytes` octets of a register, in one chip-select period. */
 uwb_dw1000_status uwb_dw1000_read(uwb_dw1000 *chip, uint32_t at, uint8_t *octets, size_t bytes);
 uwb_dw1000_status uwb_dw1000_write(uwb_dw1000 *chip, uint32_t at, const uint8_t *octets, size_t bytes);
 
-/* The same for a number of up to 8 octets. */
+/* Read or write a little-endian number of up to 8 octets. */
 uwb_dw1000_status uwb_dw1000_get(uwb_dw1000 *chip, uint32_t at, size_t bytes, uint64_t *value);
 uwb_dw1000_status uwb_dw1000_set(uwb_dw1000 *chip, uint32_t at, size_t bytes, uint64_t value);
 
-/* Write registers from a list that ends with one of no bytes. */
+/* Write a list of registers; the last entry has 0 bytes. */
 typedef struct {
     uint32_t at;
     uint32_t bytes;
@@ -127,8 +127,10 @@ typedef struct {
 } uwb_dw1000_entry;
 uwb_dw1000_status uwb_dw1000_write_list(uwb_dw1000 *chip, const uwb_dw1000_entry *entries);
 
-/* Symbols of the SFD, and octets as a little-endian number. */
+/* Return the number of symbols of the SFD. */
 uint32_t uwb_dw1000_sfd_symbols(const uwb_dw1000_settings *settings);
+
+/* Decode a little-endian number. */
 uint64_t uwb_dw1000_from_little_endian(const uint8_t *octets, size_t bytes);
 
 /* Return from the calling function if the status is not OK. */

@@ -163,8 +163,8 @@ static size_t ring_write(uwb_queue *queue, size_t at, const void *data, size_t b
 }
 
 /* Write a frame at `at`, wrapped, if it fits and leaves `reserve` bytes free; returns whether it was written. */
-static int ring_write_frame(uwb_queue *queue, size_t at, const uwb_header_t *header, const void *payload, size_t payload_bytes,
-                     size_t reserve) {
+static int ring_write_frame(uwb_queue *queue, size_t at, const uwb_header_t *header, const void *payload,
+                            size_t payload_bytes, size_t reserve) {
     const uint16_t length = (uint16_t)payload_bytes;
     const size_t free_bytes = queue->capacity - queue->used;
     const size_t needed = QUEUED_BYTES(payload_bytes);

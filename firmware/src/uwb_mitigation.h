@@ -152,7 +152,7 @@ typedef enum {
 /* With any status except OK, the raw range minus the offset is passed through, with a larger variance. */
 typedef struct {
     float range_m;
-    float correction_m; /* offset + predicted error (linear bias + network); only the offset if the range is passed through */
+    float correction_m; /* offset + predicted error (linear bias + network); only the offset if passed through */
     float variance_m2;  /* infinite where the range is not valid */
     uwb_range_status status;
 } uwb_corrected;

@@ -194,8 +194,8 @@ uwb_twr_event uwb_ranger_step(uwb_ranger *ranger) {
     }
     const uwb_twr_event event = uwb_twr_step(&ranger->twr, now_us(ranger) + UWB_RANGER_STEP_US);
     if (event == UWB_TWR_RANGED) {
-        (void)uwb_board_process_measurement(&ranger->board, ranger->twr.measurement, uwb_twr_measurement_bytes(&ranger->twr),
-                             ranger->twr.measured_us);
+        (void)uwb_board_process_measurement(&ranger->board, ranger->twr.measurement,
+                                            uwb_twr_measurement_bytes(&ranger->twr), ranger->twr.measured_us);
     }
     send_due_messages(ranger);
     return event;

@@ -75,7 +75,14 @@ typedef struct {
 } uwb_twr_anchor;
 
 /* Types of frames. DISCOVER is a broadcast; anchors answer it with DISCOVER_REPLY. */
-typedef enum { UWB_TWR_DISCOVER = 1, UWB_TWR_DISCOVER_REPLY, UWB_TWR_POLL, UWB_TWR_ANSWER, UWB_TWR_FINAL, UWB_TWR_REPORT } uwb_twr_frame_type;
+typedef enum {
+    UWB_TWR_DISCOVER = 1,
+    UWB_TWR_DISCOVER_REPLY,
+    UWB_TWR_POLL,
+    UWB_TWR_ANSWER,
+    UWB_TWR_FINAL,
+    UWB_TWR_REPORT
+} uwb_twr_frame_type;
 
 typedef struct {
     uwb_twr_frame_type kind;

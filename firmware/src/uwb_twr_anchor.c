@@ -12,7 +12,10 @@ enum {
 static uwb_dw1000_status send_frame(uwb_twr *twr, const uwb_twr_frame *frame) {
     uint8_t octets[UWB_TWR_MAX_FRAME_BYTES];
     const uwb_dw1000_status status = uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(frame, octets), 0);
-    return status == UWB_DW1000_OK ? uwb_dw1000_await_sent(&twr->chip, uwb_twr_now_us(twr) + SEND_TIMEOUT_US, NULL) : status;
+    if (status != UWB_DW1000_OK) {
+        return status;
+    }
+    return uwb_dw1000_await_sent(&twr->chip, uwb_twr_now_us(twr) + SEND_TIMEOUT_US, NULL);
 }
 
 /* Answer a tag that looks for anchors, at a random time so that answers rarely collide. */

@@ -4,16 +4,22 @@
 
 #include "uwb_twr.h"
 
-/* Perform one step in the role of a tag, or of an anchor; see uwb_twr_step. */
+/* Perform one step of a tag; see uwb_twr_step. */
 uwb_twr_event uwb_twr_tag_step(uwb_twr *twr, uint64_t until_us);
+
+/* Perform one step of an anchor; see uwb_twr_step. */
 uwb_twr_event uwb_twr_anchor_step(uwb_twr *twr, uint64_t until_us);
 
-/* Return the time, and sleep until a time, by the clock of io.now_us. */
+/* Return the time of io.now_us. */
 uint64_t uwb_twr_now_us(const uwb_twr *twr);
+
+/* Sleep until a time of io.now_us. */
 void uwb_twr_sleep_until(const uwb_twr *twr, uint64_t until_us);
 
-/* Return a random number below `limit`, which is not 0; or one of 32 bits. */
+/* Return a random number below `limit`, which is not 0. */
 uint32_t uwb_twr_random_below(uwb_twr *twr, uint32_t limit);
+
+/* Return a random number of 32 bits. */
 uint32_t uwb_twr_random(uwb_twr *twr);
 
 /* Return a frame from this radio to `to`. */

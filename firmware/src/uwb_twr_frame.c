@@ -95,7 +95,8 @@ int uwb_twr_read(const uint8_t *octets, size_t bytes, uwb_twr_frame *frame) {
     frame->to = read_le(octets, &at, broadcast ? 2 : 8);
     frame->from = read_le(octets, &at, 8);
     const uint64_t mark = read_le(octets, &at, 1), kind = read_le(octets, &at, 1);
-    if (mark != PAYLOAD_MARK || kind < UWB_TWR_DISCOVER || kind > UWB_TWR_REPORT || (kind == UWB_TWR_DISCOVER) != broadcast ||
+    if (mark != PAYLOAD_MARK || kind < UWB_TWR_DISCOVER || kind > UWB_TWR_REPORT ||
+        (kind == UWB_TWR_DISCOVER) != broadcast ||
         (broadcast && frame->to != BROADCAST_SHORT)) {
         return 0;
     }
@@ -133,12 +134,14 @@ static uint64_t ticks_between(uint64_t later, uint64_t earlier) {
 int uwb_twr_range_m(const uint64_t tag[UWB_TWR_STAMPS], const uint64_t anchor[UWB_TWR_STAMPS], double *range_m) {
     const uint64_t round_1 = ticks_between(tag[1], tag[0]), reply_1 = ticks_between(anchor[1], anchor[0]);
     const uint64_t round_2 = ticks_between(anchor[2], anchor[1]), reply_2 = ticks_between(tag[2], tag[1]);
-    if (round_1 > MAX_INTERVAL_TICKS || round_2 > MAX_INTERVAL_TICKS || reply_1 > MAX_INTERVAL_TICKS || reply_2 > MAX_INTERVAL_TICKS || reply_1 == 0 ||
+    if (round_1 > MAX_INTERVAL_TICKS || round_2 > MAX_INTERVAL_TICKS || reply_1 > MAX_INTERVAL_TICKS ||
+        reply_2 > MAX_INTERVAL_TICKS || reply_1 == 0 ||
         reply_2 == 0) {
         return 0;
     }
     const int64_t flight_1 = (int64_t)round_1 - (int64_t)reply_1, flight_2 = (int64_t)round_2 - (int64_t)reply_2;
-    if (flight_1 > MAX_FLIGHT_TICKS || flight_1 < -MAX_FLIGHT_TICKS || flight_2 > MAX_FLIGHT_TICKS || flight_2 < -MAX_FLIGHT_TICKS) {
+    if (flight_1 > MAX_FLIGHT_TICKS || flight_1 < -MAX_FLIGHT_TICKS || flight_2 > MAX_FLIGHT_TICKS ||
+        flight_2 < -MAX_FLIGHT_TICKS) {
         return 0;
     }
     const int64_t product =
