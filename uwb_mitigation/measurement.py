@@ -68,7 +68,7 @@ class Status(enum.IntEnum):
 
 
 class Origin(enum.IntEnum):
-    """Who computed a correction; the values of the `source` field of `RangeCorrected.msg`."""
+    """Device that computed a correction; the values of the `source` field of `RangeCorrected.msg`."""
 
     HOST = 0
     DEVICE = 1

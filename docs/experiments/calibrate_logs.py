@@ -8,7 +8,7 @@
 the EVK1000 logs; almost none of them received enough anchors, so they are refused. `harm` calibrates each drive and both halves
 of it. All six drives are refused, because they lead up to 50 m away from anchors that are 4 m apart and the common offset is
 not observable. With `--force` no position would become worse by more than 4 %. The constants of the slow errors (0.05 m, 20 s) were
-chosen on these drives, so they are no clean hold-out.
+chosen on these drives, so they are not a clean hold-out.
 """
 
 from __future__ import annotations

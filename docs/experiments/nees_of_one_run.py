@@ -1,6 +1,6 @@
 """Simulate how much the NEES of a single drive varies if the error model is exact.
 
-Each Hanyang drive is repeated with its own times, anchors and true path, and with ranges that err exactly as the model says,
+Each Hanyang drive is repeated with its own times, anchors and true path, and with ranges whose errors follow the noise model exactly,
 20 times. Errors that persist leave few independent samples per drive: the 5th to 95th percentiles of the live NEES per degree of
 freedom are 0.7 to 3.3 in five drives and up to 82 in NLOS_B4, so no model can guarantee 0.5 to 2 in each drive.
 

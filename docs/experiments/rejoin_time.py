@@ -64,11 +64,11 @@ COMMANDS = {
     "plain publisher": [sys.executable, "-c", BARE_PUBLISHER],
 }
 rclpy.init()
-client, got = Node("client"), {"raw": 0, "corrected": 0}
+client, received = Node("client"), {"raw": 0, "corrected": 0}
 
 
 def count(name):
-    got[name] += 1
+    received[name] += 1
 
 
 client.create_subscription(RangeCir, "/uwb/range_raw", lambda _: count("raw"), 1000)
@@ -80,8 +80,8 @@ def start(name):
 
 
 def wait_for(name):
-    got[name] = 0
-    while not got[name]:
+    received[name] = 0
+    while not received[name]:
         rclpy.spin_once(client, timeout_sec=0.01)
 
 

@@ -131,9 +131,9 @@ def reading() -> Iterator[Callable[[], None]]:
         yield on_record
 
 
-def show_skipped(refused: Mapping[str, int]) -> None:
-    """Print the number of refused ranges by reason, {reason: count}."""
-    for reason, count in refused.items():
+def show_skipped(skipped: Mapping[str, int]) -> None:
+    """Print the number of skipped ranges by reason, {reason: count}."""
+    for reason, count in skipped.items():
         err.print(f"skipped: {count} x {reason}", markup=False)
 
 

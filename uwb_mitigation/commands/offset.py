@@ -78,17 +78,17 @@ def offset(
     )
     mitigation = Mitigation(bundle_for(model, bag))
     with open_recording(bag) as source, console.reading() as on_record:
-        found = radio_offsets.estimate_offset(
+        estimate = radio_offsets.estimate_offset(
             mitigation, source, distance, tag_id=tag_id, anchor_id=anchor_id, on_record=on_record
         )
-    _show(found)
+    _show(estimate)
     if output is not None:
         comment = (
-            f"Antenna delays, m, for model {found.model_id:08x}, estimated by uwb-mitigation offset in {bag.name}.\n"
-            f"Standard deviation {found.sd_m:.3f} m."
+            f"Antenna delays, m, for model {estimate.model_id:08x}, estimated by uwb-mitigation offset in {bag.name}.\n"
+            f"Standard deviation {estimate.sd_m:.3f} m."
         )
-        write_atomically(output, dump_offsets(found.offsets(common=common), comment), ParameterError)
-    console.write_json(json, found.as_json())
+        write_atomically(output, dump_offsets(estimate.offsets(common=common), comment), ParameterError)
+    console.write_json(json, estimate.as_json())
 
 
 def _id(name: str, text: str) -> int:
@@ -100,27 +100,36 @@ def _id(name: str, text: str) -> int:
         ) from error
 
 
-def _show(found: OffsetEstimate) -> None:
+def _show(estimate: OffsetEstimate) -> None:
     from uwb_mitigation.commands.console import MAX_ROWS, print_line, show_table
 
     rows: list[tuple[object, ...]] = []
-    for one in found.placements:
-        pair = format_id(one.anchor_id), format_id(one.tag_id)
-        values = ("", "") if one.refused else (one.offset_m, one.sd_m)
-        rows.append((*pair, one.placement, one.ranges, *values, f"{one.power_gap_db:.1f}", one.predicted_m))
+    for placement in estimate.placements:
+        pair = format_id(placement.anchor_id), format_id(placement.tag_id)
+        values = ("", "") if placement.refused else (placement.offset_m, placement.sd_m)
+        rows.append(
+            (
+                *pair,
+                placement.placement,
+                placement.ranges,
+                *values,
+                f"{placement.power_gap_db:.1f}",
+                placement.predicted_m,
+            )
+        )
     show_table(
         "",
         ("anchor", "tag", "placement", "ranges", "offset, m", "sd, m", "power gap, dB", "predicted error, m"),
         rows,
     )
-    refused = [one for one in found.placements if one.refused]
-    for one in refused[:MAX_ROWS]:
-        pair = format_id(one.anchor_id), format_id(one.tag_id)
-        text = f"skipped: anchor {pair[0]}, tag {pair[1]} {one.placement}: {one.refused}"
+    rejected = [placement for placement in estimate.placements if placement.refused]
+    for placement in rejected[:MAX_ROWS]:
+        pair = format_id(placement.anchor_id), format_id(placement.tag_id)
+        text = f"skipped: anchor {pair[0]}, tag {pair[1]} {placement.placement}: {placement.refused}"
         console.err.print(text, markup=False)
-    if len(refused) > MAX_ROWS:
-        console.err.print(f"skipped: {len(refused) - MAX_ROWS} more placements")
+    if len(rejected) > MAX_ROWS:
+        console.err.print(f"skipped: {len(rejected) - MAX_ROWS} more placements")
     print_line(
-        f"offset {found.offset_m:.3f} m, standard deviation {found.sd_m:.3f} m, from {found.ranges} ranges, "
-        f"for model {found.model_id:08x}"
+        f"offset {estimate.offset_m:.3f} m, standard deviation {estimate.sd_m:.3f} m, from {estimate.ranges} ranges, "
+        f"for model {estimate.model_id:08x}"
     )

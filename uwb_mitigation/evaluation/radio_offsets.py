@@ -45,7 +45,7 @@ class PlacementOffset:
 
     Attributes:
         ranges: number of ranges that were used.
-        offset_m, sd_m: computed with medians; NaN if refused.
+        offset_m, sd_m: computed with medians; NaN if not used.
         noise_sd_m: the part of `sd_m` that more ranges reduce.
         power_gap_db: median of receive level minus first-path level, as reported or from the CIR; NaN: unknown.
         predicted_m: median of the predicted errors; NaN if no error was predicted.
@@ -71,7 +71,7 @@ class OffsetEstimate:
     Attributes:
         offset_m, sd_m: median over placements, and its standard deviation.
         ranges: number of ranges that were used.
-        placements: all placements, including refused ones.
+        placements: all placements, including those that are not used.
         model_id: id of the model for the predicted errors.
     """
 

@@ -83,7 +83,7 @@ def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Spli
         # Measurements without a configuration name count as one configuration and must not be in both parts.
         is_train = ~np.isin(dataset.configurations, np.unique(dataset.configurations[held_out]))
         if not is_train.any():
-            raise DatasetError("one configuration holds every tag or anchor", valid="named configurations")
+            raise DatasetError("one configuration contains every tag or anchor", valid="named configurations")
         splits.append(Split(np.flatnonzero(is_train), np.flatnonzero(held_out)))
     return splits
 

@@ -70,7 +70,7 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     The offset of a pair of boards is a median over placements: errors of one placement are not independent.
 
     Raises:
-        ModelError: ONNX Runtime refuses the bundle's network.
+        ModelError: ONNX Runtime rejects the bundle's network.
     """
     linear_bias = bundle.card.linear_bias.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
     predicted = (linear_bias + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)

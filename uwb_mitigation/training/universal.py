@@ -161,6 +161,6 @@ def _evaluate(
 
 
 def _balanced_rows(labels: NDArray[np.str_]) -> NDArray[np.intp]:
-    """Return rows with each condition equally often: its frequency at a site is unknown, and intervals must hold in all."""
+    """Return rows with each condition equally often: its frequency at a site is unknown, and the intervals must be valid in all of them."""
     conditions = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     return np.concatenate([part[: min(map(len, conditions))] for part in conditions])
