@@ -190,14 +190,14 @@ def calibrate(
         console.write_json(json, calibration.as_json() | {"refused": str(no_gain)})
         raise no_gain
     name = ", ".join(bag.resolve().name for bag in bags)
+    bundle, offsets_path = calibration.write(output, source, name)
+    print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     if report is not None:
         from uwb_mitigation.files import write_atomically
         from uwb_mitigation.training.site_page import site_page
 
-        write_atomically(report, site_page(calibration, name))
+        write_atomically(report, site_page(calibration, name, bundle, (str(output), str(offsets_path))))
         print_line(f"Wrote {report}.")
-    bundle, offsets_path = calibration.write(output, source, name)
-    print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     console.write_json(
         json, calibration.as_json() | {"model_id": bundle.model_id, "offsets_file": str(offsets_path)}
     )

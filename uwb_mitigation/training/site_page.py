@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
+
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.evaluation.page import render_page
+from uwb_mitigation.model.bundle import Bundle
 from uwb_mitigation.training.site_calibration import SiteCalibration
+from uwb_mitigation.viewer import palette
 
 MAX_POINTS = 2000
-WIDTH, HEIGHT, MARGIN = 720.0, 480.0, 36.0
+WIDTH, HEIGHT, MARGIN = 380.0, 280.0, 24.0
+"""Size of the plan, pixels: readable on a phone."""
+ROW, LEFT = 58.0, 12.0
+"""Height of an anchor in the figure of the residuals, and its left margin, pixels."""
+PERCENTILES = (5, 25, 50, 75, 95)
 
 
-def site_page(calibration: SiteCalibration, name: str) -> str:
-    """Return one HTML page without external resources; `name`: name of the recordings.
+def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tuple[str, str]) -> str:
+    """Return one HTML page without external resources.
+
+    Args:
+        calibration: the result.
+        name: names of the recordings.
+        bundle: the model that was written.
+        files: names of the files of the model and of the offsets.
 
     Raises:
         MissingDependencyError: jinja2 is not installed.
@@ -22,14 +36,14 @@ def site_page(calibration: SiteCalibration, name: str) -> str:
     solution, data = calibration.solution, calibration.data
     assert data.anchors is not None
     by_anchor: list[tuple[str, int, float, float]] = []
+    boxes: list[tuple[str, list[list[float]]]] = []
     for anchor in calibration.site.anchors.anchors:
         anchor_rows = data.anchors == anchor.id
         if anchor_rows.any():
-            before, after = (
-                float(np.abs(error[anchor_rows]).mean())
-                for error in (calibration.raw_error_m, calibration.held_out_error_m)
-            )
+            errors = [error[anchor_rows] for error in (calibration.raw_error_m, calibration.held_out_error_m)]
+            before, after = (float(np.abs(error).mean()) for error in errors)
             by_anchor.append((str(anchor), int(anchor_rows.sum()), before, after))
+            boxes.append((str(anchor), [np.percentile(error, PERCENTILES).tolist() for error in errors]))
     details = []
     if solution.alignment is not None:
         arms = "; ".join(", ".join(f"{value:.3f}" for value in arm) for arm in solution.alignment.lever_arm_m)
@@ -52,7 +66,11 @@ def site_page(calibration: SiteCalibration, name: str) -> str:
         details=details,
         notes=calibration.notes,
         by_anchor=by_anchor,
-        worst=max([max(row[2:]) for row in by_anchor] + [1e-9]),
+        residuals=_residuals(boxes),
+        date=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
+        model_id=f"{bundle.model_id:08x}",
+        files=files,
+        colours={"raw": palette.VERMILLION, "calibrated": palette.BLUE},
         offsets=offsets,
         candidates={"raw": calibration.raw_mae_m, **calibration.selection.mae()},
         chosen=calibration.selection.chosen,
@@ -60,6 +78,25 @@ def site_page(calibration: SiteCalibration, name: str) -> str:
         height=HEIGHT,
         plan=_plan(calibration),
     )
+
+
+def _residuals(boxes: list[tuple[str, list[list[float]]]]) -> dict[str, object]:
+    """Return the figure of the residuals in pixels: for each anchor the percentiles before and after."""
+    values = np.array([box for _, pair in boxes for box in pair] or [[0.0, 1.0]])
+    low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
+    step = next(step for step in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 1e9) if high - low <= 6 * step)
+    scale = (WIDTH - 2 * LEFT) / max(high - low, 1e-9)
+
+    def pixel(value: float) -> float:
+        return round(LEFT + (value - low) * scale, 1)
+
+    ticks = np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step
+    return {
+        "height": ROW * len(boxes) + 30.0,
+        "row": ROW,
+        "ticks": [(pixel(tick), f"{tick:g}") for tick in ticks.round(1).tolist()],
+        "boxes": [(anchor, [[pixel(value) for value in box] for box in pair]) for anchor, pair in boxes],
+    }
 
 
 def _plan(calibration: SiteCalibration) -> dict[str, object]:
