@@ -37,6 +37,8 @@ def generate(monkeypatch: pytest.MonkeyPatch):
         "launch": {"LaunchDescription": lambda entities: entities},
         "launch.actions": {
             "DeclareLaunchArgument": record("argument"),
+            "GroupAction": record("group"),
+            "IncludeLaunchDescription": record("include"),
             "OpaqueFunction": record("function"),
         },
         "launch.substitutions": {
@@ -307,3 +309,27 @@ def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate
 def test_malformed_board_is_refused(generate, text: str):
     with pytest.raises(ValueError, match="NAME=PORT"):
         launch(generate, "boards.launch.py", boards=text)
+
+
+def test_nav2_gets_the_transform_of_the_locator_and_no_amcl(generate):
+    entities = generate("nav2.launch.py")
+    groups = [entity.values[0] for entity in entities if entity.kind == "group"]
+    assert all(len(group) == 1 for group in groups), "each file in a scope of its own"
+    included = {group[0].values[0][0]: group[0] for group in groups}
+    assert {share: one.values[0][1:] for share, one in included.items()} == {
+        "share/uwb_mitigation": ["launch", "uwb.launch.py"],
+        "share/nav2_bringup": ["launch", "navigation_launch.py"],
+    }
+    nodes = [entity for entity in entities if entity.kind == "node"]
+    assert [node.executable for node in nodes] == ["map_server", "lifecycle_manager"]
+    assert nodes[1].parameters[1]["node_names"] == [nodes[0].name]
+    # The arguments for the locator, as uwb.launch.py understands them.
+    given = dict(included["share/uwb_mitigation"].launch_arguments)
+    given["odometry"] = given["odometry"].perform({"odometry": "/odom"})
+    (locator,) = launch(generate, "uwb.launch.py", **given, anchors="a.yaml")
+    assert settings(locator) == {
+        "publish_tf": True,
+        "odometry": "/odom",
+        "anchors": "a.yaml",
+        "use_sim_time": False,
+    }
