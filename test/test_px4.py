@@ -115,11 +115,11 @@ def test_positions_are_sent_in_ned_without_orientation_and_velocity(
     ros.spin_until(next_arrived)
     start = next(stamps) - 10.0
     # A repeated stamp, and a position that is not finite, are not sent.
-    for seconds, x in ((0.05, 1.1), (0.05, 9.9), (0.1, math.nan), (3.0, 5.0)):
+    for seconds, x in ((0.05, 1.1), (0.05, 9.9), (0.1, math.nan), (0.1, 1e39), (3.0, 5.0), (-9.0, 4.0)):
         publisher.publish(pose(start + seconds, x))
-    ros.spin_until(lambda: arrived(start + 3.0))
+    ros.spin_until(lambda: arrived(start - 9.0))
     lines = [line for line in receiver.output.splitlines() if line.startswith("{")]
-    first, second, third = map(json.loads, lines[-3:])
+    first, second, third, again = map(json.loads, lines[-4:])
     assert first["timestamp_sample"] == start * 1e6
     assert first["timestamp"] > 1_700_000_000_000_000
     assert (first["pose_frame"], first["position"]) == (1, [2.0, 1.0, -0.5])
@@ -130,8 +130,9 @@ def test_positions_are_sent_in_ned_without_orientation_and_velocity(
     assert second["position_variance"] == pytest.approx([1.8, 0.8, 5.0])
     assert third["position"] == [2.0, 5.0, -0.5]
     assert third["position_variance"] == pytest.approx([0.09, 0.04, 0.25])
-    resets = [one["reset_counter"] for one in (first, second, third)]
-    assert resets == [resets[0], resets[0], resets[0] + 1], "after a gap"
+    assert again["position"] == [2.0, 4.0, -0.5], "a replay starts again"
+    resets = [one["reset_counter"] - first["reset_counter"] for one in (second, third, again)]
+    assert resets == [0, 1, 2]
     assert node.signal(signal.SIGINT) == 0, node.output
 
 

@@ -17,6 +17,9 @@ from uwb_mitigation.nodes import topics
 CORRELATION_S = 1.0
 """Errors of positions within this time are correlated. EKF2 takes them as independent, so their variance is increased."""
 
+MAX_VALUE = 1e6
+"""Positions (m) and variances (m^2) beyond this, and NaN, are not sent."""
+
 _NAN3 = (math.nan,) * 3
 _NANOSECONDS = 1_000_000_000
 
@@ -53,16 +56,17 @@ class Px4(Node):
         # x is east and y is north; each position counts as much as the time since the previous one.
         values = [at.y, at.x, -at.z]
         variances = [covariance[7], covariance[0], covariance[14]]
-        increase = 1.0
+        increase, is_reset = 1.0, False
         if self._latest_ns is not None:
             since_s = (stamp_ns - self._latest_ns) / _NANOSECONDS
-            if since_s <= 0.0:
+            if -CORRELATION_S < since_s <= 0.0:
                 return
-            increase = max(1.0, CORRELATION_S / since_s)
-            # After a gap the position may be elsewhere: EKF2 must not reject it as an outlier.
-            self._resets += since_s > CORRELATION_S
-        if not all(map(math.isfinite, (*values, *variances))):
+            increase = max(1.0, CORRELATION_S / abs(since_s))
+            is_reset = abs(since_s) > CORRELATION_S
+        if not all(abs(value) < MAX_VALUE for value in (*values, *variances)):
             return
+        # After a gap, or if a replay starts again, the position may be elsewhere: EKF2 must not reject it as an outlier.
+        self._resets += is_reset
         self._latest_ns = stamp_ns
         self._publisher.publish(
             self._type(
