@@ -1,6 +1,6 @@
 """Make the pictures of the README and of the documentation. Both use simulated ranges.
 
-`raw_and_corrected.png` compares positions and range errors of a simulated drive before and after correction.
+`raw_and_corrected.png` is a map of a simulated drive with positions from raw and from corrected ranges.
 `viewer.png` and `viewer_narrow.png` are screenshots of the viewer in Chromium.
 
     python docs/pictures.py
@@ -18,6 +18,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -33,6 +34,8 @@ from uwb_mitigation.processing.tracking import track_tag  # noqa: E402
 from uwb_mitigation.sources.anchors_file import load_anchors  # noqa: E402
 from uwb_mitigation.sources.recorded_ranges import read_ranges  # noqa: E402
 from uwb_mitigation.sources.simulated import SimulatedSource  # noqa: E402
+from uwb_mitigation.sources.simulation.scene import FLAT  # noqa: E402
+from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, VERMILLION  # noqa: E402
 
 PICTURES = REPOSITORY / "docs" / "pictures"
 SIMULATED_HZ = 40.0
@@ -44,8 +47,8 @@ FILLED_S = 7.0
 
 SHOWN_S = 60.0
 """Duration of the drive that the map shows: one round through the flat."""
-ANCHOR = 2
-"""Row of the anchor whose range errors are plotted."""
+SETTLED_S = 3.0
+"""Time of the first plotted position."""
 
 
 def reduce_colours(path: Path) -> None:
@@ -64,7 +67,7 @@ def save(browser: Browser, name: str) -> None:
 
 
 def plot_raw_and_corrected() -> None:
-    """Plot a simulated drive: positions on the left, range errors of one anchor on the right."""
+    """Plot a map of a simulated drive: positions from raw and from corrected ranges."""
     command = [sys.executable, "-m", "uwb_mitigation.commands.cli"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -75,42 +78,48 @@ def plot_raw_and_corrected() -> None:
         anchors = load_anchors(folder / "drive.anchors.yaml")
         (recording,) = read_ranges(corrected, anchors).tags
     tracks = track_tag(recording, EstimatorConfig(anchors, height=Height(0.0)))
+    figure, axes = plt.subplots(figsize=(9.0, 6.2), dpi=90)
+    for wall in FLAT.walls:
+        (x0, y0), (x1, y1) = wall.start, wall.end
+        axes.add_patch(
+            Rectangle(
+                (x0 - wall.thickness_m / 2, y0 - wall.thickness_m / 2), x1 - x0 + wall.thickness_m, y1 - y0 + wall.thickness_m,
+                color=GREY, lw=0,
+            )
+        )  # fmt: skip
+    for screen in FLAT.screens:
+        axes.plot(*zip(screen.start, screen.end, strict=True), color=GREY, lw=3, ls=(0, (2, 1)))
+    axes.add_patch(Rectangle((0, 0), *FLAT.size, fill=False, color=GREY, lw=4))
     truth, begin_ns = recording.truth, recording.truth.stamp_ns[0]
-    shown: list[tuple[Any, dict[str, Any]]] = [
-        (truth, {"color": "black", "lw": 2.5, "label": "true path"}),
+    shown: list[tuple[Any, str, dict[str, Any]]] = [
         (
             tracks.snapshot,
-            {"color": "tab:orange", "ls": "", "marker": "o", "ms": 3, "label": "raw, least squares"},
+            "raw ranges, least squares",
+            {"color": VERMILLION, "lw": 0.8, "marker": "+", "ms": 5},
         ),
-        (tracks.live, {"color": "tab:blue", "lw": 1.5, "label": "corrected, locator"}),
+        (tracks.live, "corrected ranges, locator", {"color": BLUE, "lw": 3.0}),
+        (truth, "true path", {"color": NIGHT, "lw": 1.5, "ls": "--"}),
     ]
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11.0, 4.8), width_ratios=(1.0, 1.3), dpi=90)
-    for track, style in shown:
-        part = track.stamp_ns - begin_ns < SHOWN_S * 1e9
-        left.plot(*track.position[part, :2].T, **style)
-    left.plot(*anchors.position[:, :2].T, "^", color="tab:red", ms=10, label="anchors")
-    left.set(aspect="equal", xlabel="x, m", ylabel="y, m", title="Position of the tag")
-    left.legend(fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-
-    for ranges, colour, label in (
-        (recording.raw, "tab:orange", "raw"),
-        (recording.ranges, "tab:blue", "corrected"),
-    ):
-        own = (ranges.anchor == ANCHOR) & (ranges.stamp_ns - begin_ns < SHOWN_S * 1e9)
-        stamp_ns = ranges.stamp_ns[own]
-        position = np.stack([np.interp(stamp_ns, truth.stamp_ns, axis) for axis in truth.position.T], axis=1)
-        error = ranges.range_m[own] - np.linalg.norm(position - anchors.position[ANCHOR], axis=1)
-        mean = np.abs(error).mean()
-        time_s = (stamp_ns - begin_ns) / 1e9
-        right.plot(
-            time_s, error, "o-", color=colour, ms=3, lw=0.8, label=f"{label}: mean |error| {mean:.2f} m"
-        )
-    right.axhline(0.0, color="black", lw=1.0)
-    right.set(
-        xlabel="time, s", ylabel="measured minus true range, m", title=f"Range error, anchor {ANCHOR + 1}"
-    )
-    right.legend(fontsize=9, loc="upper right")
+    for track, label, style in shown:
+        time_s = (track.stamp_ns - begin_ns) / 1e9
+        part = (time_s > SETTLED_S) & (time_s < SHOWN_S)
+        position = track.position[part, :2]
+        if track is not truth:
+            true = np.stack(
+                [
+                    np.interp(time_s[part], (truth.stamp_ns - begin_ns) / 1e9, axis)
+                    for axis in truth.position.T[:2]
+                ],
+                axis=1,
+            )
+            label += f"\nmean error {np.linalg.norm(position - true, axis=1).mean():.2f} m"
+        axes.plot(*position.T, label=label, **style)
+    axes.plot(*anchors.position[:, :2].T, "^", color=NIGHT, ms=12, label="anchor")
+    axes.plot([], [], color=GREY, lw=5, label="wall")
+    axes.plot([], [], color=GREY, lw=3, ls=(0, (2, 1)), label="metal cabinet")
+    axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(-1.2, 8.8), ylim=(-0.4, 8.0))
+    axes.set_title("Simulated drive through a flat with concrete walls")
+    axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     figure.tight_layout()
     path = PICTURES / "raw_and_corrected.png"
     figure.savefig(path)
@@ -136,12 +145,12 @@ def main() -> None:
         ]
         try:
             time.sleep(WATCHED_S)
-            browser.open(f"http://localhost:{port}/", 1280, 1170)
+            browser.open(f"http://localhost:{port}/", 1280, 1420)
             browser.wait("the page", browser.ready)
             # CIRs come only while a page is open.
             time.sleep(FILLED_S)
             save(browser, "viewer")
-            browser.resize(400, 800)
+            browser.resize(400, 1250)
             time.sleep(2.0)
             save(browser, "viewer_narrow")
         finally:

@@ -1,0 +1,108 @@
+"""Measure a page of the viewer in Chromium: transferred data, first paint, and processor time with 30 anchors and 5 tags.
+
+    python docs/experiments/viewer_load.py
+
+Every pair has the same share of 500 ranges per second. CIRs have 157 samples.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test"))
+
+from browser import Browser, chromium
+
+from uwb_mitigation.bag.codec import MeasurementKey
+from uwb_mitigation.measurement import (
+    Cir,
+    CorrectedRange,
+    Encoding,
+    Origin,
+    RangeMeasurement,
+    Status,
+)
+from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.page import View
+from uwb_mitigation.viewer.scene import AnchorPosition, Pose, Scene
+from uwb_mitigation.viewer.server import ViewerServer
+
+ANCHORS, TAGS, RATE_HZ = 30, 5, 500
+MEASURED_S, PERIOD_S = 20.0, 0.1
+SCREENSHOT = Path("build") / "screens" / "viewer_30_anchors.png"
+
+
+def feed_ranges(feed: Feed, stop: threading.Event) -> None:
+    """Feed ranges of all pairs until `stop` is set."""
+    rng = np.random.default_rng(1)
+    samples = rng.integers(0, 1000, 157).astype(np.int16)
+    sequence = 0
+    while not stop.wait(PERIOD_S):
+        for tag in range(1, TAGS + 1):
+            angle = time.monotonic() / 10 + tag
+            with feed.lock:
+                feed.scene.add_pose(
+                    f"tag_{tag}",
+                    Pose(12 + 8 * np.cos(angle), 9 + 6 * np.sin(angle), 1.0, (0.5, 0.3, 0.2), 1.0),
+                )
+        for _ in range(int(RATE_HZ * PERIOD_S)):
+            anchor, tag = 1 + sequence % ANCHORS, 1 + sequence // ANCHORS % TAGS
+            key = MeasurementKey(time.time_ns(), tag, anchor, sequence)
+            status = Status(rng.choice(len(Status), p=(0.9, 0.025, 0.025, 0.025, 0.025)))
+            raw_m = 8.0 + rng.normal()
+            cir = Cir(samples, Encoding.MAGNITUDE, 745, 750.4, rx_power_dbm=-85.0, first_path_power_dbm=-89.0)
+            feed.measurement(RangeMeasurement(key.stamp_ns, tag, anchor, sequence, 0, raw_m, cir))
+            feed.corrected(key, CorrectedRange(raw_m - 0.4, raw_m, 0.4, 0.01, status, Origin.HOST, 1))
+            sequence += 1
+
+
+def load(browser: Browser, url: str) -> None:
+    """Print the transferred bytes and the times of one page."""
+    browser.open(url, 1280, 2000)
+    began_s = time.monotonic()
+    browser.wait("the page", browser.ready)
+    drawn_s = time.monotonic() - began_s
+    paint_ms, transferred = browser.run(
+        "const paint = performance.getEntriesByName('first-contentful-paint')[0].startTime;"
+        "const files = [...performance.getEntriesByType('navigation'), ...performance.getEntriesByType('resource')];"
+        "return [paint, files.reduce((sum, file) => sum + file.transferSize, 0)]"
+    )
+    print(
+        f"transferred {transferred / 1e3:.0f} kB, first paint {paint_ms:.0f} ms, figures after {1e3 * drawn_s:.0f} ms more"
+    )
+
+
+def main() -> None:
+    scene = Scene()
+    scene.set_anchors({n: AnchorPosition(4.0 * (n % 6), 4.5 * (n // 6), 2.0) for n in range(1, ANCHORS + 1)})
+    view, stop = View(scene, threading.Lock()), threading.Event()
+    feed = Feed(scene, view.lock)
+    with ViewerServer(view, port=0) as server, chromium() as browser:
+        thread = threading.Thread(target=feed_ranges, args=(feed, stop))
+        thread.start()
+        try:
+            time.sleep(3.0)
+            for _ in range(3):
+                load(browser, server.url)
+            process = psutil.Process()
+            before_s, began_s = sum(process.cpu_times()[:2]), time.monotonic()
+            time.sleep(MEASURED_S)
+            used_s = sum(process.cpu_times()[:2]) - before_s
+            print(
+                f"{ANCHORS} anchors, {TAGS} tags, {RATE_HZ} ranges/s: {used_s / (time.monotonic() - began_s):.0%} of a core"
+            )
+            SCREENSHOT.parent.mkdir(parents=True, exist_ok=True)
+            browser.driver.save_screenshot(str(SCREENSHOT))
+        finally:
+            stop.set()
+            thread.join()
+
+
+if __name__ == "__main__":
+    main()
