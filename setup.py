@@ -71,6 +71,7 @@ setup(
             "mappings/*.yaml",
             "evaluation/templates/*.j2",
             "paper/templates/*.j2",
+            "radio/templates/*.j2",
             "viewer/templates/*",
         ]
     },

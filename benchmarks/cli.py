@@ -224,6 +224,33 @@ def radio(
 
 
 @app.command()
+def uci(
+    exchanges: Annotated[
+        int, typer.Option(min=0, max=10_000_000, help="Exchanges on the damaged stream; 0: skip.")
+    ] = (100_000),
+    seconds: Annotated[float, typer.Option(min=1.0, max=600.0, help="Duration of each rate.")] = 10.0,
+    unplugs: Annotated[int, typer.Option(min=1, max=1000, help="Number of unplugged cables.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of losses and damage.")] = 1,
+    json: JsonOption = None,
+) -> None:
+    """Emulated UCI boards: rates, joins with 5 % lost notifications and 1 % damaged bytes, recovery.
+
+    The rates are those of two boards on pseudo-terminals in wall-clock time. No result was measured on a real board.
+    """
+    from benchmarks import uci as bench
+
+    result: dict[str, Any] = {f"rate_{taps}_taps_hz": bench.rate_hz(taps, seconds) for taps in (16, 157)}
+    recoveries_s = bench.recoveries_s(unplugs)
+    result |= {"unplugs": unplugs, "longest_recovery_s": max(recoveries_s)}
+    if exchanges:
+        with console.share_bar("exchanges") as advance:
+            result |= asdict(bench.joins(exchanges, 16, 0.05, 0.01, seed, advance))
+            lossy = bench.joins(exchanges // 10, 157, 0.05, 0.0, seed, advance)
+        result |= {"lossy_157_taps": asdict(lossy)}
+    _report(result, json)
+
+
+@app.command()
 def firmware(
     model: Annotated[
         Path | None, typer.Option(help="Measure only this int8 bundle.", show_default=False)

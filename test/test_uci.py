@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks import uci
 from benchmarks.uci_board import FIRST_PATH, UciBoardModel, UciFaults, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterError, RecordingError
 from uwb_mitigation.link.layout import Role
@@ -18,6 +19,7 @@ from uwb_mitigation.measurement import RadioType, RangeMeasurement, Segment
 from uwb_mitigation.radio.uci import messages
 from uwb_mitigation.radio.uci.capture import FIRST_LINE, CaptureWriter, UciCapture
 from uwb_mitigation.radio.uci.cir import read_cir
+from uwb_mitigation.radio.uci.joining import Joiner
 from uwb_mitigation.radio.uci.messages import Diagnostics, Kind
 from uwb_mitigation.radio.uci.packets import MAX_GAP_NS, PacketDecoder, encode
 from uwb_mitigation.radio.uci.session import UciSession, UciSettings
@@ -401,3 +403,21 @@ def test_responses_have_no_effect_before_their_command():
     run = Bench()
     run.step(encode(*messages.RANGE_START, b"\0", Kind.RESPONSE) * 10)
     assert run.session.state
+
+
+def test_the_benchmark_finds_no_wrong_join_but_would_find_one(monkeypatch: pytest.MonkeyPatch):
+    result = uci.joins(1000, 16, 0.05, 0.01, 1, lambda _: None)
+    assert (result.wrong, result.exchanges) == (0, 1000)
+    assert result.with_cir > 300
+    monkeypatch.setattr(Joiner, "_accept", lambda *_, **__: True)
+    monkeypatch.setattr(UciBoardModel, "diagnostics_packet", _previous_cir(UciBoardModel.diagnostics_packet))
+    assert uci.joins(200, 16, 0.0, 0.0, 1, lambda _: None).wrong > 100
+
+
+def _previous_cir(packet):
+    def build(self, handle: int, sequence: int) -> bytes:
+        built = bytearray(packet(self, handle, sequence - 1))
+        built[8:12] = struct.pack("<I", sequence)
+        return bytes(built)
+
+    return build

@@ -18,6 +18,7 @@ from uwb_mitigation.commands import (
     console,
     data,
     doctor,
+    field_report,
     model,
     offset,
     paper,
@@ -48,6 +49,7 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     },
     "Boards": {
         "board": board.app,
+        "field-report": field_report.field_report,
     },
     "The paper": {
         "paper": paper.app,

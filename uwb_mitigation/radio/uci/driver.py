@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,6 +49,7 @@ class UciReport:
         settings: active settings.
         window: taps and lead of the CIR that the board has confirmed; None = unknown.
         device_info: identity of the board, not decoded.
+        clock_offset_ppm: median carrier frequency offset of the peers; NaN = unknown.
         counts: {name: count}.
     """
 
@@ -55,6 +58,7 @@ class UciReport:
     settings: UciSettings
     window: tuple[int, int] | None
     device_info: bytes
+    clock_offset_ppm: float
     counts: dict[str, int]
 
 
@@ -112,6 +116,7 @@ class UciDriver(Connection[UciEvent]):
                 session.settings,
                 session.window,
                 session.device_info,
+                statistics.median(session.clock_offsets_ppm or [math.nan]),
                 session.totals() | {"openings": self.openings, "overflowed": self.overflowed},
             )
 

@@ -6,8 +6,9 @@ opened for each peer: FiRa double-sided two-way ranging (deferred), SP3 frames, 
 
 from __future__ import annotations
 
+import math
 import struct
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Generator
 from dataclasses import dataclass
 
@@ -150,6 +151,7 @@ class UciSession:
         device_info: answer of the board to the request for its identity, not decoded.
         counts: numbers of messages, ranges and problems.
         starts: how often ranging was started.
+        clock_offsets_ppm: latest carrier frequency offsets of the peers.
     """
 
     def __init__(self, settings: UciSettings) -> None:
@@ -162,6 +164,7 @@ class UciSession:
         self.counts: Counter[str] = Counter(
             ranges=0, without_cir=0, inconsistent_cir=0, unknown_session=0, restarts=0, error_answers=0
         )
+        self.clock_offsets_ppm: deque[float] = deque(maxlen=200)
         self._decoder = PacketDecoder()
         self._joined_before: Counter[str] = Counter()
         self._outgoing = bytearray()
@@ -464,6 +467,8 @@ class UciSession:
             if record.status != STATUS_OK or not record.range_m >= 0:
                 continue
             reading = read_cir(joined.diagnostics, s.channel, record.rssi_dbm)
+            if not math.isnan(reading.clock_offset_ppm):
+                self.clock_offsets_ppm.append(reading.clock_offset_ppm)
             self.counts["ranges"] += 1
             self.counts["without_cir"] += not len(reading.cir)
             self.counts["inconsistent_cir"] += not reading.consistent

@@ -1,0 +1,164 @@
+"""`uwb-mitigation field-report` with emulated boards, and injected faults."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import math
+import re
+import socket
+import threading
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compilers import NEEDS_CC
+from typer.testing import CliRunner
+
+from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.uci_board import EmulatedUciBoards, UciFaults
+from uwb_mitigation.commands import cli, field_report
+from uwb_mitigation.measurement import Cir, RangeMeasurement
+from uwb_mitigation.radio.field_checks import Observation, Verdict, run_checks
+from uwb_mitigation.radio.uci.capture import UciCapture
+from uwb_mitigation.sources.mcap import McapRecording
+
+Report = Callable[..., dict[str, dict]]
+
+
+@pytest.fixture
+def report(tmp_path: Path) -> Report:
+    """Return the checks of a report, {name: check}."""
+
+    def run(source: str, ports: int = 2, *options: str) -> dict[str, dict]:
+        names = ",".join(str(tmp_path / f"{source}{number}") for number in range(ports))
+        command = ["field-report", "--source", source, "--port", names, "--distance", "3.0", "--seconds", "3"]
+        files = ["-o", str(tmp_path / "out.zip"), "--json", str(tmp_path / "out.json")]
+        result = CliRunner().invoke(cli.app, [*command, *files, *(options or ("--no-unplug",))])
+        assert result.exit_code == 0, (result.output, result.exception)
+        checks = json.loads((tmp_path / "out.json").read_text())["checks"]
+        return {check["name"]: check for check in checks}
+
+    return run
+
+
+def failed(checks: dict[str, dict]) -> set[str]:
+    return {name for name, check in checks.items() if check["verdict"] == "fail"}
+
+
+def test_good_uci_boards_pass_and_the_file_names_nobody(
+    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    with EmulatedUciBoards(links=tmp_path / "uci") as boards:
+
+        def replug(_: str) -> None:
+            def act() -> None:
+                boards.unplug(0)
+                time.sleep(0.6)
+                boards.plug(0)
+
+            threading.Thread(target=act).start()
+
+        monkeypatch.setattr(field_report, "_ask", replug)
+        checks = report("uci", 2, "--unplug")
+    assert not failed(checks)
+    assert checks["model"]["verdict"] == "warning"
+    assert checks["read back: CIR taps"]["value"] == "157"
+    assert "recovery after reconnecting" in checks
+    with zipfile.ZipFile(tmp_path / "out.zip") as archive:
+        assert set(archive.namelist()) == {"capture.txt", "ranges.mcap", "report.html", "report.json"}
+        archive.extractall(tmp_path / "out")
+        contents = {name: archive.read(name).decode("latin1") for name in archive.namelist()}
+    contents["report.html"] = contents["report.html"].partition("</style>")[2]
+    for name, text in contents.items():
+        for secret in (str(tmp_path), str(Path.home()), "/dev/"):
+            assert secret not in text
+        if not name.endswith(".mcap"):  # compressed bytes may contain a short name by chance
+            assert not re.search(rf"\b({socket.gethostname()}|{getpass.getuser()})\b", text)
+    assert len(list(UciCapture(tmp_path / "out" / "capture.txt"))) > 20
+    records = list(McapRecording(tmp_path / "out" / "ranges.mcap"))
+    assert len(records) > 20
+    assert records[0].truth.range_m == 3.0
+
+
+@pytest.mark.parametrize(
+    ("faults", "names"),
+    [
+        ({"offset_m": 0.5}, {"error of the median range"}),
+        ({"empty_cir": True}, {"share of ranges with CIR"}),
+        ({"swapped_ids": True}, {"ids", "ranges per second"}),
+        ({"clock_ppm": 60.0}, {"clock error"}),
+    ],
+)
+def test_a_fault_of_uci_boards_is_detected(report: Report, tmp_path: Path, faults: dict, names: set[str]):
+    with EmulatedUciBoards(links=tmp_path / "uci", faults=UciFaults(**faults)):
+        assert failed(report("uci")) == names
+
+
+@NEEDS_CC
+def test_good_evb1000s_pass_and_a_low_supply_fails(report: Report, tmp_path: Path):
+    with EmulatedEvb1000s(None, port_links=tmp_path / "evb1000") as boards:
+        checks = report("evb1000")
+        assert not failed(checks)
+        assert checks["read back: device id"]["value"] == "0xdeca0130"
+        assert checks["read back: antenna delay"]["verdict"] == "pass"
+        boards._boards[0].chip.set_environment(30.0, 2.6)
+        assert failed(report("evb1000")) == {"supply"}
+
+
+def test_missing_board_gives_a_report(report: Report, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("uwb_mitigation.radio.field_test.START_TIMEOUT_S", 0.5)
+    assert {"problem of the driver", "ranges per second", "ids"} <= failed(report("uci", 1))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--source", "radio"),
+        ("--port", ""),
+        ("--port", "/dev/a,/dev/b,/dev/c"),
+        ("--distance", "nan"),
+        ("-o", "report.txt"),
+    ],
+)
+def test_invalid_options_are_refused(options: tuple[str, str]):
+    command = ["field-report", "--source", "uci", "--port", "/dev/a", "--distance", "3", *options]
+    result = CliRunner().invoke(cli.app, command)
+    assert result.exit_code
+    assert result.exception is not None
+
+
+RANGE = RangeMeasurement(0, 1, 2, 0, 0, 3.0, Cir(np.tile(np.int16([3, -3]), 20), first_path_index=5.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"written": {"channel": 5}, "read": {"channel": 9}}, "read back: channel"),
+        ({"expected_ids": (2, 1)}, "ids"),
+        ({"temperature_c": 95.0}, "temperature"),
+        ({"recovery_s": math.inf}, "recovery after reconnecting"),
+        ({"damaged": 500}, "damaged packets per range"),
+        ({"ranges": []}, "ranges per second"),
+        ({"problem": "lost"}, "problem of the driver"),
+        ({"distance_m": math.nan}, "error of the median range"),
+    ],
+)
+def test_a_check_fails(change: dict, name: str):
+    good = Observation(3.0, 1.0, (1, 2), ranges=[replace(RANGE, stamp_ns=number) for number in range(100)])
+    before = {check.name: check.verdict for check in run_checks(good)}
+    assert before.get(name) in (None, Verdict.PASS)
+    after = {check.name: check.verdict for check in run_checks(replace(good, **change))}
+    assert after[name] is Verdict.FAIL
+
+
+def test_texts_are_anonymised():
+    text = f"/dev/ttyACM0: in use by x; {Path.home()}/a b; host {socket.gethostname()}; 60 Hz, a/b"
+    cleaned = field_report.anonymise(text)
+    assert "/dev/" not in cleaned
+    assert not re.search(rf"\b{socket.gethostname()}\b", cleaned)
+    assert cleaned.endswith("60 Hz, a/b")

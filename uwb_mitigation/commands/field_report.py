@@ -1,0 +1,161 @@
+"""`uwb-mitigation field-report`: a guided test of a pair of radios, as a page and a file to send."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import platform
+import re
+import socket
+import tempfile
+import zipfile
+from collections import Counter
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+import uwb_mitigation
+from uwb_mitigation.commands import console
+from uwb_mitigation.commands.console import JsonOption, print_line
+from uwb_mitigation.errors import ParameterError
+
+if TYPE_CHECKING:
+    from uwb_mitigation.radio.field_checks import Check, Observation
+
+
+def field_report(
+    source: Annotated[str, typer.Option(help="Kind of radio: uci, evb1000, spi or serial.")],
+    port: Annotated[
+        str,
+        typer.Option(
+            metavar="P[,P2]", help="Port of the tag, and of the anchor if it is also on this computer."
+        ),
+    ],
+    distance: Annotated[float, typer.Option(help="Distance between the antennas, m.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.zip", help="File to attach to an issue.")
+    ] = Path("field_report.zip"),
+    seconds: Annotated[float, typer.Option(min=2.0, max=3600.0, help="Duration of the measurement.")] = 300.0,
+    unplug: Annotated[
+        bool, typer.Option("--unplug/--no-unplug", help="Test unplugging and reconnecting the first port.")
+    ] = True,
+    json: JsonOption = None,
+) -> None:
+    """Test a pair of radios at a known distance and write a report.
+
+    Place both radios in line of sight, 2 m to 10 m apart, and stop all drivers. The zip file contains the page
+    report.html, the ranges with their CIRs and, for UCI boards, the raw bytes. It contains no host name, user name or
+    path. Attach it to an issue of type "Field report".
+
+        uwb-mitigation field-report --source uci --port /dev/ttyACM0,/dev/ttyACM1 --distance 3.00
+    """
+    from uwb_mitigation.radio.field_checks import Observation, Verdict, run_checks
+    from uwb_mitigation.radio.field_test import observe
+
+    if not 0.1 <= distance <= 500.0:
+        raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")
+    if output.suffix != ".zip" or output.is_dir() or not output.absolute().parent.is_dir():
+        raise ParameterError(f"-o {output}", valid="a file .zip in a folder that exists")
+    ports = [part.strip() for part in port.split(",") if part.strip()]
+    observation = Observation(distance, seconds)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with console.share_bar("ranging") as advance:
+            observe(source, ports, observation, folder / "capture.txt", _ask if unplug else None, advance)
+        _correct(observation)
+        checks = [
+            replace(check, value=anonymise(check.value), remedy=anonymise(check.remedy))
+            for check in run_checks(observation)
+        ]
+        _write(folder, source, observation, checks)
+        _pack(folder, output)
+    rows = [(check.name, check.verdict.value, check.value, check.limit, check.remedy) for check in checks]
+    console.show_table("field report", ("check", "result", "value", "limit", "what to do"), rows, left=5)
+    failed = sum(check.verdict is Verdict.FAIL for check in checks)
+    print_line(
+        f"{output}: {len(checks)} checks, {failed} failed; read report.html in it, and attach the file to an issue"
+    )
+    console.write_json(json, {"checks": [asdict(check) for check in checks]})
+
+
+def _ask(port: str) -> None:
+    console.warn(f"Unplug the board at {port}, wait 2 s, and plug it in again (60 s).")
+
+
+def _correct(observation: Observation) -> None:
+    """Correct the ranges with the shipped model if it was trained for the radio."""
+    from uwb_mitigation.mitigation import Mitigation
+    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.model.shipped import model_path
+
+    bundle = load_bundle(model_path(None))
+    cirs = [measured.cir for measured in observation.ranges]
+    sources = {f"{cir.radio.name} {cir.segment.name}" for cir in cirs}
+    observation.model = (
+        f"{bundle.name}: trained for {bundle.card.source}, ranges of {', '.join(sorted(sources))}"
+    )
+    if all(bundle.card.fits(cir.radio, cir.segment, len(cir) > 0) for cir in cirs):
+        observation.corrected = Mitigation(bundle).correct(observation.ranges)
+
+
+def _write(folder: Path, source: str, observation: Observation, checks: list[Check]) -> None:
+    """Write the page, the values and the ranges."""
+    from uwb_mitigation.bag.writer import BagWriter
+    from uwb_mitigation.evaluation.page import render_page
+    from uwb_mitigation.measurement import Record, Truth
+
+    system = {
+        "uwb_mitigation": uwb_mitigation.__version__,
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "Python": platform.python_version(),
+        **{name: anonymise(text) for name, text in observation.identity.items()},
+    }
+    counts = Counter(check.verdict.value for check in checks)
+    values = {
+        "source": source,
+        "distance_m": observation.distance_m,
+        "seconds": observation.seconds,
+        "ranges": len(observation.ranges),
+        "system": system,
+    }
+    templates = Path(uwb_mitigation.__file__).parent / "radio" / "templates"
+    shown = {name: counts[name] for name in ("pass", "warning", "fail")}
+    page = render_page("field_report.html.j2", templates, checks=checks, counts=shown, **values)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    values["checks"] = [asdict(check) for check in checks]
+    (folder / "report.json").write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    truth = Truth(observation.distance_m, "LOS", "field report")
+    with BagWriter(folder / "ranges.mcap", {"source": "field report", "simulated": "unknown"}) as bag:
+        for measured in observation.ranges:
+            bag.write(Record(measured, truth))
+
+
+def _pack(folder: Path, output: Path) -> None:
+    """Write the zip file."""
+    with tempfile.NamedTemporaryFile(dir=output.absolute().parent, suffix=".part", delete=False) as file:
+        part = Path(file.name)
+    try:
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+            for path in sorted(folder.iterdir()):
+                # Without the times and owners of files.
+                archive.writestr(zipfile.ZipInfo(path.name), path.read_bytes(), zipfile.ZIP_DEFLATED)
+        part.replace(output)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def anonymise(text: str) -> str:
+    """Replace host name, user name and paths of devices and folders."""
+    text = re.sub(
+        r"(?<![\w<])~?/(?:dev|home|root|tmp|run|media|mnt|usr|var|opt|etc|work)/[^\s\"'<>,;:)]*", "PATH", text
+    )
+    names = [socket.gethostname()]
+    with suppress(Exception):  # a container may have no user
+        names.append(getpass.getuser())
+    for name in names:
+        if len(name) > 1:
+            text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "NAME", text)
+    return text
