@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, Robot, drive, wrapped
 
 from uwb_mitigation.positioning.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
@@ -286,3 +290,16 @@ def test_motion_backwards_in_time_returns_to_the_start():
     end, start = ahead.at(5 * NANOSECONDS), path.at(5 * NANOSECONDS)
     assert start.yaw == pytest.approx(-end.yaw, abs=0.01)
     assert math.hypot(start.x, start.y) == pytest.approx(math.hypot(end.x, end.y), abs=0.05)
+
+
+def test_real_robot_reaches_the_documented_errors():
+    root = Path(os.environ.get("UWB_MITIGATION_DATA", REPOSITORY.parent / "shared" / "data"))
+    folder = root / "chemnitz_labyrinth"
+    if not folder.is_dir():
+        pytest.skip(f"the Labyrinth data set is not at {folder}: set UWB_MITIGATION_DATA to run this test")
+    experiment = runpy.run_path(str(REPOSITORY / "docs" / "experiments" / "odometry_real_run.py"))
+    _, without = experiment["evaluate"](folder, with_odometry=False)
+    _, errors = experiment["evaluate"](folder, with_odometry=True)
+    assert errors.rmse <= 0.085 < without.rmse
+    assert errors.coverage95 >= 0.85
+    assert errors.heading_rmse <= math.radians(15.0)

@@ -13,7 +13,7 @@ import pytest
 from bag_material import write_corrected
 from command_line import run
 from conftest import REPOSITORY
-from drives import HALL, NANOSECONDS, circuit, drive
+from drives import HALL, NANOSECONDS, circuit, drive, wrapped
 
 from uwb_mitigation.bag.pose_paths import read_truth
 from uwb_mitigation.bag.poses import encode_pose
@@ -155,6 +155,63 @@ def test_height_topic_is_used_and_excludes_a_constant_height(tmp_path: Path):
     assert excerpt["tags"][0]["warnings"] == []
     for more in (("/height", "--height", "1.0"), ("/nothing",)):
         assert run(*arguments, *more, "--force", folder=tmp_path).returncode != 0
+
+
+@pytest.fixture(scope="module")
+def robot_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bag of a simulated drive with odometry and IMU, and its anchors file."""
+    bag = tmp_path_factory.mktemp("robot") / "drive.mcap"
+    assert (
+        run(
+            "data", "simulate", "--like", "drive", "--ranges", "1200", "-o", bag, folder=bag.parent
+        ).returncode
+        == 0
+    )
+    return bag
+
+
+def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path):
+    results = []
+    for number, options in enumerate(([], ["--odometry", "/odom"], ["--odometry", "/odom", "--imu", "/imu"])):
+        out, report, tum = (tmp_path / f"{number}.{kind}" for kind in ("mcap", "json", "tum"))
+        ran = run(
+            "track", str(robot_bag), "-o", str(out), "--height", "0", *options,
+            "--json", str(report), "--tum", str(tum), folder=tmp_path,
+        )  # fmt: skip
+        assert ran.returncode == 0, ran.stderr
+        results.append(json.loads(report.read_text()))
+    without, with_odometry, with_imu = results
+    assert without["live"]["heading_rmse_rad"] is None
+    for kind in ("live", "smoothed"):
+        assert with_odometry[kind]["horizontal_rmse_m"] < without[kind]["horizontal_rmse_m"]
+        assert with_odometry[kind]["heading_rmse_rad"] < 0.2
+        assert with_imu[kind]["heading_rmse_rad"] < 0.2
+        assert with_imu[kind]["heading_rmse_rad"] != with_odometry[kind]["heading_rmse_rad"]
+    quaternions = np.loadtxt(tum)[:, 4:]
+    assert np.abs(quaternions[:, 2]).max() > 0.5
+    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0, atol=1e-5)
+    # The written truth contains the heading.
+    (truth,) = read_truth(out).values()
+    (recorded,) = read_truth(robot_bag).values()
+    np.testing.assert_allclose(wrapped(truth.yaw - recorded.yaw), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "excerpt"),
+    [
+        (["--imu", "/imu"], "without --odometry"),
+        (["--odometry", "/imu"], "sensor_msgs"),
+        (["--odometry", "/odom", "--lever-arm", "1,2"], "three numbers"),
+    ],
+)
+def test_unusable_odometry_options_are_refused(
+    robot_bag: Path, tmp_path: Path, options: list[str], excerpt: str
+):
+    ran = run(
+        "track", str(robot_bag), "-o", str(tmp_path / "x.mcap"), "--height", "0", *options, folder=tmp_path
+    )
+    assert ran.returncode != 0
+    assert excerpt in ran.stderr
 
 
 def recording_of(ranges: Ranges, truth: TruePath) -> TagRecording:

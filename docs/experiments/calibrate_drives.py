@@ -44,6 +44,7 @@ from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimat
 from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
 from uwb_mitigation.sources.simulated import SimulatedSource
 from uwb_mitigation.sources.simulation.buildings import RADIO
+from uwb_mitigation.sources.simulation.odometry import RobotMotion
 from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
 from uwb_mitigation.training import site_calibration, site_solution, train
 
@@ -80,6 +81,10 @@ class Drive:
         self.plan = plan
         self.anchors: AnchorMap = self._inner.anchors
         self.name = self._inner.name
+
+    def motion(self) -> RobotMotion:
+        """Return the motion of the robot that carries the tag, with its odometry."""
+        return self._inner.motion()
 
     def __iter__(self) -> Iterator[Record]:
         for record in self._inner:

@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_mitigation.bag.poses import POSITION_TYPES, tag_of_frame
+from uwb_mitigation.bag.codec import decode_frame_id
+from uwb_mitigation.bag.poses import POSITION_TYPES, UNOBSERVED, tag_of_frame
 from uwb_mitigation.bag.reader import BagReader, Channel
 from uwb_mitigation.bag.topics import (
     IMU_TYPE,
     ODOMETRY_TRUTH,
     ODOMETRY_TYPE,
     POSE_TYPE,
+    RANGE_CORRECTED,
+    RANGE_RAW,
     RANGE_SENSOR_TYPE,
     TF,
     TF_STATIC,
@@ -54,8 +57,21 @@ def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, True
     if topic not in bag.topics:
         return {}
     check_topic(path, bag.topics, topic, POSITION_TYPES)
-    bodies = _bodies(bag, topic, f"{path}, topic {topic}", oriented=False)
-    return {tag_of_frame(child): TruePath(one.stamp_ns, one.position) for child, one in bodies.items()}
+    where = f"{path}, topic {topic}"
+    bodies = _bodies(bag, topic, where, oriented=False)
+    yaws: dict[str, dict[int, float]] = {}
+    for decoded in decode_messages(bag, [topic], where):
+        # An unknown heading has a very large variance, or a type without variances.
+        if getattr(decoded.pose, "covariance", (math.inf,) * 36)[35] < UNOBSERVED:
+            stamp, q = decoded.header.stamp, decoded.pose.pose.orientation
+            child = _frame(getattr(decoded, "child_frame_id", ""))
+            yaws.setdefault(child, {})[stamp.sec * _NANOSECONDS + stamp.nanosec] = 2.0 * math.atan2(q.z, q.w)
+    found = {}
+    for child, one in bodies.items():
+        own = yaws.get(child, {})
+        yaw = np.array([own.get(stamp, math.nan) for stamp in one.stamp_ns.tolist()]) if own else None
+        found[tag_of_frame(child)] = TruePath(one.stamp_ns, one.position, yaw)
+    return found
 
 
 def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
@@ -128,6 +144,17 @@ def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, flo
         raise RecordingError(f"{frame} moves relative to {base}", where=where, valid="--lever-arm X,Y,Z")
     x, y, z = np.median(position, axis=0).tolist()
     return x, y, z
+
+
+def read_range_frame(path: Path) -> str:
+    """Return the frame of the first range of a bag; empty: none.
+
+    Raises:
+        RecordingError: the bag or the message cannot be read.
+    """
+    for message in BagReader(path).messages((RANGE_RAW, RANGE_CORRECTED)):
+        return decode_frame_id(message.data)
+    return ""
 
 
 def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:

@@ -21,6 +21,7 @@ from uwb_mitigation.commands.positioning import (
     OffsetOption,
     area_of,
     height_of,
+    parse_lever_arm,
 )
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
@@ -141,7 +142,7 @@ def calibrate(
     height_prior, area_bounds, lever_arm_m = (
         height_of(height, height_sd),
         area_of(area),
-        _lever_arm(lever_arm),
+        parse_lever_arm(lever_arm),
     )
     anchor_map = load_anchors(anchors or anchors_path(bags[0]))
     source = bundle_for(None, bags[0])
@@ -304,18 +305,6 @@ def _lever_arm_in(
                 valid="--lever-arm, or bags with the antenna at one position",
             )
     return known[0][1] if known else None
-
-
-def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        x, y, z = (float(word) for word in text.split(","))
-    except ValueError as error:
-        raise ParameterError(f"lever arm {text!r}", valid="three numbers: X,Y,Z") from error
-    if not all(math.isfinite(value) and abs(value) <= 100.0 for value in (x, y, z)):
-        raise ParameterError(f"lever arm {text!r}", valid="-100 to 100 m each")
-    return x, y, z
 
 
 def _show(calibration: SiteCalibration) -> None:

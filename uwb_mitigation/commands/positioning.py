@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap
     from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.survey import SurveyResult
+    from uwb_mitigation.positioning.tag_estimator import RobotData
     from uwb_mitigation.positioning.tracks import Heights
     from uwb_mitigation.processing.tracking import HeldOut, TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
@@ -28,6 +29,7 @@ _COLUMNS = {
     "nees_per_dof": ("NEES", "{:.2f}"),
     "exceeded": ("beyond", "{:.2%}"),
     "height_rmse": ("height", "{:.3f}"),
+    "heading_rmse": ("heading", "{:.3f}"),
 }
 """{field of `TrackErrors`: title and format of its column}."""
 
@@ -93,6 +95,27 @@ def track(
     height_sd: HeightSdOption = 0.1,
     height_topic: HeightTopicOption = None,
     area: AreaOption = None,
+    odometry: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC",
+            help="Odometry of the robot with the tag (nav_msgs/Odometry): also estimate its heading.",
+        ),
+    ] = None,
+    imu: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC",
+            help="With --odometry: IMU of the robot (sensor_msgs/Imu); its yaw rate replaces that of the odometry.",
+        ),
+    ] = None,
+    lever_arm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="With --odometry: the antenna in the robot's frame, m. Default: from the transforms of the bag, otherwise 0.",
+        ),
+    ] = None,
     stamp_offset: OffsetOption = 0.0,
     acceleration: AccelerationOption = 1.0,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
@@ -107,6 +130,8 @@ def track(
         uwb-mitigation data import LOS_A1 -o a1.mcap
 
         uwb-mitigation track a1.mcap -o track.mcap --height 1.0 --stamp-offset=-0.2
+
+        uwb-mitigation track drive.mcap -o track.mcap --height 0.4 --odometry /odom --imu /imu
     """
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.files import write_atomically
@@ -120,7 +145,8 @@ def track(
     place, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
-    config = EstimatorConfig(known, model, place, box, measured)
+    robot = _robot_of(bag, odometry, imu, lever_arm, recorded)
+    config = EstimatorConfig(known, model, place, box, measured, robot)
     if tum is not None and tum.exists() and not force:
         raise ParameterError("exists already", where=str(tum), valid="--force replaces it")
     tracks = []
@@ -249,6 +275,41 @@ def heights_of(
     return read_heights(bag, topic, sd)
 
 
+def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    """Return the numbers of --lever-arm."""
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise ParameterError(f"lever arm {text!r}", valid="three numbers: X,Y,Z") from error
+    if not all(math.isfinite(value) and abs(value) <= 100.0 for value in (x, y, z)):
+        raise ParameterError(f"lever arm {text!r}", valid="-100 to 100 m each")
+    return x, y, z
+
+
+def _robot_of(
+    bag: Path, odometry: str | None, imu: str | None, lever_arm: str | None, recorded: RecordedRanges
+) -> RobotData | None:
+    """Read the motion of --odometry and --imu, and the lever arm."""
+    arm = parse_lever_arm(lever_arm)
+    if odometry is None:
+        if imu is not None or arm is not None:
+            raise ParameterError("--imu or --lever-arm without --odometry", valid="with --odometry TOPIC")
+        return None
+    if len(recorded.tags) > 1:
+        tags = ", ".join(format_id(tag.tag_id) for tag in recorded.tags)
+        raise ParameterError(f"--odometry with the tags {tags}", valid="a bag with one tag")
+    from uwb_mitigation.bag.odometry import BASE_LINK, read_imu, read_odometry
+    from uwb_mitigation.bag.pose_paths import read_lever_arm, read_range_frame
+    from uwb_mitigation.positioning.tag_estimator import RobotData
+
+    if arm is None:
+        arm = read_lever_arm(bag, BASE_LINK, read_range_frame(bag)) or (0.0, 0.0, 0.0)
+    motion = read_odometry(bag, odometry)
+    return RobotData(motion, None if imu is None else read_imu(bag, imu), arm)
+
+
 def area_of(text: str | None) -> Area | None:
     """Return the box of --area."""
     from uwb_mitigation.positioning.geometry import Area
@@ -258,18 +319,22 @@ def area_of(text: str | None) -> Area | None:
 
 def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     rows = []
+    with_heading = any(math.isfinite(error.heading_rmse) for one in tracks for error in one.errors.values())
+    fields = {field: form for field, form in _COLUMNS.items() if with_heading or field != "heading_rmse"}
     for one in tracks:
         kind = "corrected" if one.recording.corrected else "raw"
         names = {"snapshot": "snapshots, raw", "live": f"live, {kind}", "smoothed": f"smoothed, {kind}"}
         for key, name in names.items():
             errors, track = one.errors[key], getattr(one, key)
-            cells = [_number(getattr(errors, field), form) for field, (_, form) in _COLUMNS.items()]
+            cells = [_number(getattr(errors, field), form) for field, (_, form) in fields.items()]
             rows.append([format_id(one.recording.tag_id), name, errors.epochs or len(track), *cells])
-    columns = ("tag", "track", "epochs", *(title for title, _ in _COLUMNS.values()))
+    columns = ("tag", "track", "epochs", *(title for title, _ in fields.values()))
     show_table("Horizontal errors, m", columns, rows, left=2, max_rows=len(rows))
     console.out.print(
         "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. "
-        "Beyond: errors beyond the protection levels. Height: RMSE of z.",
+        "Beyond: errors beyond the protection levels. Height: RMSE of z."
+        + " Heading: RMSE of the yaw, rad."
+        * with_heading,
         style="dim",
     )
     for one in tracks:

@@ -40,6 +40,11 @@ YAW_CONCENTRATION = 2.0
 """Concentration of the von Mises prior of the yaw after the odometry was missing or wrong."""
 
 
+def make_estimator(config: EstimatorConfig) -> TagEstimator:
+    """Return the estimator for a configuration: with odometry if it contains the motion of a robot."""
+    return TagEstimator(config) if config.robot is None else RobotEstimator(config)
+
+
 @dataclass(slots=True)
 class _Hypothesis:
     filter: OdometryFilter

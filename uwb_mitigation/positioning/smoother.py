@@ -13,6 +13,7 @@ weights of Niehsen 2002).
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,8 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.geometry import directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.robot_estimator import make_estimator
+from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
 
 KNOT_S = 0.1
@@ -259,22 +261,29 @@ def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
         config.heights.height_m[backwards],
         config.heights.variance_m2[backwards],
     )
-    track = TagEstimator(replace(config, heights=heights)).run(mirrored)
+    robot = config.robot and replace(
+        config.robot,
+        odometry=config.robot.odometry and config.robot.odometry.reversed(end_ns),
+        imu=config.robot.imu and config.robot.imu.reversed(end_ns),
+    )
+    track = make_estimator(replace(config, heights=heights, robot=robot)).run(mirrored)
     later = _at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
     state, covariance, spread = _fused(_at(live, stamp_ns), later)
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
     found = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
-    try:
-        batch = Smoother(config, ranges).fit(live).track
-    except DatasetError:
-        batch = None
+    yaw = _fused_yaw(_yaw_at(live, stamp_ns), _yaw_at(track, end_ns - stamp_ns))
+    batch = None
+    # The batch smoother has no odometry.
+    if not np.isfinite(yaw[:, 0]).any():
+        with contextlib.suppress(DatasetError):
+            batch = Smoother(config, ranges).fit(live).track
     if batch is not None:
         state, covariance, more = fused_with_batch(state, covariance, batch)
         spread += more
     position = state[:, :3] if config.area is None else config.area.clip(state[:, :3])
-    return Track(stamp_ns, position, state[:, 3:], covariance + spread).take(found)
+    return Track(stamp_ns, position, state[:, 3:], covariance + spread, yaw).take(found)
 
 
 def fused_with_batch(
@@ -309,6 +318,36 @@ def _at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64],
     absent = (latest < 0) | (age_ns > _OLDEST_NS)
     state[absent], covariance[absent] = np.nan, np.nan
     return state, covariance
+
+
+def _yaw_at(track: Track, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return yaws and their variances (k, 2) between the estimates around each stamp; NaN where one is unknown."""
+    found = np.full((len(stamp_ns), 2), np.nan)
+    if len(track) > 1:
+        after = np.searchsorted(track.stamp_ns, stamp_ns).clip(1, len(track) - 1)
+        span_ns = track.stamp_ns[after] - track.stamp_ns[after - 1]
+        part = ((stamp_ns - track.stamp_ns[after - 1]) / np.maximum(span_ns, 1)).clip(0.0, 1.0)
+        first, second = track.yaw[after - 1], track.yaw[after]
+        found[:, 0] = first[:, 0] + part * _wrapped(second[:, 0] - first[:, 0])
+        found[:, 1] = np.maximum(first[:, 4], second[:, 4])
+        found[span_ns > _OLDEST_NS] = np.nan
+    return found
+
+
+def _fused_yaw(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Fuse yaws and variances (k, 2) by covariance intersection, as `_fused`; return the columns of `Track.yaw`."""
+    (a, p), (b, q) = one.T, other.T
+    apart, weight = _wrapped(b - a), q / (p + q)
+    both = np.isfinite(apart)
+    yaw = np.where(both, a + (1.0 - weight) * apart, np.where(np.isfinite(a), a, b))
+    variance = 1.0 / (weight / p + (1.0 - weight) / q) + weight * (1.0 - weight) * apart**2
+    variance = np.where(both, variance, np.where(np.isfinite(a), p, q))
+    zero = np.where(np.isfinite(yaw), 0.0, np.nan)
+    return np.stack([_wrapped(yaw), zero, zero, zero, variance], axis=1)
+
+
+def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi, np.float64)
 
 
 def _fused(

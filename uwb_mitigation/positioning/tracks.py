@@ -139,10 +139,11 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruePath:
-    """True positions of a tag: int64 (n,) stamps in order, float64 (n, 3) positions in m."""
+    """True positions of a tag: int64 (n,) stamps in order, float64 (n, 3) positions in m, and yaws (n,) in rad if known."""
 
     stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
+    yaw: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -158,6 +159,14 @@ class TruePath:
         if len(own) > 1:
             found[own[after] - own[after - 1] > 1_000_000_000] = np.nan
         return found
+
+    def yaw_at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return yaws float64 (k,) at other times, by interpolation; NaN where unknown."""
+        if self.yaw is None:
+            return np.full(len(stamp_ns), np.nan)
+        circle = np.stack([np.cos(self.yaw), np.sin(self.yaw), np.zeros(len(self))], axis=1)
+        cosine, sine, _ = TruePath(self.stamp_ns, circle).at(stamp_ns).T
+        return np.asarray(np.arctan2(sine, cosine), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,6 +263,7 @@ class TrackErrors:
             more is overconfident (Bar-Shalom et al., section 5.4); NaN without covariances.
         exceeded: share of epochs with an error in x or y above its protection level; NaN without covariances.
         height_rmse: RMSE of z.
+        heading_rmse: RMSE of the yaw where it is known, rad; NaN: never, or without a true yaw.
     """
 
     epochs: int
@@ -264,6 +274,7 @@ class TrackErrors:
     nees_per_dof: float
     exceeded: float
     height_rmse: float
+    heading_rmse: float = math.nan
 
     def as_json(self) -> dict[str, float | int | None]:
         """Return the keys of `track --json`; unknown values are null."""
@@ -277,6 +288,7 @@ _JSON_KEYS = {
     "p95": "p95_m",
     "exceeded": "protection_exceeded",
     "height_rmse": "height_rmse_m",
+    "heading_rmse": "heading_rmse_rad",
 }
 NO_ERRORS = TrackErrors(0, *(math.nan,) * 7)
 
@@ -293,7 +305,10 @@ def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErro
     known = np.isfinite(true).all(axis=1)
     if not known.any():
         return NO_ERRORS
-    return errors_of(track.position[known], track.covariance[known], true[known])
+    errors = errors_of(track.position[known], track.covariance[known], true[known])
+    of_yaw = np.angle(np.exp(1j * (track.yaw[:, 0] - truth.yaw_at(track.stamp_ns + offset_ns))))
+    of_yaw = of_yaw[np.isfinite(of_yaw)]
+    return replace(errors, heading_rmse=float(np.sqrt(np.mean(of_yaw**2)))) if len(of_yaw) else errors
 
 
 def errors_of(

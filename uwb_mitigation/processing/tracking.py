@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.bag.poses import encode_odometry, encode_pose, encode_true_position, tag_frame, tag_topic
+from uwb_mitigation.bag.poses import (
+    BodyTwist,
+    encode_odometry,
+    encode_pose,
+    encode_true_position,
+    tag_frame,
+    tag_topic,
+)
 from uwb_mitigation.bag.topics import (
     ODOMETRY,
     ODOMETRY_TRUTH,
@@ -22,10 +29,12 @@ from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import Shape, geometry, shape
 from uwb_mitigation.positioning.initialization import snapshot
+from uwb_mitigation.positioning.robot_estimator import make_estimator
 from uwb_mitigation.positioning.smoother import Smoother, smooth
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import (
     NO_ERRORS,
+    Estimate,
     Ranges,
     Track,
     TrackErrors,
@@ -93,7 +102,7 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
         DatasetError: no position of the tag can be determined; the message contains the reason, if the anchors show it.
     """
     ranges, anchors = recording.ranges, config.anchors
-    locator = TagEstimator(config)
+    locator = make_estimator(config)
     live = locator.run(ranges)
     if len(live) < 2:
         raise _no_position(recording, config, locator)
@@ -111,7 +120,7 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     if not hdop <= POOR_HDOP:
         warnings.append(
             f"poor geometry: median HDOP {hdop:.0f}. The anchors are {shape(used).value}. "
-            "CandidatePosition anchors on more sides of the tag"
+            "Place anchors on more sides of the tag"
         )
     share = len(live) / len(ranges)
     if share < 0.9:
@@ -264,22 +273,40 @@ def _messages(one: TagTracks, several: bool) -> Iterator[tuple[int, str, str, by
     tag = one.recording.tag_id
     name, frame = (tag if several else None), tag_frame(tag)
     for estimate in one.live:
-        data = encode_odometry(estimate, child_frame_id=frame)
+        data = encode_odometry(estimate, child_frame_id=frame, twist=_body_twist(estimate))
         yield estimate.stamp_ns, tag_topic(ODOMETRY, name), ODOMETRY_TYPE, data
     for estimate in one.smoothed:
         yield estimate.stamp_ns, tag_topic(POSE_SMOOTHED, name), POSE_TYPE, encode_pose(estimate)
     truth = one.recording.truth
-    for stamp, position in zip(truth.stamp_ns.tolist(), truth.position.tolist(), strict=True):
-        yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, encode_true_position(position, tag, stamp)
+    yaws = truth.yaw_at(truth.stamp_ns).tolist()
+    for stamp, position, yaw in zip(truth.stamp_ns.tolist(), truth.position.tolist(), yaws, strict=True):
+        data = encode_true_position(position, tag, stamp, yaw if np.isfinite(yaw) else None)
+        yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, data
+
+
+def _body_twist(estimate: Estimate) -> BodyTwist | None:
+    """Return the velocity in the axes of the robot; None: its heading is unknown."""
+    if estimate.heading is None:
+        return None
+    cosine, sine = np.cos(estimate.heading.yaw), np.sin(estimate.heading.yaw)
+    vx, vy, _ = estimate.velocity.tolist()
+    variance = float(estimate.covariance[[3, 4], [3, 4]].max())
+    return BodyTwist(cosine * vx + sine * vy, cosine * vy - sine * vx, speed_variance=variance)
 
 
 def tum(track: Track) -> str:
-    """Return a track in TUM's format: stamp in s, position, and the identity as orientation, which is unobservable."""
+    """Return a track in TUM's format: stamp in s, position, and orientation, which is the identity if it is unknown."""
     lines = (
-        f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d} {x:.6f} {y:.6f} {z:.6f} 0 0 0 1\n"
-        for stamp, (x, y, z) in zip(track.stamp_ns.tolist(), track.position.tolist(), strict=True)
+        f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d} {x:.6f} {y:.6f} {z:.6f} {_quaternion_text(yaw)}\n"
+        for stamp, (x, y, z), yaw in zip(
+            track.stamp_ns.tolist(), track.position.tolist(), track.yaw[:, 0].tolist(), strict=True
+        )
     )
     return "".join(lines)
+
+
+def _quaternion_text(yaw: float) -> str:
+    return f"0 0 {np.sin(yaw / 2.0):.6f} {np.cos(yaw / 2.0):.6f}" if np.isfinite(yaw) else "0 0 0 1"
 
 
 def tum_file(path: Path, tag_id: int, several: bool) -> Path:
