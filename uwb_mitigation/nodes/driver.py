@@ -39,7 +39,6 @@ from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.live_feeds import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.nodes.replay import ReplayFeed
-from uwb_mitigation.nodes.topic_feed import TopicFeed
 from uwb_mitigation.nodes.uci_feed import UciFeed, uci_settings
 from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.sources.source import Source
@@ -197,6 +196,9 @@ class Driver(ManagedNode):
         return lambda: UciFeed(self.value, self._publish_range, self.now_ns, self.get_logger())
 
     def _prepare_topics(self) -> Callable[[], Feed]:
+        # Mapping files need pandas and pydantic, which the other sources do not.
+        from uwb_mitigation.nodes.topic_feed import TopicFeed
+
         feed = TopicFeed(self, self.value("map"), self.value("topic"), self._publish_topic_range, self.now_ns)
         return lambda: feed
 

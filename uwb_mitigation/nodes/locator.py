@@ -38,7 +38,6 @@ from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
 from uwb_mitigation.nodes.robot_motion import RobotMotion, check_frames, transform_type
-from uwb_mitigation.nodes.topic_feed import TopicRanges
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.geometry import Area, Height
@@ -47,7 +46,6 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.tracks import Estimate, Heading
 from uwb_mitigation.sources.anchors_file import load_anchors
-from uwb_mitigation.sources.mapping import load_mapping, shipped_mappings
 
 BATCH = 64
 """Maximum number of queued ranges that one callback processes."""
@@ -200,18 +198,28 @@ class Locator(ManagedNode):
         self._tf = self.publisher(message, topics.TF, QoSProfile(depth=100))
         self._make_tf = lambda transforms: message(transforms=transforms)
 
+    def _subscribe_to_mapping(self, name: str) -> bool:
+        """Subscribe to the topics of a mapping; return False if `name` is that of a topic."""
+        # Mapping files need pandas and pydantic, which other ranges do not.
+        from uwb_mitigation.nodes.topic_feed import TopicRanges
+        from uwb_mitigation.sources.mapping import load_mapping, shipped_mappings
+
+        if name not in shipped_mappings() and not name.endswith((".yaml", ".yml")):
+            return False
+        mapping = load_mapping(name)
+        variance_m2 = mapping.range_sd**2 or math.nan
+
+        def on_range(measurement: RangeMeasurement) -> None:
+            if self._estimator is not None and self.is_active:
+                self._update_lever_arm(self._estimator, measurement.tag_id, lambda: measurement.frame_id)
+                self._add(self._estimator, *_uncorrected(measurement, variance_m2))
+
+        source_topics = TopicRanges(self, mapping, "", on_range, self.now_ns)
+        self.destroy_at_close(source_topics, TopicRanges.close).open()
+        return True
+
     def _subscribe_to_ranges(self, source: str) -> None:
-        if source in shipped_mappings() or source.endswith((".yaml", ".yml")):
-            mapping = load_mapping(source)
-            variance_m2 = mapping.range_sd**2 or math.nan
-
-            def on_range(measurement: RangeMeasurement) -> None:
-                if self._estimator is not None and self.is_active:
-                    self._update_lever_arm(self._estimator, measurement.tag_id, lambda: measurement.frame_id)
-                    self._add(self._estimator, *_uncorrected(measurement, variance_m2))
-
-            source_topics = TopicRanges(self, mapping, "", on_range, self.now_ns)
-            self.destroy_at_close(source_topics, TopicRanges.close).open()
+        if source and self._subscribe_to_mapping(source):
             return
         kind, name = (RangeCir, source) if source else (RangeCorrected, topics.RANGE_CORRECTED)
         self._decode = (
