@@ -217,6 +217,13 @@ def test_stamps_of_every_unit(unit: str, text: str, stamp_ns: int, tmp_path: Pat
     assert abs(record.measurement.stamp_ns - stamp_ns) < 500
 
 
+def test_rows_without_an_id_are_dropped_and_counted(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r\n0,1,2\n1,,3\n2,-,4\n3,2.0,5\n")
+    source = read(PLAIN, tmp_path / "x.csv")
+    assert ranges_of(source) == [2.0, 5.0]
+    assert source.dropped == {"tag or anchor is unknown": 2}
+
+
 def test_files_are_merged_by_time_and_their_names_give_ids(tmp_path: Path):
     write(tmp_path / "a1.csv", "t,r\n0,1\n2,3\n")
     write(tmp_path / "a2.csv", "t,r\n1,2\n3,4\n")

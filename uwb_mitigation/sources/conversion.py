@@ -19,7 +19,9 @@ from uwb_mitigation.sources.tables import LOG_TIME, TOPIC, Chunk, series
 _MISSING = frozenset(("", "-", "nan", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
 
-_MAX_ID = 1 << 64
+UNKNOWN_ID = (1 << 64) - 1
+"""Id of a row without an id."""
+
 NO_SAMPLES: NDArray[np.int16] = np.zeros(0, np.int16)
 
 _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
@@ -43,7 +45,7 @@ class Columns:
 
     Attributes:
         stamp_ns: int64 (n,).
-        tag_id, anchor_id: uint64 (n,).
+        tag_id, anchor_id: uint64 (n,); `UNKNOWN_ID`: unknown.
         numbers: {name: float64 (n,)} for `range`, `rx_power`, `first_path_power`, `first_path_index`,
             `preamble_count`, `channel`, `sequence`, `true range`, `error`, and true positions such as `tag x`.
         label, configuration: texts (n,).
@@ -327,9 +329,12 @@ def _ids(value: Value, chunk: Chunk, name: str, file: str, names: Names) -> NDAr
         if item in found:
             continue
         try:
+            if str(item).strip().lower() in _MISSING:
+                found[item] = UNKNOWN_ID
+                continue
             text = _text(value, item, name)
             found[item] = names.number(text) if value.names else _id(text) + round(value.offset)
-            if not 0 <= found[item] < _MAX_ID:
+            if not 0 <= found[item] < UNKNOWN_ID:
                 raise ValueError(text)
         except (ValueError, UwbMitigationError) as error:
             raise RecordingError(

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, format_id
 from uwb_mitigation.measurement import Cir, Encoding, Record, Truth
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.positioning.tracks import Odometry, TruePath
 from uwb_mitigation.sources.conversion import (
     NO_SAMPLES,
+    UNKNOWN_ID,
     Columns,
     Converter,
     kept_rows,
@@ -181,6 +182,7 @@ class MappedRecording(Source):
         for what, good in (
             ("range is not a number", np.isfinite(part.numbers["range"])),
             ("stamp is not a number", part.stamp_ns != _UNKNOWN_STAMP),
+            ("tag or anchor is unknown", (part.tag_id != UNKNOWN_ID) & (part.anchor_id != UNKNOWN_ID)),
         ):
             count = int(np.count_nonzero(~good))
             if count:
@@ -233,7 +235,11 @@ class MappedRecording(Source):
             for path in paths[:1]:
                 self._positions = self._anchors_in(path)
         names = {number: text for text, number in self._converter.anchors.numbers.items()}
-        if self._positions:
+        if len(self._positions) > MAX_ANCHORS:
+            self.warnings.append(
+                f"{len(self._positions)} anchors, of which none is written: at most {MAX_ANCHORS}"
+            )
+        elif self._positions:
             chosen = [self._positions[key] for key in sorted(self._positions)]
             self.anchors = AnchorMap(
                 [Anchor(each.id, each.position, each.sd, names.get(each.id, "")[:100]) for each in chosen],
