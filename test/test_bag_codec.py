@@ -79,7 +79,7 @@ corrections = st.builds(
 
 
 @given(measurements, truths, corrections)
-def test_messages_equal_those_of_the_rosbags_library(
+def test_messages_equal_rosbags(
     measurement: RangeMeasurement, truth: Truth, correction: CorrectedRange
 ) -> None:
     store = schemas.typestore()
@@ -125,7 +125,7 @@ def test_truncated_message_is_refused(measurement: RangeMeasurement, data: st.Da
 
 @pytest.mark.parametrize("decode", [codec.decode_range, codec.decode_truth, codec.decode_corrected])
 @given(noise=st.binary(max_size=200), start=st.sampled_from([b"", b"\0\1\0\0"]))
-def test_arbitrary_bytes_decode_or_are_refused(
+def test_any_bytes_decode_or_are_refused(
     decode: Callable[[bytes], object], noise: bytes, start: bytes
 ) -> None:
     with contextlib.suppress(RecordingError):

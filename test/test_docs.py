@@ -177,7 +177,7 @@ def test_parameters_set_on_pages_are_live(words: list[str]):
 
 
 @pytest.mark.parametrize("words", lines_of("ros2", "launch", "uwb_mitigation"))
-def test_launch_commands_on_pages_start_nodes(
+def test_launch_commands_start_nodes(
     words: list[str], generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -263,9 +263,7 @@ def test_templates_use_everything_that_can_be_generated():
         ("Message.msg", "# fine\nfloat32 range # m, absurd\n", [2]),
     ],
 )
-def test_language_check_finds_expressions_outside_code(
-    tmp_path: Path, name: str, text: str, lines: list[int]
-):
+def test_language_check_finds_expressions_in_text(tmp_path: Path, name: str, text: str, lines: list[int]):
     (tmp_path / name).write_text(text, encoding="utf-8")
     command = [sys.executable, generated.DOCS / "style" / "check_words.py", tmp_path / name]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

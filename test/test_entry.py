@@ -55,9 +55,7 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
         ("benchmarks", signal.SIGINT),
     ],
 )
-def test_signal_during_the_import_ends_the_process_immediately(
-    executable: str, number: signal.Signals, tmp_path: Path
-):
+def test_signal_during_the_import_ends_the_process(executable: str, number: signal.Signals, tmp_path: Path):
     for package in ("rclpy", "typer"):
         (tmp_path / f"{package}.py").write_text(
             "import time\nprint('loading', flush=True)\ntime.sleep(600)\n"

@@ -91,9 +91,7 @@ def test_site_model_does_not_worsen_out_of_distribution_measurements(name, mitig
 
 
 @pytest.mark.parametrize("decibels", [-14, -13, -12, -11])
-def test_radio_that_is_weaker_by_a_wall_or_two_is_made_worse_by_an_eighth_at_most(
-    decibels, mitigation, records
-):
+def test_weaker_radio_is_made_worse_by_an_eighth_at_most(decibels, mitigation, records):
     # A single range cannot distinguish a weaker radio in LOS from walls with the same attenuation.
     outcome = changed(mitigation, records, louder(decibels))
     # If a bundle is better, update the table in docs/background/results.md.

@@ -15,9 +15,7 @@ from uwb_mitigation.files import partial_path, read_bounded, write_all_atomicall
 @pytest.mark.parametrize(
     ("name", "excerpt"), [("absent", "no such file"), (".", "no such file"), ("empty", "empty")]
 )
-def test_empty_file_is_refused_with_its_name_and_the_valid_content(
-    tmp_path: Path, name: str, excerpt: str
-) -> None:
+def test_missing_or_empty_file_is_refused_with_its_name(tmp_path: Path, name: str, excerpt: str) -> None:
     (tmp_path / "empty").touch()
     with pytest.raises(ModelError, match=rf"{excerpt}.*\(a model\)") as caught:
         read_bounded(tmp_path / name, 10, ModelError, "a model")

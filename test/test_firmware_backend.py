@@ -39,9 +39,7 @@ if TYPE_CHECKING:
         firmware_models.mlp_bundle,
     ],
 )
-def test_firmware_gives_the_corrected_ranges_of_onnx_runtime(
-    bundle_in: Callable[[Path], Bundle], tmp_path: Path
-):
+def test_firmware_equals_the_ranges_of_onnx_runtime(bundle_in: Callable[[Path], Bundle], tmp_path: Path):
     bundle = bundle_in(tmp_path)
     random = np.random.default_rng(8)
     measurements = [firmware_models.random_measurement(random) for _ in range(600)]
@@ -74,9 +72,7 @@ def test_cc_may_be_empty_or_contain_options(words: str, monkeypatch: pytest.Monk
 
 @NEEDS_CC
 @pytest.mark.ros
-def test_mitigator_corrects_with_the_firmware_backend(
-    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_mitigator_uses_the_firmware_backend(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from rclpy.serialization import deserialize_message
     from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 

@@ -64,9 +64,7 @@ def check_windows(exported: Exported, image: toolchain.Image, windows: np.ndarra
     return result
 
 
-def test_kernels_equal_onnx_runtime_on_thousands_of_windows_within_the_budgets(
-    exported: Exported, image: toolchain.Image
-):
+def test_kernels_equal_onnx_runtime_within_the_budgets(exported: Exported, image: toolchain.Image):
     subject = exported.subject
     # Emulated inferences take most of the time: run half as many with the unusual first kernel, which is tested
     # natively.

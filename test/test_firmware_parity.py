@@ -56,13 +56,11 @@ def check_windows(exported: Exported, compiled: CompiledFirmware, windows: np.nd
     assert np.array_equal(bits(compiled.predict_m(windows)), expected)
 
 
-def test_c_and_oracle_equal_onnx_runtime_on_five_thousand_windows(
-    exported: Exported, compiled: CompiledFirmware
-):
+def test_c_and_reference_equal_onnx_runtime_on_windows(exported: Exported, compiled: CompiledFirmware):
     check_windows(exported, compiled, exported.windows())
 
 
-def test_c_and_oracle_equal_onnx_runtime_on_real_logs(
+def test_c_and_reference_equal_onnx_runtime_on_logs(
     exported: Exported, compiled: CompiledFirmware, apartment: Path
 ):
     windows = exported.real_windows(apartment)

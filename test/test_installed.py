@@ -94,9 +94,7 @@ def test_command_is_in_the_path_of_a_sourced_workspace(prefix: Path):
         ("pipeline", "simulated_rate:=100.0", "replaying"),
     ],
 )
-def test_node_starts_where_it_is_installed_and_ends_on_ctrl_c(
-    prefix: Path, tmp_path: Path, name: str, parameter: str, words: str
-):
+def test_installed_node_starts_and_ends(prefix: Path, tmp_path: Path, name: str, parameter: str, words: str):
     start_and_end([prefix / "lib" / NAME / name, "--ros-args", "-p", parameter], words, tmp_path)
 
 
@@ -178,9 +176,7 @@ def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: 
         ("mitigator", "uwb_mitigation_msgs", "error: ROS 2 is not set up: there is no uwb_mitigation_msgs"),
     ],
 )
-def test_missing_dependency_of_an_executable_is_one_line(
-    tmp_path: Path, name: str, absent: str, excerpt: str
-):
+def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, name: str, absent: str, excerpt: str):
     command = without([absent], name)
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1

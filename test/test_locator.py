@@ -169,7 +169,7 @@ def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors
     ("text", "excerpt"),
     [(None, "no such file"), ("anchors: [{id: 1, x: 0, y: 0}]", "the field z is missing")],
 )
-def test_unusable_anchors_file_is_reported_and_the_node_keeps_running(
+def test_unusable_anchors_file_is_reported_by_the_node(
     ros: Ros, tmp_path: Path, text: str | None, excerpt: str
 ):
     path = tmp_path / "anchors.yaml"

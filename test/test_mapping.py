@@ -519,9 +519,7 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
         ("", {}, "the file is empty"),
     ],
 )
-def test_a_file_that_does_not_fit_is_an_error_with_a_remedy(
-    text: str, changes: Any, message: str, tmp_path: Path
-):
+def test_unsuitable_file_is_an_error_with_a_remedy(text: str, changes: Any, message: str, tmp_path: Path):
     write(tmp_path / "x.csv", text)
     with pytest.raises(RecordingError, match=message):
         read(with_fields(**changes), tmp_path / "x.csv")

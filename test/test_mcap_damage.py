@@ -72,9 +72,7 @@ def test_damaged_chunk_loses_only_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shift", [-(2**40), -7, 3, 2**40])
-def test_false_index_with_valid_checksum_is_reported_and_allocates_little_memory(
-    tmp_path: Path, shift: int
-) -> None:
+def test_false_index_is_reported_and_allocates_little_memory(tmp_path: Path, shift: int) -> None:
     path = write_bag(tmp_path / "bag.mcap")
     content = bytearray(path.read_bytes())
     ((offset, _),) = chunk_offsets(path)

@@ -136,9 +136,9 @@ def test_other_file_is_refused(tmp_path: Path, content: bytes, excerpt: str) -> 
 
 
 def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> None:
-    source = McapRecording(write_bag(tmp_path / "bag.mcap"), topic="/other")
+    source = McapRecording(write_bag(tmp_path / "bag.mcap"), topic="/uwb/range")
     with pytest.raises(
-        RecordingError, match=r"no topic /other.*range_raw \(uwb_mitigation_msgs/msg/RangeCir\)"
+        RecordingError, match=r"mean '/uwb/range_raw'.*raw \(uwb_mitigation_msgs/msg/RangeCir\)"
     ):
         list(source)
 
@@ -151,7 +151,7 @@ def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> N
         ((RANGE_RAW, RANGE_CIR_TYPE, "float32 range"), "another version .* 'float32 range'"),
     ],
 )
-def test_topic_with_another_layout_is_refused(
+def test_topic_of_other_layout_is_refused(
     tmp_path: Path, channel: tuple[str, str, str | None], excerpt: str
 ) -> None:
     bag = Foreign(tmp_path / "bag.mcap")

@@ -176,10 +176,11 @@ def test_invalid_row_is_named(tmp_path, row, named):
 
 def test_file_that_is_not_a_truth_table_is_refused(tmp_path):
     (tmp_path / "binary.csv").write_bytes(b"\xff\x00\xfe")
-    without_anchor = write(tmp_path, "1,2", header="tag_id,range_m").rename(tmp_path / "columns.csv")
+    without_anchor = write(tmp_path, "1,2,3", header="tag_id,anchor,range_m").rename(tmp_path / "columns.csv")
     for path in (tmp_path / "absent.csv", tmp_path / "binary.csv", write(tmp_path), without_anchor):
-        with pytest.raises(RecordingError):
+        with pytest.raises(RecordingError) as caught:
             load_truth(path)
+    assert caught.value.suggestion == "did you mean 'anchor_id'?"
 
 
 # --- the command ---

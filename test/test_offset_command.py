@@ -189,9 +189,7 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
         (("--truth", "--anchor", "door"), "anchor = 'door'"),
     ],
 )
-def test_contradictory_options_are_refused_before_the_work(
-    options: tuple[str, ...], excerpt: str, tmp_path: Path
-):
+def test_contradictory_options_are_refused_early(options: tuple[str, ...], excerpt: str, tmp_path: Path):
     outcome = command_line.run("offset", "none.mcap", *options, folder=tmp_path)
     assert outcome.returncode != 0
     assert excerpt in outcome.stderr

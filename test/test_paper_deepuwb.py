@@ -77,9 +77,7 @@ def amplitudes_of(records: list[Record]) -> np.ndarray:
         lambda data: data.set_index(pd.Index([f"r{i}" for i in range(len(data))])),
     ],
 )
-def test_frame_is_read_in_every_representation(
-    tmp_path: Path, writing: Callable[[pd.DataFrame], pd.DataFrame]
-) -> None:
+def test_every_kind_of_frame_is_read(tmp_path: Path, writing: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
     data = frame()
     records = list(DeepUwbRecording(written(tmp_path, writing(data))))
     assert np.allclose(amplitudes_of(records), np.stack(list(data["CIR"])), atol=2e-5)
@@ -299,9 +297,7 @@ def mirror(tmp_path: Path) -> Iterator[str]:
         thread.join()
 
 
-def test_wrong_checksum_leaves_no_file_and_a_file_with_the_checksum_is_kept(
-    mirror: str, tmp_path: Path
-) -> None:
+def test_wrong_checksum_leaves_no_file_and_a_valid_file_is_kept(mirror: str, tmp_path: Path) -> None:
     path = tmp_path / "a.pkl"
     with pytest.raises(RecordingError):
         fetch_deepuwb(path, f"{mirror}/dataset.pkl", "0" * 64)

@@ -44,9 +44,7 @@ def replaying(tmp_path_factory: pytest.TempPathFactory):
         ("rate", 3, None),
     ],
 )
-def test_value_is_refused_by_name_value_and_range(
-    replaying: Ros, name: str, value: object, excerpt: tuple | None
-):
+def test_invalid_value_is_refused_with_range(replaying: Ros, name: str, value: object, excerpt: tuple | None):
     result = replaying.set_parameter("driver", name, value)
     assert result.successful == (excerpt is None)
     assert all(word in result.reason for word in excerpt or ()), result.reason
@@ -76,9 +74,7 @@ def test_parameters_of_other_nodes_in_a_shared_file_are_logged_in_one_line(ros: 
     assert line.endswith("anchors, height, model")
 
 
-def test_parameters_that_were_set_survive_a_respawn(
-    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_live_parameters_survive_a_respawn(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(KEPT_PARAMETERS, str(tmp_path))
     mitigator = ros.start("mitigator", "offsets:=0.1")
     mitigator.wait_for_output("correcting with")

@@ -222,9 +222,7 @@ def test_smart_power_sends_one_frame_per_millisecond(air: Air):
         (RadioSettings(channel=2, antenna_delay=32_700), 32_700, 32_700),
     ],
 )
-def test_antenna_delay_of_a_trek1000_board_is_that_of_its_use_case(
-    air: Air, settings: RadioSettings, tag: int, anchor: int
-):
+def test_antenna_delay_of_a_trek1000_is_from_otp(air: Air, settings: RadioSettings, tag: int, anchor: int):
     assert antenna_delays(air, settings, revision=2) == (anchor, tag)
 
 

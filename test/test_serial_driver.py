@@ -245,9 +245,7 @@ def test_board_subtracts_the_offsets_of_the_driver(ros: Ros, link: Path):
         assert "millimetres" in refused.reason
 
 
-def test_missing_or_forbidden_port_is_logged_once(
-    ros: Ros, link: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_unusable_port_is_logged_once(ros: Ros, link: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     driver = drive(ros, link)
     absent = f"{link}: is not there (plug the board in); waiting for the board"
     driver.wait_for_output(absent)

@@ -92,9 +92,7 @@ def test_line_of_sight_errors_centre_on_the_offset(survey: list[Record]) -> None
     assert np.percentile(error, 75) - np.percentile(error, 25) < 0.06
 
 
-def test_obstacles_make_the_range_long_and_a_lost_direct_path_longer(
-    drive: list[Record], survey: list[Record]
-) -> None:
+def test_obstacles_and_lost_direct_paths_lengthen_ranges(drive: list[Record], survey: list[Record]) -> None:
     for records in (drive, survey):
         los, nlos, ndp = (errors_of(records, label) for label in ("LOS", "NLOS", "NDP NLOS"))
         assert min(len(los), len(nlos), len(ndp)) >= 20
@@ -153,9 +151,7 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
         (["--seed", "-1"], "seed"),
     ],
 )
-def test_invalid_simulation_is_refused_and_leaves_no_file(
-    tmp_path: Path, words: list[str], excerpt: str
-) -> None:
+def test_invalid_simulation_is_refused(tmp_path: Path, words: list[str], excerpt: str) -> None:
     done = CliRunner().invoke(app, ["data", "simulate", "-o", str(tmp_path / "sim.mcap"), *words])
     assert isinstance(done.exception, ParameterError)
     assert excerpt in str(done.exception)
@@ -181,9 +177,7 @@ def test_invalid_simulation_is_refused_and_leaves_no_file(
         (lambda: SimulatedSurvey(plan=FloorPlan((1.0, 9.0))), "plan size in x", "1.0", "2 to 1000"),
     ],
 )
-def test_bad_parameter_is_refused_by_name_value_and_range(
-    make: Callable[[], object], name: str, value: str, valid: str
-) -> None:
+def test_invalid_parameter_is_refused(make: Callable[[], object], name: str, value: str, valid: str) -> None:
     with pytest.raises(ParameterError) as caught:
         make()
     for part in (name, value, valid):

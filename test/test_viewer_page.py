@@ -151,9 +151,7 @@ def test_slow_pair_has_data_between_its_ranges(view: View, clock: Clock) -> None
     assert source.data["rate"] == pytest.approx([0.2])
 
 
-def test_map_view_is_fixed_until_the_user_changes_it(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_map_view_is_fixed_until_changed(browser: Browser, view: View, server: ViewerServer) -> None:
     fill_scene(view)
     open_page(browser, server)
 
@@ -357,9 +355,7 @@ def test_unknown_host_is_refused(view: View, server: ViewerServer, path: str) ->
         assert fetch(other, Host="robot.local:5006").status == 200
 
 
-def test_content_security_policy_blocks_other_scripts(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_content_security_policy_blocks_scripts(browser: Browser, view: View, server: ViewerServer) -> None:
     fill_scene(view)
     policies = [
         fetch(server, path, Host=f"localhost:{server.port}", **{"X-Nonce": "mine"}).headers[
@@ -386,9 +382,7 @@ def test_content_security_policy_blocks_other_scripts(
     assert browser.run("return window.pwned ?? null") is None
 
 
-def test_swipe_over_a_figure_scrolls_the_page_on_a_phone(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_swipe_over_a_figure_scrolls_a_phone(browser: Browser, view: View, server: ViewerServer) -> None:
     fill_scene(view)
     with browser.touch_screen():
         open_page(browser, server, 400, 800)
@@ -403,9 +397,7 @@ def test_swipe_over_a_figure_scrolls_the_page_on_a_phone(
 
 
 @pytest.mark.parametrize("width", [1280, 1024, 400])
-def test_content_fits_the_width_of_the_screen(
-    browser: Browser, view: View, server: ViewerServer, width: int
-) -> None:
+def test_content_fits_the_screen(browser: Browser, view: View, server: ViewerServer, width: int) -> None:
     fill_scene(view)
     with view.lock:
         view.scene.add_sample(
@@ -445,9 +437,7 @@ def test_unusable_address_is_refused(server: ViewerServer, view: View) -> None:
         ViewerServer(view, port=server.port)
 
 
-def test_pairs_can_be_sorted_filtered_searched_and_selected(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_pairs_can_be_sorted_and_selected(browser: Browser, view: View, server: ViewerServer) -> None:
     fill_scene(view)
     open_page(browser, server)
 
@@ -473,9 +463,7 @@ def test_pairs_can_be_sorted_filtered_searched_and_selected(
     browser.wait("it in the URL", lambda: "#anchor=2&tag=7" in browser.driver.current_url)
 
 
-def test_map_shows_tracks_rays_and_statuses_and_can_be_exported(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_map_shows_and_exports_tracks_and_rays(browser: Browser, view: View, server: ViewerServer) -> None:
     fill_scene(view)
     with view.lock:
         view.scene.add_pose("tag", Pose(4, 3, 1, (0.4, 0.2, 0.3), 0.9, 0.5))
