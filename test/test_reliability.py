@@ -293,7 +293,7 @@ def test_best_effort_publisher_is_reported_and_received_with_a_qos_override(ros:
     data = encode_range(next(iter(SimulatedSource(seed=2))).measurement)
     publisher = ros.node.create_publisher(RangeCir, RAW, qos_profile_sensor_data)
     mitigator = ros.start("mitigator")
-    status = ros.diagnosis("mitigator", lambda status: "best effort" in status.message)
+    status = ros.diagnosis("mitigator", lambda status: "best-effort" in status.message)
     assert status.level == DiagnosticStatus.WARN
     assert "/test_client publishes with best-effort reliability and is not received" in status.message
     (parameter,) = re.findall(r"qos_overrides\S+", status.message)
