@@ -188,8 +188,9 @@ uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, co
         corrected->correction_m = offset_m;
         /* Without an offset the variance contains the offsets of the training boards. */
         const int calibrated = status == UWB_EMPTY && offset_m != 0.0f;
-        corrected->variance_m2 = INFINITY;
-        if (valid) {
+        if (!valid) {
+            corrected->variance_m2 = INFINITY;
+        } else {
             corrected->variance_m2 = calibrated ? model->variance_m2 : model->variance_uncorrected_m2;
         }
     }
