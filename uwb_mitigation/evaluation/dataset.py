@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.measurement import RadioType, Record, Segment
+from uwb_mitigation.measurement import RadioType, RangeMeasurement, Record, Segment, Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing
 
 _BATCH = 256
@@ -61,6 +61,11 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.error_m)
 
+    @property
+    def has_cirs(self) -> bool:
+        """Whether the measurements have CIRs; without, all inputs are zero."""
+        return len(self) > 0 and bool(self.inputs[0].any())
+
     def rows(self, selected: NDArray[np.intp] | NDArray[np.bool_]) -> Dataset:
         """Return a dataset with these rows."""
         columns = {name: getattr(self, name) for name in _COLUMNS}
@@ -93,6 +98,8 @@ def build_dataset(
 ) -> Dataset:
     """Preprocess every measurement that has a true range; count the others by reason.
 
+    If no measurement has a CIR, the inputs are zero. If some have one, only those are used.
+
     `on_record` is called with each record that was read.
 
     Raises:
@@ -100,18 +107,10 @@ def build_dataset(
     """
     skipped: Counter[str] = Counter()
     inputs, values, headers, ids, configurations, labels = [], [], [], [], [], []
+    without_cir: list[tuple[RangeMeasurement, Truth]] = []
     sources: set[tuple[RadioType, Segment]] = set()
-    for record, fault, window in _preprocessed(records, preprocessing, on_record):
-        measurement, truth = record.measurement, record.truth
-        if truth is None or not math.isfinite(truth.range_m):
-            skipped["no true range"] += 1
-            continue
-        if not (math.isfinite(measurement.range_m) and measurement.range_m >= 0):
-            skipped["no valid range"] += 1
-            continue
-        if fault:
-            skipped[CirFault(fault).text] += 1
-            continue
+
+    def add(measurement: RangeMeasurement, truth: Truth, window: NDArray[np.float32]) -> None:
         inputs.append(window)
         sources.add((measurement.cir.radio or RadioType.DW1000, measurement.cir.segment or Segment.IPATOV))
         values.append(
@@ -126,6 +125,27 @@ def build_dataset(
         ids.append((measurement.tag_id, measurement.anchor_id))
         configurations.append(truth.configuration)
         labels.append(truth.label)
+
+    for record, fault, window in _preprocessed(records, preprocessing, on_record):
+        measurement, truth = record.measurement, record.truth
+        if truth is None or not math.isfinite(truth.range_m):
+            skipped["no true range"] += 1
+            continue
+        if not (math.isfinite(measurement.range_m) and measurement.range_m >= 0):
+            skipped["no valid range"] += 1
+            continue
+        if fault == CirFault.EMPTY and not inputs:
+            without_cir.append((measurement, truth))
+        elif fault:
+            skipped[CirFault(fault).text] += 1
+        else:
+            add(measurement, truth, window)
+    if inputs or skipped[CirFault.EMPTY.text]:
+        skipped[CirFault.EMPTY.text] += len(without_cir)
+    else:
+        for measurement, truth in without_cir:
+            add(measurement, truth, np.zeros(preprocessing.samples, np.float32))
+    skipped = +skipped
     if not inputs:
         reasons = ", ".join(f"{count} x {reason}" for reason, count in skipped.items()) or "no measurements"
         raise DatasetError(f"no labelled measurement that can be used: {reasons}")

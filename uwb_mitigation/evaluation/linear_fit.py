@@ -15,6 +15,9 @@ from uwb_mitigation.model.linear_bias import LinearBiasModel
 MIN_CONFIGURATIONS = 6
 """With fewer configurations, the linear bias model is their median, because three coefficients are not observable."""
 
+MAX_LOS_GAIN_M, MAX_LOS_STEPS, LOS_WEIGHT_STEP = 0.01, 8, 1.5
+"""Largest increase of the error of LOS ranges by a line that is fitted to single ranges, and how it is enforced."""
+
 MIN_POWER_RANGE_DB = 1.0
 """Minimum span of the received powers for fitting a line in the received power."""
 
@@ -56,6 +59,52 @@ def fit_linear_bias(
     if has_constant_power or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         return fit_constant(configurations, error_m)
     coefficients = least_absolute_deviations(design, configuration_means(names, error_m[has_powers]))
+    return LinearBiasModel(*(float(np.float32(value)) for value in coefficients))
+
+
+def fit_linear_bias_to_rows(
+    rx_power_dbm: NDArray[np.floating],
+    first_path_power_dbm: NDArray[np.floating],
+    error_m: NDArray[np.floating],
+    is_los: NDArray[np.bool_],
+) -> LinearBiasModel:
+    """Fit the linear bias model to single ranges, for recordings without CIRs; all arrays have the shape (n,).
+
+    In such recordings, a configuration is often a whole environment with LOS and NLOS ranges, so that its mean shows no
+    line. LOS ranges get more weight until their error does not grow. Levels that no range has are not used.
+
+    Args:
+        rx_power_dbm: received power, dBm; NaN: unknown.
+        first_path_power_dbm: first-path power, dBm; NaN: unknown.
+        error_m: measured - true range, m.
+        is_los: whether a range is in line of sight.
+
+    Raises:
+        DatasetError: there are no measurements.
+    """
+    constant = LinearBiasModel(float(np.float32(np.median(error_m)))) if len(error_m) else None
+    if constant is None:
+        raise DatasetError("no measurements to fit a linear bias model to")
+    columns = [rx_power_dbm.astype(np.float64)]
+    gap = columns[0] - first_path_power_dbm
+    if np.isfinite(gap).any():
+        columns.append(gap)
+    known = np.isfinite(np.sum(columns, axis=0))
+    design = np.column_stack([np.ones(len(error_m)), *columns])[known]
+    target, los = error_m[known], is_los[known]
+    has_line = len(design) and float(np.ptp(design[:, 1])) >= MIN_POWER_RANGE_DB
+    if not has_line or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
+        return constant
+    weight = np.ones(len(target))
+    raw_los_m = float(np.abs(target[los]).mean()) if los.any() else np.inf
+    for _ in range(MAX_LOS_STEPS):
+        coefficients = least_absolute_deviations(design * weight[:, None], target * weight)
+        if (
+            not los.any()
+            or np.abs((target - design @ coefficients)[los]).mean() <= raw_los_m + MAX_LOS_GAIN_M
+        ):
+            break
+        weight[los] *= LOS_WEIGHT_STEP
     return LinearBiasModel(*(float(np.float32(value)) for value in coefficients))
 
 

@@ -35,8 +35,8 @@ _BATCH = 256
 _MAD_TO_SD = 1.4826
 _MEDIAN_SD_FACTOR = math.sqrt(math.pi / 2.0)
 
-_Sample = tuple[float, float, float, str]
-"""Offset, m; predicted error, m, or NaN; power gap, dB, or NaN; status."""
+_Sample = tuple[float, float, float, float, str]
+"""Offset, m; predicted error, m, or NaN; power gap, dB, or NaN; 1: LOS, 0: NLOS, NaN: unknown; status."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,11 +143,18 @@ def estimate_offset(
                 continue
             placement = truth.configuration if truth is not None and distance_m is None else ""
             predicted = math.nan
-            if result.status is Status.OK:
+            if len(measured.cir) == 0 and result.status is Status.NO_CIR:
+                # Without a CIR, the whole error is the offset.
+                predicted = 0.0
+            elif result.status is Status.OK:
                 known_offset = mitigation.offsets.of([measured.tag_id], [measured.anchor_id])
                 predicted = result.correction_m - float(known_offset[0])
             offset, gap = measured.range_m - predicted - true_m, _power_gap_db(measured, preprocessing)
-            sample = offset, predicted, gap, result.status.name
+            is_los = float(gap < LINE_OF_SIGHT_DB) if math.isfinite(gap) else math.nan
+            if truth is not None and distance_m is None and math.isnan(is_los) and not len(measured.cir):
+                # Neither levels nor a CIR: the label decides; surveyed ranges without labels are used.
+                is_los = float(truth.label in ("", "LOS"))
+            sample = offset, predicted, gap, is_los, result.status.name
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
     if not groups:
         if without_truth:
@@ -181,20 +188,26 @@ def _power_gap_db(measurement: RangeMeasurement, preprocessing: Preprocessing) -
 def _placement_offset(
     tag_id: int, anchor_id: int, placement: str, samples: list[_Sample], limit_m: float
 ) -> PlacementOffset:
-    offset, predicted, gap = np.array([sample[:3] for sample in samples], np.float64).T
-    has_gap, is_predicted = np.isfinite(gap), np.isfinite(predicted)
-    is_los = has_gap & (gap < LINE_OF_SIGHT_DB)
+    offset, predicted, gap, los = np.array([sample[:4] for sample in samples], np.float64).T
+    has_gap, is_predicted, is_known, is_los = (
+        np.isfinite(gap),
+        np.isfinite(predicted),
+        np.isfinite(los),
+        los == 1.0,
+    )
     used, n = offset[is_los & is_predicted], len(offset)
     median_gap = float(np.median(gap[has_gap])) if has_gap.any() else math.nan
     median_predicted = float(np.median(predicted[is_predicted])) if is_predicted.any() else math.nan
     found, noise, refused = math.nan, math.nan, ""
-    if 2 * has_gap.sum() < n:
+    if 2 * is_known.sum() < n:
         refused = "the first-path power is unknown, so that line of sight cannot be checked"
-    elif 2 * is_los.sum() < has_gap.sum():
-        refused = (
-            f"not line of sight: the first path is {median_gap:.1f} dB below the receive level "
-            f"(line of sight: less than {LINE_OF_SIGHT_DB:g} dB)"
-        )
+    elif 2 * is_los.sum() < is_known.sum():
+        refused = "not line of sight: labelled as NLOS"
+        if has_gap.any():
+            refused = (
+                f"not line of sight: the first path is {median_gap:.1f} dB below the receive level "
+                f"(line of sight: less than {LINE_OF_SIGHT_DB:g} dB)"
+            )
     elif not len(used) or 2 * is_predicted.sum() < n:
         others = Counter(status for *_, status in samples if status != Status.OK.name).most_common()
         statuses = ", ".join(f"{count} {name}" for name, count in others)

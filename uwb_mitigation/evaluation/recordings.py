@@ -57,7 +57,10 @@ def load_inputs(
         RecordingError, DatasetError: it cannot be read, or no CIR is usable.
     """
     with opening.open_recording(path) as source:
-        return datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
+        found = datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
+    if not found.has_cirs:
+        raise DatasetError("the recording has no CIRs", where=str(path))
+    return found
 
 
 def _with_configuration(record: Record) -> Record:

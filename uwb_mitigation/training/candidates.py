@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation import linear_fit, splits
 from uwb_mitigation.evaluation.dataset import Dataset
+from uwb_mitigation.measurement import LINE_OF_SIGHT_DB
 from uwb_mitigation.model import graph
 from uwb_mitigation.model.architecture import Remnet
 from uwb_mitigation.model.bundle import Bundle, session_options
@@ -175,7 +176,24 @@ def _fit_residuals(
 
 
 def fit_line(data: Dataset) -> LinearBiasModel:
-    """Fit a line in both powers (see `linear_fit.fit_linear_bias`)."""
+    """Fit a line in both powers: to configurations (see `linear_fit`), or without CIRs to single ranges."""
+    if not data.has_cirs:
+        # Ranges of one pair at one distance are not independent.
+        true_m = np.round(data.range_m - data.error_m, 1)
+        assert data.tags is not None
+        assert data.anchors is not None
+        cells = np.array(
+            [
+                "/".join(map(str, each))
+                for each in zip(data.configurations, true_m, data.tags, data.anchors, strict=True)
+            ]
+        )
+        rows = data.rows(splits.subsample(cells, PER_CONFIGURATION, 0))
+        gap = rows.rx_power_dbm - rows.first_path_power_dbm
+        is_los = np.where(rows.labels == "", gap < LINE_OF_SIGHT_DB, rows.labels == "LOS")
+        return linear_fit.fit_linear_bias_to_rows(
+            rows.rx_power_dbm, rows.first_path_power_dbm, rows.error_m, is_los.astype(np.bool_)
+        )
     return linear_fit.fit_linear_bias(
         data.configurations, data.rx_power_dbm, data.first_path_power_dbm, data.error_m
     )

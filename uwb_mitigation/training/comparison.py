@@ -31,6 +31,9 @@ NAMES = (
 )
 """The rows of the table in order; the rows of `zero_shot.NAMES` follow."""
 
+NAMES_WITHOUT_CIRS = ("raw", "los_median", "overall_median", "l1_line", "shipped_float")
+"""The rows for a recording without CIRs; the last one is the line with its limits."""
+
 Coverage = Mapping[str, tuple[float, float]]
 """{label, or "" for all: shares of the errors within the 68 % and the 95 % intervals}."""
 
@@ -124,11 +127,12 @@ def run(
     known = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
     dataset = dataset.rows(known) if known.any() else dataset
     held_out_by_seed = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
+    names = NAMES if dataset.has_cirs else NAMES_WITHOUT_CIRS
     errors_by_row = {
-        name: np.array([seed_result.errors[name] for seed_result in held_out_by_seed]) for name in NAMES
+        name: np.array([seed_result.errors[name] for seed_result in held_out_by_seed]) for name in names
     }
     zero_shot_result = None
-    if universal is not None and universal.preprocessing == dataset.preprocessing:
+    if universal is not None and universal.preprocessing == dataset.preprocessing and dataset.has_cirs:
         zero_shot_result = zero_shot.run(dataset, universal)
         errors_by_row |= {name: error[None] for name, error in zero_shot_result.errors.items()}
     labels = list(dict.fromkeys(dataset.labels.tolist()))
@@ -138,7 +142,7 @@ def run(
         by_label = {label: float(np.abs(errors[:, dataset.labels == label]).mean()) for label in labels}
         interval = bootstrap_interval(errors[0], dataset.configurations)
         rows.append(ErrorRow(name, float(maes.mean()), float(maes.std()), by_label, interval))
-    final = np.array([seed_result.errors["shipped_int8"] for seed_result in held_out_by_seed])
+    final = np.array([seed_result.errors[names[-1]] for seed_result in held_out_by_seed])
     variance = np.array([seed_result.variance_m2 for seed_result in held_out_by_seed])
     wide_variance = variance * np.array([seed_result.sigmas95 for seed_result in held_out_by_seed]) ** 2
     return Comparison(
@@ -184,6 +188,8 @@ def _hold_out(
     dataset: Dataset, recipe: Recipe, group: Group, folds: int, seed: int, on_fold: Callable[[], None]
 ) -> _HeldOut:
     recipe = replace(recipe, fit=replace(recipe.fit, seed=seed))
+    if not dataset.has_cirs:
+        recipe = recipe.for_candidate(candidates.LINE)
     errors = {name: dataset.error_m.copy() for name in NAMES}
     variance, sigmas95 = np.empty(len(dataset)), np.empty(len(dataset))
     passed_through = np.zeros(len(dataset), np.bool_)
@@ -192,12 +198,12 @@ def _hold_out(
         for name, predicted in _baselines(train_data, test, recipe, seed):
             errors[name][fold.test] -= predicted
         card, network = train.fit_with_card(train_data, recipe, INNER_FOLDS)
-        integers = quantize(network, calibration_inputs(train_data, seed), exact=False)
         linear_bias = linear_bias_m(card.linear_bias, test)
-        for name, output in (
-            ("shipped_float", network_m(network, test.inputs).astype(np.float32)),
-            ("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)),
-        ):
+        outputs = [("shipped_float", network_m(network, test.inputs).astype(np.float32))]
+        if dataset.has_cirs:
+            integers = quantize(network, calibration_inputs(train_data, seed), exact=False)
+            outputs.append(("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)))
+        for name, output in outputs:
             corrections = zero_shot.apply_card(test, card, (linear_bias + output).astype(np.float32))
             errors[name][fold.test] -= corrections.correction_m
         variance[fold.test] = corrections.variance_m2
@@ -212,6 +218,9 @@ def _baselines(
 ) -> Iterator[tuple[str, NDArray[np.floating]]]:
     yield "los_median", baselines.los_median(train_data)(test)
     yield "overall_median", baselines.overall_median(train_data)(test)
+    if not test.has_cirs:
+        yield "l1_line", linear_bias_m(candidates.fit_line(train_data), test)
+        return
     yield "ridge", baselines.ridge(train_data, header=False)(test)
     yield "ridge_header", baselines.ridge(train_data, header=True)(test)
     yield "gradient_boosting", baselines.gradient_boosting(train_data, seed)(test)

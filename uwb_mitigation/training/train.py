@@ -128,9 +128,17 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
     dataset, folds = job.dataset, min(job.folds, len(job.dataset.names))
     _check_configurations(dataset, selections.min_configurations(job.folds) if recipe_name == AUTO else 2)
     selection, seed = None, recipe.fit.seed
+    if not dataset.has_cirs and recipe_name in (models.LINE_NETWORK, models.NETWORK):
+        raise DatasetError(
+            "the recording has no CIRs, which networks need", valid=f"--recipe {AUTO}, constant or line"
+        )
     if recipe_name == AUTO:
         universal = load_bundle(default_model_path(dataset.preprocessing.scaling))
-        candidates = models.with_cold_start(models.new_models(recipe), dataset, universal)
+        candidates = models.new_models(recipe)
+        if dataset.has_cirs:
+            candidates = models.with_cold_start(candidates, dataset, universal)
+        else:
+            candidates = [item for item in candidates if not item.trains]
         selection = _select(job, candidates, seed)
         recipe_name = selection.chosen
         if recipe_name in (models.COLD_START, models.COLD_START_MEAN):
@@ -138,11 +146,12 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
     recipe = recipe.for_candidate(recipe_name)
     total = recipe.fit.epochs * (folds + 1)
     on_epoch = selections.step_counter(total, lambda share: job.on_progress("training", share))
-    validation = cross_validate(dataset, recipe, folds, seed, on_epoch)
+    validation = cross_validate(dataset, recipe, folds, seed, on_epoch, quantised=dataset.has_cirs)
     fitted = fit_new_model(dataset, recipe, seed, on_epoch)
     card = make_card(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
+    card = replace(card, needs_cir=dataset.has_cirs)
     mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
-    mae_m = mae["int8"] if selection is None else selection.mae()[NESTED]
+    mae_m = mae.get("int8", mae["float"]) if selection is None else selection.mae()[NESTED]
     assert fitted.network is not None
     bundle = save_bundle(job.output, graph.float_model(fitted.network), card)
     return TrainedBundle(bundle, selection, validation, mae_m, {"raw": mae["raw"]})
@@ -156,6 +165,8 @@ def train_from_bundle(
     Raises:
         DatasetError: too few configurations; see also `fitting.fit`. ModelError: the network is not a REMNet.
     """
+    if not job.dataset.has_cirs:
+        raise DatasetError("the recording has no CIRs, which networks need", valid="train --data")
     _check_configurations(job.dataset, selections.min_configurations(job.folds))
     candidates = models.from_bundle(source, options)
     universal = load_bundle(default_model_path(job.dataset.preprocessing.scaling))
@@ -272,7 +283,7 @@ def make_card(
         },
     }
     residual_m = validation.errors["float"]
-    ood_bands = ood_bands_of(dataset)
+    ood_bands = ood_bands_of(dataset) if dataset.has_cirs else None
     return card_of(name, recipe.architecture, dataset, linear_bias, dataset, residual_m, training, ood_bands)
 
 

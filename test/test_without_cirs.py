@@ -1,0 +1,141 @@
+"""Models and offsets for ranges without CIRs: constants and lines in the levels. All data is simulated here."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import run
+
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.evaluation import splits
+from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
+from uwb_mitigation.evaluation.radio_offsets import estimate_offset
+from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.training.candidates import fit_line
+
+EMPTY = np.zeros(0, np.int16)
+
+
+def ranges(environments: int = 10, seed: int = 0, levels: bool = True) -> list[Record]:
+    """Environments with LOS and NLOS placements; the error grows with the power gap, with a long tail."""
+    rng, records = np.random.default_rng(seed), []
+    for environment in range(environments):
+        shift = rng.normal(0.0, 0.03)
+        for placement in range(12):
+            nlos = rng.random() < 0.5
+            distance = rng.uniform(2.0, 9.0)
+            excess = rng.exponential(0.7) if nlos else 0.0
+            for _ in range(15):
+                gap = rng.normal(12.0 + 6.0 * excess, 2.0) if nlos else rng.normal(3.0, 1.0)
+                level = -75.0 - 20.0 * np.log10(distance / 2.0) - 4.0 * nlos + rng.normal(0.0, 0.5)
+                error = -0.05 + shift + excess + rng.normal(0.0, 0.05)
+                powers = {"rx_power_dbm": level, "first_path_power_dbm": level - gap} if levels else {}
+                number = len(records)
+                measured = RangeMeasurement(
+                    10**18 + number * 10**8,
+                    7,
+                    1 + placement,
+                    number,
+                    0,
+                    distance + error,
+                    Cir(EMPTY, **powers),
+                )
+                label = "NLOS" if nlos else "LOS"
+                records.append(Record(measured, Truth(distance, label, f"environment {environment}")))
+    return records
+
+
+def dataset(records: list[Record]) -> Dataset:
+    return build_dataset(records, Preprocessing(157, Scaling.PREAMBLE))
+
+
+def mae(values: np.ndarray) -> float:
+    return float(np.abs(values).mean())
+
+
+def test_line_corrects_held_out_environments_and_spares_line_of_sight():
+    data = dataset(ranges())
+    assert not data.has_cirs
+    held_out = data.error_m.copy()
+    for fold in splits.by_configuration(data.configurations, 5, 0):
+        line, test = fit_line(data.rows(fold.train)), data.rows(fold.test)
+        held_out[fold.test] -= line.predict_m(test.rx_power_dbm, test.first_path_power_dbm)
+    los = data.labels == "LOS"
+    assert mae(held_out) < 0.7 * mae(data.error_m - np.median(data.error_m))
+    assert mae(held_out[los]) < mae(data.error_m[los]) + 0.03
+
+
+def test_cirs_are_preferred_to_ranges_without():
+    bare = ranges(1)
+    strong = np.full(2 * 200, 100, np.int16)
+    cir = replace(bare[0].measurement.cir, samples=strong, first_path_index=20.0, preamble_count=128)
+    with_cir = replace(bare[0], measurement=replace(bare[0].measurement, cir=cir))
+    mixed = dataset([*bare[1:5], with_cir, *bare[5:9]])
+    assert mixed.has_cirs
+    assert len(mixed) == 1
+    assert sum(mixed.skipped.values()) == 8
+
+
+def test_train_and_evaluate_without_cirs(tmp_path: Path):
+    with BagWriter(tmp_path / "bare.mcap", {"source": "test", "simulated": "true"}) as bag:
+        for record in ranges():
+            bag.write(record)
+    done = run("train", "--data", "bare.mcap", "-o", "line.onnx", "--json", "train.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    trained = json.loads((tmp_path / "train.json").read_text())
+    assert trained["choice"]["chosen"] == "line"
+    assert {row["name"] for row in trained["rows"]} == {"raw", "overall_median", "l1_line", "float"}
+    assert trained["helped"]
+    assert not load_bundle(tmp_path / "line.onnx").card.needs_cir
+
+    done = run("evaluate", "--data", "bare.mcap", "--model", "line.onnx", "--json", "e.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "e.json").read_text())
+    assert result["statuses"] == {"OK": result["n"]}
+    assert result["corrected"]["mae"] < 0.7 * result["raw"]["mae"]
+    los = result["by_label"]["LOS"]
+    assert los["corrected_mae"] < los["raw_mae"] + 0.03
+
+    done = run(
+        *(
+            "evaluate",
+            "--data",
+            "bare.mcap",
+            "--cross-validate",
+            "configuration",
+            "--seeds",
+            1,
+            "--json",
+            "c.json",
+        ),
+        folder=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    rows = {row["name"]: row["mae_mean"] for row in json.loads((tmp_path / "c.json").read_text())["rows"]}
+    assert list(rows) == ["raw", "los_median", "overall_median", "l1_line", "shipped_float"]
+    assert rows["l1_line"] < 0.7 * rows["raw"]
+
+    refused = run("train", "--data", "bare.mcap", "-o", "n.onnx", "--recipe", "network", folder=tmp_path)
+    assert refused.returncode != 0
+    assert "no CIRs, which networks need" in refused.stderr
+
+
+def test_offset_from_true_ranges_needs_no_levels():
+    universal = Mitigation(load_bundle(default_model_path()))
+    records = ranges(4, levels=False)
+    found = estimate_offset(universal, records)
+    assert found.offset_m == pytest.approx(-0.05, abs=0.05)
+    refused = {one.refused for one in found.placements if one.refused}
+    assert refused == {"not line of sight: labelled as NLOS"}
+    blocked = [record for record in records if record.truth is not None and record.truth.label == "NLOS"]
+    with pytest.raises(DatasetError, match="labelled as NLOS"):
+        estimate_offset(universal, blocked)
