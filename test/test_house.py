@@ -135,3 +135,12 @@ def test_versions_agree():
         "CITATION.cff": f"\nversion: {version}\n",
     }
     assert [name for name, line in stated.items() if line not in (REPOSITORY / name).read_text()] == []
+
+
+def test_dockerfile_has_the_commands_of_the_installation_guide():
+    guide = (REPOSITORY / "docs" / "guides" / "installation.md").read_text()
+    block = guide.partition("## ROS 2 workspace")[2].partition("```bash\n")[2].partition("```")[0]
+    commands = [line for line in block.splitlines() if not line.startswith(("mkdir", "git clone"))]
+    dockerfile = (REPOSITORY / "Dockerfile").read_text().replace("ENV PIP", "export PIP")
+    assert len(commands) > 5
+    assert [command for command in commands if command not in dockerfile] == []

@@ -123,7 +123,9 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
     }
     templates = Path(uwb_mitigation.__file__).parent / "radio" / "templates"
     shown = {name: counts[name] for name in ("pass", "warning", "fail")}
-    page = render_page("field_report.html.j2", templates, checks=checks, counts=shown, **values)
+    severity = ("fail", "warning", "pass")
+    first_failed = sorted(checks, key=lambda check: severity.index(check.verdict.value))
+    page = render_page("field_report.html.j2", templates, checks=first_failed, counts=shown, **values)
     (folder / "report.html").write_text(page, encoding="utf-8")
     values["checks"] = [asdict(check) for check in checks]
     (folder / "report.json").write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
