@@ -172,8 +172,8 @@ def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: 
         ("mitigator", "yaml", "error: pyyaml is not installed (run uwb-mitigation doctor)"),
         ("driver", "serial", "error: pyserial is not installed (run uwb-mitigation doctor)"),
         ("monitor", "rich", "error: rich is not installed (run uwb-mitigation doctor)"),
-        ("mitigator", "rclpy", "error: ROS 2 is not set up: there is no rclpy"),
-        ("mitigator", "uwb_mitigation_msgs", "error: ROS 2 is not set up: there is no uwb_mitigation_msgs"),
+        ("mitigator", "rclpy", "error: ROS 2 is not set up: rclpy is missing"),
+        ("mitigator", "uwb_mitigation_msgs", "error: ROS 2 is not set up: uwb_mitigation_msgs is missing"),
     ],
 )
 def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, name: str, absent: str, excerpt: str):
