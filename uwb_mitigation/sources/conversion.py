@@ -348,7 +348,8 @@ def _ids(value: Value, chunk: Chunk, name: str, file: str, names: Names) -> NDAr
 def _id(text: str) -> int:
     if re.fullmatch(r"[0-9a-fA-F]{2}([:-][0-9a-fA-F]{2}){1,7}", text):
         return int(re.sub("[:-]", "", text), 16)
-    return int(text, 16 if text.lower().startswith("0x") else 10)
+    # A column with unknown values contains texts such as 10.0.
+    return int(text, 16) if text.lower().startswith("0x") else int(re.sub(r"\.0+$", "", text))
 
 
 def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, float]:
