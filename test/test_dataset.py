@@ -14,7 +14,7 @@ from model_material import record, window_of
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation import splits
 from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.measurement import Truth
+from uwb_mitigation.measurement import RadioType, Segment, Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing
 
 
@@ -85,3 +85,17 @@ def test_thinning_keeps_a_maximum_number_per_configuration():
     assert np.count_nonzero(names[rows] == "a") == 10
     assert np.count_nonzero(names[rows] == "b") == 3
     assert (np.diff(rows) > 0).all()
+
+
+def test_radios_and_segments_of_a_dataset_are_those_of_its_cirs():
+    records = [
+        replace(each, measurement=replace(each.measurement, cir=replace(each.measurement.cir, **source)))
+        for each, source in zip(
+            [record(), record()], [{}, {"radio": RadioType.DW3000, "segment": Segment.STS}], strict=True
+        )
+    ]
+    dataset = build_dataset(records, Preprocessing(157))
+    assert (dataset.radios, dataset.segments) == (
+        (RadioType.DW1000, RadioType.DW3000),
+        (Segment.IPATOV, Segment.STS),
+    )

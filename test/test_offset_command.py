@@ -15,7 +15,7 @@ from model_material import amplitudes_only
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.evaluation.radio_offsets import OffsetEstimate, estimate_offset
-from uwb_mitigation.measurement import Record
+from uwb_mitigation.measurement import RadioType, Record, Segment
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
@@ -193,3 +193,16 @@ def test_contradictory_options_are_refused_early(options: tuple[str, ...], excer
     outcome = command_line.run("offset", "none.mcap", *options, folder=tmp_path)
     assert outcome.returncode != 0
     assert excerpt in outcome.stderr
+
+
+def test_ranges_of_another_radio_have_their_whole_error_as_offset(
+    universal: Mitigation, direct: list[Record]
+):
+    def of_dw3000(record: Record) -> Record:
+        cir = replace(record.measurement.cir, radio=RadioType.DW3000, segment=Segment.STS, preamble_count=0)
+        return replace(record, measurement=replace(record.measurement, cir=cir))
+
+    records = [of_dw3000(record) for record in longer(direct, 0.4)]
+    errors = [record.measurement.range_m - record.truth.range_m for record in records]
+    estimate = estimate_offset(universal, records)
+    assert estimate.offset_m == pytest.approx(np.median(errors), abs=0.1)

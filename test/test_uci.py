@@ -421,3 +421,23 @@ def _previous_cir(packet):
         return bytes(built)
 
     return build
+
+
+def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges():
+    class Busy(UciBoardModel):
+        refusals = 3
+
+        def _command(self, name, payload, now_s):
+            if name == messages.SESSION_INIT and self.sessions and self.refusals:
+                self.refusals -= 1
+                return self._respond(name, b"\x12")
+            return super()._command(name, payload, now_s)
+
+    run = Bench(Busy(), peers=(2, 3))
+    for number in range(400):
+        run.step()
+        for handle, session in list(run.board.sessions.items()):
+            if session.active and handle in run.board.sessions:
+                run.step(run.board.range_packet(handle, number, 3.0))
+    assert run.session.state == ""
+    assert {measured.anchor_id for measured in run.found} == {2, 3}

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.measurement import RadioType, RangeMeasurement, Record, Segment, Truth
+from uwb_mitigation.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Truth
 from uwb_mitigation.preprocessing import CirFault, Preprocessing
 
 _BATCH = 256
@@ -93,6 +93,30 @@ class Dataset:
         return [str(name) for name in np.unique(self.configurations)]
 
 
+class CirSources:
+    """Collects the radios and segments of CIRs; unknown ones are those of earlier versions: DW1000, IPATOV."""
+
+    def __init__(self) -> None:
+        self._radios: set[RadioType] = set()
+        self._segments: set[Segment] = set()
+
+    def add(self, cir: Cir) -> None:
+        """Add a CIR; without samples it has no segment."""
+        self._radios.add(cir.radio or RadioType.DW1000)
+        if len(cir):
+            self._segments.add(cir.segment or Segment.IPATOV)
+
+    @property
+    def radios(self) -> tuple[RadioType, ...]:
+        """All radios."""
+        return tuple(sorted(self._radios))
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        """All segments."""
+        return tuple(sorted(self._segments)) or (Segment.IPATOV,)
+
+
 def build_dataset(
     records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
 ) -> Dataset:
@@ -108,11 +132,11 @@ def build_dataset(
     skipped: Counter[str] = Counter()
     inputs, values, headers, ids, configurations, labels = [], [], [], [], [], []
     without_cir: list[tuple[RangeMeasurement, Truth]] = []
-    sources: set[tuple[RadioType, Segment]] = set()
+    sources = CirSources()
 
     def add(measurement: RangeMeasurement, truth: Truth, window: NDArray[np.float32]) -> None:
         inputs.append(window)
-        sources.add((measurement.cir.radio or RadioType.DW1000, measurement.cir.segment or Segment.IPATOV))
+        sources.add(measurement.cir)
         values.append(
             (
                 measurement.cir.rx_power_dbm,
@@ -164,8 +188,8 @@ def build_dataset(
         np.array(headers, np.float32),
         tags=tags,
         anchors=anchors,
-        radios=tuple(sorted({radio for radio, _ in sources})),
-        segments=tuple(sorted({segment for _, segment in sources})),
+        radios=sources.radios,
+        segments=sources.segments,
     )
 
 

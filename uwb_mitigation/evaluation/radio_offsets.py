@@ -143,8 +143,10 @@ def estimate_offset(
                 continue
             placement = truth.configuration if truth is not None and distance_m is None else ""
             predicted = math.nan
-            if len(measured.cir) == 0 and result.status is Status.NO_CIR:
-                # Without a CIR, the whole error is the offset.
+            cir = measured.cir
+            is_foreign = not mitigation.bundle.card.fits(cir.radio, cir.segment, len(cir) > 0)
+            if is_foreign or (len(cir) == 0 and result.status is Status.NO_CIR):
+                # Without a CIR, or with that of another radio, the whole error is the offset.
                 predicted = 0.0
             elif result.status is Status.OK:
                 known_offset = mitigation.offsets.of([measured.tag_id], [measured.anchor_id])

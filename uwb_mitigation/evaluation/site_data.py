@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.evaluation.dataset import Dataset
+from uwb_mitigation.evaluation.dataset import CirSources, Dataset
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import MAX_RANGE_M
 from uwb_mitigation.positioning.anchors import AnchorMap
@@ -48,6 +48,7 @@ class SiteData:
         frame_ids: {tag id: the frame ids of its ranges}.
         skipped: {reason: number of excluded ranges}.
         shift_ns: time added to the stamps of each recording, so that recordings do not overlap.
+        sources: radios and segments of the CIRs.
     """
 
     anchors: AnchorMap
@@ -62,6 +63,7 @@ class SiteData:
     frame_ids: dict[int, tuple[str, ...]]
     skipped: Counter[str]
     shift_ns: tuple[int, ...]
+    sources: CirSources
 
     @property
     def first_rows(self) -> NDArray[np.intp]:
@@ -118,6 +120,8 @@ class SiteData:
             np.full(len(rows), ""),
             tags=tag,
             anchors=anchor_ids[ranges.anchor],
+            radios=self.sources.radios,
+            segments=self.sources.segments,
         )
 
 
@@ -147,6 +151,7 @@ def read_site(
     unknown: Counter[int] = Counter()
     rows: list[tuple[int, int, int, float, float, float, float, bool]] = []
     windows: list[NDArray[np.float32]] = []
+    sources = CirSources()
     frame_ids: dict[int, dict[str, None]] = {}
     shifts: list[int] = []
     last_stamp_ns: int | None = None
@@ -176,6 +181,7 @@ def read_site(
                 powers = measured.cir.rx_power_dbm, measured.cir.first_path_power_dbm
                 rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *powers, height, fault == 0))
                 windows.append(window)
+                sources.add(measured.cir)
         shifts.append(shift or 0)
     for anchor_id, count in unknown.items():
         skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
@@ -218,4 +224,5 @@ def read_site(
         frame_ids={tag_id: tuple(names) for tag_id, names in frame_ids.items()},
         skipped=skipped,
         shift_ns=tuple(shifts),
+        sources=sources,
     )

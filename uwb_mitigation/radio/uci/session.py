@@ -50,6 +50,9 @@ ANSWER_NS = 150 * _MS
 """Timeout of a command."""
 
 TRIES = 3
+RETRY_NS = 300 * _MS
+"""Time after which a start that failed is repeated."""
+
 SILENCE_NS = 1500 * _MS
 """Time without a notification, in addition to five intervals, after which the host asks whether the board works."""
 
@@ -175,7 +178,7 @@ class UciSession:
         self._active: set[int] = set()
         self._ready = False
         self._boot_due = False
-        self._received_ns = 0
+        self._received_ns = self._ended_ns = 0
         self._asked = False
 
     def opened(self, now_ns: int) -> None:
@@ -345,7 +348,7 @@ class UciSession:
         except StopIteration as end:
             self._steps = self._pending = None
             self.state = str(end.value)
-            self._received_ns = now_ns
+            self._received_ns = self._ended_ns = now_ns
             return
         self._pending.left = self._pending.tries
         self._send_pending(now_ns)
@@ -377,10 +380,8 @@ class UciSession:
         elif self._steps is None and self.state != "not connected":
             silence = now_ns - self._received_ns
             limit = SILENCE_NS + 5 * self.settings.effective_interval_ms * _MS
-            if self.state or silence > 2 * limit:
-                if silence > limit:
-                    self.counts["restarts"] += 1
-                    self._begin(now_ns)
+            if silence > 2 * limit or (self.state and now_ns - self._ended_ns > RETRY_NS):
+                self._boot_due = True
             elif silence > limit and not self._asked:
                 # An anchor without its tag may have nothing to report: ask whether the board works.
                 self._asked = True
