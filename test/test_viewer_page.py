@@ -484,6 +484,39 @@ def test_map_shows_and_exports_tracks_and_rays(browser: Browser, view: View, ser
     browser.wait("cells", lambda: len(browser.column("map", "mean")) > 0)
 
 
+def test_map_is_moved_by_keys_and_follows_the_tag_and_a_tap_shows_values(
+    browser: Browser, view: View, server: ViewerServer
+) -> None:
+    fill_scene(view)
+    open_page(browser, server)
+
+    def x_range() -> tuple[float, float]:
+        return tuple(
+            browser.run(
+                "const {start, end} = Bokeh.documents[0].get_model_by_name('map').x_range; return [start, end]"
+            )
+        )
+
+    def press(key: str) -> None:
+        browser.driver.execute_script("document.getElementById('map').focus()")
+        browser.driver.switch_to.active_element.send_keys(key)
+
+    start, end = x_range()
+    press("\ue014")
+    browser.wait("it to move to the right", lambda: x_range()[0] > start)
+    press("+")
+    browser.wait("it to zoom in", lambda: x_range()[1] - x_range()[0] < 0.9 * (end - start))
+    browser.click("button", "Follow")
+    with view.lock:
+        view.scene.add_pose("tag", Pose(60, 3, 1))
+    browser.wait("the tag in the centre", lambda: abs(sum(x_range()) / 2 - 60) < 1)
+    browser.click("button", "Fit")
+    browser.wait("the anchors", lambda: x_range()[0] < 0)
+    assert browser.find("button", "Follow").get_attribute("aria-pressed") == "false"
+    browser.wait("the figure", lambda: browser.run("return document.getElementById('strip')")).click()
+    browser.wait("values", lambda: "raw 5.300; corrected 5.100; true 5.100" in browser.text())
+
+
 def test_raw_fix_and_innovation_follow_from_raw_ranges() -> None:
     scene = Scene()
     anchors = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}

@@ -172,7 +172,7 @@ class Models:
         return renderer
 
     def _map(self) -> figure:
-        plot = _figure(480, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
+        plot = _figure(540, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
@@ -182,7 +182,7 @@ class Models:
                 url=[plan.url], x=[plan.x], y=[plan.y], w=[plan.width], h=[plan.height], angle=[plan.yaw],
                 anchor="bottom_left",
             )  # fmt: skip
-        self.heat_levels = levels = LinearColorMapper("Cividis256", low=0.0, high=1.0)
+        self.heat_levels = levels = LinearColorMapper("Viridis256", low=0.0, high=1.0)
         self.heat_renderer = heat = plot.rect(
             "x", "y", width=CELL_M, height=CELL_M, source=self.heat, line_color=None, fill_alpha=0.8,
             fill_color={"field": "mean", "transform": levels}, name="heat", visible=False,

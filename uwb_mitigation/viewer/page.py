@@ -349,7 +349,8 @@ class Page:
             x, y = ((cells[:, axis] + 0.5) * CELL_M for axis in (0, 1))
             models.heat.data = {"x": x, "y": y, "mean": cells[:, 2]}
             if len(cells):
-                models.heat_levels.update(low=float(cells[:, 2].min()), high=float(cells[:, 2].max()) + 1e-6)
+                low, high = np.percentile(cells[:, 2], (5, 95)).tolist()
+                models.heat_levels.update(low=low, high=high + 1e-6)
 
     def _fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
