@@ -441,3 +441,23 @@ def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges(
                 run.step(run.board.range_packet(handle, number, 3.0))
     assert run.session.state == ""
     assert {measured.anchor_id for measured in run.found} == {2, 3}
+
+
+def test_a_board_that_starts_slowly_after_a_reset_gets_its_window():
+    class Slow(UciBoardModel):
+        ready_s = 0.0
+
+        def receive(self, data, now_s):
+            if now_s < self.ready_s:
+                return b""
+            ready = self._notify(messages.DEVICE_STATUS, b"\1") if self.ready_s else b""
+            self.ready_s = 0.0
+            if data.startswith(encode(*messages.RESET, b"\0")):
+                self.ready_s = now_s + 0.4
+                self.sessions.clear()
+                return self._respond(messages.RESET, b"\0")
+            return ready + super().receive(data, now_s)
+
+    run = Bench(Slow(), window=157).start()
+    assert run.session.window == (157, 5)
+    assert run.session.starts == 1

@@ -49,6 +49,9 @@ _MS = 10**6
 ANSWER_NS = 150 * _MS
 """Timeout of a command."""
 
+READY_NS = 600 * _MS
+"""Timeout of the notification that a board is ready after a reset; it ignores commands before."""
+
 TRIES = 3
 RETRY_NS = 300 * _MS
 """Time after which a start that failed is repeated."""
@@ -268,7 +271,7 @@ class UciSession:
                 messages.SET_CALIBRATION, messages.set_calibration(wanted, count_bytes), tries=1
             )
             values = {}
-            answer = yield _Command(messages.GET_CALIBRATION, messages.get_calibration(list(wanted)), tries=1)
+            answer = yield _Command(messages.GET_CALIBRATION, messages.get_calibration(list(wanted)), tries=2)
             if answer is not None:
                 values = messages.calibration_values(answer.payload)
                 if _TAPS in values:
@@ -357,7 +360,7 @@ class UciSession:
         command = self._pending
         assert command is not None
         command.left -= 1
-        command.due_ns = now_ns + ANSWER_NS
+        command.due_ns = now_ns + (ANSWER_NS if command.name is not None else READY_NS)
         if command.name is not None:
             if len(self._outgoing) > MAX_OUTGOING_BYTES:
                 # The port accepts no bytes.
