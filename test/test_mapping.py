@@ -153,6 +153,9 @@ def test_a_pickle_in_a_numpy_file_is_not_loaded(tmp_path: Path):
     np.save(tmp_path / "x.npy", np.array([{"t": 1}], object), allow_pickle=True)
     with pytest.raises(RecordingError, match="Python objects"):
         read(PLAIN, tmp_path / "x.npy")
+    np.savez(tmp_path / "x.npz", t=np.array([{"t": 1}], object))
+    with pytest.raises(RecordingError, match="allow_pickle"):
+        read(PLAIN, tmp_path / "x.npz")
 
 
 @pytest.mark.parametrize("form", ["magnitude", "complex", "interleaved"])

@@ -220,6 +220,8 @@ def test_standard_messages():
     message.header.stamp.sec, message.header.stamp.nanosec = 17, 5
     assert convert.take(message, "/uwb/range_12") == [(1, 12, 3.5)]
     assert convert.found[0].stamp_ns == 17_000_000_005
+    convert.take(Range(range=3.5), "/uwb/range_12")
+    assert convert.found[1].stamp_ns == 5_000
     line = "AT+RANGE=tid:4,mask:05,seq:218,range:(72,0,131,0,0,0,0,0),rssi:(-77.60,0.00,-75.13,0.00,0.00,0.00,0.00,0.00)"
     convert = Convert("string_at")
     assert convert.take(String(data=line)) == [(4, 0, 0.72), (4, 2, 1.31)]
