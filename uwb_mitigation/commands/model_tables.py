@@ -80,7 +80,7 @@ def show_selection(selection: Selection) -> None:
 
 def show_comparison(result: Comparison) -> None:
     """Show the table of `evaluate --cross-validate`."""
-    labels = list(result.rows[0].by_label)
+    labels, names = list(result.rows[0].by_label), [row.name for row in result.rows]
 
     def covered(coverage: Coverage) -> str:
         return ", ".join(
@@ -98,7 +98,7 @@ def show_comparison(result: Comparison) -> None:
     )
     kept = ", ".join(f"{share:.0%}: {mae:.3f}" for share, mae in result.rejection)
     print_line(
-        f"shipped_int8: coverage of the 68 % and 95 % intervals: {covered(result.coverage)}\n"
+        f"{'shipped_int8' if 'shipped_int8' in names else 'shipped_float'}: coverage of the 68 % and 95 % intervals: {covered(result.coverage)}\n"
         f"MAE after rejecting the share of ranges with the largest variances: {kept}\n"
         f"not corrected, because out of distribution: {result.passed_through:.1%}"
     )

@@ -15,7 +15,7 @@ from uwb_mitigation.model.linear_bias import LinearBiasModel
 MIN_CONFIGURATIONS = 6
 """With fewer configurations, the linear bias model is their median, because three coefficients are not observable."""
 
-MAX_LOS_GAIN_M, MAX_LOS_STEPS, LOS_WEIGHT_STEP = 0.01, 8, 1.5
+MAX_LOS_INCREASE_M, MAX_LOS_STEPS, LOS_WEIGHT_STEP = 0.02, 8, 1.5
 """Largest increase of the error of LOS ranges by a line that is fitted to single ranges, and how it is enforced."""
 
 MIN_POWER_RANGE_DB = 1.0
@@ -101,7 +101,7 @@ def fit_linear_bias_to_rows(
         coefficients = least_absolute_deviations(design * weight[:, None], target * weight)
         if (
             not los.any()
-            or np.abs((target - design @ coefficients)[los]).mean() <= raw_los_m + MAX_LOS_GAIN_M
+            or np.abs((target - design @ coefficients)[los]).mean() <= raw_los_m + MAX_LOS_INCREASE_M
         ):
             break
         weight[los] *= LOS_WEIGHT_STEP

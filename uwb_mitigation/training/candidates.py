@@ -147,7 +147,7 @@ def fit_new_model(
     if recipe.line:
         linear_bias = fit_line(data)
     elif not recipe.network:
-        linear_bias = linear_fit.fit_constant(data.configurations, data.error_m)
+        linear_bias = fit_constant(data)
     if not recipe.network:
         with fitting.single_thread(seed):
             return FittedModel(linear_bias, networks.weights_of(networks.build(recipe.architecture, 0)))
@@ -173,6 +173,13 @@ def _fit_residuals(
     # If the linear bias model needs a power that is unknown, the range is passed through.
     known = np.isfinite(residual)
     return fitting.fit(architecture, subset.inputs[known], residual[known], options, on_epoch, start=start)
+
+
+def fit_constant(data: Dataset) -> LinearBiasModel:
+    """Fit a constant: to configurations, or without CIRs to single ranges."""
+    # Each range counts as a configuration.
+    configurations = data.configurations if data.has_cirs else np.arange(len(data)).astype(str)
+    return linear_fit.fit_constant(configurations, data.error_m)
 
 
 def fit_line(data: Dataset) -> LinearBiasModel:
@@ -214,9 +221,7 @@ def new_models(recipe: Recipe) -> list[Candidate]:
 
 
 def _constant() -> Candidate:
-    return Candidate(
-        CONSTANT, lambda data, seed: FittedModel(linear_fit.fit_constant(data.configurations, data.error_m))
-    )
+    return Candidate(CONSTANT, lambda data, seed: FittedModel(fit_constant(data)))
 
 
 def _line() -> Candidate:
@@ -307,7 +312,10 @@ def site_models(
         The data with the predictions of the universal network, so that they are computed only once; the candidates;
         notes about missing candidates.
     """
-    offsets = Candidate(SITE_OFFSETS, _constant().fit)
+    offsets = Candidate(
+        SITE_OFFSETS,
+        lambda data, seed: FittedModel(linear_fit.fit_constant(data.configurations, data.error_m)),
+    )
     if not has_cirs:
         line = Candidate(SITE_LINE, lambda data, seed: FittedModel(_site_line(data, data.error_m)))
         return data, [offsets, line], ["no networks: the recording has no CIRs"]
