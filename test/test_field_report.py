@@ -69,6 +69,7 @@ def test_good_uci_boards_pass_and_the_file_names_nobody(
     assert checks["model"]["verdict"] == "warning"
     assert checks["read back: CIR taps"]["value"] == "157"
     assert "recovery after reconnecting" in checks
+    assert b"emulated".hex() in zipfile.Path(tmp_path / "out.zip", "report.html").read_text()
     with zipfile.ZipFile(tmp_path / "out.zip") as archive:
         assert set(archive.namelist()) == {"capture.txt", "ranges.mcap", "report.html", "report.json"}
         archive.extractall(tmp_path / "out")

@@ -202,6 +202,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         ({"source": "simulated", "height": "1.0"}, "height:=1.0.*locate:=true"),
         ({"source": "simulated", "frame_id": "12e4"}, "parses the text 12e4 as a number"),
         ({"source": "serial"}, "serial without a port"),
+        ({"source": "uci"}, "uci without a port"),
         ({"source": "decaranging"}, "decaranging without a path"),
     ],
 )

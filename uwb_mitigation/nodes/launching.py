@@ -186,6 +186,7 @@ def check_driver(values: Mapping[str, Any]) -> None:
     needed = {
         "serial": serial,
         "evb1000": serial,
+        "uci": ("path" if values.get("path") else "port", "/dev/ttyACM0"),
         "spi": ("port", "/dev/spidev0.0"),
         "mcap": ("path", "FILE"),
         "decaranging": ("path", "FILE"),

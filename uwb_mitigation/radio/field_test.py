@@ -111,7 +111,7 @@ def _open(source: str, ports: list[str], capture: Path, stack: ExitStack) -> lis
     if source == "uci":
         writer = CaptureWriter(capture, 64 << 20)
         stack.callback(writer.close)
-        roles = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
+        roles = (UciSettings(identify=True), UciSettings(Role.ANCHOR, 2, (1,)))
         return [
             stack.enter_context(
                 closing(UciDriver(PortAddress.parse(port), settings, capture=writer, number=number))

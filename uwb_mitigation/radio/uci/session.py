@@ -83,6 +83,7 @@ class UciSettings:
         interval_ms: time between two exchanges with the same peer; 0 = the default of the window and of `sessions`.
         report: an anchor also publishes its ranges.
         sessions: number of sessions that share the air.
+        identify: ask the board for its device information after the start.
     """
 
     role: Role = Role.TAG
@@ -94,6 +95,7 @@ class UciSettings:
     interval_ms: int = 0
     report: bool = False
     sessions: int = 1
+    identify: bool = False
 
     def check(self) -> None:
         """Raise ParameterError, with the name of the setting, for an invalid value."""
@@ -255,9 +257,10 @@ class UciSession:
             if problem:
                 return problem
         self.starts += 1
-        answer = yield _Command(messages.DEVICE_INFO, tries=1)
-        if answer is not None and answer.status == STATUS_OK:
-            self.device_info = answer.payload[1:]
+        if self.settings.identify:
+            answer = yield _Command(messages.DEVICE_INFO, tries=1)
+            if answer is not None and answer.status == STATUS_OK:
+                self.device_info = answer.payload[1:]
         return ""
 
     def _set_window(self) -> _Steps:
