@@ -46,7 +46,7 @@ from uwb_mitigation.viewer import playback
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Scene
+from uwb_mitigation.viewer.scene import AnchorPosition, Scene
 
 COUNT = 400
 """Number of ranges in the bag, at intervals of 10 ms, from two anchors in turn."""
@@ -252,7 +252,9 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
     done = run("data", "simulate", "--like", "drive", "--ranges", "400", "-o", bag, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     player, scene = open_bag(bag)
-    player.index(load_anchors(anchors_path(bag))).join()
+    anchors = load_anchors(anchors_path(bag))
+    scene.set_anchors({anchor.id: AnchorPosition(*anchor.position) for anchor in anchors.anchors})
+    player.index(anchors).join()
     timeline = player.timeline
     assert timeline is not None
     assert len(timeline.time_s) == len(timeline.pairs) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
@@ -277,6 +279,8 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
         timeline.tracks["tag_101", TrackKind.CORRECTED][1][-1, :2], abs=0.5
     )
     assert scene.tags["tag_101"].pose is not None
+    innovations = [abs(sample.innovation_m) for sample in scene.pairs[1, 101].samples]
+    assert np.nanmedian(innovations[5:]) < 1.0, "also of the ranges that a seek reads"
 
 
 def test_next_bad_range_is_found_and_a_step_advances_by_one_range(tmp_path: Path):

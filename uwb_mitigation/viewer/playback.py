@@ -62,6 +62,9 @@ DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 MAX_STEP_S = 1.0
 """If no page was open for longer than this, playing continues from the last position."""
 
+POSE_PERIOD_S = 0.1
+"""Recorded time between two positions of a tag."""
+
 _BATCH = 256
 _RANGE_TYPES = {
     RANGE_RAW: RANGE_CIR_TYPE,
@@ -146,7 +149,7 @@ class BagPlayer:
         self._next: RawMessage | None = None
         self._messages: Iterator[RawMessage] = iter(())
         self._advanced_s = time.monotonic()
-        self._clock_s = 0.0
+        self._clock_s, self._posed_s = 0.0, -math.inf
         feed.scene.clock = lambda: self._clock_s
         per_s = self._bag.message_count / max(self.seconds, 1e-9)
         self._window_s = min(HISTORY_S, MAX_MESSAGES / max(per_s, 1e-9))
@@ -241,14 +244,27 @@ class BagPlayer:
                     self._next = message
                     break
                 self._clock_s = (message.log_time_ns - self._start_ns) / 1e9
+                self._show_poses()
                 self._callbacks[message.channel.topic](message.data)
         except RecordingError as error:
             self._messages = iter(())
             self._feed.report("recording", NodeStatus(2, f"{error.what}: nothing beyond can be shown"))
         self._correct()
         self._clock_s = self.position_s
+        self._posed_s = -math.inf
+        self._show_poses()
         if self.timeline is not None:
             self._show_tracks(self.timeline)
+
+    def _show_poses(self) -> None:
+        """Show the estimates of the index at the time of the message that is read."""
+        if self.timeline is None or 0.0 <= self._clock_s - self._posed_s < POSE_PERIOD_S:
+            return
+        self._posed_s = self._clock_s
+        for tag, estimates in self.timeline.estimates.items():
+            time_s, _ = self.timeline.tracks[tag, TrackKind.CORRECTED]
+            if count := int(np.searchsorted(time_s, self._clock_s, side="right")):
+                self._feed.estimate(tag, estimates[count - 1])
 
     def _show_tracks(self, timeline: Timeline) -> None:
         """Show the tracks up to the current position."""
@@ -260,8 +276,6 @@ class BagPlayer:
                 step = max(1, math.ceil(count / MAX_TRACK))
                 with self._feed.lock:
                     scene.set_track(*key, position[:count:step, :2].tolist())
-                if count and key[1] is TrackKind.CORRECTED and (estimates := timeline.estimates.get(key[0])):
-                    self._feed.estimate(key[0], estimates[count - 1])
 
     def _callbacks_of(self, prefix: str, topics: dict[str, str]) -> dict[str, Callable[[bytes], None]]:
         """Return the callback of each topic that is shown."""
@@ -308,6 +322,7 @@ class BagPlayer:
         batch, self._uncorrected = self._uncorrected, []
         results = self._backend.correct([measurement for _, measurement in batch])
         for (self._clock_s, measurement), corrected in zip(batch, results, strict=True):
+            self._show_poses()
             self._feed.corrected(measurement_key(measurement), corrected)
 
 
