@@ -19,6 +19,7 @@ from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.robot_estimator import RobotEstimator
+from uwb_mitigation.positioning.smoother import smooth
 from uwb_mitigation.positioning.tag_estimator import RobotData, TagEstimator
 from uwb_mitigation.positioning.tracks import Imu, Odometry
 
@@ -65,6 +66,9 @@ def test_lever_arm_is_rotated_by_the_heading():
 
 def test_heading_of_a_stationary_robot_is_unknown():
     robot = Robot(stand=(0.0, 30.0))
+    standing = RobotEstimator(robot.config)
+    standing.run(robot.ranges(seconds=25.0))
+    assert standing.yaw_hypotheses == 0
     track = RobotEstimator(robot.config).run(robot.ranges())
     known = np.isfinite(track.yaw[:, 0])
     assert not known[track.stamp_ns < 30 * NANOSECONDS].any()
@@ -281,15 +285,30 @@ def test_invalid_odometry_is_rejected(twist):
     assert path.at(20_000_000).x == pytest.approx(0.002)
 
 
-def test_motion_backwards_in_time_returns_to_the_start():
+@pytest.mark.parametrize("poses", [True, False])
+def test_motion_backwards_in_time_returns_to_the_start(poses: bool):
     odometry = Robot(seconds=5.0).odometry
     back = odometry.reversed(int(odometry.stamp_ns[-1]))
-    ahead, path = DeadReckoning(), DeadReckoning()
-    _add_all(ahead, odometry, poses=False)
-    _add_all(path, back, poses=True)
-    end, start = ahead.at(5 * NANOSECONDS), path.at(5 * NANOSECONDS)
-    assert start.yaw == pytest.approx(-end.yaw, abs=0.01)
-    assert math.hypot(start.x, start.y) == pytest.approx(math.hypot(end.x, end.y), abs=0.05)
+    path = DeadReckoning()
+    _add_all(path, back, poses=poses)
+    point = path.at(5 * NANOSECONDS)
+    x, y, yaw = odometry.pose[0] - odometry.pose[-1]
+    cosine, sine = math.cos(odometry.pose[-1, 2]), math.sin(odometry.pose[-1, 2])
+    assert point.yaw == pytest.approx(yaw, abs=0.01)
+    assert (point.x, point.y) == pytest.approx((cosine * x + sine * y, cosine * y - sine * x), abs=0.05)
+
+
+def test_smoothed_track_has_headings_from_the_start():
+    robot = Robot()
+    ranges = robot.ranges()
+    live = RobotEstimator(robot.config).run(ranges)
+    smoothed = smooth(robot.config, ranges, live)
+    early = smoothed.take(smoothed.stamp_ns < int(live.stamp_ns[np.isfinite(live.yaw[:, 0])][0]))
+    assert len(early) > 5
+    assert np.isfinite(early.yaw[:, 0]).all()
+    distance, of_yaw, _ = robot.errors(smoothed)
+    assert rms(of_yaw) < math.radians(3.0)
+    assert rms(distance) < rms(robot.errors(live)[0])
 
 
 def test_real_robot_reaches_the_documented_errors():
