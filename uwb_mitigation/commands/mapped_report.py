@@ -1,4 +1,4 @@
-"""Tables of `data import --map`: the first ranges as they were understood, errors, and what is missing for a model."""
+"""Tables of `data import --map`: the first converted ranges, errors, and what is missing for a model."""
 
 from __future__ import annotations
 

@@ -246,7 +246,7 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, value: Value) -> NDArray
 
 
 def _raw(value: Value, chunk: Chunk, file: str) -> NDArray[Any] | None:
-    """Return the values of the rows as they are in the file; None: the column is optional and missing."""
+    """Return the unconverted values of the rows; None: the column is optional and missing."""
     if value.file_name or value.topic_name:
         source = [file] * chunk.count if value.file_name else chunk.columns.get(TOPIC, [""] * chunk.count)
         rule = value.file_name or value.topic_name

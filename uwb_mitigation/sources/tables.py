@@ -99,7 +99,7 @@ def find_files(table: Table, root: Path, ranges: Path | None = None) -> list[Pat
         ranges: the file of the ranges, if the table contains other values; a pattern in `files` is searched in its path.
 
     Raises:
-        RecordingError: there is none.
+        RecordingError: no file matches.
     """
     if root.is_file() or (root / "metadata.yaml").is_file():
         return [root]
