@@ -414,6 +414,19 @@ def test_ghent_industrial_and_office(mapping: str, file: str, tmp_path: Path):
     assert second.measurement.cir.preamble_count == 0
 
 
+def test_ghent_industrial_2020(tmp_path: Path):
+    write(
+        tmp_path / "meta_IIoT_20.csv",
+        ",channel,fpindex_tag,rxpower_tag,fppower_tag,rxpacc_tag,loc_tag,tag_ID,anchor_ID,distance_UWB,distance_GT,error,NLOS\n"
+        "1,3,747.704,-79.948,-81.873,1048,1-3,1,3,10786,10969.411424502228,-183.41142450222833,LOS\n",
+    )
+    source = open_mapped(tmp_path, "ghent_industrial_2020")
+    (record,) = source
+    assert source.errors_m.tolist() == pytest.approx([-0.18341142])
+    assert record.measurement.cir.first_path_index == 747.704
+    assert record.measurement.cir.power_gap_db == pytest.approx(1.925)
+
+
 def test_ghent_university(tmp_path: Path):
     write(
         tmp_path / "meta_University.csv",
