@@ -460,6 +460,8 @@ def test_pairs_can_be_sorted_and_selected(browser: Browser, view: View, server: 
     browser.wait("the bad pair", lambda: anchors() == ["2, 7"])
     browser.find("button", "Select anchor 2, tag 7").send_keys("\ue007")
     browser.wait("its CIR", lambda: browser.find("heading", "CIR: anchor 2, tag 7"))
+    pressed = browser.find("button", "Select anchor 2, tag 7").get_attribute("aria-pressed")
+    assert pressed == "true"
     browser.wait("it in the URL", lambda: "#anchor=2&tag=7" in browser.driver.current_url)
 
 

@@ -68,6 +68,16 @@ FIGURES = {
 """Names and headings of the figures."""
 
 
+_LINES = {
+    "raw": (VERMILLION, 1.0, "solid", "raw"),
+    "range": (BLUE, 2.5, "solid", "corrected"),
+    "corrected": (BLUE, 2.5, "solid", "corrected"),
+    "compared": (PURPLE, 2.5, "dotted", TrackKind.COMPARED.value),
+    "true": (None, 1.5, "dashed", "true"),
+}
+"""Colour, width, dashes and label of the columns of line charts; colour None: ink."""
+
+
 class Controls(DataModel):  # type: ignore[misc]
     """State that the page's script shows, and its commands.
 
@@ -118,7 +128,7 @@ class Models:
         self.waterfall = ColumnDataSource({"image": [blank_waterfall()]})
         self.errors = _source("left", "right", "raw", "corrected", "compared")
         self.timeline = _source("time", "raw", "corrected")
-        self.compared_timeline = _source("time", "corrected")
+        self.compared_timeline = _source("time", "compared")
         self.position = _source("time", "low", "high")
         # A figure without data has no axis ranges: invisible corners define them until data arrives.
         self.corners = {name: _source("corner_x", "corner_y") for name in ("cir", "strip")}
@@ -323,12 +333,7 @@ class Models:
     def _strip(self) -> figure:
         plot = _figure(230, "seconds", "m")
         plot.x_range = Range1d(-HISTORY_S, 0)
-        self._lines(
-            plot,
-            self.strip,
-            "age",
-            (("raw", VERMILLION), ("range", BLUE), ("compared", PURPLE), ("true", None)),
-        )
+        self._lines(plot, self.strip, "age", "raw", "range", "compared", "true")
         plot.scatter("age", "range", source=self.bad, marker="marker", color="colour", size=8)
         return _with_legend(plot)
 
@@ -336,34 +341,20 @@ class Models:
         plot = _figure(170, "time in the recording, s", "mean |error|, m")
         plot.x_range = Range1d(0.0, max(seconds, 0.1))
         plot.y_range = DataRange1d(start=0.0)
-        self._lines(plot, self.timeline, "time", (("raw", VERMILLION), ("corrected", BLUE)))
-        self._lines(plot, self.compared_timeline, "time", (("corrected", PURPLE),))
+        self._lines(plot, self.timeline, "time", "raw", "corrected")
+        self._lines(plot, self.compared_timeline, "time", "compared")
         self._inked(plot.vspan("time", source=self.position, line_width=2), "line_color")
         return _with_legend(plot)
 
-    def _lines(
-        self, plot: figure, source: ColumnDataSource, x: str, columns: tuple[tuple[str, str | None], ...]
-    ) -> None:
-        for column, colour in columns:
-            label = {"range": "corrected"}.get(column, column)
-            if column == "compared" or (column, colour) == ("corrected", PURPLE):
-                label = TrackKind.COMPARED.value
-                if not self._compares:
-                    continue
-            width, dash = {VERMILLION: (1.0, "solid"), BLUE: (2.5, "solid"), PURPLE: (2.5, "dotted")}.get(
-                colour or "", (1.5, "dashed")
-            )
-            line = plot.line(
-                x,
-                column,
-                source=source,
-                line_color=colour or NIGHT,
-                line_width=width,
-                line_dash=dash,
-                legend_label=label,
-            )
-            if colour is None:
-                self._inked(line, "line_color")
+    def _lines(self, plot: figure, source: ColumnDataSource, x: str, *columns: str) -> None:
+        for column in columns:
+            colour, width, dash, label = _LINES[column]
+            if column != "compared" or self._compares:
+                line = plot.line(
+                    x, column, source=source, line_color=colour or NIGHT, line_width=width, line_dash=dash, legend_label=label
+                )  # fmt: skip
+                if colour is None:
+                    self._inked(line, "line_color")
 
     def _errors(self) -> figure:
         plot = _figure(230, "measured - true, m", "ranges")

@@ -203,7 +203,7 @@ class Page:
                 and self._changed("compared_timeline", True)
             ):
                 columns = second.timeline.mean_errors(second.seconds)
-                models.compared_timeline.data = {name: columns[name] for name in ("time", "corrected")}
+                models.compared_timeline.data = {"time": columns["time"], "compared": columns["corrected"]}
         if models.controls.player != state:
             models.controls.player = state
 

@@ -63,9 +63,9 @@ function start(doc) {
       const key = `${data.anchor[i]} ${data.tag[i]}`;
       if (!rows.has(key)) rows.set(key, makeRow(data, i));
       const row = rows.get(key);
-      row.className = data.no_data[i] ? "no-data" : "";
       const selected = controls.selected?.join(" ") === key;
-      row.setAttribute("aria-selected", selected);
+      row.className = `${data.no_data[i] ? "no-data" : ""} ${selected ? "selected" : ""}`;
+      row.querySelector("button").setAttribute("aria-pressed", selected);
       fields.forEach((field, cell) => {
         if (field === "pair") return;
         const element = row.cells[cell];
