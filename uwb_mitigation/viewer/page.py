@@ -213,6 +213,7 @@ class Page:
         largest = timeline.largest_error()
         self._models.controls.marks = {
             "bad": bad_s.tolist(),
+            "count": int(timeline.bad.sum()),
             "largest": None
             if largest is None
             else float(timeline.time_s[largest] / max(player.seconds, 1e-9)),

@@ -184,7 +184,7 @@ function start(doc) {
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
-      const {bad, largest, truth} = controls.marks, marks = $("bad-marks");
+      const {bad, count, largest, truth} = controls.marks, marks = $("bad-marks");
       const draw = (share, text, colour) => {
         const mark = document.createElementNS("http://www.w3.org/2000/svg", "text");
         for (const [name, value] of Object.entries({x: `${100 * share}%`, y: 11, fill: colour, "font-size": 11, "text-anchor": "middle"}))
@@ -195,7 +195,7 @@ function start(doc) {
       marks.style.overflow = "visible";
       marks.replaceChildren(...bad.map((share) => draw(share, "|", "#d55e00")));
       if (largest != null) marks.append(draw(largest, "\u25b2", "currentColor"));
-      $("marks-legend").textContent = `| ranges that are not OK: ${bad.length || "none"}; \u25b2 largest ${truth ? "error" : "correction"}`;
+      $("marks-legend").textContent = `| ranges that are not OK: ${count || "none"}; \u25b2 largest ${truth ? "error" : "correction"}`;
     });
   }
   on("player", () => {
