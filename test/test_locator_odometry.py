@@ -52,7 +52,7 @@ class LiveRobot:
     def __init__(self, ros: Ros, *, seconds: float = 40.0, lever=LEVER, imu: bool = False) -> None:
         self.robot = Robot(lever=lever, facing=0.7, seconds=seconds)
         self.ranges = self.robot.ranges(seconds=seconds)
-        # So long ago that the locator does not predict poses at the current time.
+        # Old enough that the locator does not predict poses at the current time.
         self.start_ns = ros.node.get_clock().now().nanoseconds - round((seconds + 40.0) * NANOSECONDS)
         self._ros, self._at_s, self._uses_imu = ros, 0.0, imu
         qos = QoSProfile(depth=1000)

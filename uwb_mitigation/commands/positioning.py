@@ -142,11 +142,11 @@ def track(
     from uwb_mitigation.sources.anchors_file import anchors_path, save_anchors
 
     model = NoiseModel(acceleration=acceleration)
-    place, box = height_of(height, height_sd), area_of(area)
+    height_prior, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
     robot = _robot_of(bag, odometry, imu, lever_arm, recorded)
-    config = EstimatorConfig(known, model, place, box, measured, robot)
+    config = EstimatorConfig(known, model, height_prior, box, measured, robot)
     if tum is not None and tum.exists() and not force:
         raise ParameterError("exists already", where=str(tum), valid="--force replaces it")
     tracks = []
@@ -209,7 +209,7 @@ def survey(
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
     if output.exists() and not force:
         raise ParameterError("exists already", where=str(output), valid="--force replaces it")
-    place, box = height_of(height, height_sd), area_of(area)
+    height_prior, box = height_of(height, height_sd), area_of(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
     ids = {
@@ -223,7 +223,7 @@ def survey(
     tag = max(recorded.tags, key=lambda one: len(one.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
-        config = EstimatorConfig(known, NoiseModel(acceleration=acceleration), place, box, measured)
+        config = EstimatorConfig(known, NoiseModel(acceleration=acceleration), height_prior, box, measured)
         result = find(config, tag.ranges, off_m=off, fixed=frozenset(rows))
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force

@@ -182,11 +182,11 @@ class Locator(ManagedNode):
         level, text = diagnostics.OK, "locating" if estimator.tags else "no ranges yet"
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings[:5])
-        facts = estimator.diagnostics() | {"dropped by a queue": self._lost, "malformed": self._malformed}
-        facts |= self._meter.entries()
-        taken, self._processing_ns = self._processing_ns, []
-        facts |= diagnostics.percentiles("processing", taken)
-        return "host", level, text, facts
+        values = estimator.diagnostics() | {"dropped by a queue": self._lost, "malformed": self._malformed}
+        values |= self._meter.entries()
+        durations_ns, self._processing_ns = self._processing_ns, []
+        values |= diagnostics.percentiles("processing", durations_ns)
+        return "host", level, text, values
 
     def _open_tf(self) -> None:
         message = transform_type()

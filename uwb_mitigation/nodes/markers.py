@@ -132,7 +132,7 @@ def tag_markers(
     ellipse.scale = Vector3(x=float(large), y=float(small), z=0.02)
     trail = marker("trails", Marker.LINE_STRIP, _colour(palette.BLUE))
     trail.scale.x = 0.03
-    trail.points = [_point(place) for place in picture.trail]
+    trail.points = [_point(position) for position in picture.trail]
     return [rays, symbols, tag, name, ellipse, trail]
 
 
@@ -148,6 +148,6 @@ def _marker(namespace: str, number: int, kind: int, frame: str, stamp_ns: int, c
     )
 
 
-def _point(place: Any) -> Point:
-    x, y, z = place
+def _point(position: Any) -> Point:
+    x, y, z = position
     return Point(x=float(x), y=float(y), z=float(z))

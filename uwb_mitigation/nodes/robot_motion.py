@@ -87,7 +87,7 @@ class RobotMotion:
     def map_to_odom(self, base: Estimate, tolerance_ns: int) -> TransformStamped | None:
         """Return the transform from map to odom for an estimate of the base, valid for `tolerance_ns` longer.
 
-        While the heading is unknown again, the last transform is repeated for `HOLD_S`. None: there is none.
+        While the heading is unknown again, the last transform is repeated for `HOLD_S`. None: no heading was known yet.
         """
         pose, stamp_ns = self.path.pose_at(base.stamp_ns), base.stamp_ns + tolerance_ns
         if pose is None or base.heading is None or not self.odom_frame:

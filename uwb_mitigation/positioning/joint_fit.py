@@ -290,12 +290,12 @@ def fit_joint(
         observations.segment, model.loss(z) * observations.share, minlength=len(observations.is_stationary)
     )
     loss = losses.astype(np.float64)
-    place, velocity = np.full((len(x), 3), problem.level), np.zeros((len(x), 3))
-    place[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
+    position, velocity = np.full((len(x), 3), problem.level), np.zeros((len(x), 3))
+    position[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
     weight = model.weight(z) * observations.share / scale[observations.noise_group] ** 2
     covariance = problem.covariance(solution, unit, weight)
     return JointFit(
-        config, observations, prior, place, velocity, shared, covariance, error, scale, loss, solution
+        config, observations, prior, position, velocity, shared, covariance, error, scale, loss, solution
     )
 
 

@@ -16,7 +16,7 @@ STILL_M = 0.06
 2 to 5 cm."""
 
 FEW = 3
-"""If the median number of ranges per anchor is smaller, a tag is taken as at one position."""
+"""If the median number of ranges per anchor is smaller, the tag is treated as stationary."""
 
 BIN_S = 1.0
 LEAST_S = 4.0
@@ -82,8 +82,8 @@ def find_segments(tags: Sequence[Ranges]) -> Segments:
             of.append(np.full(len(piece), len(stationary)))
             stationary.append(is_stationary)
     tag_of, row_of = np.concatenate(tag), np.concatenate(row)
-    taken = [one.take(row_of[tag_of == number]) for number, one in enumerate(tags)]
-    columns = Ranges.joined(taken)
+    kept_ranges = [one.take(row_of[tag_of == number]) for number, one in enumerate(tags)]
+    columns = Ranges.joined(kept_ranges)
     return Segments(columns, tag_of, row_of, np.concatenate(of), np.array(stationary), np.zeros(len(columns)))
 
 

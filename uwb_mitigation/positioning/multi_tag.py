@@ -220,10 +220,10 @@ class MultiTagEstimator:
                 found.append(f"{name}: {self._unknown_reason(estimator)}")
             if isinstance(estimator, RobotEstimator) and not estimator.odometry.is_available(tag.latest_ns):
                 found.append(f"{name}: no odometry at the times of the ranges: estimated from ranges only")
-            odd = [self.anchors.anchors[row] for row in estimator.disagreeing()]
+            contradicting = [self.anchors.anchors[row] for row in estimator.disagreeing()]
             found += [
                 f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
-                for anchor in odd
+                for anchor in contradicting
             ]
             geometry = estimator.geometry()
             if geometry is not None and geometry.hdop > 10.0:

@@ -147,11 +147,11 @@ def survey(
     sd = np.sqrt(np.einsum("ijij->i", found.anchor_covariance) / 3.0)
     moved = displacements(found.anchors[used], guesses.position[used])
     distance = np.zeros(len(guesses))
-    # A drive at constant height hardly determines heights: they were taken as measured.
+    # A drive at constant height hardly determines heights: they are those of the guesses.
     axes = slice(0, config.dims)
     distance[used] = np.linalg.norm(moved[:, axes], axis=1)
     relative = np.linalg.norm(_relative_sd(found.anchors, found.anchor_covariance)[:, axes], axis=1)
-    odd = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
+    misplaced = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
     alternatives = {
         row: other
         for row in used.tolist()
@@ -165,7 +165,7 @@ def survey(
     return SurveyResult(
         guesses.moved(found.anchors, np.maximum(sd, 1e-3)),
         distance,
-        odd,
+        misplaced,
         [(swapped[0], swapped[1])] if swapped else [],
         found.track,
         loss,

@@ -255,8 +255,8 @@ class TagEstimator:
     def disagreeing(self) -> list[int]:
         """Return the rows of anchors whose ranges contradict those of most others."""
         received = self.received_anchors(5.0)
-        odd = [i for i in received if abs(self._states[i].mean_z) > DISAGREES]
-        return odd if 2 * len(odd) < len(received) else []
+        contradicting = [i for i in received if abs(self._states[i].mean_z) > DISAGREES]
+        return contradicting if 2 * len(contradicting) < len(received) else []
 
     def geometry(self) -> Geometry | None:
         """Return the geometry of the anchors that are received; None: the position is not known."""
@@ -291,9 +291,9 @@ class TagEstimator:
             self._checked_s = time_s
             received = self.received_anchors()
             known.updates_consider_states = len(received) >= self._dims + _SPARE_ANCHORS
-            odd = sum(self._states[i].outliers > 0.5 for i in received)
+            num_contradicting = sum(self._states[i].outliers > 0.5 for i in received)
             # At the edge of the area the filter may follow a solution that is outside of it.
-            if self._at_boundary or (2 * odd >= len(received) > 0 and odd):
+            if self._at_boundary or (2 * num_contradicting >= len(received) > 0 and num_contradicting):
                 self._at_boundary = False
                 self._check_lost(known)
 

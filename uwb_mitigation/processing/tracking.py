@@ -115,7 +115,7 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
     used = anchors.position[np.unique(ranges.anchor)]
     level = config.height is not None or config.heights is not None
-    hdop = float(np.median([geometry(used, place, level=level).hdop for place in sample]))
+    hdop = float(np.median([geometry(used, position, level=level).hdop for position in sample]))
     warnings = []
     if not hdop <= POOR_HDOP:
         warnings.append(
@@ -140,12 +140,12 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
         )
 
     # The locator judges by its last ranges only: use the whole recording.
-    odd = [
+    contradicting = [
         row
         for row in locator.disagreeing()
         if contradicts(anchors, ranges, row, TagEstimator(config).run(ranges.take(ranges.anchor != row)))
     ]
-    return TagTracks(recording, live, smoothed, snapshots, errors, hdop, odd, warnings)
+    return TagTracks(recording, live, smoothed, snapshots, errors, hdop, contradicting, warnings)
 
 
 def contradicts(anchors: AnchorMap, ranges: Ranges, row: int, others: Track) -> bool:
