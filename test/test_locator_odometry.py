@@ -115,6 +115,10 @@ class LiveRobot:
                 imu = Imu(header=header, angular_velocity=Vector3(z=rate / 1.02))
                 imu.angular_velocity_covariance[8] = 1e-6
                 self._imu_out.publish(imu)
+                # Rates that are not measured are skipped.
+                imu.header = self.header(int(measured.stamp_ns[i]) + 10_000_000)
+                imu.angular_velocity.z, imu.angular_velocity_covariance[0] = 9.0, -1.0
+                self._imu_out.publish(imu)
 
     def values(self) -> dict[str, str]:
         for array in reversed(self.diagnostics):

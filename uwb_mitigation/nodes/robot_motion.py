@@ -132,6 +132,9 @@ class RobotMotion:
         )
 
     def _on_imu(self, message: Imu) -> None:
+        # A -1 in front of the covariance marks rates that are not measured.
+        if message.angular_velocity_covariance[0] == -1.0:
+            return
         rate, variance = message.angular_velocity.z, message.angular_velocity_covariance[8]
         if self._uses_orientation:
             self.path.add_imu_yaw(_stamp_ns(message), yaw_of(message.orientation), rate, variance)
