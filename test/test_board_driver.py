@@ -124,7 +124,8 @@ def test_board_that_resets_is_connected_again(board, port):
 
 def test_faulty_channel_delivers_only_sent_messages(link):
     faults = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05)
-    with EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4):
+    # Long enough that the numbers do not start again while the port is opened.
+    with EmulatedBoard(Recording(10**6), rate_hz=1000, faults=faults, link=link, seed=4):
         port = BoardDriver(PortAddress(str(link)))
         received = [wait_for(port, of(RangeMeasurement)) for _ in range(300)]
         counts = port.report().counts

@@ -34,6 +34,13 @@ from uwb_mitigation.sources.simulation.rooms import ROOMS as SIMULATED_ROOMS
 OBSTACLES = ("0000000000", "1000000000", "0000001001", "0000000001")
 
 
+@pytest.fixture(autouse=True)
+def strings_of_python() -> Iterator[None]:
+    """Store strings as the published frame does; with pyarrow installed, pandas uses its own ones."""
+    with pd.option_context("mode.string_storage", "python"):
+        yield
+
+
 def frame(count: int = 12) -> pd.DataFrame:
     """Return a frame with the published columns and random values."""
     generator = np.random.default_rng(5)
@@ -85,6 +92,13 @@ def test_every_kind_of_frame_is_read(tmp_path: Path, writing: Callable[[pd.DataF
     assert np.allclose(errors, data["Error"], rtol=1e-6)
     names = [rooms.configuration_of(*row) for row in zip(data["Room"], data["Obstacles"], strict=True)]
     assert [record.truth.configuration for record in records if record.truth] == names
+
+
+def test_columns_of_pyarrow_are_refused_with_a_remedy(tmp_path: Path):
+    pytest.importorskip("pyarrow")
+    data = frame().astype({"Obstacles": pd.StringDtype("pyarrow")})
+    with pytest.raises(RecordingError, match="astype"):
+        DeepUwbRecording(written(tmp_path, data))
 
 
 @pytest.mark.parametrize("version", ["0.25.3", "1.1.5", "1.5.3", "2.2.3"])

@@ -98,6 +98,8 @@ class _FrameUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         package = module.partition(".")[0]
         allowed = _PANDAS.fullmatch(name) if package == "pandas" else name in _ALLOWED.get(package, ())
+        if package == "pyarrow":  # its constructors do not check the offsets that a file contains
+            raise ValueError("it has columns of pyarrow; convert them with astype(object)")
         if not allowed:
             raise ValueError(f"{module}.{name} is not part of a data frame of numbers and text")
         if name in ("Int64Index", "UInt64Index", "Float64Index"):  # classes of pandas before version 2
