@@ -83,6 +83,7 @@ class Ekf:
         self.P = J @ self.P @ J.T + dt * np.diag(self._noise)
 
     def _diagonal(self, name: str, default: list[float]) -> NDArray[np.float64]:
-        values = self._parameters.get(name, default)
-        assert len(values) == 15
-        return np.take(np.asarray(values, np.float64), PLANAR)
+        values = np.array(self._parameters.get(name, np.diag(default)), np.float64)
+        # Some versions of robot_localization read 225 values without a check of their number.
+        assert values.size == 225
+        return np.take(np.diag(values.reshape(15, 15)), PLANAR)

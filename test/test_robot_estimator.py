@@ -322,3 +322,12 @@ def test_real_robot_reaches_the_documented_errors():
     assert errors.rmse <= 0.085 < without.rmse
     assert errors.coverage95 >= 0.85
     assert errors.heading_rmse <= math.radians(15.0)
+
+
+def test_twist_is_unknown_after_a_gap_of_the_odometry():
+    path = DeadReckoning()
+    _add_all(path, Robot().odometry, poses=True)
+    assert path.twist is not None
+    latest_ns = int(Robot().odometry.stamp_ns[-1])
+    path.add(latest_ns + NANOSECONDS, (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
+    assert path.twist is None

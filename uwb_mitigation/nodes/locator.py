@@ -58,6 +58,9 @@ PREDICT_AFTER_S, PREDICT_UNTIL_S = 0.3, 30.0
 
 _NANOSECONDS = 1_000_000_000
 
+_REPEAT_AFTER_NS = 300_000_000
+"""After this time without estimates, map to odom is repeated."""
+
 
 class _Outputs:
     """The publishers of one tag, its frame, and the stamps of its last messages."""
@@ -306,7 +309,7 @@ class Locator(ManagedNode):
 
     def _publish_estimate(self, outputs: _Outputs, estimate: Estimate, *, of_robot: bool) -> None:
         outputs.picture.add(estimate)
-        base, robot = self._at_base(estimate), self._robot if of_robot else None
+        base, robot = self._at_base(estimate, of_robot=of_robot), self._robot if of_robot else None
         outputs.pose.publish(encode_pose(base, self._map))
         if robot is None:
             outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
@@ -328,10 +331,19 @@ class Locator(ManagedNode):
         outputs.transform_ns = estimate.stamp_ns
         self._tf.publish(self._make_tf([transform]))
 
-    def _at_base(self, estimate: Estimate) -> Estimate:
+    def _repeat_transform(self, outputs: _Outputs, stamp_ns: int) -> None:
+        """Publish the last map to odom again while there is no estimate."""
+        if self._tf is None or self._robot is None or stamp_ns - outputs.transform_ns < _REPEAT_AFTER_NS:
+            return
+        if (transform := self._robot.last_map_to_odom(stamp_ns, self._tolerance_ns)) is not None:
+            outputs.transform_ns = stamp_ns
+            self._tf.publish(self._make_tf([transform]))
+
+    def _at_base(self, estimate: Estimate, *, of_robot: bool) -> Estimate:
         """Return the estimate of the robot's origin. With an unknown heading, a horizontal lever arm may point anywhere."""
         x, y, z = self.lever_arm
-        if not (x or y or z):
+        # With odometry the lever arm is that of the robot's tag.
+        if not (x or y or z) or (self._robot is not None and not of_robot):
             return estimate
         covariance, heading = estimate.covariance.copy(), estimate.heading
         if heading is None:
@@ -356,17 +368,21 @@ class Locator(ManagedNode):
         if estimator is None or not self.is_active:
             return
         for tag in list(estimator.tags.values()):
-            outputs = self._outputs_of(tag)
+            outputs, of_robot = self._outputs_of(tag), tag.estimator is estimator.robot
             age_s = (now_ns + self._offset_ns - tag.latest_ns) / _NANOSECONDS
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
                 ahead = tag.estimator.at(now_ns + self._offset_ns)
                 if ahead is not None:
-                    self._publish_estimate(outputs, ahead, of_robot=tag.estimator is estimator.robot)
+                    self._publish_estimate(outputs, ahead, of_robot=of_robot)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
                 outputs.smoothed_ns = tag.latest_ns
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
-                    outputs.smoothed.publish(encode_pose(self._at_base(smoothed), self._map))
+                    outputs.smoothed.publish(
+                        encode_pose(self._at_base(smoothed, of_robot=of_robot), self._map)
+                    )
+            if of_robot:
+                self._repeat_transform(outputs, now_ns + self._offset_ns)
         if self._anchors_out is not None and estimator.tags and self._anchors_out.get_subscription_count():
             self._show_anchors()
 

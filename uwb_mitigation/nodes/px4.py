@@ -63,7 +63,9 @@ class Px4(Node):
                 return
             increase = max(1.0, CORRELATION_S / abs(since_s))
             is_reset = abs(since_s) > CORRELATION_S
-        if not all(abs(value) < MAX_VALUE for value in (*values, *variances)):
+        if not all(abs(value) < MAX_VALUE for value in values) or not all(
+            0.0 < v < MAX_VALUE for v in variances
+        ):
             return
         # After a gap, or if a replay starts again, the position may be elsewhere: EKF2 must not reject it as an outlier.
         self._resets += is_reset

@@ -79,23 +79,26 @@ class RobotMotion:
         return None
 
     def twist(self, stamp_ns: int) -> BodyTwist:
-        """Return the velocity of the base at a time; unobserved without odometry."""
-        if not self.path.is_available(stamp_ns):
+        """Return the velocity of the base at a time; unobserved without odometry, or just after it started."""
+        if not self.path.is_available(stamp_ns) or self.path.twist is None:
             return BodyTwist()
         return BodyTwist(*self.path.twist, *self.path.twist_variance)
+
+    def last_map_to_odom(self, stamp_ns: int, tolerance_ns: int) -> TransformStamped | None:
+        """Return the last transform with a new stamp, for `HOLD_S`; None: later, or no heading was known yet."""
+        if self._last is None or not 0 <= stamp_ns - self._last_ns <= HOLD_S * _NANOSECONDS:
+            return None
+        self._last.header = topics.header(stamp_ns + tolerance_ns, self._map)
+        return self._last
 
     def map_to_odom(self, base: Estimate, tolerance_ns: int) -> TransformStamped | None:
         """Return the transform from map to odom for an estimate of the base, valid for `tolerance_ns` longer.
 
-        While the heading is unknown again, the last transform is repeated for `HOLD_S`. None: no heading was known yet.
+        While the heading is unknown again, it is `last_map_to_odom`.
         """
         pose, stamp_ns = self.path.pose_at(base.stamp_ns), base.stamp_ns + tolerance_ns
         if pose is None or base.heading is None or not self.odom_frame:
-            last = self._last
-            if last is None or not 0 <= base.stamp_ns - self._last_ns <= HOLD_S * _NANOSECONDS:
-                return None
-            last.header = topics.header(stamp_ns, self._map)
-            return last
+            return self.last_map_to_odom(base.stamp_ns, tolerance_ns)
         odom_x, odom_y, odom_yaw = pose
         yaw = base.heading.yaw - odom_yaw
         cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -119,7 +122,10 @@ class RobotMotion:
         frame = message.header.frame_id
         if not self.odom_frame and frame:
             if frame == self._map:
-                self._log.error(f"the odometry is in the frame {frame} of the anchors: it must be in odom")
+                self._log.error(
+                    f"the odometry is in the frame {frame} of the anchors: it must be in odom",
+                    throttle_duration_sec=10.0,
+                )
                 return
             self.odom_frame = frame
             self.base_frame = self.base_frame or message.child_frame_id
@@ -136,7 +142,8 @@ class RobotMotion:
         if message.angular_velocity_covariance[0] == -1.0:
             return
         rate, variance = message.angular_velocity.z, message.angular_velocity_covariance[8]
-        if self._uses_orientation:
+        # The same mark for orientations.
+        if self._uses_orientation and message.orientation_covariance[0] != -1.0:
             self.path.add_imu_yaw(_stamp_ns(message), yaw_of(message.orientation), rate, variance)
         else:
             self.path.add_yaw_rate(_stamp_ns(message), rate, variance)
@@ -144,10 +151,14 @@ class RobotMotion:
     def _on_static(self, message: Any) -> None:
         for one in message.transforms:
             t, r = one.transform.translation, one.transform.rotation
-            if len(self._static) < _MAX_FRAMES and all(
-                map(math.isfinite, (t.x, t.y, t.z, r.x, r.y, r.z, r.w))
+            norm = math.hypot(r.x, r.y, r.z, r.w)
+            if (
+                len(self._static) < _MAX_FRAMES
+                and all(map(math.isfinite, (t.x, t.y, t.z)))
+                and 0.9 < norm < 1.1  # false for NaN
             ):
-                self._static[one.child_frame_id] = one.header.frame_id, (t.x, t.y, t.z), (r.x, r.y, r.z, r.w)
+                rotation = r.x / norm, r.y / norm, r.z / norm, r.w / norm
+                self._static[one.child_frame_id] = one.header.frame_id, (t.x, t.y, t.z), rotation
 
 
 def transform_type() -> Any:

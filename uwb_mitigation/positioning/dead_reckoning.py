@@ -71,13 +71,13 @@ class DeadReckoning:
 
     Attributes:
         rejected: number of messages that were invalid or out of order.
-        twist: velocity in the axes of the base (m/s) and yaw rate (rad/s) of the latest interval.
+        twist: velocity in the axes of the base (m/s) and yaw rate (rad/s) of the latest interval; None before its end.
         twist_variance: of x and y, and of the yaw rate.
     """
 
     def __init__(self) -> None:
         self.rejected = 0
-        self.twist = (0.0, 0.0, 0.0)
+        self.twist: tuple[float, float, float] | None = None
         self.twist_variance = (SPEED_SD**2, YAW_RATE_SD**2)
         self._samples: deque[_Sample] = deque(maxlen=_NUM_SAMPLES)
         self._part = 0
@@ -117,7 +117,7 @@ class DeadReckoning:
             self._part += 1
             self._samples.clear()
             self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 7, pose))
-            self._imu_yaw = imu_yaw
+            self._imu_yaw, self.twist = imu_yaw, None
             return
         dt = gap_ns / _SECOND_NS
         if pose is not None and last.pose is not None:
@@ -174,7 +174,8 @@ class DeadReckoning:
         """Add the yaw of an IMU in a frame of its own, rad, of which only differences are used, as `add_yaw_rate`."""
         if self._imu is not None and math.isfinite(yaw):
             yaw = self._imu[3] + math.remainder(yaw - self._imu[3], math.tau)
-        if not (math.isfinite(yaw) and abs(yaw_rate) <= MAX_YAW_RATE):
+        is_late = self._imu is not None and 0 <= self._imu[0] - stamp_ns < _SECOND_NS
+        if is_late or not (math.isfinite(yaw) and abs(yaw_rate) <= MAX_YAW_RATE):
             self.rejected += 1
             return
         self._set_imu(stamp_ns, yaw_rate, variance, yaw)

@@ -126,7 +126,7 @@ class OdometryFilter(RangeFilter):
         to_antenna[:2, YAW] = -arm_y, arm_x
         pose = to_antenna @ P[:4, :4] @ to_antenna.T
         yaw = math.remainder(float(x[YAW]), math.tau)
-        vx, vy, yaw_rate = odometry.twist
+        vx, vy, yaw_rate = odometry.twist or (0.0, 0.0, 0.0)
         cosine, sine = math.cos(yaw), math.sin(yaw)
         velocity = np.array(
             [cosine * vx - sine * vy - yaw_rate * arm_y, sine * vx + cosine * vy + yaw_rate * arm_x, 0.0]

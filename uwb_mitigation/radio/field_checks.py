@@ -113,7 +113,7 @@ def run_checks(o: Observation) -> list[Check]:
         remedy = "supply the radio with 3.3 V; use another cable or a powered hub"
         checks.append(_judge("supply", o.voltage, 3.0, 2.8, "V", remedy, low=True))
     if not math.isnan(o.clock_offset_ppm):
-        remedy = "one crystal is out of its limits of 20 ppm: check its trim"
+        remedy = "one crystal is out of its limits: check its trim"
         checks.append(_judge("clock error", abs(o.clock_offset_ppm), 25, 40, "ppm", remedy))
     if not math.isnan(o.recovery_s):
         checks.append(_judge("recovery after reconnecting", o.recovery_s, 1.0, 5.0, "s", "send this report"))
