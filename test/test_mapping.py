@@ -532,6 +532,8 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
             {"stamp": {"column": "t", "unit": "iso8601"}},
             "stamp = 'yesterday' is not a date",
         ),
+        ("t,a,r\n1700000000000,1,2\n", {}, "stamp = 1700000000000 is outside .*unit: ms"),
+        ("t,a,r\n0,9007199254740993,2\n1,,2\n", {}, "is not an id"),
         ("", {}, "the file is empty"),
     ],
 )
@@ -539,6 +541,12 @@ def test_unsuitable_file_is_an_error_with_a_remedy(text: str, changes: Any, mess
     write(tmp_path / "x.csv", text)
     with pytest.raises(RecordingError, match=message):
         read(with_fields(**changes), tmp_path / "x.csv")
+
+
+def test_empty_label_is_no_label(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r,true,label\n0,1,2,1.9,\n1,1,3,2.9,NLOS\n")
+    records = read(with_fields() | {"truth": {"range": "true", "label": "label"}}, tmp_path / "x.csv")
+    assert [record.truth.label for record in records] == ["", "NLOS"]
 
 
 def test_millimetres_of_the_truth_are_an_error(tmp_path: Path):

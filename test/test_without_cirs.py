@@ -14,6 +14,7 @@ from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.evaluation import splits
 from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
+from uwb_mitigation.evaluation.linear_fit import fit_linear_bias_to_rows
 from uwb_mitigation.evaluation.radio_offsets import estimate_offset
 from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
 from uwb_mitigation.mitigation import Mitigation
@@ -72,6 +73,16 @@ def test_line_corrects_held_out_environments_and_spares_line_of_sight():
     los = data.labels == "LOS"
     assert mae(held_out) < 0.7 * mae(data.error_m - np.median(data.error_m))
     assert mae(held_out[los]) < mae(data.error_m[los]) + 0.03
+
+
+@pytest.mark.parametrize("has_levels", [False, True])
+def test_line_of_sight_is_spared_also_if_most_ranges_are_not(has_levels: bool):
+    generator = np.random.default_rng(3)
+    is_los = np.arange(1000) % 10 < 3
+    error = np.where(is_los, 0.0, 0.9) + generator.normal(0.0, 0.05, 1000)
+    levels = generator.uniform(-95.0, -75.0, (2, 1000)) if has_levels else np.full((2, 1000), np.nan)
+    left = error - fit_linear_bias_to_rows(*levels, error, is_los).predict_m(*levels)
+    assert mae(left[is_los]) < mae(error[is_los]) + 0.03
 
 
 def test_cirs_are_preferred_to_ranges_without():

@@ -71,7 +71,8 @@ def fit_linear_bias_to_rows(
     """Fit the linear bias model to single ranges, for recordings without CIRs; all arrays have the shape (n,).
 
     In such recordings, a configuration is often a whole environment with LOS and NLOS ranges, so that its mean shows no
-    line. LOS ranges get more weight until their error does not grow. Levels that no range has are not used.
+    line. LOS ranges get more weight until their error does not grow; if it still does, or without levels, the model is
+    a constant, that of the LOS ranges if the median of all is too large for them. Levels that no range has are not used.
 
     Args:
         rx_power_dbm: received power, dBm; NaN: unknown.
@@ -82,9 +83,13 @@ def fit_linear_bias_to_rows(
     Raises:
         DatasetError: there are no measurements.
     """
-    constant = LinearBiasModel(float(np.float32(np.median(error_m)))) if len(error_m) else None
-    if constant is None:
+    if not len(error_m):
         raise DatasetError("no measurements to fit a linear bias model to")
+    of_los, offset_m = error_m[is_los], float(np.median(error_m))
+    limit_m = float(np.abs(of_los).mean()) + MAX_LOS_INCREASE_M if len(of_los) else np.inf
+    if len(of_los) and np.abs(of_los - offset_m).mean() > limit_m:
+        offset_m = float(np.median(of_los))
+    constant = LinearBiasModel(float(np.float32(offset_m)))
     columns = [rx_power_dbm.astype(np.float64)]
     gap = columns[0] - first_path_power_dbm
     if np.isfinite(gap).any():
@@ -96,15 +101,14 @@ def fit_linear_bias_to_rows(
     if not has_line or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         return constant
     weight = np.ones(len(target))
-    raw_los_m = float(np.abs(target[los]).mean()) if los.any() else np.inf
+    limit_m = float(np.abs(target[los]).mean()) + MAX_LOS_INCREASE_M if los.any() else np.inf
     for _ in range(MAX_LOS_STEPS):
         coefficients = least_absolute_deviations(design * weight[:, None], target * weight)
-        if (
-            not los.any()
-            or np.abs((target - design @ coefficients)[los]).mean() <= raw_los_m + MAX_LOS_INCREASE_M
-        ):
+        if not los.any() or np.abs((target - design @ coefficients)[los]).mean() <= limit_m:
             break
         weight[los] *= LOS_WEIGHT_STEP
+    else:
+        return constant
     return LinearBiasModel(*(float(np.float32(value)) for value in coefficients))
 
 

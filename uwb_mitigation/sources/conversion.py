@@ -188,9 +188,10 @@ def read_texts(value: Value, chunk: Chunk, name: str, file: str) -> NDArray[Any]
     if raw is None:
         return np.array([""] * chunk.count, object)
     # Constants and file names are the same in all rows.
-    unique = list(dict.fromkeys(raw.tolist()))
-    texts = {each: _text(value, each, name) for each in unique}
-    return np.array([texts[each] for each in raw.tolist()], object)
+    # None and NaN are missing values.
+    given = ["" if each is None or each != each else each for each in raw.tolist()]
+    texts = {each: _text(value, each, name) if each != "" else "" for each in dict.fromkeys(given)}
+    return np.array([texts[each] for each in given], object)
 
 
 def _text(value: Value, given: Any, name: str) -> str:
@@ -299,11 +300,18 @@ def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int6
                     valid="2024-06-09T19:39:13.4387",
                 )
         return np.asarray(found + round(value.offset * 1e9))
-    # Without a unit: seconds in files, and a stamp in nanoseconds from a message.
-    factor = TIME[value.unit or ("ns" if LOG_TIME in chunk.columns else "s")]
+    # Without a unit: seconds; the stamp of a message is an integer in nanoseconds.
+    is_stamp = LOG_TIME in chunk.columns and raw.dtype.kind in "iu"
+    factor = TIME[value.unit or ("ns" if is_stamp else "s")]
     offset = round(value.offset * 1e9)
     if raw.dtype.kind in "iu" and value.scale == 1.0:
         # As integers, because a float64 resolves nanoseconds since 1970 to 256 ns only.
+        if len(raw) and max(-int(raw.min()), int(raw.max())) >= 9.2e18 / factor:
+            raise RecordingError(
+                f"stamp = {int(raw.max())} is outside of the years 1678 to 2261",
+                where=str(chunk.path),
+                valid="unit: ms, us or ns",
+            )
         return np.asarray(raw.astype(np.int64) * factor + offset)
     scaled = _floats(raw, chunk, "stamp", value) * value.scale
     good = np.isfinite(scaled) & (np.abs(scaled) < 9.2e18 / factor)
@@ -332,6 +340,9 @@ def _ids(value: Value, chunk: Chunk, name: str, file: str, names: Names) -> NDAr
             if str(item).strip().lower() in _MISSING:
                 found[item] = UNKNOWN_ID
                 continue
+            # Tables read whole numbers in a column with missing values as float64, which merges larger ids.
+            if isinstance(item, float) and abs(item) >= 2**53:
+                raise ValueError(item)
             text = _text(value, item, name)
             found[item] = names.number(text) if value.names else _id(text) + round(value.offset)
             if not 0 <= found[item] < UNKNOWN_ID:
