@@ -188,6 +188,23 @@ def test_a_cir_of_another_file_is_joined_by_row(tmp_path: Path):
     assert source.dropped == {"ok equals 0.0": 1}
 
 
+@pytest.mark.parametrize(
+    ("ids", "rule", "expected"),
+    [
+        (("9007199254740993", "9007199254740992"), {}, [[1, 1], [2, 2]]),
+        (("hall", "lab"), {"names": True}, [[1, 1], [2, 2]]),
+    ],
+)
+def test_a_cir_is_joined_by_large_and_named_ids(ids: Any, rule: Any, expected: Any, tmp_path: Path):
+    first, second = ids
+    write(tmp_path / "x.csv", f"t,a,r\n0.00,{first},2\n0.01,{second},3\n")
+    write(tmp_path / "cirs.csv", f"t,id,c\n0.00,{second},2 2\n0.01,{first},1 1\n")
+    anchor = {"column": "a"} | rule
+    join = {"stamp": "t", "anchor": anchor | {"column": "id"}}
+    document = with_fields(anchor=anchor) | {"cir": {"files": "cirs.csv", "column": "c", "join": join}}
+    assert [one.measurement.cir.samples.tolist() for one in read(document, tmp_path / "x.csv")] == expected
+
+
 def test_ids_are_read_from_texts_hexadecimal_numbers_and_names(tmp_path: Path):
     write(
         tmp_path / "x.csv",

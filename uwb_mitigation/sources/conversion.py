@@ -164,8 +164,8 @@ class Converter:
         ]
         return Columns(
             read_stamps(fields.stamp, chunk, file),
-            _ids(fields.tag, chunk, "tag", file, self.tags),
-            _ids(fields.anchor, chunk, "anchor", file, self.anchors),
+            read_ids(fields.tag, chunk, "tag", file, self.tags),
+            read_ids(fields.anchor, chunk, "anchor", file, self.anchors),
             numbers,
             *texts,
         )
@@ -324,7 +324,12 @@ def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int6
     return np.where(good, found, np.iinfo(np.int64).min)
 
 
-def _ids(value: Value, chunk: Chunk, name: str, file: str, names: Names) -> NDArray[np.uint64]:
+def read_ids(value: Value, chunk: Chunk, name: str, file: str, names: Names) -> NDArray[np.uint64]:
+    """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`.
+
+    Raises:
+        RecordingError: a value is not an id; `where` names its row.
+    """
     raw = _raw(value, chunk, file)
     if raw is None:
         raise RecordingError(f"no column {value.column} for the {name}", where=str(chunk.path))

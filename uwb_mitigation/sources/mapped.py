@@ -22,7 +22,9 @@ from uwb_mitigation.sources.conversion import (
     UNKNOWN_ID,
     Columns,
     Converter,
+    Names,
     kept_rows,
+    read_ids,
     read_numbers,
     read_stamps,
     samples_of,
@@ -153,7 +155,10 @@ class MappedRecording(Source):
     def _read_file(self, file: Path, number: int, folder: Path) -> Columns | None:
         mapping, converter, parts = self.mapping, self._converter, []
         name = file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
-        other = _OtherCirs(mapping.cir, file, self._cirs) if mapping.cir and mapping.cir.files else None
+        names = (converter.tags, converter.anchors)
+        other = (
+            _OtherCirs(mapping.cir, file, self._cirs, names) if mapping.cir and mapping.cir.files else None
+        )
         before = self._rows_read
         try:
             for chunk in read_chunks(mapping, file, converter.columns, converter.optional):
@@ -461,8 +466,8 @@ class _CirFile:
 class _OtherCirs:
     """CIRs in another file: joined by row, or by stamp and ids."""
 
-    def __init__(self, source: CirSource, ranges: Path, cirs: _CirFile) -> None:
-        self._source, self._cirs = source, cirs
+    def __init__(self, source: CirSource, ranges: Path, cirs: _CirFile, names: tuple[Names, Names]) -> None:
+        self._source, self._cirs, self._names = source, cirs, names
         self.joined = source.join is not None
         self._numbers: NDArray[np.float64] = np.zeros(0)
         self._indices: NDArray[np.float64] = np.zeros(0)
@@ -525,13 +530,11 @@ class _OtherCirs:
             numbers.append(self._cirs.add_all(lists, source, chunk))
             indices.append(read_numbers(index, chunk, "first_path_index", path.name))
             if join:
-                tag = read_numbers(join.tag or Value(constant=1), chunk, "tag", path.name)
-                anchor = read_numbers(join.anchor, chunk, "anchor", path.name)
                 found.append(
                     (
                         read_stamps(join.stamp, chunk, path.name),
-                        tag.astype(np.uint64),
-                        anchor.astype(np.uint64),
+                        read_ids(join.tag or Value(constant=1), chunk, "tag", path.name, self._names[0]),
+                        read_ids(join.anchor, chunk, "anchor", path.name, self._names[1]),
                     )
                 )
         self._numbers, self._indices = np.concatenate(numbers), np.concatenate(indices)
