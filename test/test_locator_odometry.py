@@ -49,8 +49,8 @@ def stamp_ns(header: Header) -> int:
 class LiveRobot:
     """Publishes ranges and odometry of a robot in chunks, and waits until the locator has processed each."""
 
-    def __init__(self, ros: Ros, *, seconds: float = 40.0, lever=LEVER, imu: bool = False) -> None:
-        self.robot = Robot(lever=lever, facing=0.7, seconds=seconds)
+    def __init__(self, ros: Ros, *, seconds: float = 40.0, imu: bool = False, slip=(0.0, 0.0)) -> None:
+        self.robot = Robot(lever=LEVER, facing=0.7, seconds=seconds, slip=slip)
         self.ranges = self.robot.ranges(seconds=seconds)
         # Old enough that the locator does not predict poses at the current time.
         self.start_ns = ros.node.get_clock().now().nanoseconds - round((seconds + 40.0) * NANOSECONDS)
@@ -125,7 +125,7 @@ class LiveRobot:
             for status in array.status:
                 if status.name.startswith("locator"):
                     return diagnostic_values(status) | {"": status.message}
-        return {}
+        return {"": ""}
 
     def poses_between(self, begin_s: float, end_s: float) -> list[PoseWithCovarianceStamped]:
         limits = [self.start_ns + round(s * NANOSECONDS) for s in (begin_s, end_s)]
@@ -154,7 +154,7 @@ def start(ros: Ros, anchors: Path, *parameters: str):
     )
 
 
-def test_three_modes_ranges_only_odometry_and_odometry_lost(ros: Ros, anchors: Path):
+def test_modes_ranges_only_odometry_odometry_lost_and_odometry_wrong(ros: Ros, anchors: Path):
     static = ros.node.create_publisher(
         TFMessage, "/tf_static", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     )
@@ -168,7 +168,7 @@ def test_three_modes_ranges_only_odometry_and_odometry_lost(ros: Ros, anchors: P
     static.publish(TFMessage(transforms=[antenna, mast]))
     locator = start(ros, anchors, "publish_tf:=true", "transform_tolerance:=1.0")
     locator.wait_for_output("locating")
-    live = LiveRobot(ros)
+    live = LiveRobot(ros, seconds=44.0, slip=(40.0, 44.0))
     live.wait()
     ros.spin_until(lambda: static.get_subscription_count() == 1)
 
@@ -209,6 +209,11 @@ def test_three_modes_ranges_only_odometry_and_odometry_lost(ros: Ros, anchors: P
     distance, of_yaw = live.errors(live.poses_between(38.0, 40.0))
     assert np.sqrt(np.mean(of_yaw**2)) < math.radians(6.0)
     ros.spin_until(lambda: live.values().get("tag 7 heading") == "known")
+
+    # The wheels slip.
+    live.play(44.0)
+    assert live.odometry[-1].twist.covariance[0] >= 1e5
+    assert live.odometry[-1].twist.twist.linear.x == 0.0
 
 
 def _check_lookups(live: LiveRobot, transforms: list[TransformStamped]) -> None:

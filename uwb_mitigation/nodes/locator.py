@@ -31,7 +31,7 @@ from uwb_mitigation.bag.codec import (
     decode_range,
     measurement_key,
 )
-from uwb_mitigation.bag.poses import encode_odometry, encode_pose, tag_frame, tag_of_frame
+from uwb_mitigation.bag.poses import BodyTwist, encode_odometry, encode_pose, tag_frame, tag_of_frame
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement, Status
 from uwb_mitigation.nodes import diagnostics, markers, topics
@@ -43,6 +43,7 @@ from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
 from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.tracks import Estimate, Heading
 from uwb_mitigation.sources.anchors_file import load_anchors
@@ -63,9 +64,12 @@ _REPEAT_AFTER_NS = 300_000_000
 
 
 class _Outputs:
-    """The publishers of one tag, its frame, and the stamps of its last messages."""
+    """The publishers of one tag, its frame, and the stamps of its last messages.
 
-    def __init__(self, node: Locator, prefix: str, frame: str) -> None:
+    `robot` is the estimator of the tag if a robot with odometry carries it.
+    """
+
+    def __init__(self, node: Locator, tag: Tag, prefix: str, frame: str) -> None:
         def publisher(kind: type, topic: str) -> Publisher:
             head, _, tail = topic.rpartition("/")
             return node.publisher(kind, f"{head}/{prefix}{tail}")
@@ -74,6 +78,7 @@ class _Outputs:
         self.odometry = publisher(Odometry, topics.ODOMETRY)
         self.smoothed = publisher(PoseWithCovarianceStamped, topics.POSE_SMOOTHED)
         self.frame = frame
+        self.robot = tag.estimator if isinstance(tag.estimator, RobotEstimator) else None
         self.picture = markers.TagPicture(frame)
         self.published_ns = self.smoothed_ns = self.transform_ns = -(1 << 62)
 
@@ -275,7 +280,7 @@ class Locator(ManagedNode):
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
         if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
             outputs.published_ns = stamp_ns
-            self._publish_estimate(outputs, estimate, of_robot=tag.estimator is estimator.robot)
+            self._publish_estimate(outputs, estimate)
         now_ns = time.perf_counter_ns()
         if len(self._processing_ns) < 20_000:
             self._processing_ns.append(now_ns - began_ns)
@@ -289,7 +294,7 @@ class Locator(ManagedNode):
             name = tag_frame(tag.tag_id)
             # Tags of several robots share the map, so the namespace keeps their frames apart.
             frame = f"{self.get_namespace()}/{self._plain_frame if plain else name}".lstrip("/")
-            outputs = _Outputs(self, "" if plain else f"{name}/", frame)
+            outputs = _Outputs(self, tag, "" if plain else f"{name}/", frame)
             for publisher in outputs.all():
                 publisher.on_activate(None)
             self._outputs[tag.tag_id] = outputs
@@ -307,14 +312,15 @@ class Locator(ManagedNode):
             self._robot.lever_arm_is_set = True
             self.get_logger().info(f"lever arm of the antenna: {arm[0]:.3f}, {arm[1]:.3f}, {arm[2]:.3f} m")
 
-    def _publish_estimate(self, outputs: _Outputs, estimate: Estimate, *, of_robot: bool) -> None:
+    def _publish_estimate(self, outputs: _Outputs, estimate: Estimate) -> None:
         outputs.picture.add(estimate)
-        base, robot = self._at_base(estimate, of_robot=of_robot), self._robot if of_robot else None
+        base, robot = self._at_base(outputs, estimate), self._robot
         outputs.pose.publish(encode_pose(base, self._map))
-        if robot is None:
+        if robot is None or outputs.robot is None:
+            robot = None
             outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
         else:
-            twist = robot.twist(estimate.stamp_ns)
+            twist = BodyTwist() if outputs.robot.rejects_odometry else robot.twist(estimate.stamp_ns)
             outputs.odometry.publish(encode_odometry(base, self._map, robot.base_frame or "base_link", twist))
         # tf warns of a repeated stamp.
         if self._tf is None or estimate.stamp_ns <= outputs.transform_ns:
@@ -339,11 +345,11 @@ class Locator(ManagedNode):
             outputs.transform_ns = stamp_ns
             self._tf.publish(self._make_tf([transform]))
 
-    def _at_base(self, estimate: Estimate, *, of_robot: bool) -> Estimate:
+    def _at_base(self, outputs: _Outputs, estimate: Estimate) -> Estimate:
         """Return the estimate of the robot's origin. With an unknown heading, a horizontal lever arm may point anywhere."""
         x, y, z = self.lever_arm
         # With odometry the lever arm is that of the robot's tag.
-        if not (x or y or z) or (self._robot is not None and not of_robot):
+        if not (x or y or z) or (self._robot is not None and outputs.robot is None):
             return estimate
         covariance, heading = estimate.covariance.copy(), estimate.heading
         if heading is None:
@@ -368,20 +374,18 @@ class Locator(ManagedNode):
         if estimator is None or not self.is_active:
             return
         for tag in list(estimator.tags.values()):
-            outputs, of_robot = self._outputs_of(tag), tag.estimator is estimator.robot
+            outputs = self._outputs_of(tag)
             age_s = (now_ns + self._offset_ns - tag.latest_ns) / _NANOSECONDS
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
                 ahead = tag.estimator.at(now_ns + self._offset_ns)
                 if ahead is not None:
-                    self._publish_estimate(outputs, ahead, of_robot=of_robot)
+                    self._publish_estimate(outputs, ahead)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
                 outputs.smoothed_ns = tag.latest_ns
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
-                    outputs.smoothed.publish(
-                        encode_pose(self._at_base(smoothed, of_robot=of_robot), self._map)
-                    )
-            if of_robot:
+                    outputs.smoothed.publish(encode_pose(self._at_base(outputs, smoothed), self._map))
+            if outputs.robot is not None:
                 self._repeat_transform(outputs, now_ns + self._offset_ns)
         if self._anchors_out is not None and estimator.tags and self._anchors_out.get_subscription_count():
             self._show_anchors()

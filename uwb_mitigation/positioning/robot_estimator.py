@@ -60,6 +60,7 @@ class RobotEstimator(TagEstimator):
 
     Attributes:
         odometry: add live messages to it in the order of time.
+        rejects_odometry: the odometry contradicted the ranges, and no heading was found since.
     """
 
     def __init__(self, config: EstimatorConfig, odometry: DeadReckoning | None = None) -> None:
@@ -69,6 +70,7 @@ class RobotEstimator(TagEstimator):
         self._yaws: list[_Hypothesis] = []
         self._begin: PathPoint | None = None
         self._last_yaw: float | None = None
+        self.rejects_odometry = False
         self._evidence = self._outlier_share = 0.0
         self._recorded: deque[tuple[int, int, int]] = deque()
         for kind, data in enumerate((self._robot.imu, self._robot.odometry)):
@@ -177,6 +179,7 @@ class RobotEstimator(TagEstimator):
             self._evidence = max(0.0, self._evidence + best_loss - self._latest_loss)
         if self._evidence > IMPLAUSIBLE or self._outlier_share > 0.5:
             self._forget("odometry wrong")
+            self.rejects_odometry = True
 
     def _start_yaws(self, point: PathPoint) -> None:
         """Start filters at the position of the ranges-only filter when the robot drives."""
@@ -207,7 +210,7 @@ class RobotEstimator(TagEstimator):
             self._yaws = kept
         best = self._yaws[0].filter
         if self._known is None and len(self._yaws) == 1 and best.yaw_variance < KNOWN_YAW_SD**2:
-            self._known = best
+            self._known, self.rejects_odometry = best, False
             self._outlier_share = 0.0
             self.counts["heading found"] += 1
 
