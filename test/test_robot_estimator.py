@@ -114,6 +114,24 @@ def test_missing_odometry_leaves_ranges_only():
     )
 
 
+def test_drift_is_estimated_again_when_the_imu_is_lost():
+    robot = Robot()
+    wheels = robot.odometry
+    # The wheels drift by 0.05 rad/m, the IMU does not; it is lost after 30 s.
+    twist = wheels.twist + 0.04 * np.hypot(*wheels.twist[:, :2].T)[:, None] * (0.0, 0.0, 1.0)
+    wheels = replace(wheels, pose=np.full_like(wheels.pose, np.nan), twist=twist)
+    time_s = wheels.stamp_ns[wheels.stamp_ns < 30 * NANOSECONDS] / NANOSECONDS
+    n = len(time_s)
+    rate = np.gradient(robot.yaw(time_s), time_s)
+    imu = Imu(wheels.stamp_ns[:n], rate, np.full(n, 1e-6), np.full(n, np.nan), np.zeros(n))
+    track = RobotEstimator(replace(robot.config, robot=RobotData(wheels, imu))).run(robot.ranges())
+    _, with_imu, sd = robot.errors(track.take(track.stamp_ns < 30 * NANOSECONDS), 15.0)
+    assert rms(with_imu / sd) < 1.5
+    _, without, sd = robot.errors(track, 30.0)
+    assert len(without) > 1000
+    assert rms(without / sd) < 1.5
+
+
 def test_kidnapped_robot_is_found_again():
     robot = Robot()
     ranges = robot.ranges()

@@ -42,6 +42,7 @@ class PathPoint(NamedTuple):
         distance_m: distance driven.
         drift: standard deviation of the yaw error by a constant drift, rad.
         position_variance, yaw_variance: variances of the random errors, m^2 and rad^2.
+        source: number of changes of the source of the yaw: wheels if even, IMU if odd.
     """
 
     part: int
@@ -52,6 +53,7 @@ class PathPoint(NamedTuple):
     drift: float = 0.0
     position_variance: float = 0.0
     yaw_variance: float = 0.0
+    source: int = 0
 
 
 class _Sample(NamedTuple):
@@ -139,9 +141,11 @@ class DeadReckoning:
         drift = WHEEL_DRIFT * speed
         share = 2.0 * CORRELATION_S * MOTION_SHARE**2
         yaw_density = of_yaw_rate * dt + share * yaw_rate**2
+        source = last.point.source + last.point.source % 2
         if imu_yaw is not None and self._imu_yaw is not None and self._imu is not None:
             yaw_rate, of_yaw_rate = (imu_yaw - self._imu_yaw) / dt, self._imu[2]
             drift, yaw_density = GYRO_DRIFT, of_yaw_rate * dt
+            source = last.point.source | 1
         self._imu_yaw = imu_yaw
         self.twist, self.twist_variance = (vx, vy, yaw_rate), (of_speed, of_yaw_rate)
         middle = last.point.yaw + 0.5 * yaw_rate * dt
@@ -155,7 +159,8 @@ class DeadReckoning:
             of_speed * dt + share * speed**2,
             yaw_density,
         )
-        self._samples.append(_Sample(stamp_ns, _moved(last.point, rates, dt), rates, pose))
+        point = _moved(last.point, rates, dt)._replace(source=source)
+        self._samples.append(_Sample(stamp_ns, point, rates, pose))
 
     def add_yaw_rate(self, stamp_ns: int, yaw_rate: float, variance: float = 0.0) -> None:
         """Add a yaw rate of an IMU, rad/s, and its variance (0: unknown); an invalid one is rejected."""
@@ -238,5 +243,6 @@ def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, f
 
 
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float) -> PathPoint:
-    part, *values = point
-    return PathPoint(part, *(value + rate * dt for value, rate in zip(values, rates, strict=True)))
+    part, *values, source = point
+    moved = (value + rate * dt for value, rate in zip(values, rates, strict=True))
+    return PathPoint(part, *moved, source)

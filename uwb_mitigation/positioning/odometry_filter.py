@@ -84,6 +84,10 @@ class OdometryFilter(RangeFilter):
             return
         self.time_s, self.point = time_s, point
         x, P = self.x, self.P
+        if point.source != before.source:
+            # The drift of wheels says nothing about that of an IMU.
+            x[DRIFT] = P[DRIFT] = P[:, DRIFT] = 0.0
+            P[DRIFT, DRIFT] = 1.0
         relative = float(x[YAW]) - before.yaw
         cosine, sine = math.cos(relative), math.sin(relative)
         east, north = point.x - before.x, point.y - before.y
