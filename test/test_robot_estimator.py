@@ -278,6 +278,16 @@ def test_yaw_rates_of_the_imu_replace_those_of_the_wheels():
     assert path.at(robot.odometry.stamp_ns[-1].item()).yaw == pytest.approx(1.25, abs=0.01)
 
 
+def test_wrong_stamp_of_the_imu_does_not_turn_the_path():
+    path = DeadReckoning()
+    for stamp in range(0, 2 * NANOSECONDS, 10_000_000):
+        is_wrong = stamp == 1_010_000_000
+        path.add_yaw_rate(stamp + is_wrong * 86_400 * NANOSECONDS, 1e-9 * stamp, 1e-4)
+        if stamp % 20_000_000 == 0:
+            path.add(stamp, None, (0.5, 0.0, 0.0))
+    assert path.at(2 * NANOSECONDS).yaw == pytest.approx(2.0, abs=0.1)
+
+
 def test_orientation_of_the_imu_counts_by_its_differences():
     robot = Robot(seconds=5.0)
     n = len(robot.odometry)

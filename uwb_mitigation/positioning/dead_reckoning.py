@@ -187,6 +187,9 @@ class DeadReckoning:
 
     def _set_imu(self, stamp_ns: int, yaw_rate: float, variance: float, yaw: float) -> None:
         known = 0.0 < variance < _MAX_VARIANCE
+        if self._imu is not None and not 0 < stamp_ns - self._imu[0] <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
+            # The rotation in a gap is unknown, also after a wrong stamp.
+            self._imu_yaw = None
         self._imu = stamp_ns, yaw_rate, variance if known else YAW_RATE_SD**2, yaw
 
     def is_available(self, stamp_ns: int) -> bool:
