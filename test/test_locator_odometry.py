@@ -244,8 +244,7 @@ def _check_lookups(live: LiveRobot, transforms: list[TransformStamped]) -> None:
 
 
 def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: Path):
-    arm = [f"lever_arm_{axis}:={value}" for axis, value in zip("xyz", LEVER, strict=True)]
-    locator = start(ros, anchors, *arm, "imu:=/imu", "base_frame:=base_footprint")
+    locator = start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "imu:=/imu", "base_frame:=base_footprint")
     locator.wait_for_output("locating")
     live = LiveRobot(ros, seconds=20.0, imu=True)
     live.wait()
@@ -255,6 +254,14 @@ def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: 
     assert np.sqrt(np.mean(of_yaw**2)) < math.radians(4.0)
     assert live.odometry[-1].child_frame_id == "base_footprint"
     assert not live.transforms
+
+
+def test_lever_arm_of_zero_is_not_read_from_tf(ros: Ros, anchors: Path):
+    locator = start(ros, anchors, "lever_arm:=0,0,0")
+    locator.wait_for_output("locating")
+    # Its other subscriptions were created later.
+    ros.wait_for_subscribers("/uwb/range_corrected", 1)
+    assert ros.node.count_subscribers("/tf_static") == 0
 
 
 def test_base_frame_that_is_the_map_is_refused(ros: Ros, anchors: Path):

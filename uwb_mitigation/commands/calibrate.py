@@ -19,9 +19,6 @@ from uwb_mitigation.commands.positioning import (
     HeightSdOption,
     HeightTopicOption,
     OffsetOption,
-    area_of,
-    height_of,
-    parse_lever_arm,
 )
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
@@ -121,6 +118,7 @@ def calibrate(
         uwb-mitigation process other.mcap --model site.onnx --offsets site.offsets.yaml -o corrected.mcap
     """
     from uwb_mitigation.commands.bundles import bundle_for
+    from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
     from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
     from uwb_mitigation.training import site_calibration, site_solution
 
@@ -139,11 +137,8 @@ def calibrate(
     for option, seconds in (("stamp offset", stamp_offset), ("time offset", time_offset)):
         if seconds is not None and not abs(seconds) <= 3600.0:
             raise ParameterError(f"{option} {seconds}", valid="-3600 to 3600 s")
-    height_prior, area_bounds, lever_arm_m = (
-        height_of(height, height_sd),
-        area_of(area),
-        parse_lever_arm(lever_arm),
-    )
+    height_prior = None if height is None else Height(height, height_sd)
+    area_bounds, lever_arm_m = Area.parse(area), parse_lever_arm(lever_arm)
     anchor_map = load_anchors(anchors or anchors_path(bags[0]))
     source = bundle_for(None, bags[0])
     try:

@@ -14,7 +14,6 @@ from uwb_mitigation.errors import ParameterError, RecordingError, check_name, fo
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap
-    from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.survey import SurveyResult
     from uwb_mitigation.positioning.tag_estimator import RobotData
     from uwb_mitigation.positioning.tracks import Heights
@@ -135,6 +134,7 @@ def track(
     """
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.files import write_atomically
+    from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.processing.tracking import held_out, track_tag, tum_file, write_tracks
@@ -142,7 +142,8 @@ def track(
     from uwb_mitigation.sources.anchors_file import anchors_path, save_anchors
 
     model = NoiseModel(acceleration=acceleration)
-    height_prior, box = height_of(height, height_sd), area_of(area)
+    height_prior = None if height is None else Height(height, height_sd)
+    box = Area.parse(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
     robot = _robot_of(bag, odometry, imu, lever_arm, recorded)
@@ -200,6 +201,7 @@ def survey(
     not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
+    from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.survey import survey as find
     from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
@@ -209,7 +211,8 @@ def survey(
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
     if output.exists() and not force:
         raise ParameterError("exists already", where=str(output), valid="--force replaces it")
-    height_prior, box = height_of(height, height_sd), area_of(area)
+    height_prior = None if height is None else Height(height, height_sd)
+    box = Area.parse(area)
     known, recorded = _read(bag, anchors, stamp_offset)
     measured = heights_of(bag, height_topic, height_sd, height, recorded)
     ids = {
@@ -252,13 +255,6 @@ def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorM
     return known, recorded
 
 
-def height_of(height: float | None, sd: float) -> Height | None:
-    """Return the height of --height and --height-sd."""
-    from uwb_mitigation.positioning.geometry import Height
-
-    return None if height is None else Height(height, sd)
-
-
 def heights_of(
     bag: Path, topic: str | None, sd: float, height: float | None, recorded: RecordedRanges
 ) -> Heights | None:
@@ -275,23 +271,12 @@ def heights_of(
     return read_heights(bag, topic, sd)
 
 
-def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
-    """Return the numbers of --lever-arm."""
-    if text is None:
-        return None
-    try:
-        x, y, z = (float(word) for word in text.split(","))
-    except ValueError as error:
-        raise ParameterError(f"lever arm {text!r}", valid="three numbers: X,Y,Z") from error
-    if not all(math.isfinite(value) and abs(value) <= 100.0 for value in (x, y, z)):
-        raise ParameterError(f"lever arm {text!r}", valid="-100 to 100 m each")
-    return x, y, z
-
-
 def _robot_of(
     bag: Path, odometry: str | None, imu: str | None, lever_arm: str | None, recorded: RecordedRanges
 ) -> RobotData | None:
     """Read the motion of --odometry and --imu, and the lever arm."""
+    from uwb_mitigation.positioning.geometry import parse_lever_arm
+
     arm = parse_lever_arm(lever_arm)
     if odometry is None:
         if imu is not None or arm is not None:
@@ -308,13 +293,6 @@ def _robot_of(
         arm = read_lever_arm(bag, BASE_LINK, read_range_frame(bag)) or (0.0, 0.0, 0.0)
     motion = read_odometry(bag, odometry)
     return RobotData(motion, None if imu is None else read_imu(bag, imu), arm)
-
-
-def area_of(text: str | None) -> Area | None:
-    """Return the box of --area."""
-    from uwb_mitigation.positioning.geometry import Area
-
-    return Area.parse(text or "")
 
 
 def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:

@@ -40,7 +40,7 @@ from uwb_mitigation.nodes.parameter_tables import LOCATOR
 from uwb_mitigation.nodes.robot_motion import RobotMotion, check_frames, transform_type
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
-from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.robot_estimator import RobotEstimator
@@ -126,8 +126,7 @@ class Locator(ManagedNode):
         model = NoiseModel(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
         area = Area.parse(self.value("area"))
-        x, y, z = (float(self.value(f"lever_arm_{axis}")) for axis in "xyz")
-        self.lever_arm = x, y, z
+        self.lever_arm = parse_lever_arm(self.value("lever_arm")) or (0.0, 0.0, 0.0)
         robot = RobotData(lever_arm=self.lever_arm) if self.value("odometry") else None
         path_of_base = DeadReckoning()
         self._make_estimator = lambda anchors: MultiTagEstimator(

@@ -218,11 +218,9 @@ LOCATOR = (
               "/tf. It is at the antenna and has the axes of map_frame. Other tags use tag_N. The namespace "
               "of the node is prepended. Do not use a frame of the robot such as base_link: its heading is unknown here, and a "
               "frame has only one parent in tf."),
-    Parameter("lever_arm_x", 0.0, "Position of the antenna in the robot's frame, x. With a lever arm, uwb/pose and "
+    Parameter("lever_arm", "", "Position X,Y,Z of the antenna in the robot's frame, m. With a lever arm, uwb/pose and "
               "uwb/pose_smoothed are the position of the robot's origin. While the heading is unknown, a horizontal arm "
-              "only widens the covariance. With `odometry`, an arm of 0 in all axes is read from /tf_static.", low=-100.0, high=100.0, unit="m"),
-    Parameter("lever_arm_y", 0.0, "The same in y.", low=-100.0, high=100.0, unit="m"),
-    Parameter("lever_arm_z", 0.0, "The same in z; subtracted from the height.", low=-100.0, high=100.0, unit="m"),
+              "only widens the covariance. Empty: from /tf_static with `odometry`, otherwise 0,0,0."),
     Parameter("odometry", "", "Topic of the robot's odometry (nav_msgs/Odometry): pose increments or twists, with "
               "covariances. The locator then estimates the heading of the robot with the tag with the plain topic names. "
               "Empty = ranges only."),

@@ -46,7 +46,7 @@ class RobotMotion:
         self._uses_orientation = node.value("imu_orientation")
         self._last: TransformStamped | None = None
         self._last_ns = 0
-        self.lever_arm_is_set = any(node.value(f"lever_arm_{axis}") for axis in "xyz")
+        self.lever_arm_is_set = bool(node.value("lever_arm"))
         # {child frame: (parent frame, translation, quaternion x y z w)} of static transforms.
         self._static: dict[str, tuple[str, Vector, tuple[float, float, float, float]]] = {}
 

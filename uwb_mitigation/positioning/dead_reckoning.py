@@ -248,4 +248,4 @@ def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, f
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float) -> PathPoint:
     part, *values, source = point
     moved = (value + rate * dt for value, rate in zip(values, rates, strict=True))
-    return PathPoint(part, *moved, source)
+    return PathPoint._make((part, *moved, source))

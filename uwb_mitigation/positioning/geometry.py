@@ -60,8 +60,8 @@ class Area:
             )
 
     @classmethod
-    def parse(cls, text: str) -> Area | None:
-        """Parse `X,Y,Z,X,Y,Z`, m; an empty text gives None.
+    def parse(cls, text: str | None) -> Area | None:
+        """Parse `X,Y,Z,X,Y,Z`, m; an empty text or None gives None.
 
         Raises:
             ParameterError: the text is no box.
@@ -83,6 +83,24 @@ class Area:
         """Return the nearest point of the box to each position float64 (..., 3)."""
         nearest: NDArray[np.float64] = np.clip(position, self.low, self.high)
         return nearest
+
+
+def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    """Parse `X,Y,Z`, m; an empty text or None gives None.
+
+    Raises:
+        ParameterError: the text is not a vector, or longer than 100 m in an axis.
+    """
+    if not text:
+        return None
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise ParameterError(f"lever arm {text!r}", valid="three numbers: X,Y,Z") from error
+    # False for NaN.
+    if not (abs(x) <= 100.0 and abs(y) <= 100.0 and abs(z) <= 100.0):
+        raise ParameterError(f"lever arm {text!r}", valid="-100 to 100 m each")
+    return x, y, z
 
 
 def directions(
