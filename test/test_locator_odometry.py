@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from bisect import bisect
 from pathlib import Path
@@ -25,6 +26,7 @@ from geometry_msgs.msg import (
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_harness import Ros, diagnostic_values
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -72,7 +74,7 @@ class LiveRobot:
         stamp += self.start_ns
         return Header(stamp=Time(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS), frame_id=frame)
 
-    def play(self, until_s: float, *, odometry: bool = True) -> None:
+    def play(self, until_s: float, *, odometry: bool = True, tags: tuple[int, ...] = (7,)) -> None:
         while self._at_s < until_s - CHUNK_S / 2:
             begin, end = (round(s * NANOSECONDS) for s in (self._at_s, self._at_s + CHUNK_S))
             self._at_s += CHUNK_S
@@ -80,22 +82,27 @@ class LiveRobot:
                 self._send_odometry(begin, end)
             stamps = self.ranges.stamp_ns
             rows = np.flatnonzero((stamps >= begin) & (stamps < end)).tolist()
-            for i in rows:
-                self._ranges_out.publish(
-                    RangeCorrected(
-                        header=self.header(int(stamps[i]), "uwb_antenna"),
-                        tag_id=7,
-                        anchor_id=HALL.anchors[self.ranges.anchor[i]].id,
-                        sequence=i,
-                        range=float(self.ranges.range_m[i]),
-                        variance=0.01,
-                    )
-                )
+            for i, tag in itertools.product(rows, tags):
+                self.send_range(i, tag)
             last_ns = self.start_ns + int(stamps[rows[-1]])
             if self._at_s > 1.0:
                 self._ros.spin_until(
                     lambda last_ns=last_ns: bool(self.poses) and stamp_ns(self.poses[-1].header) >= last_ns
                 )
+
+    def send_range(self, row: int, tag: int = 7) -> None:
+        # The first ranges are in no frame.
+        frame = "uwb_antenna" if self._at_s > 1.0 else ""
+        self._ranges_out.publish(
+            RangeCorrected(
+                header=self.header(int(self.ranges.stamp_ns[row]), frame),
+                tag_id=tag,
+                anchor_id=HALL.anchors[self.ranges.anchor[row]].id,
+                sequence=row,
+                range=float(self.ranges.range_m[row]),
+                variance=0.01,
+            )
+        )
 
     def _send_odometry(self, begin: int, end: int) -> None:
         measured = self.robot.odometry
@@ -113,9 +120,10 @@ class LiveRobot:
             self._odometry_out.publish(message)
             if self._uses_imu:
                 imu = Imu(header=header, angular_velocity=Vector3(z=rate / 1.02))
+                imu.orientation_covariance[0] = -1.0
                 imu.angular_velocity_covariance[8] = 1e-6
                 self._imu_out.publish(imu)
-                # Rates that are not measured are skipped.
+                # Rates that are not measured are skipped, and the orientation, which is not measured either.
                 imu.header = self.header(int(measured.stamp_ns[i]) + 10_000_000)
                 imu.angular_velocity.z, imu.angular_velocity_covariance[0] = 9.0, -1.0
                 self._imu_out.publish(imu)
@@ -158,14 +166,17 @@ def test_modes_ranges_only_odometry_odometry_lost_and_odometry_wrong(ros: Ros, a
     static = ros.node.create_publisher(
         TFMessage, "/tf_static", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     )
-    # The antenna is on a mast that is turned by 90 degrees.
+    # The antenna is on a mast that is turned by 90 degrees; the quaternion is not quite normalised.
     mast = TransformStamped(child_frame_id="mast", header=Header(frame_id="base_link"))
-    mast.transform = Transform(
-        translation=Vector3(x=0.1), rotation=Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5))
-    )
+    mast.transform = Transform(translation=Vector3(x=0.1), rotation=Quaternion(z=0.74, w=0.74))
     antenna = TransformStamped(child_frame_id="uwb_antenna", header=Header(frame_id="mast"))
     antenna.transform = Transform(translation=Vector3(x=0.1, y=-0.2, z=0.2), rotation=Quaternion(w=1.0))
-    static.publish(TFMessage(transforms=[antenna, mast]))
+    # Transforms that are not rotations are skipped.
+    invalid = [
+        TransformStamped(child_frame_id="mast", header=mast.header, transform=Transform(rotation=rotation))
+        for rotation in (Quaternion(w=0.0), Quaternion(w=2.0), Quaternion(x=math.nan, w=1.0))
+    ]
+    static.publish(TFMessage(transforms=[antenna, mast, *invalid]))
     locator = start(ros, anchors, "publish_tf:=true", "transform_tolerance:=1.0")
     locator.wait_for_output("locating")
     live = LiveRobot(ros, seconds=44.0, slip=(40.0, 44.0))
@@ -244,16 +255,47 @@ def _check_lookups(live: LiveRobot, transforms: list[TransformStamped]) -> None:
 
 
 def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: Path):
-    locator = start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "imu:=/imu", "base_frame:=base_footprint")
+    locator = start(
+        ros,
+        anchors,
+        "lever_arm:=0.3,0.1,0.2",
+        "imu:=/imu",
+        "imu_orientation:=true",
+        "base_frame:=base_footprint",
+    )
     locator.wait_for_output("locating")
     live = LiveRobot(ros, seconds=20.0, imu=True)
     live.wait()
-    live.play(20.0)
+    others = ros.collect(PoseWithCovarianceStamped, "/uwb/tag_9/pose")
+    live.play(18.0)
+    live.play(20.0, tags=(7, 9))
     distance, of_yaw = live.errors(live.poses_between(12.0, 20.0))
     assert np.sqrt(np.mean(distance**2)) < 0.2
     assert np.sqrt(np.mean(of_yaw**2)) < math.radians(4.0)
     assert live.odometry[-1].child_frame_id == "base_footprint"
     assert not live.transforms
+    # The lever arm is that of the robot's tag.
+    ros.spin_until(lambda: bool(others))
+    assert others[-1].pose.pose.position.z == pytest.approx(1.2, abs=0.09)
+    assert live.poses[-1].pose.pose.position.z == pytest.approx(1.0, abs=0.09)
+
+
+def test_transform_is_repeated_while_there_is_no_position(ros: Ros, anchors: Path):
+    locator = start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
+    locator.wait_for_output("locating")
+    clock = ros.node.create_publisher(Clock, "/clock", 10)
+    live = LiveRobot(ros, seconds=25.0)
+    live.wait()
+    live.play(16.0)
+    # One range after a gap does not determine a position.
+    live.send_range(len(live.ranges) - 1)
+    now = live.header(25 * NANOSECONDS)
+    ros.spin_until(
+        lambda: clock.publish(Clock(clock=now.stamp)) or live.values().get("tag 7 candidates") == "0"
+    )
+    expected = stamp_ns(now) + NANOSECONDS
+    ros.spin_until(lambda: stamp_ns(live.transforms[-1].transforms[0].header) == expected)
+    assert stamp_ns(live.poses[-1].header) < live.start_ns + 16 * NANOSECONDS
 
 
 def test_lever_arm_of_zero_is_not_read_from_tf(ros: Ros, anchors: Path):

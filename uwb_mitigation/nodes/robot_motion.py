@@ -69,7 +69,7 @@ class RobotMotion:
         """Return the position of a range's frame in the frame of the base, from /tf_static; None: unknown."""
         point: Vector = (0.0, 0.0, 0.0)
         for _ in range(len(self._static) + 1):
-            if frame == self.base_frame:
+            if frame and frame == self.base_frame:
                 return point
             if frame not in self._static:
                 return None
