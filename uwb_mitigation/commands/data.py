@@ -228,7 +228,7 @@ def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu | None] | N
 
     if isinstance(source, MappedRecording) and (odometry := source.motion) is not None:
         # Without a date, the first range starts at `start_ns`.
-        first_ns = int(source.values.stamp_ns[0])
+        first_ns = int(source.values["stamp"][0])
         shift_ns = start_ns - first_ns if first_ns < FIRST_DATE_NS else 0
         return replace(odometry, stamp_ns=odometry.stamp_ns + shift_ns), None
     if not isinstance(source, SimulatedSource):

@@ -38,39 +38,43 @@ def show(sources: Sequence[MappedRecording], *, preview: bool) -> dict[str, Any]
         console.warn(f"warning: {warning}")
     for source in sources if preview else ():
         show_preview(source)
+
+    def distinct(name: str) -> int:
+        return len(np.unique(np.concatenate([source.values[name] for source in sources])))
+
     return {
-        "ranges": sum(len(source.values) for source in sources),
-        "with_cir": sum(source.with_cir for source in sources),
+        "ranges": sum(map(len, sources)),
+        "with_cir": sum(map(_with_cir, sources)),
         "with_truth": sum(len(source.errors_m) for source in sources),
-        "anchors": len({anchor for source in sources for anchor in source.anchor_ids}),
-        "tags": len({tag for source in sources for tag in source.tags}),
+        "anchors": distinct("anchor"),
+        "tags": distinct("tag"),
         "dropped": dict(dropped),
         "warnings": warnings,
     }
 
 
+def _with_cir(source: MappedRecording) -> int:
+    return int(np.count_nonzero(source.values["cir"] >= 0))
+
+
 def show_preview(source: MappedRecording) -> None:
     """Print the first ranges with units, a histogram of the errors, and what is missing."""
-    values, numbers = source.values, source.values.numbers
-    shown = range(min(_ROWS, len(values)))
-    stamps = (values.stamp_ns[: len(shown)] - values.stamp_ns[0]) / 1e9
-    cirs = [source.cir(row) for row in shown]
+    values = source.values
+    shown = range(min(_ROWS, len(source)))
+    first = int(values["stamp"][0])
     rows = [
-        ["time s", *(f"{stamp:.3f}" for stamp in stamps)],
-        ["tag", *(format_id(int(values.tag_id[row])) for row in shown)],
-        ["anchor", *(format_id(int(values.anchor_id[row])) for row in shown)],
+        ["time s", *(f"{(int(values['stamp'][row]) - first) / 1e9:.3f}" for row in shown)],
+        *([name, *(format_id(int(values[name][row])) for row in shown)] for name in ("tag", "anchor")),
         *(
-            [name, *(_cell(float(numbers[key][row]), digits) for row in shown)]
+            [name, *(_cell(float(values[key][row]), digits) for row in shown)]
             for name, key, digits in _FIELDS
         ),
-        ["CIR samples", *("-" if cir is None else str(len(cir)) for cir in cirs)],
-        ["label", *(values.label[row] or "-" for row in shown)],
-        ["placement", *(values.configuration[row] or "-" for row in shown)],
+        ["CIR samples", *(str(len(source.cir(row)) or "-") for row in shown)],
+        ["label", *(values["label"][row] or "-" for row in shown)],
+        ["placement", *(values["configuration"][row] or "-" for row in shown)],
     ]
-    first = np.datetime64(int(values.stamp_ns[0]) // 1_000_000, "ms")
-    show_table(
-        f"The first of {len(values)} ranges, from {first} UTC", ("", *(str(row + 1) for row in shown)), rows
-    )
+    title = f"The first of {len(source)} ranges, from {np.datetime64(first // 1_000_000, 'ms')} UTC"
+    show_table(title, ("", *(str(row + 1) for row in shown)), rows)
     _show_errors(source.errors_m)
     for line in missing(source):
         print_line(line)
@@ -78,32 +82,27 @@ def show_preview(source: MappedRecording) -> None:
 
 def missing(source: MappedRecording) -> list[str]:
     """Return what a model or command will be missing, and the reason."""
-    numbers, count = source.values.numbers, len(source.values)
+    count, with_cir = len(source), _with_cir(source)
 
     def unknown(name: str) -> bool:
-        return not np.isfinite(numbers[name]).any()
+        return not np.isfinite(source.values[name]).any()
 
-    found = []
-    if source.with_cir < count:
-        found.append(
-            f"{count - source.with_cir} of {count} ranges have no CIR: networks pass them through with status NO_CIR; "
-            "constants and linear models can correct them"
+    texts = {
+        f"{count - with_cir} of {count} ranges have no CIR: networks pass them through with status NO_CIR; "
+        "constants and linear models can correct them": with_cir < count,
+        "no first-path index: networks need it (status BAD_CIR)": with_cir and unknown("first_path_index"),
+        "no preamble count: `universal` needs it; use `universal_amplitude`": with_cir
+        and unknown("preamble_count"),
+        "no receive or first-path level: no linear model, no out-of-distribution check of levels": unknown(
+            "rx_power"
         )
-    if source.with_cir and unknown("first_path_index"):
-        found.append("no first-path index: networks need it (status BAD_CIR)")
-    if source.with_cir and unknown("preamble_count"):
-        found.append("no preamble count: `universal` needs it; use `universal_amplitude`")
-    if unknown("rx_power") or unknown("first_path_power"):
-        found.append(
-            "no receive or first-path level: no linear model, no out-of-distribution check of levels"
-        )
-    if not len(source.errors_m):
-        found.append(
-            "no true range: `evaluate`, `train` and `offset` cannot use it; `calibrate` needs a drive and anchors"
-        )
-    if not hasattr(source, "anchors"):
-        found.append("no positions of the anchors: `track` and `calibrate` need --anchors")
-    return found
+        or unknown("first_path_power"),
+        "no true range: `evaluate`, `train` and `offset` cannot use it; `calibrate` needs a drive and anchors": not len(
+            source.errors_m
+        ),
+        "no positions of the anchors: `track` and `calibrate` need --anchors": not hasattr(source, "anchors"),
+    }
+    return [text for text, applies in texts.items() if applies]
 
 
 def _cell(value: float, digits: int) -> str:

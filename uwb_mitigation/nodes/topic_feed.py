@@ -17,12 +17,11 @@ from uwb_mitigation.measurement import Cir, RangeMeasurement
 from uwb_mitigation.nodes import diagnostics, topics
 from uwb_mitigation.nodes.diagnostics import Description
 from uwb_mitigation.offsets import Offsets
-from uwb_mitigation.sources.conversion import NO_SAMPLES, Converter, kept_rows, samples_of
+from uwb_mitigation.sources.conversion import NO_CIR, Converter, kept_rows, measurement, samples_of
 from uwb_mitigation.sources.mapping import LIST_INDEX, Mapping, load_mapping
 from uwb_mitigation.sources.messages import MessageRows
 from uwb_mitigation.sources.tables import LOG_TIME, TOPIC, UNREADABLE, Chunk
 
-_NO_CIR = Cir(NO_SAMPLES)
 _WARNING_PERIOD_S = 10.0
 
 
@@ -83,8 +82,9 @@ class TopicRanges:
         self.problem = ""
         self._node, self._mapping, self._on_range, self._now_ns = node, mapping, on_range, now_ns
         self._type = message_type(mapping.type)
-        self._converter = Converter(mapping)
-        self._rows = MessageRows(mapping, self._converter.columns, self._converter.optional)
+        self._converter = Converter(mapping.values)
+        columns = [*self._converter.columns, *mapping.cir_columns, *(rule.column for rule in mapping.drop)]
+        self._rows = MessageRows(mapping, columns, self._converter.optional)
         self._subscriptions: list[Subscription] = []
 
     def open(self) -> None:
@@ -128,11 +128,11 @@ class TopicRanges:
             return []
         values = self._converter.convert(chunk)
         # Radios without a synchronised clock send a zero stamp.
-        values.stamp_ns[values.stamp_ns <= 0] = now_ns
+        values["stamp"][values["stamp"] <= 0] = now_ns
         found = []
-        for row in range(len(values)):
-            if np.isfinite(values.numbers["range"][row]):
-                found.append(values.measurement(row, self._cir(chunk, row), self.ranges + row))
+        for row in range(chunk.count):
+            if np.isfinite(values["range"][row]):
+                found.append(measurement(values, row, self._cir(chunk, row), self.ranges + row))
             else:
                 self.counts["range is not a number"] += 1
         return found
@@ -140,7 +140,7 @@ class TopicRanges:
     def _cir(self, chunk: Chunk, row: int) -> Cir:
         source = self._mapping.cir
         if source is None or source.files:
-            return _NO_CIR
+            return NO_CIR
         samples, encoding, scale = samples_of(chunk.columns[source.column][row], source.samples)
         return Cir(samples, encoding, source.start_index, scale=scale)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,93 +14,66 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
-from uwb_mitigation.sources.mapping import INDEX, LENGTH, LIST_INDEX, TIME, Drop, Mapping, Point, Value
-from uwb_mitigation.sources.tables import LOG_TIME, TOPIC, Chunk, series
+from uwb_mitigation.sources.mapping import SCALES, TIME, Drop, Value
+from uwb_mitigation.sources.tables import LOG_TIME, TOPIC, Chunk
 
-_MISSING = frozenset(("", "-", "nan", "none", "null", "n/a", "na"))
+_MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
 
 UNKNOWN_ID = (1 << 64) - 1
-"""Id of a row without an id."""
+UNKNOWN_STAMP = np.iinfo(np.int64).min
+"""Id and stamp of a row without one."""
 
-NO_SAMPLES: NDArray[np.int16] = np.zeros(0, np.int16)
+MAX_STAMP_S = 4.6e9
+"""Stamps are within the years 1824 to 2115, so that differences fit into 64 bits."""
 
+NO_CIR = Cir(np.zeros(0, np.int16))
 _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
 """Constant A of the DW1000's levels by PRF in MHz (user manual, section 4.7)."""
 
-
-class Names:
-    """Numbers for texts that name tags and anchors, in the order of their appearance, from 1."""
-
-    def __init__(self) -> None:
-        self.numbers: dict[str, int] = {}
-
-    def number(self, text: str) -> int:
-        """Return the number of a text."""
-        return self.numbers.setdefault(text, len(self.numbers) + 1)
+Columns = dict[str, NDArray[Any]]
+"""{name: array (n,)} in SI units. `stamp`: ns, int64; `tag`, `anchor`: uint64; `label`, `configuration`: texts; others, such
+as `range`, `true range` and `tag x`: float64, NaN: unknown."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Columns:
-    """Values of n ranges in SI units; NaN: unknown. Names as in `RangeMeasurement`, `Cir` and `Record`.
+def joined(parts: list[Columns]) -> Columns:
+    """Concatenate parts with the same columns."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    Attributes:
-        stamp_ns: int64 (n,).
-        tag_id, anchor_id: uint64 (n,); `UNKNOWN_ID`: unknown.
-        numbers: {name: float64 (n,)} for `range`, `rx_power`, `first_path_power`, `first_path_index`,
-            `preamble_count`, `channel`, `sequence`, `true range`, `error`, and true positions such as `tag x`.
-        label, configuration: texts (n,).
-    """
 
-    stamp_ns: NDArray[np.int64]
-    tag_id: NDArray[np.uint64]
-    anchor_id: NDArray[np.uint64]
-    numbers: dict[str, NDArray[np.float64]]
-    label: NDArray[Any]
-    configuration: NDArray[Any]
+def take(columns: Columns, rows: NDArray[Any]) -> Columns:
+    """Return the chosen rows."""
+    return {name: values[rows] for name, values in columns.items()}
 
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
 
-    def take(self, rows: NDArray[Any]) -> Columns:
-        """Return the chosen rows."""
-        numbers = {name: values[rows] for name, values in self.numbers.items()}
-        texts = self.label[rows], self.configuration[rows]
-        return Columns(self.stamp_ns[rows], self.tag_id[rows], self.anchor_id[rows], numbers, *texts)
+def measurement(columns: Columns, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
+    """Return one range with the samples of `cir` and its own levels; `sequence` is used if the columns have none."""
+    number = {name: columns[name][row] for name in _NUMBERS}
+    given = number["sequence"]
+    return RangeMeasurement(
+        int(columns["stamp"][row]),
+        int(columns["tag"][row]),
+        int(columns["anchor"][row]),
+        (int(given) if math.isfinite(given) else sequence) & 0xFFFFFFFF,
+        0,
+        float(number["range"]),
+        Cir(
+            cir.samples,
+            cir.encoding,
+            cir.start_index,
+            float(number["first_path_index"]),
+            scale=cir.scale,
+            preamble_count=_whole(number["preamble_count"], 65535),
+            rx_power_dbm=float(number["rx_power"]),
+            first_path_power_dbm=float(number["first_path_power"]),
+            channel=_whole(number["channel"], 255),
+        ),
+    )
 
-    @classmethod
-    def joined(cls, parts: list[Columns]) -> Columns:
-        """Concatenate parts of one mapping."""
-        numbers = {name: np.concatenate([part.numbers[name] for part in parts]) for name in parts[0].numbers}
-        stamp, tag, anchor, label, configuration = (
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("stamp_ns", "tag_id", "anchor_id", "label", "configuration")
-        )
-        return cls(stamp, tag, anchor, numbers, label, configuration)
 
-    def measurement(self, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
-        """Return one range with the samples of `cir` and its own levels."""
-        n = self.numbers
-        given = n["sequence"][row]
-        return RangeMeasurement(
-            int(self.stamp_ns[row]),
-            int(self.tag_id[row]),
-            int(self.anchor_id[row]),
-            (int(given) if math.isfinite(given) else sequence) & 0xFFFFFFFF,
-            0,
-            float(n["range"][row]),
-            Cir(
-                cir.samples,
-                cir.encoding,
-                cir.start_index,
-                float(n["first_path_index"][row]),
-                scale=cir.scale,
-                preamble_count=_whole(n["preamble_count"][row], 65535),
-                rx_power_dbm=float(n["rx_power"][row]),
-                first_path_power_dbm=float(n["first_path_power"][row]),
-                channel=_whole(n["channel"][row], 255),
-            ),
-        )
+_NUMBERS = (
+    "range", "sequence", "rx_power", "first_path_power", "first_path_index", "preamble_count", "channel",
+)  # fmt: skip
 
 
 def _whole(value: float, most: int) -> int:
@@ -108,38 +82,26 @@ def _whole(value: float, most: int) -> int:
 
 @dataclass(slots=True)
 class Converter:
-    """Converts the rows of a mapping.
+    """Converts the rows of a table.
 
     Args:
-        mapping: the mapping.
-
-    Attributes:
-        tags, anchors: numbers of named tags and anchors.
+        values: the columns of the result; None: unknown.
+        names: numbers of named tags and anchors.
     """
 
-    mapping: Mapping
-    tags: Names = field(default_factory=Names)
-    anchors: Names = field(default_factory=Names)
+    values: Mapping[str, Value | None]
+    names: Mapping[str, dict[str, int]] = field(default_factory=lambda: {"tag": {}, "anchor": {}})
 
     @property
     def columns(self) -> list[str]:
-        """Return the columns that a table must contain, except those in `optional`."""
-        rows = {name: None for _, value, _ in self.mapping.measured() if value for name in value.columns}
-        rows |= {rule.column: None for rule in self.mapping.drop if rule.column != LIST_INDEX}
-        cir = self.mapping.cir
-        if cir and not cir.files:
-            rows |= dict.fromkeys(series(cir.column))
-        return list(rows)
+        """Return the columns of the table that are needed, except those in `optional`."""
+        return list(dict.fromkeys(name for value in self.values.values() if value for name in value.columns))
 
     @property
     def optional(self) -> list[str]:
         """Return the columns that may be missing."""
-        return [
-            name
-            for _, value, _ in self.mapping.measured()
-            if value and value.optional
-            for name in value.columns
-        ]
+        given = (value for value in self.values.values() if value and value.optional)
+        return [name for value in given for name in value.columns]
 
     def convert(self, chunk: Chunk, file: str = "") -> Columns:
         """Return the values of all rows of a chunk; `file`: its path for `file_name`.
@@ -147,47 +109,37 @@ class Converter:
         Raises:
             RecordingError: an id or a number cannot be read; `where` names the row.
         """
-        fields, numbers = self.mapping.fields, {}
-        for name, value, _ in self.mapping.measured():
-            if name not in ("stamp", "tag", "anchor", "label", "configuration"):
-                numbers[name] = read_numbers(value, chunk, name, file)
-        if registers := self.mapping.registers:
-            _levels(numbers, registers.amplitudes)
-        for name in ("rx_power", "first_path_power"):
-            numbers[name] = np.where(np.isfinite(numbers[name]), numbers[name], np.nan)
-        texts = [
-            np.array([""] * chunk.count, object) if value is None else read_texts(value, chunk, name, file)
-            for name, value in (
-                ("label", self.mapping.truth.label),
-                ("configuration", self.mapping.truth.configuration),
-            )
-        ]
-        return Columns(
-            read_stamps(fields.stamp, chunk, file),
-            read_ids(fields.tag, chunk, "tag", file, self.tags),
-            read_ids(fields.anchor, chunk, "anchor", file, self.anchors),
-            numbers,
-            *texts,
-        )
+        found: Columns = {}
+        for name, value in self.values.items():
+            if name == "stamp":
+                found[name] = read_stamps(value, chunk, file)
+            elif name in self.names:
+                found[name] = _read_ids(value or Value(constant=1), chunk, name, file, self.names[name])
+            elif name in ("label", "configuration"):
+                found[name] = _read_texts(value, chunk, name, file)
+            else:
+                found[name] = read_numbers(value, chunk, name, file)
+        if "cir_power" in found:
+            _add_levels(found)
+        return found
 
 
-def _levels(numbers: dict[str, NDArray[np.float64]], amplitudes: Point) -> None:
+def _add_levels(columns: Columns) -> None:
     """Compute both levels from the registers of a DW1000."""
-    count = numbers["preamble_count"]
-    constant = np.where(numbers["prf"] == 16, _LEVEL_OFFSETS[16], _LEVEL_OFFSETS[64])
-    power = numbers["cir_power"] * 2.0**17
-    first = sum(numbers[f"amplitude {n}"] ** 2 for n in range(1, len(amplitudes) + 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        numbers["rx_power"] = 10 * np.log10(power / count**2) - constant
-        numbers["first_path_power"] = 10 * np.log10(first / count**2) - constant
+    count = columns["preamble_count"]
+    constant = np.where(columns["prf"] == 16, _LEVEL_OFFSETS[16], _LEVEL_OFFSETS[64])
+    first = sum(columns[f"amplitude {n}"] ** 2 for n in (1, 2, 3))
+    for name, power in (("rx_power", columns["cir_power"] * 2.0**17), ("first_path_power", first)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            level = 10 * np.log10(power / count**2) - constant
+        columns[name] = np.where(np.isfinite(level), level, np.nan)
 
 
-def read_texts(value: Value, chunk: Chunk, name: str, file: str) -> NDArray[Any]:
-    """Return a value as texts (n,), after `pattern` and `values`."""
-    raw = _raw(value, chunk, file)
-    if raw is None:
-        return np.array([""] * chunk.count, object)
-    # Constants and file names are the same in all rows.
+def _read_texts(value: Value | None, chunk: Chunk, name: str, file: str) -> NDArray[Any]:
+    """Return a value as texts (n,), after `pattern` and `values`; empty: unknown."""
+    raw = None if value is None else _raw(value, chunk, file)
+    if value is None or raw is None:
+        return np.full(chunk.count, "", object)
     # None and NaN are missing values.
     given = ["" if each is None or each != each else each for each in raw.tolist()]
     texts = {each: _text(value, each, name) if each != "" else "" for each in dict.fromkeys(given)}
@@ -204,26 +156,24 @@ def _text(value: Value, given: Any, name: str) -> str:
     return value.values.get(text, text)
 
 
-def read_numbers(value: Value | None, chunk: Chunk, name: str, file: str) -> NDArray[np.float64]:
+def read_numbers(value: Value | None, chunk: Chunk, name: str, file: str = "") -> NDArray[np.float64]:
     """Return a value in SI units, float64 (n,); NaN: unknown.
 
     Raises:
         RecordingError: a text is not a number; `where` names its row.
     """
-    if value is None:
-        return np.full(chunk.count, np.nan)
-    raw = _raw(value, chunk, file)
-    if raw is None:
+    raw = None if value is None else _raw(value, chunk, file)
+    if value is None or raw is None:
         return np.full(chunk.count, np.nan)
     if value.pattern or value.values:
-        raw = read_texts(value, chunk, name, file)
-    factor = LENGTH.get(value.unit) or INDEX.get(value.unit) or 1.0
-    return _floats(raw, chunk, name, value) * factor * value.scale + value.offset
+        raw = _read_texts(value, chunk, name, file)
+    numbers = _floats(raw, chunk, name, value.column)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = numbers * SCALES.get(value.unit, 1.0) * value.scale + value.offset
+    return np.where(np.isfinite(found), found, np.nan)
 
 
-def _floats(raw: NDArray[Any], chunk: Chunk, name: str, value: Value) -> NDArray[np.float64]:
-    if raw.dtype.kind in "iufb":
-        return raw.astype(np.float64)
+def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[np.float64]:
     with np.errstate(all="ignore"):
         try:
             return raw.astype(np.float64)
@@ -241,16 +191,15 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, value: Value) -> NDArray
             raise RecordingError(
                 f"{name} = {text!r:.40} is not a number",
                 where=chunk.where(row),
-                valid="decimal commas: set decimal: ','" if comma else f"a number in column {value.column}",
+                valid="decimal commas: set decimal: ','" if comma else f"a number in column {column}",
             ) from None
     return found
 
 
 def _raw(value: Value, chunk: Chunk, file: str) -> NDArray[Any] | None:
     """Return the unconverted values of the rows; None: the column is optional and missing."""
-    if value.file_name or value.topic_name:
+    if rule := value.file_name or value.topic_name:
         source = [file] * chunk.count if value.file_name else chunk.columns.get(TOPIC, [""] * chunk.count)
-        rule = value.file_name or value.topic_name
         found = {text: re.search(rule, text) for text in set(source)}
         if missing := [text for text, match in found.items() if match is None]:
             raise RecordingError(f"{missing[0]!r} does not match {rule!r}", where=str(chunk.path))
@@ -258,29 +207,27 @@ def _raw(value: Value, chunk: Chunk, file: str) -> NDArray[Any] | None:
     if value.rate_hz:
         return np.asarray((chunk.before + chunk.rows) / value.rate_hz)
     if value.constant is not None:
-        return np.array([value.constant] * chunk.count)
-    if value.sum and not (value.optional and set(value.sum) - set(chunk.columns)):
-        parts = [
-            factor * _floats(_array(chunk.columns[name]), chunk, name, value)
-            for name, factor in value.sum.items()
-        ]
-        return np.asarray(np.sum(parts, axis=0))
-    if value.column not in chunk.columns:
+        return np.full(chunk.count, value.constant)
+    needed = list(value.sum) or [value.column]
+    if missing := [name for name in needed if name not in chunk.columns]:
         if value.optional:
             return None
-        raise RecordingError(f"no column {value.column}", where=str(chunk.path))
-    return _array(chunk.columns[value.column])
-
-
-def _array(values: Any) -> NDArray[Any]:
-    array = np.asarray(values)
-    if array.ndim > 1:
-        raise RecordingError(f"a column of shape {array.shape} where single values are needed")
-    return array
+        raise RecordingError(f"no column {missing[0]}", where=str(chunk.path))
+    arrays = {name: np.asarray(chunk.columns[name]) for name in needed}
+    if bad := [name for name, array in arrays.items() if array.ndim > 1]:
+        raise RecordingError(f"column {bad[0]} contains lists", where=str(chunk.path), valid="single values")
+    if value.sum:
+        parts = [factor * _floats(arrays[name], chunk, name, name) for name, factor in value.sum.items()]
+        return np.asarray(np.sum(parts, axis=0))
+    return arrays[value.column]
 
 
 def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int64]:
-    """Return stamps in ns, int64 (n,); the smallest integer: unknown."""
+    """Return stamps in ns, int64 (n,); `UNKNOWN_STAMP`: unknown.
+
+    Raises:
+        RecordingError: a text is not a date or number; or most stamps are impossible, so that the unit is wrong.
+    """
     raw = None if value is None else _raw(value, chunk, file)
     if value is None or raw is None:
         if LOG_TIME in chunk.columns:
@@ -289,42 +236,47 @@ def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int6
     if value.unit == "iso8601":
         import pandas as pd
 
-        times = pd.to_datetime(pd.Series(raw), utc=True, errors="coerce", format="ISO8601")
-        found = times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64)
-        bad = np.flatnonzero(times.isna().to_numpy())
-        for row in bad.tolist():
-            if str(raw[row]).strip().lower() not in _MISSING | {"nat"}:
+        times = pd.to_datetime(pd.Series(raw).astype(str), utc=True, errors="coerce", format="ISO8601")
+        given = times.notna().to_numpy()
+        for row in np.flatnonzero(~given).tolist():
+            if str(raw[row]).strip().lower() not in _MISSING:
                 raise RecordingError(
                     f"stamp = {raw[row]!r:.40} is not a date",
                     where=chunk.where(row),
                     valid="2024-06-09T19:39:13.4387",
                 )
-        return np.asarray(found + round(value.offset * 1e9))
-    # Without a unit: seconds; the stamp of a message is an integer in nanoseconds.
-    is_stamp = LOG_TIME in chunk.columns and raw.dtype.kind in "iu"
-    factor = TIME[value.unit or ("ns" if is_stamp else "s")]
-    offset = round(value.offset * 1e9)
-    if raw.dtype.kind in "iu" and value.scale == 1.0:
-        # As integers, because a float64 resolves nanoseconds since 1970 to 256 ns only.
-        if len(raw) and max(-int(raw.min()), int(raw.max())) >= 9.2e18 / factor:
-            raise RecordingError(
-                f"stamp = {int(raw.max())} is outside of the years 1678 to 2261",
-                where=str(chunk.path),
-                valid="unit: ms, us or ns",
-            )
-        return np.asarray(raw.astype(np.int64) * factor + offset)
-    scaled = _floats(raw, chunk, "stamp", value) * value.scale
-    good = np.isfinite(scaled) & (np.abs(scaled) < 9.2e18 / factor)
-    whole = np.floor(np.where(good, scaled, 0.0))
-    fraction = np.where(good, scaled, 0.0) - whole
-    # A float64 resolves seconds since 1970 to 0.2 us only: round them to 1 us.
-    step = np.where((np.abs(whole) > 1e8) & (factor == TIME["s"]), 1000, 1)
-    rest = np.rint(fraction * factor / step).astype(np.int64) * step
-    found = whole.astype(np.int64) * factor + rest + offset
-    return np.where(good, found, np.iinfo(np.int64).min)
+        found = times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64)
+        possible = given & (np.abs(found / 1e9) < MAX_STAMP_S)
+    else:
+        # Without a unit: seconds; the stamp of a message is an integer in nanoseconds.
+        is_stamp = LOG_TIME in chunk.columns and raw.dtype.kind in "iu"
+        factor = TIME[value.unit or ("ns" if is_stamp else "s")]
+        scaled = _floats(raw, chunk, "stamp", value.column) * value.scale
+        given = np.isfinite(scaled)
+        possible = given & (np.abs(scaled) < MAX_STAMP_S * 1e9 / factor)
+        if raw.dtype.kind in "iu" and value.scale == 1.0:
+            # As integers, because a float64 resolves nanoseconds since 1970 to 256 ns only.
+            found = np.where(possible, raw, 0).astype(np.int64) * factor
+        else:
+            scaled = np.where(possible, scaled, 0.0)
+            whole = np.floor(scaled)
+            # A float64 resolves seconds since 1970 to 0.2 us only: round them to 1 us.
+            step = np.where((np.abs(whole) > 1e8) & (factor == TIME["s"]), 1000, 1)
+            rest = np.rint((scaled - whole) * factor / step).astype(np.int64) * step
+            found = whole.astype(np.int64) * factor + rest
+    if 2 * np.count_nonzero(possible) < np.count_nonzero(given):
+        first = raw[np.flatnonzero(given & ~possible)[0]]
+        raise RecordingError(
+            f"stamp = {first} is outside of the years 1824 to 2115",
+            where=str(chunk.path),
+            valid="unit: ms, us or ns",
+        )
+    possible &= np.abs(found / 1e9 + value.offset) < MAX_STAMP_S
+    offset = round(min(max(value.offset, -MAX_STAMP_S), MAX_STAMP_S) * 1e9)
+    return np.where(possible, found + offset, UNKNOWN_STAMP)
 
 
-def read_ids(value: Value, chunk: Chunk, name: str, file: str, names: Names) -> NDArray[np.uint64]:
+def _read_ids(value: Value, chunk: Chunk, name: str, file: str, names: dict[str, int]) -> NDArray[np.uint64]:
     """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`.
 
     Raises:
@@ -349,7 +301,8 @@ def read_ids(value: Value, chunk: Chunk, name: str, file: str, names: Names) -> 
             if isinstance(item, float) and abs(item) >= 2**53:
                 raise ValueError(item)
             text = _text(value, item, name)
-            found[item] = names.number(text) if value.names else _id(text) + round(value.offset)
+            number = names.setdefault(text, len(names) + 1) if value.names else _id(text)
+            found[item] = number + round(value.offset)
             if not 0 <= found[item] < UNKNOWN_ID:
                 raise ValueError(text)
         except (ValueError, UwbMitigationError) as error:
@@ -387,7 +340,7 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
         array = np.abs(array)
     flat = array.reshape(-1).astype(np.float64)
     if not np.isfinite(flat).all():
-        return NO_SAMPLES, encoding, 1.0
+        return NO_CIR.samples, encoding, 1.0
     largest = float(np.abs(flat).max()) if len(flat) else 0.0
     exact = largest <= 32767 and bool(np.all(flat == np.rint(flat)))
     scale = 1.0 if exact or largest == 0.0 else largest / 32767
@@ -395,7 +348,7 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
 
 
 def kept_rows(rules: list[Drop], chunk: Chunk, dropped: Counter[str], prefix: str = "") -> NDArray[np.bool_]:
-    """Return which rows no rule drops, and count the others by rule."""
+    """Return which rows no rule drops, and count the others by rule; `from_median` needs all files and is ignored."""
     kept = np.ones(chunk.count, bool)
     for rule in rules:
         raw = np.asarray(chunk.columns[rule.column])
@@ -409,14 +362,16 @@ def kept_rows(rules: list[Drop], chunk: Chunk, dropped: Counter[str], prefix: st
                     np.isin(raw, values) if raw.dtype.kind in "iuf" else False
                 )
                 bad |= ~same if opposite else same
-        if rule.below is not None or rule.above is not None or rule.from_median is not None:
-            found = read_numbers(Value(column=rule.column), chunk, rule.column, "")
+        if rule.below is not None or rule.above is not None:
+            found = _floats(raw, chunk, rule.column, rule.column)
             bad |= found < (-np.inf if rule.below is None else rule.below)
             bad |= found > (np.inf if rule.above is None else rule.above)
-            if rule.from_median is not None:
-                bad |= np.abs(found - np.nanmedian(found)) > rule.from_median
-        count = int(np.count_nonzero(bad & kept))
-        if count:
-            dropped[f"{prefix}{rule}"] += count
-        kept &= ~bad
+        kept &= ~count_bad(bad & kept, dropped, f"{prefix}{rule}")
     return kept
+
+
+def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDArray[np.bool_]:
+    """Count the rows that are not used, by reason; return `bad`."""
+    if bad.any():
+        dropped[reason] += int(np.count_nonzero(bad))
+    return bad

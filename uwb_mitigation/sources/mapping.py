@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from uwb_mitigation.errors import ParameterError, did_you_mean
 from uwb_mitigation.files import read_bounded
@@ -23,23 +31,26 @@ MAX_BYTES = 1 << 20
 TIME = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "iso8601": 1}
 """Nanoseconds per unit of time."""
 
-LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-INDEX = {"samples": 1.0, "10.6": 1 / 64}
-"""Units of the first-path index: samples, or the fixed-point number of the DW1000."""
-
-LEVEL = {"dBm": 1.0}
-NUMBER = {"": 1.0}
+SCALES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "samples": 1.0, "10.6": 1 / 64, "dBm": 1.0}
+"""SI units per unit; 10.6 is the fixed-point first-path index of the DW1000."""
 
 LIST_INDEX = "#"
 """Column with the index of an element in the list of a message."""
+
+_SERIES = re.compile(r"(.*)\{(\d{1,5})\.\.(\d{1,5})\}")
 
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def _texts(given: Any) -> Any:
+    """YAML reads the keys 0 and 1 as numbers."""
+    return {str(key): str(value) for key, value in given.items()} if isinstance(given, dict) else given
+
+
 class Value(_Strict):
-    """Where one value is: exactly one of the first seven fields; a text is short for a column, a number for a constant.
+    """Where one value is: exactly one of the first six fields; a text is short for a column, a number for a constant.
 
     Attributes:
         column: name of a column, or path of a message's field, such as `nodes[].dis`; `#`: index in the list.
@@ -48,10 +59,10 @@ class Value(_Strict):
         file_name, topic_name: regular expression; its first group in the path of the file or topic.
         rate_hz: row number divided by this (stamps only).
         pattern: regular expression; its first group in the text of the value is used.
-        values: {text: other value}; any other text is kept.
+        values: {text: other text}; any other text is kept.
         names: texts are numbered from 1 in the order of their appearance (ids only).
-        unit: see the tables above.
-        scale, offset: value * scale + offset, after the unit.
+        unit: a key of `TIME` or `SCALES`.
+        scale, offset: value * scale + offset, after the unit; of stamps the offset is in s.
         optional: if the column is absent, the value is unknown.
     """
 
@@ -62,11 +73,11 @@ class Value(_Strict):
     topic_name: str = ""
     rate_hz: float = Field(default=0.0, ge=0.0)
     pattern: str = ""
-    values: dict[str, str] = {}
+    values: Annotated[dict[str, str], BeforeValidator(_texts)] = {}
     names: bool = False
     unit: str = ""
-    scale: float = 1.0
-    offset: float = 0.0
+    scale: float = Field(default=1.0, allow_inf_nan=False)
+    offset: float = Field(default=0.0, allow_inf_nan=False)
     optional: bool = False
 
     @model_validator(mode="after")
@@ -77,6 +88,8 @@ class Value(_Strict):
         for text in filter(None, (self.pattern, self.file_name, self.topic_name)):
             if _compiled(text).groups < 1:
                 raise ValueError(f"the pattern {text!r} has no group (...)")
+        if self.unit == "iso8601" and self.scale != 1:
+            raise ValueError("a date has no scale")
         return self
 
     @property
@@ -99,18 +112,21 @@ def _value(given: Any) -> Any:
     return {"constant": given} if isinstance(given, int | float) else given
 
 
-V = Annotated[Value, BeforeValidator(_value)]
+def _with_unit(*units: str) -> AfterValidator:
+    def check(value: Value) -> Value:
+        if value.unit and value.unit not in units:
+            raise ValueError(f"unit {value.unit!r}; valid: {', '.join(units) or 'none'}")
+        return value
+
+    return AfterValidator(check)
 
 
-def _keys_as_text(given: Any) -> Any:
-    """YAML reads the keys 0 and 1 as numbers."""
-    if isinstance(given, dict) and isinstance(given.get("values"), dict):
-        return given | {"values": {str(key): str(value) for key, value in given["values"].items()}}
-    return {"column": given} if isinstance(given, str) else given
-
-
-Label = Annotated[Value, BeforeValidator(_keys_as_text)]
-Point = tuple[V, V, V]
+Number = Annotated[Value, BeforeValidator(_value), _with_unit()]
+Time = Annotated[Value, BeforeValidator(_value), _with_unit(*TIME)]
+Length = Annotated[Value, BeforeValidator(_value), _with_unit("m", "cm", "mm")]
+Level = Annotated[Value, BeforeValidator(_value), _with_unit("dBm")]
+Index = Annotated[Value, BeforeValidator(_value), _with_unit("samples", "10.6")]
+Point = tuple[Length, Length, Length]
 
 
 class Drop(_Strict):
@@ -119,7 +135,7 @@ class Drop(_Strict):
     Attributes:
         equals, differs: text or number; or list of them.
         below, above: limits of a number in the unit of the file.
-        from_median: largest distance from the median of the column.
+        from_median: largest distance from the median of the column in all files of the table.
     """
 
     column: str
@@ -167,16 +183,16 @@ class Table(_Strict):
 class Fields(_Strict):
     """The values of a range. Required: `anchor` and `range`; without a stamp the time of the message is used."""
 
-    stamp: V | None = None
-    tag: V = Value(constant=1)
-    anchor: V
-    range: V
-    sequence: V | None = None
-    rx_power: V | None = None
-    first_path_power: V | None = None
-    first_path_index: V | None = None
-    preamble_count: V | None = None
-    channel: V | None = None
+    stamp: Time | None = None
+    tag: Number = Value(constant=1)
+    anchor: Number
+    range: Length
+    sequence: Number | None = None
+    rx_power: Level | None = None
+    first_path_power: Level | None = None
+    first_path_index: Index | None = None
+    preamble_count: Number | None = None
+    channel: Number | None = None
 
 
 class Registers(_Strict):
@@ -188,17 +204,17 @@ class Registers(_Strict):
         prf: 16 or 64 (MHz).
     """
 
-    cir_power: V
-    amplitudes: Point
-    prf: V = Value(constant=64)
+    cir_power: Number
+    amplitudes: tuple[Number, Number, Number]
+    prf: Number = Value(constant=64)
 
 
 class Join(_Strict):
     """Stamp and ids of a CIR in another file; the nearest range of the pair within the tolerance gets it."""
 
-    stamp: V
-    tag: V | None = None
-    anchor: V
+    stamp: Time
+    tag: Number = Value(constant=1)
+    anchor: Number
     tolerance_s: float = Field(default=0.02, gt=0.0)
 
 
@@ -219,7 +235,7 @@ class CirSource(Table):
     samples: Literal["magnitude", "complex", "interleaved"] = "magnitude"
     start_index: int = Field(default=0, ge=0, le=65535)
     join: Join | None = None
-    first_path_index: V | None = None
+    first_path_index: Index | None = None
     optional: bool = False
 
 
@@ -232,9 +248,9 @@ class Poses(Table):
         lever_arm: position of the antenna in the robot's frame, m; or {tag: position}.
     """
 
-    stamp: V
+    stamp: Time
     position: Point
-    orientation: tuple[V, V, V, V] | None = None
+    orientation: tuple[Number, Number, Number, Number] | None = None
     lever_arm: tuple[float, float, float] | dict[int, tuple[float, float, float]] = (0.0, 0.0, 0.0)
 
 
@@ -251,10 +267,10 @@ class TruthSource(_Strict):
         range_from_positions: compute the true range from the positions of tag and anchor.
     """
 
-    range: V | None = None
-    error: V | None = None
-    label: Label | None = None
-    configuration: Label | None = None
+    range: Length | None = None
+    error: Length | None = None
+    label: Number | None = None
+    configuration: Number | None = None
     tag_position: Point | None = None
     poses: Poses | None = None
     range_from_positions: bool = False
@@ -270,7 +286,7 @@ class AnchorSource(Table):
     """
 
     files: str | dict[str, str] = ""
-    id: V | None = None
+    id: Number | None = None
     position: Point | None = None
     sd: float = Field(default=0.02, gt=0.0)
     optional: bool = False
@@ -287,10 +303,10 @@ class Motion(Table):
     """
 
     files: str | dict[str, str] = ""
-    stamp: V
-    forward: V
-    left: V = Value(constant=0.0)
-    yaw_rate: V
+    stamp: Time
+    forward: Number
+    left: Number = Value(constant=0.0)
+    yaw_rate: Number
 
 
 class Mapping(Table):
@@ -320,47 +336,42 @@ class Mapping(Table):
 
     @model_validator(mode="after")
     def _check(self) -> Mapping:
-        for name, value, units in self.measured():
-            if value is not None and value.unit and value.unit not in units:
-                raise ValueError(
-                    f"{name}: unit {value.unit!r}; valid: {', '.join(filter(None, units)) or 'none'}"
-                )
         if self.registers and not self.fields.preamble_count:
             raise ValueError("registers: needs fields.preamble_count")
+        if self.anchors and self.anchors.files and not (self.anchors.id and self.anchors.position):
+            raise ValueError("anchors: id and position are needed with files")
         return self
 
-    def measured(self) -> list[tuple[str, Value | None, dict[str, Any]]]:
-        """Return name, value and valid units of everything that is in a row of the ranges."""
-        fields, truth, registers = self.fields, self.truth, self.registers
-        rows: list[tuple[str, Value | None, dict[str, Any]]] = [
-            ("stamp", fields.stamp, TIME),
-            ("tag", fields.tag, NUMBER),
-            ("anchor", fields.anchor, NUMBER),
-            ("range", fields.range, LENGTH),
-            ("sequence", fields.sequence, NUMBER),
-            ("rx_power", fields.rx_power, LEVEL),
-            ("first_path_power", fields.first_path_power, LEVEL),
-            ("first_path_index", fields.first_path_index, INDEX),
-            ("preamble_count", fields.preamble_count, NUMBER),
-            ("channel", fields.channel, NUMBER),
-            ("true range", truth.range, LENGTH),
-            ("error", truth.error, LENGTH),
-            ("label", truth.label, NUMBER),
-            ("configuration", truth.configuration, NUMBER),
-        ]
+    @property
+    def values(self) -> dict[str, Value | None]:
+        """Return everything that is in a row of the ranges, by the names of `conversion.Columns`."""
+        truth, registers = self.truth, self.registers
+        found: dict[str, Value | None] = dict(self.fields)
+        found |= {"true range": truth.range} | {name: getattr(truth, name) for name in _TRUTH}
         if registers:
-            rows += [("cir_power", registers.cir_power, NUMBER), ("prf", registers.prf, NUMBER)]
-            rows += [(f"amplitude {n}", value, NUMBER) for n, value in enumerate(registers.amplitudes, 1)]
-        for name, point in (("tag", truth.tag_position), ("anchor", self.anchor_columns)):
-            rows += [
-                (f"{name} {axis}", value, LENGTH) for axis, value in zip("xyz", point or (), strict=False)
-            ]
-        return rows
+            found |= {"cir_power": registers.cir_power, "prf": registers.prf}
+            found |= {f"amplitude {n}": value for n, value in enumerate(registers.amplitudes, 1)}
+        own_anchors = self.anchors.position if self.anchors and not self.anchors.files else None
+        return found | axes("tag", truth.tag_position) | axes("anchor", own_anchors)
 
     @property
-    def anchor_columns(self) -> Point | None:
-        """Return the columns of the ranges that contain the position of the anchor."""
-        return self.anchors.position if self.anchors and not self.anchors.files else None
+    def cir_columns(self) -> list[str]:
+        """Return the columns of the ranges that contain the CIR."""
+        return series(self.cir.column) if self.cir and not self.cir.files else []
+
+
+_TRUTH = ("error", "label", "configuration")
+
+
+def axes(name: str, point: Point | None) -> dict[str, Value | None]:
+    """Return the coordinates of a point by their names, such as `tag x`."""
+    return {f"{name} {axis}": value for axis, value in zip("xyz", point or (None,) * 3, strict=True)}
+
+
+def series(column: str) -> list[str]:
+    """Return the columns of `CIR{0..1015}`; another name is returned alone."""
+    match = _SERIES.fullmatch(column)
+    return [f"{match[1]}{n}" for n in range(int(match[2]), int(match[3]) + 1)] if match else [column]
 
 
 def shipped_mappings() -> list[str]:

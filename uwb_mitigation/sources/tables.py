@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import lzma
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import (
-    DamagedRecordingError,
-    RecordingError,
-    did_you_mean,
-    not_installed,
-)
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError, did_you_mean, not_installed
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.sources.mapping import LIST_INDEX, Table
 from uwb_mitigation.sources.messages import MessageRows
@@ -28,8 +24,8 @@ from uwb_mitigation.sources.messages import MessageRows
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 """Largest number of rows, and of values in columns, of a chunk."""
 
-MAX_FILE_BYTES, MAX_ARRAY_BYTES = 64 << 30, 4 << 30
-"""Largest size of a file that is read in chunks, and of one that is loaded."""
+MAX_ARRAY_BYTES = 4 << 30
+"""Largest size of a file that is loaded."""
 
 MAX_YAML_BYTES = 1 << 20
 LOG_TIME = "@stamp"
@@ -43,7 +39,9 @@ _SUFFIXES = {
     ".mat": "matlab", ".h5": "hdf5", ".hdf5": "hdf5", ".bag": "messages", ".db3": "messages", ".mcap": "messages",
     ".yaml": "yaml", ".yml": "yaml",
 }  # fmt: skip
-_SERIES = re.compile(r"(.*)\{(\d+)\.\.(\d+)\}")
+UNREADABLE = (
+    OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError, MemoryError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,21 +78,16 @@ class Chunk:
         return Chunk(columns, len(chosen), self.path, self.rows[kept], self.before)
 
 
-def _chunk(columns: Mapping[str, Any], count: int, path: Path, first: int) -> Chunk:
-    return Chunk(columns, count, path, np.arange(first, first + count))
-
-
-def series(column: str) -> list[str]:
-    """Return the columns of `CIR{0..1015}`; another name is returned alone."""
-    match = _SERIES.fullmatch(column)
-    return [f"{match[1]}{n}" for n in range(int(match[2]), int(match[3]) + 1)] if match else [column]
+def _kind_of(path: Path) -> str:
+    name = path.name.lower().removesuffix(".xz").removesuffix(".gz")
+    return "messages" if path.is_dir() else _SUFFIXES.get(Path(name).suffix, "")
 
 
 def find_files(table: Table, root: Path, ranges: Path | None = None) -> list[Path]:
     """Return the files of a table below a folder, or the file `root` itself, in the order of their names.
 
     Args:
-        table: description of the files.
+        table: description of the files; without `files`, all whose names show a format, except YAML.
         root: the folder, or the only file.
         ranges: the file of the ranges, if the table contains other values; a pattern in `files` is searched in its path.
 
@@ -113,16 +106,23 @@ def find_files(table: Table, root: Path, ranges: Path | None = None) -> list[Pat
         raise RecordingError(
             f"files = {pattern!r}: {error}", where=str(root), valid="a relative glob"
         ) from error
+    if pattern == "*":
+        found = [path for path in found if (_kind_of(path) or table.format or "yaml") != "yaml"]
     if not found:
         what = "no such file or folder" if not root.exists() else f"no file {pattern!r}"
         raise RecordingError(what, where=str(root), valid="the folder that contains the files of the mapping")
     return found
 
 
+_Rows = Iterator[tuple[dict[str, Any], int]]
+_Choose = Callable[[Sequence[str]], dict[str, str]]
+"""Returns {wanted column: column of the file}, from all columns of the file."""
+
+
 def read_chunks(
     table: Table, path: Path, columns: Sequence[str], optional: Sequence[str] = ()
 ) -> Iterator[Chunk]:
-    """Yield the rows of a file, only the given columns.
+    """Yield the rows of a file, only the given columns and those of the rules to drop rows.
 
     Args:
         table: format of the file.
@@ -134,41 +134,48 @@ def read_chunks(
         RecordingError: the file cannot be read, or a column is missing; the message names similar columns.
         DamagedRecordingError: the file is truncated, after yielding the rows before.
     """
-    kind = table.format or _SUFFIXES.get(
-        Path(path.name.removesuffix(".xz").removesuffix(".gz")).suffix.lower(), ""
-    )
-    if path.is_dir():
-        kind = "messages"
-    readers = {
-        "csv": _csv, "parquet": _parquet, "numpy": _loaded, "matlab": _loaded, "hdf5": _hdf5, "messages": _messages,
-        "yaml": _loaded,
-    }  # fmt: skip
-    if kind not in readers:
-        raise RecordingError("unknown format", where=str(path), valid=f"format: {', '.join(readers)}")
-    if path.is_file() and path.stat().st_size > MAX_FILE_BYTES:
-        raise RecordingError(f"more than {MAX_FILE_BYTES >> 30} GiB", where=str(path))
+    kind = ("" if path.is_dir() else table.format) or _kind_of(path)
+    wanted = list(dict.fromkeys([*columns, *(rule.column for rule in table.drop)]))
+    first = 0
+
+    def choose(known: Sequence[str]) -> dict[str, str]:
+        return _choose(known, wanted, optional, path)
+
     try:
-        yield from readers[kind](table, path, columns, optional)
+        if kind == "messages":
+            rows = _messages(table, path, wanted, optional)
+        elif kind in _READERS:
+            rows = _READERS[kind](table, path, choose)
+        else:
+            raise RecordingError("unknown format", where=str(path), valid=f"format: {', '.join(_FORMATS)}")
+        for found, count in rows:
+            yield Chunk(found, count, path, np.arange(first, first + count))
+            first += count
+    except (EOFError, lzma.LZMAError, zlib.error) as error:
+        raise DamagedRecordingError(
+            f"truncated or corrupt: {error}", where=f"{path}: after row {first}"
+        ) from error
     except UNREADABLE as error:
         raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
 
 
-UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError)
-
-
-def _chosen(known: Sequence[str], columns: Sequence[str], optional: Sequence[str], path: Path) -> list[str]:
-    """Return the columns that exist; raise RecordingError if a required one is missing."""
-    for name in columns:
-        if name not in known and name not in optional:
+def _choose(
+    known: Sequence[str], columns: Sequence[str], optional: Sequence[str], path: Path
+) -> dict[str, str]:
+    """Return the columns that exist, also with other case; raise RecordingError if a required one is missing."""
+    folded = {name.strip().lower(): name for name in known}
+    chosen = {name: name if name in known else folded.get(name.lower(), "") for name in columns}
+    for name, found in chosen.items():
+        if not found and name not in known and name not in optional:
             valid = f"columns: {', '.join(known[:40])}"
             if len(known) == 1 and (other := next((mark for mark in ";\t|," if mark in known[0]), "")):
                 valid = f"there is one column {known[0]!r:.60}; set separator: {other!r}"
             suggestion = did_you_mean(name, known)
             raise RecordingError(f"no column {name}", where=str(path), valid=valid, suggestion=suggestion)
-    return [name for name in columns if name in known]
+    return {name: found for name, found in chosen.items() if found in known}
 
 
-def _csv(table: Table, path: Path, columns: Sequence[str], optional: Sequence[str]) -> Iterator[Chunk]:
+def _csv(table: Table, path: Path, choose: _Choose) -> _Rows:
     import pandas as pd
 
     options: dict[str, Any] = {
@@ -177,124 +184,91 @@ def _csv(table: Table, path: Path, columns: Sequence[str], optional: Sequence[st
     }  # fmt: skip
     if table.columns:
         options |= {"names": table.columns, "header": None, "index_col": False}
-    first = 0
     try:
-        with _text(path) as stream:
-            known = table.columns or [str(name) for name in pd.read_csv(stream, nrows=0, **options).columns]
-        chosen = _chosen(known, columns, optional, path)
+        known = table.columns or [str(name) for name in pd.read_csv(path, nrows=0, **options).columns]
+        chosen = choose(known)
         rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(len(chosen), 1)))
-        with _text(path) as stream:
-            # Unused columns cost most of the time of a file with CIRs.
-            for frame in pd.read_csv(stream, usecols=chosen, chunksize=rows, **options):
-                yield _chunk({name: frame[name].to_numpy() for name in chosen}, len(frame), path, first)
-                first += len(frame)
+        # Unused columns cost most of the time of a file with CIRs.
+        with pd.read_csv(path, usecols=list(chosen.values()), chunksize=rows, **options) as frames:
+            for frame in frames:
+                yield {name: frame[column].to_numpy() for name, column in chosen.items()}, len(frame)
     except pd.errors.EmptyDataError as error:
         raise RecordingError("the file is empty", where=str(path)) from error
-    except (EOFError, lzma.LZMAError) as error:
-        raise DamagedRecordingError(
-            f"truncated or corrupt: {error}", where=f"{path}: after row {first}"
-        ) from error
 
 
-@contextlib.contextmanager
-def _text(path: Path) -> Iterator[Any]:
-    import gzip
-
-    openers: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
-    with openers.get(path.suffix, open)(path, "rb") as stream:
-        yield _Limited(stream, path)
-
-
-class _Limited(io.RawIOBase):
-    """Reads at most `MAX_FILE_BYTES` after decompression."""
-
-    def __init__(self, stream: Any, path: Path) -> None:
-        self._stream, self._path, self._left = stream, path, MAX_FILE_BYTES
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1) -> bytes:
-        data: bytes = self._stream.read(size)
-        self._left -= len(data)
-        if self._left < 0:
-            raise RecordingError(f"more than {MAX_FILE_BYTES >> 30} GiB", where=str(self._path))
-        return data
-
-    def readinto(self, buffer: Any) -> int:
-        data = self.read(len(buffer))
-        buffer[: len(data)] = data
-        return len(data)
-
-
-def _parquet(table: Table, path: Path, columns: Sequence[str], optional: Sequence[str]) -> Iterator[Chunk]:
+def _parquet(table: Table, path: Path, choose: _Choose) -> _Rows:
     try:
         import pyarrow.parquet as parquet
     except ImportError as error:
         raise not_installed("pyarrow") from error
-    file, first = parquet.ParquetFile(path), 0
-    chosen = _chosen(file.schema_arrow.names, columns, optional, path)
-    for batch in file.iter_batches(batch_size=CHUNK_ROWS // 10, columns=chosen):
-        values = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in chosen}
-        yield _chunk(values, batch.num_rows, path, first)
-        first += batch.num_rows
+    file = parquet.ParquetFile(path)
+    chosen = choose(file.schema_arrow.names)
+    for batch in file.iter_batches(batch_size=CHUNK_ROWS // 10, columns=list(chosen.values())):
+        found = {name: batch.column(column) for name, column in chosen.items()}
+        yield {name: values.to_numpy(zero_copy_only=False) for name, values in found.items()}, batch.num_rows
 
 
-def _loaded(table: Table, path: Path, columns: Sequence[str], optional: Sequence[str]) -> Iterator[Chunk]:
-    """Read a NumPy, MATLAB or YAML file."""
-    if path.stat().st_size > MAX_ARRAY_BYTES:
-        raise RecordingError(
-            f"more than {MAX_ARRAY_BYTES >> 30} GiB", where=str(path), valid="Parquet or HDF5"
-        )
-    arrays: Any
-    if path.suffix in (".yaml", ".yml"):
-        arrays = _yaml(table, path)
-    elif path.suffix in (".npy", ".npz"):
-        loaded = np.load(path, allow_pickle=False, mmap_mode="r" if path.suffix == ".npy" else None)
-        arrays = loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
-    else:
+def _arrays(table: Table, path: Path, choose: _Choose) -> _Rows:
+    """Read a NumPy, MATLAB, HDF5 or YAML file in slices."""
+    with contextlib.ExitStack() as stack:
+        arrays = _as_columns(_load(table, path, stack), table, path)
+        chosen = choose([str(name) for name in arrays if not str(name).startswith("__")])
+        found = {name: arrays[column] for name, column in chosen.items()}
+        found = {name: each if np.ndim(each) else np.atleast_1d(each) for name, each in found.items()}
+        lengths = {name: len(each) for name, each in found.items()}
+        if len(set(lengths.values())) > 1:
+            raise RecordingError("columns of different length", where=str(path), valid=str(lengths))
+        width = max([int(np.prod(each.shape[1:])) for each in found.values()], default=1)
+        rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(width, 1)))
+        count = max(lengths.values(), default=0)
+        for first in range(0, count, rows):
+            part = {name: np.asarray(each[first : first + rows]) for name, each in found.items()}
+            yield part, min(rows, count - first)
+
+
+def _load(table: Table, path: Path, stack: contextlib.ExitStack) -> Any:
+    """Return an array, or {name: array}: the variables of a file, or of its variable `group`."""
+    kind = table.format or _kind_of(path)
+    if kind != "hdf5" and path.stat().st_size > MAX_ARRAY_BYTES:
+        raise RecordingError(f"more than {MAX_ARRAY_BYTES >> 30} GiB", where=str(path), valid="Parquet, HDF5")
+    found: Any = None
+    if kind == "yaml":
+        found = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
+    elif kind == "numpy":
+        found = np.load(path, allow_pickle=False, mmap_mode="r" if path.suffix == ".npy" else None)
+    elif kind == "matlab":
         from scipy.io import loadmat
 
+        # Version 7.3 is HDF5.
+        with contextlib.suppress(NotImplementedError):
+            found = loadmat(path, simplify_cells=True)
+    if is_hdf5 := found is None:
         try:
-            arrays = loadmat(path, simplify_cells=True)
-        except NotImplementedError:
-            # Version 7.3 is HDF5.
-            yield from _hdf5(table, path, columns, optional)
-            return
-    if isinstance(arrays, dict) and table.group and path.suffix not in (".yaml", ".yml"):
-        if table.group not in arrays:
+            import h5py
+        except ImportError as error:
+            raise not_installed("h5py") from error
+        found = stack.enter_context(h5py.File(path, "r"))
+    if table.group and not isinstance(found, np.ndarray):
+        if table.group not in found:
             raise RecordingError(
-                f"no variable {table.group}", where=str(path), valid=", ".join(map(str, arrays))
+                f"no variable {table.group}", where=str(path), valid=", ".join(map(str, found))
             )
-        arrays = arrays[table.group]
-    yield from _slices(_as_columns(arrays, table, path), columns, optional, path)
+        found = found[table.group]
+    if kind == "yaml":
+        return _yaml_rows(found)
+    if is_hdf5 and kind == "matlab":
+        # MATLAB writes the transposed array.
+        return {name: np.squeeze(item[()].T) for name, item in found.items() if hasattr(item, "dtype")}
+    return found
 
 
-def _hdf5(table: Table, path: Path, columns: Sequence[str], optional: Sequence[str]) -> Iterator[Chunk]:
-    try:
-        import h5py
-    except ImportError as error:
-        raise not_installed("h5py") from error
-    with h5py.File(path, "r") as file:
-        found = file[table.group] if table.group else file
-        if isinstance(found, h5py.Group):
-            arrays: Any = {name: item for name, item in found.items() if isinstance(item, h5py.Dataset)}
-            if path.suffix == ".mat":
-                # MATLAB writes the transposed array.
-                arrays = {name: np.squeeze(item[()].T) for name, item in arrays.items()}
-        else:
-            arrays = found
-        yield from _slices(_as_columns(arrays, table, path), columns, optional, path)
-
-
-def _as_columns(arrays: Any, table: Table, path: Path) -> dict[str, Any]:
+def _as_columns(arrays: Any, table: Table, path: Path) -> Mapping[str, Any]:
     """Return {name: array with one entry a row}: the fields of a structure, or the columns of a matrix."""
     if isinstance(arrays, Mapping):
-        return {str(name): value for name, value in arrays.items() if not str(name).startswith("__")}
+        return arrays
     if isinstance(arrays, list) and arrays and isinstance(arrays[0], dict):
         return {name: np.array([row[name] for row in arrays]) for name in arrays[0]}
-    names = getattr(arrays.dtype, "names", None) if hasattr(arrays, "dtype") else None
-    if names:
+    if names := getattr(getattr(arrays, "dtype", None), "names", None):
         return {name: arrays[name] for name in names}
     if table.columns and len(arrays.shape) == 2 and arrays.shape[1] == len(table.columns):
         return {name: arrays[:, column] for column, name in enumerate(table.columns)}
@@ -305,29 +279,8 @@ def _as_columns(arrays: Any, table: Table, path: Path) -> dict[str, Any]:
     )
 
 
-def _slices(
-    arrays: dict[str, Any], columns: Sequence[str], optional: Sequence[str], path: Path
-) -> Iterator[Chunk]:
-    chosen = _chosen(list(arrays), columns, optional, path)
-    whole = {
-        name: np.atleast_1d(arrays[name]) if np.ndim(arrays[name]) == 0 else arrays[name] for name in chosen
-    }
-    lengths = {name: len(value) for name, value in whole.items()}
-    count = max(lengths.values(), default=0)
-    if len(set(lengths.values())) > 1:
-        raise RecordingError("columns of different length", where=str(path), valid=str(lengths))
-    width = max([int(np.prod(value.shape[1:])) for value in whole.values()], default=1)
-    rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // width))
-    for first in range(0, count, rows):
-        part = {name: np.asarray(value[first : first + rows]) for name, value in whole.items()}
-        yield _chunk(part, min(rows, count - first), path, first)
-
-
-def _yaml(table: Table, path: Path) -> dict[str, NDArray[Any]]:
-    """Return the entries of a YAML mapping or list as rows: `key`, and nested names joined with dots."""
-    document = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
-    if table.group:
-        document = document[table.group]
+def _yaml_rows(document: Any) -> dict[str, NDArray[Any]]:
+    """Return the entries of a mapping or list as rows: `key`, and nested names joined with dots."""
     entries = document.items() if isinstance(document, dict) else enumerate(document)
     rows = [{"key": str(key), **dict(_flat(value, ""))} for key, value in entries]
     names = sorted(set.intersection(*map(set, rows))) if rows else []
@@ -348,12 +301,16 @@ def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
         yield prefix.rstrip("."), value
 
 
-def _messages(table: Table, path: Path, columns: Sequence[str], optional: Sequence[str]) -> Iterator[Chunk]:
+_READERS = {"csv": _csv, "parquet": _parquet} | dict.fromkeys(("numpy", "matlab", "hdf5", "yaml"), _arrays)
+_FORMATS = (*_READERS, "messages")
+
+
+def _messages(table: Table, path: Path, columns: Sequence[str], optional: Sequence[str]) -> _Rows:
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.serde import SerdeError
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-    reader = MessageRows(table, [name for name in columns if not name.startswith("@")], optional)
+    reader = MessageRows(table, columns, optional)
     store = get_typestore(Stores.ROS2_JAZZY)
     try:
         for name, text in table.definitions.items():
@@ -363,28 +320,19 @@ def _messages(table: Table, path: Path, columns: Sequence[str], optional: Sequen
             if missing := [topic for topic in table.topics if topic not in topics]:
                 known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:40])
                 raise RecordingError(f"no topic {missing[0]}", where=str(path), valid=f"the bag has: {known}")
-            chosen = [each for each in bag.connections if each.topic in table.topics]
-            rows: dict[str, list[Any]] = {}
-            first = 0
-            for number, (connection, stamp_ns, data) in enumerate(bag.messages(chosen)):
-                try:
-                    found = reader.rows(bag.deserialize(data, connection.msgtype))
-                except RecordingError as error:
-                    raise RecordingError(
-                        error.what, where=f"{path}: {connection.topic}", valid=error.valid
-                    ) from error
-                count = len(found[LIST_INDEX])
-                found |= {LOG_TIME: [stamp_ns] * count, TOPIC: [connection.topic] * count}
-                for name, values in found.items():
-                    rows.setdefault(name, []).extend(values)
-                if number % 1000 == 999:
-                    yield _message_chunk(rows, path, first)
-                    first, rows = first + len(rows[LIST_INDEX]), {}
-            if rows:
-                yield _message_chunk(rows, path, first)
+            messages = bag.messages([each for each in bag.connections if each.topic in table.topics])
+            while batch := list(islice(messages, 1000)):
+                rows: dict[str, list[Any]] = {}
+                for connection, stamp_ns, data in batch:
+                    try:
+                        found = reader.rows(bag.deserialize(data, connection.msgtype))
+                    except RecordingError as error:
+                        where = f"{path}: {connection.topic}"
+                        raise RecordingError(error.what, where=where, valid=error.valid) from error
+                    count = len(found[LIST_INDEX])
+                    found |= {LOG_TIME: [stamp_ns] * count, TOPIC: [connection.topic] * count}
+                    for name, values in found.items():
+                        rows.setdefault(name, []).extend(values)
+                yield rows, len(rows[LIST_INDEX])
     except (AnyReaderError, SerdeError, TypesysError) as error:
         raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
-
-
-def _message_chunk(rows: dict[str, list[Any]], path: Path, first: int) -> Chunk:
-    return _chunk(rows, len(rows[LIST_INDEX]), path, first)

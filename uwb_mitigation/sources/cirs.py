@@ -1,0 +1,91 @@
+"""Channel impulse responses of a mapped recording, in a temporary file."""
+
+from __future__ import annotations
+
+import tempfile
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.measurement import Cir, Encoding
+from uwb_mitigation.sources.conversion import Columns, samples_of
+from uwb_mitigation.sources.mapping import CirSource, series
+from uwb_mitigation.sources.tables import UNREADABLE, Chunk
+
+
+class CirFile:
+    """Numbered CIRs in a temporary file."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+        self._rows: list[tuple[int, int, Encoding, int, float]] = []
+
+    def add(self, source: CirSource, chunk: Chunk) -> NDArray[np.int64]:
+        """Store the CIRs of rows; return their numbers, -1 if a row has none.
+
+        Raises:
+            RecordingError: a value is not a CIR; `where` names its row.
+        """
+        names = series(source.column)
+        lists: Any = chunk.columns[names[0]]
+        if len(names) > 1:
+            lists = np.stack([np.asarray(chunk.columns[name], np.float64) for name in names], axis=1)
+        found = np.full(chunk.count, -1)
+        for row in range(chunk.count):
+            values = lists[row]
+            if values is None or isinstance(values, float):
+                continue
+            try:
+                samples, encoding, scale = samples_of(values, source.samples)
+            except UNREADABLE as error:
+                raise RecordingError(
+                    f"not a CIR: {error}", where=chunk.where(row), valid=source.samples
+                ) from error
+            if len(samples):
+                found[row] = len(self._rows)
+                start = self._file.seek(0, 2)
+                self._file.write(samples.tobytes())
+                self._rows.append((start, len(samples), encoding, source.start_index, scale))
+        return found
+
+    def read(self, number: int) -> Cir:
+        """Return the samples of a CIR."""
+        start, length, encoding, start_index, scale = self._rows[number]
+        self._file.seek(start)
+        samples = np.frombuffer(self._file.read(2 * length), np.int16)
+        return Cir(samples, encoding, start_index, scale=scale)
+
+    def close(self) -> None:
+        """Delete the file."""
+        self._file.close()
+
+
+def join_by_row(ranges: Columns, rows: NDArray[Any], cirs: Columns, where: str) -> None:
+    """Give the ranges at `rows` the CIRs of the same rows in another file."""
+    known = int(cirs["row"].max(initial=-1)) + 1
+    if ranges["row"][rows].max(initial=-1) >= known:
+        raise RecordingError(f"{known} CIRs for more ranges", where=where, valid="one row for each range")
+    by_row = np.full(known, -1)
+    by_row[cirs["row"]] = cirs["cir"]
+    ranges["cir"][rows] = by_row[ranges["row"][rows]]
+
+
+def join_by_time(
+    ranges: Columns, rows: NDArray[Any], cirs: Columns, tolerance_s: float, has_index: bool
+) -> None:
+    """Give the ranges at `rows` the CIRs of their pairs that are nearest in time, within the tolerance."""
+    for tag, anchor in np.unique(np.stack([cirs["tag"], cirs["anchor"]], axis=1), axis=0).tolist():
+        mine = np.flatnonzero((cirs["tag"] == tag) & (cirs["anchor"] == anchor))
+        mine = mine[np.argsort(cirs["stamp"][mine], kind="stable")]
+        pair = rows[(ranges["tag"][rows] == tag) & (ranges["anchor"][rows] == anchor)]
+        wanted, own = ranges["stamp"][pair], cirs["stamp"][mine]
+        after = np.clip(np.searchsorted(own, wanted), 0, len(own) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(np.abs(own[before] - wanted) <= np.abs(own[after] - wanted), before, after)
+        close = np.abs(own[nearest] - wanted) <= tolerance_s * 1e9
+        pair, chosen = pair[close], mine[nearest[close]]
+        ranges["cir"][pair] = cirs["cir"][chosen]
+        if has_index:
+            ranges["first_path_index"][pair] = cirs["first_path_index"][chosen]
