@@ -132,7 +132,12 @@ def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
     assert "polyline" in page
     assert result["chosen"] in page
     assert page.count('class="raw"><line') == page.count('class="new"><line') == 5, "residuals of each anchor"
-    for text in ("drive.mcap", f"{bundle.model_id:08x}", "model:=site.onnx -p offsets:=site.offsets.yaml"):
+    for text in (
+        "drive.mcap",
+        f"{bundle.model_id:08x}",
+        "model:=site.onnx -p offsets:=site.offsets.yaml",
+        "Calibration reduces the range residual by at least",
+    ):
         assert text in page
     again = run("calibrate", "drive.mcap", *LEVEL, "-o", "site.onnx", folder=site)
     assert (again.returncode, "--force" in again.stderr) == (1, True)

@@ -96,9 +96,12 @@ class SiteCalibration:
     def summary(self) -> str:
         """Return the result in one sentence."""
         truth, chosen = self.solution.truth, self.selection.chosen
-        against = "residuals against the other anchors (not ground truth)"
+        kind = "residual" if truth is None else "error"
+        against = (
+            "against the other anchors, not against ground truth" if truth is None else f"against {truth}"
+        )
         text = (
-            f"Held-out range {against if truth is None else f'errors against {truth}'}: {self.raw_mae_m:.3f} m raw, "
+            f"Mean absolute range {kind} on held-out segments, {against}: {self.raw_mae_m:.3f} m raw, "
             f"{self.calibrated_mae_m:.3f} m calibrated ({chosen})"
         )
         for what, (raw, calibrated) in (
@@ -108,10 +111,10 @@ class SiteCalibration:
             if not math.isnan(raw):
                 text += f"; {what} {raw:.3f} m raw, {calibrated:.3f} m calibrated"
         if self.lacks_gain:
-            return f"{text}: no gain."
+            return f"{text}. Calibration does not improve both ranges and positions."
         if (gain := self.gain_lower_bound) <= 0.0:
-            return f"{text}. The gain is smaller than its uncertainty."
-        return f"{text}: at least {gain:.0%} less."
+            return f"{text}. The reduction of the range {kind} is smaller than its uncertainty."
+        return f"{text}. Calibration reduces the range {kind} by at least {gain:.0%}."
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation calibrate`."""

@@ -65,6 +65,7 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         summary=calibration.summary(),
         details=details,
         notes=calibration.notes,
+        reference=solution.truth,
         by_anchor=by_anchor,
         residuals=_residuals(boxes),
         date=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
