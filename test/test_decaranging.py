@@ -374,7 +374,7 @@ def test_damaged_log_does_not_stop_the_other_logs(surveyed):
         ("tags.csv", "location,x,y\n" * 100_000, None),
     ],
 )
-def test_malformed_survey_is_rejected_with_file_and_line(surveyed, name, text, line):
+def test_malformed_survey_is_rejected_with_file_and_row(surveyed, name, text, line):
     if text is None:
         (surveyed / name).unlink()
     else:
@@ -382,7 +382,7 @@ def test_malformed_survey_is_rejected_with_file_and_line(surveyed, name, text, l
     with pytest.raises(RecordingError) as caught:
         open_decaranging(surveyed)
     assert name in caught.value.where
-    assert line is None or caught.value.where.endswith(f"line {line}")
+    assert line is None or caught.value.where.endswith(f"row {line - 1}")
 
 
 # ---- the real recordings ----

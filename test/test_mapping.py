@@ -703,10 +703,10 @@ def test_a_truncated_compressed_file_gives_what_is_before_the_damage(tmp_path: P
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name: x\nfields: {anchor: a, rang: r}\n", "fields.rang: unknown field; did you mean .range"),
+        ("name: x\nfields: {anchor: a, rang: r}\n", "fields: unknown field .rang.; did you mean .range"),
         (
             "name: x\nfields: {anchor: a, range: r, rng: r}\n",
-            r"fields.rng: unknown field; did you mean 'range'",
+            r"fields: unknown field .rng.; did you mean 'range'",
         ),
         (
             "name: x\nfields: {anchor: a, range: {column: r, unit: inch}}\n",

@@ -153,7 +153,7 @@ def test_truth_table_assigns_ranges_by_pair_and_time(tmp_path):
     table = load_truth(write(tmp_path, "1,2,2.5,0,10,door", "1,2,3.5,10,,"))
     truths = [item.truth for item in with_truth([at(0), at(9.9), at(10), at(500)], table)]
     assert [truth.range_m for truth in truths] == [2.5, 2.5, 3.5, 3.5]
-    assert [truth.configuration for truth in truths[::2]] == ["door", "truth.csv line 3"]
+    assert [truth.configuration for truth in truths[::2]] == ["door", "truth.csv row 2"]
     assert next(with_truth([at(0)], load_truth(write(tmp_path, "1,3,2.5,,,")))).truth is None
 
 
@@ -171,7 +171,7 @@ def test_truth_table_assigns_ranges_by_pair_and_time(tmp_path):
 def test_invalid_row_is_named(tmp_path, row, named):
     with pytest.raises(RecordingError, match=named) as caught:
         load_truth(write(tmp_path, row))
-    assert "line 2" in str(caught.value)
+    assert "row 1" in str(caught.value)
 
 
 def test_file_that_is_not_a_truth_table_is_refused(tmp_path):
@@ -180,7 +180,7 @@ def test_file_that_is_not_a_truth_table_is_refused(tmp_path):
     for path in (tmp_path / "absent.csv", tmp_path / "binary.csv", write(tmp_path), without_anchor):
         with pytest.raises(RecordingError) as caught:
             load_truth(path)
-    assert caught.value.suggestion == "did you mean 'anchor_id'?"
+    assert caught.value.suggestion == "did you mean 'anchor'?"
 
 
 # --- the command ---

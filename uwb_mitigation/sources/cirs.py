@@ -72,20 +72,16 @@ def join_by_row(ranges: Columns, rows: NDArray[Any], cirs: Columns, where: str) 
     ranges["cir"][rows] = by_row[ranges["row"][rows]]
 
 
-def join_by_time(
-    ranges: Columns, rows: NDArray[Any], cirs: Columns, tolerance_s: float, has_index: bool
-) -> None:
+def join_by_time(ranges: Columns, rows: NDArray[Any], cirs: Columns, tolerance_s: float) -> None:
     """Give the ranges at `rows` the CIRs of their pairs that are nearest in time, within the tolerance."""
-    for tag, anchor in np.unique(np.stack([cirs["tag"], cirs["anchor"]], axis=1), axis=0).tolist():
-        mine = np.flatnonzero((cirs["tag"] == tag) & (cirs["anchor"] == anchor))
-        mine = mine[np.argsort(cirs["stamp"][mine], kind="stable")]
-        pair = rows[(ranges["tag"][rows] == tag) & (ranges["anchor"][rows] == anchor)]
-        wanted, own = ranges["stamp"][pair], cirs["stamp"][mine]
-        after = np.clip(np.searchsorted(own, wanted), 0, len(own) - 1)
-        before = np.maximum(after - 1, 0)
-        nearest = np.where(np.abs(own[before] - wanted) <= np.abs(own[after] - wanted), before, after)
-        close = np.abs(own[nearest] - wanted) <= tolerance_s * 1e9
-        pair, chosen = pair[close], mine[nearest[close]]
-        ranges["cir"][pair] = cirs["cir"][chosen]
-        if has_index:
-            ranges["first_path_index"][pair] = cirs["first_path_index"][chosen]
+    import pandas as pd
+
+    keys = ("stamp", "tag", "anchor")
+    left = pd.DataFrame({name: ranges[name][rows] for name in keys} | {"to": rows})
+    right = pd.DataFrame({name: cirs[name] for name in (*keys, "cir", "first_path_index")})
+    left, right = (frame.sort_values("stamp", kind="stable") for frame in (left, right))
+    within = {"direction": "nearest", "tolerance": round(tolerance_s * 1e9)}
+    found = pd.merge_asof(left, right, on="stamp", by=["tag", "anchor"], **within).dropna(subset="cir")
+    ranges["cir"][found["to"]] = found["cir"]
+    index = found["first_path_index"]
+    ranges["first_path_index"][found["to"][index.notna()]] = index.dropna()

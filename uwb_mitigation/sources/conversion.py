@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +16,8 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
-from uwb_mitigation.sources.mapping import SCALES, TIME, Drop, Value
-from uwb_mitigation.sources.tables import LOG_TIME, TOPIC, Chunk
+from uwb_mitigation.sources.mapping import SCALES, TIME, Drop, Table, Value
+from uwb_mitigation.sources.tables import CHUNK_ROWS, LOG_TIME, TOPIC, Chunk, read_chunks
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
@@ -179,20 +181,17 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
             return raw.astype(np.float64)
         except (ValueError, TypeError):
             pass
-    found = np.full(len(raw), np.nan)
-    for row, item in enumerate(raw.tolist()):
-        text = "" if item is None else str(item).strip()
-        try:
-            found[row] = float(text)
-        except ValueError:
-            if text.lower() in _MISSING:
-                continue
-            comma = re.fullmatch(r"[-+]?\d+,\d+", text)
-            raise RecordingError(
-                f"{name} = {text!r:.40} is not a number",
-                where=chunk.where(row),
-                valid="decimal commas: set decimal: ','" if comma else f"a number in column {column}",
-            ) from None
+    import pandas as pd
+
+    texts = pd.Series(raw).astype(str).str.strip()
+    found = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
+    for row in np.flatnonzero(np.isnan(found) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
+        comma = re.fullmatch(r"[-+]?\d+,\d+", texts[row])
+        raise RecordingError(
+            f"{name} = {texts[row]!r:.40} is not a number",
+            where=chunk.where(row),
+            valid="decimal commas: set decimal: ','" if comma else f"a number in column {column}",
+        )
     return found
 
 
@@ -375,3 +374,40 @@ def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDA
     if bad.any():
         dropped[reason] += int(np.count_nonzero(bad))
     return bad
+
+
+def read_csv(
+    path: Path,
+    ids: Sequence[str],
+    numbers: Mapping[str, tuple[float, float]],
+    texts: Sequence[str] = (),
+    optional: Sequence[str] = (),
+) -> Columns:
+    """Read a CSV file of at most `CHUNK_ROWS` rows.
+
+    Args:
+        path: the file; `.xz` is decompressed.
+        ids: columns with ids.
+        numbers: columns with numbers, and their limits.
+        texts: `label`, `configuration`, or none.
+        optional: columns, and values of them, that may be missing.
+
+    Raises:
+        RecordingError: a column or a value is missing or invalid; `where` gives the row.
+    """
+    values = {name: Value(column=name, optional=name in optional) for name in (*ids, *numbers, *texts)}
+    converter = Converter(values, {name: {} for name in ids})
+    chunks = list(islice(read_chunks(Table(format="csv"), path, converter.columns, converter.optional), 2))
+    if len(chunks) != 1 or not chunks[0].count:
+        raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
+    found = converter.convert(chunks[0])
+    for name in (*ids, *numbers):
+        low, high = numbers.get(name, (0, UNKNOWN_ID - 1))
+        bad = ~((found[name] >= low) & (found[name] <= high))
+        if name in optional:
+            bad &= ~np.isnan(found[name])
+        for row in np.flatnonzero(bad)[:1].tolist():
+            raise RecordingError(
+                f"{name} = {found[name][row]}", where=chunks[0].where(row), valid=f"{low:g} to {high:g}"
+            )
+    return found

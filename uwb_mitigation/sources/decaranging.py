@@ -19,7 +19,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.measurement import (
@@ -33,14 +32,14 @@ from uwb_mitigation.measurement import (
     Truth,
 )
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.sources.csv_rows import id_cell, number_cell, read_rows
+from uwb_mitigation.sources.conversion import NO_CIR, Columns, read_csv
 from uwb_mitigation.sources.source import Source
 
 MAX_ACCUMULATOR = 1016
 """Samples of the accumulator at 64 MHz PRF; 992 at 16 MHz (DW1000 user manual, section 7.2.38)."""
 
-MAX_BYTES, MAX_CSV_BYTES = 1 << 30, 1 << 20
-"""Maximum size of a decompressed log (one hour has 80 MB), and of a file of the survey."""
+MAX_BYTES = 1 << 30
+"""Maximum size of a decompressed log (one hour has 80 MB)."""
 
 _TOKEN = re.compile(
     rb"(?m)^(?:"
@@ -58,7 +57,6 @@ _TOKEN = re.compile(
 """All parts of a log that are used; the last group that matches determines the kind."""
 
 _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
-_NO_SAMPLES: NDArray[np.int16] = np.zeros(0, np.int16)
 
 
 class CirFrame(str, enum.Enum):
@@ -201,7 +199,11 @@ class DecaRangingLog(Source):
                 cir_owner = None
             elif kind == "range":
                 empty = Cir(
-                    _NO_SAMPLES, channel=channel, prf_mhz=prf, radio=RadioType.DW1000, segment=Segment.IPATOV
+                    NO_CIR.samples,
+                    channel=channel,
+                    prf_mhz=prf,
+                    radio=RadioType.DW1000,
+                    segment=Segment.IPATOV,
                 )
                 time, cir = frames.get(self._cir_frame, (latest or 0, empty))
                 if len(cir) == 0:
@@ -220,7 +222,7 @@ class DecaRangingLog(Source):
     def _diagnostics(self, match: re.Match[bytes], channel: int, prf: int) -> Cir:
         power, first = (self._number(match[name], -1000.0, 1000.0) for name in ("power", "first"))
         return Cir(
-            _NO_SAMPLES,
+            NO_CIR.samples,
             # fixed point: ten integer and six fractional bits
             first_path_index=self._number(match["path"], 0.0, 1024 - 2**-6),
             preamble_count=int(match["preamble"]),
@@ -369,37 +371,37 @@ def find_survey(folder: Path) -> Survey | None:
     if not (folder / "pairs.csv").is_file():
         return None
 
-    def table(name: str, *columns: str) -> Iterator[tuple[str, int, dict[str, str]]]:
-        seen: set[int] = set()
-        for line, row in read_rows(folder / name, columns, MAX_CSV_BYTES):
-            where = f"{folder / name}: line {line}"
-            key = id_cell(row, columns[0], where)
-            if key in seen:
-                raise RecordingError(f"{columns[0]} {key} is repeated", where=where)
-            seen.add(key)
-            yield where, key, row
+    def table(name: str, *ids: str, axes: tuple[str, ...] = (), texts: tuple[str, ...] = ()) -> Columns:
+        found = read_csv(folder / name, ids, dict.fromkeys(axes, (-1e6, 1e6)), texts)
+        known, first = np.unique(found[ids[0]], return_index=True)
+        if len(known) < len(found[ids[0]]):
+            row = min(set(range(len(found[ids[0]]))) - set(first.tolist()))
+            raise RecordingError(
+                f"{ids[0]} {found[ids[0]][row]} is repeated", where=f"{folder / name}: row {row + 1}"
+            )
+        return found
 
-    def positions(name: str) -> dict[int, tuple[float, ...]]:
-        limits = -1e6, 1e6
-        rows = table(name, "location", "x", "y")
-        return {
-            key: tuple(number_cell(row, axis, where, *limits) for axis in "xy") for where, key, row in rows
-        }
-
-    labels = {}
+    labels, surveyed = {}, {}
     if (folder / "labels.csv").is_file():
-        labels = {key: row["label"].strip() for _, key, row in table("labels.csv", "file_id", "label")}
-    surveyed = {kind: positions(f"{kind}s.csv") for kind in ("anchor", "tag")}
+        found = table("labels.csv", "file_id", texts=("label",))
+        labels = dict(zip(found["file_id"].tolist(), found["label"].tolist(), strict=True))
+    for kind in ("anchor", "tag"):
+        found = table(f"{kind}s.csv", "location", axes=("x", "y"))
+        places = zip(found["x"].tolist(), found["y"].tolist(), strict=True)
+        surveyed[kind] = dict(zip(found["location"].tolist(), places, strict=True))
+    pairs = table("pairs.csv", "file_number", "anchor_location", "tag_location")
     placements = {}
-    for where, log, row in table("pairs.csv", "file_number", "anchor_location", "tag_location"):
-        ids = {kind: id_cell(row, f"{kind}_location", where) for kind in surveyed}
-        for kind, location in ids.items():
+    for row, log in enumerate(pairs["file_number"].tolist()):
+        anchor, tag = (int(pairs[f"{kind}_location"][row]) for kind in surveyed)
+        for kind, location in (("anchor", anchor), ("tag", tag)):
             if location not in surveyed[kind]:
-                raise RecordingError(f"{kind} location {location} is unknown", where=where)
-        tag = surveyed["tag"][ids["tag"]]
-        range_m = math.dist(surveyed["anchor"][ids["anchor"]], tag)
-        truth = Truth(range_m, labels.get(log, ""), f"{folder.name}/{log}")
-        placements[log] = Placement(ids["anchor"], ids["tag"], (*tag, 0.0), truth)  # type: ignore[arg-type]
+                what = f"{kind} location {location} is unknown"
+                raise RecordingError(what, where=f"{folder / 'pairs.csv'}: row {row + 1}")
+        place = surveyed["tag"][tag]
+        truth = Truth(
+            math.dist(surveyed["anchor"][anchor], place), labels.get(log, ""), f"{folder.name}/{log}"
+        )
+        placements[log] = Placement(anchor, tag, (*place, 0.0), truth)
     anchors = [Anchor(key, (x, y, 0.0)) for key, (x, y) in surveyed["anchor"].items()]
     return placements, AnchorMap(anchors, str(folder / "anchors.csv"))
 

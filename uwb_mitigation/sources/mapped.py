@@ -207,8 +207,8 @@ class MappedRecording(Source):
 
     def _add_other_cirs(self, source: CirSource) -> None:
         """Join the CIRs of other files, by row or by time and ids."""
-        join, index = source.join, source.first_path_index
-        keys: dict[str, Value | None] = {"first_path_index": index}
+        join = source.join
+        keys: dict[str, Value | None] = {"first_path_index": source.first_path_index}
         if join:
             keys |= {"stamp": join.stamp, "tag": join.tag, "anchor": join.anchor}
         for number, file in enumerate(self._files):
@@ -216,7 +216,7 @@ class MappedRecording(Source):
                 rows = np.flatnonzero(self.values["file"] == number)
                 found = self._read(source, paths, keys, "CIR ", source)
                 if join:
-                    join_by_time(self.values, rows, found, join.tolerance_s, has_index=index is not None)
+                    join_by_time(self.values, rows, found, join.tolerance_s)
                 else:
                     join_by_row(self.values, rows, found, str(file))
 
@@ -330,10 +330,11 @@ class MappedRecording(Source):
 
     def _warn(self) -> None:
         """Collect warnings of implausible values."""
+        import pandas as pd
+
         values, truth = self.values, self._mapping.truth
-        keys = np.stack([values["stamp"].view(np.uint64), values["tag"], values["anchor"]])
-        ordered = keys[:, np.lexsort(keys)]
-        if repeated := int(np.count_nonzero((ordered[:, 1:] == ordered[:, :-1]).all(axis=0))):
+        keys = pd.DataFrame({name: values[name] for name in ("stamp", "tag", "anchor")})
+        if repeated := int(keys.duplicated().sum()):
             self.warnings.append(f"{repeated} ranges repeat the stamp of another range of the same pair")
         errors = self.errors_m
         if truth.error and not truth.range and len(errors) >= 20:

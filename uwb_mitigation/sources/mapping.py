@@ -41,7 +41,16 @@ _SERIES = re.compile(r"(.*)\{(\d{1,5})\.\.(\d{1,5})\}")
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_names(cls, given: Any) -> Any:
+        for name in given if isinstance(given, dict) else ():
+            if name not in cls.model_fields:
+                valid, suggestion = ", ".join(cls.model_fields), did_you_mean(str(name), cls.model_fields)
+                raise ValueError(f"unknown field {name!r:.40}; {suggestion or f'valid: {valid}'}")
+        return given
 
 
 def _texts(given: Any) -> Any:
@@ -196,13 +205,7 @@ class Fields(_Strict):
 
 
 class Registers(_Strict):
-    """Registers of a DW1000, from which both levels are computed (user manual, section 4.7).
-
-    Attributes:
-        cir_power: CIR_PWR.
-        amplitudes: FP_AMPL1, FP_AMPL2, FP_AMPL3.
-        prf: 16 or 64 (MHz).
-    """
+    """Registers of a DW1000, from which both levels are computed (user manual, section 4.7): CIR_PWR, FP_AMPL1 to 3, MHz."""
 
     cir_power: Number
     amplitudes: tuple[Number, Number, Number]
@@ -255,17 +258,7 @@ class Poses(Table):
 
 
 class TruthSource(_Strict):
-    """Ground truth.
-
-    Attributes:
-        range: true range.
-        error: measured - true.
-        label: LOS, NLOS or any other text.
-        configuration: name of the placement.
-        tag_position: true position of the tag.
-        poses: of the tag.
-        range_from_positions: compute the true range from the positions of tag and anchor.
-    """
+    """Ground truth: true range, error (measured - true), label (LOS, NLOS, other), name of the placement, positions."""
 
     range: Length | None = None
     error: Length | None = None
@@ -277,13 +270,7 @@ class TruthSource(_Strict):
 
 
 class AnchorSource(Table):
-    """Positions of the anchors: in columns of the ranges, in the mapping, or in another file (`files`).
-
-    Attributes:
-        id, position: of an anchor; without `files`, columns of the ranges.
-        sd: standard deviation of each coordinate, m.
-        optional: the files may be absent.
-    """
+    """Positions of the anchors, and `sd` of each coordinate in m: columns of the ranges, or of other `files` with `id`."""
 
     files: str | dict[str, str] = ""
     id: Number | None = None
@@ -293,14 +280,7 @@ class AnchorSource(Table):
 
 
 class Motion(Table):
-    """Wheel odometry, written to the topic `/odom`: speeds in the robot's frame.
-
-    Attributes:
-        files: empty: the file of the ranges.
-        stamp: of a row.
-        forward, left: speeds, m/s.
-        yaw_rate: rad/s.
-    """
+    """Wheel odometry, written to the topic `/odom`: speeds in the robot's frame in m/s and rad/s."""
 
     files: str | dict[str, str] = ""
     stamp: Time
@@ -314,12 +294,8 @@ class Mapping(Table):
 
     Attributes:
         name, source: name of the data set or radio, and where its format is described.
-        simulated: whether the data is simulated.
         moving: the tag moves during pauses, so they are kept.
         range_sd: standard deviation of a range, m (data sheet); 0: unknown.
-        fields: values of a range.
-        registers: levels of a DW1000.
-        cir, truth, anchors, odometry: see there.
     """
 
     name: str
@@ -406,27 +382,7 @@ def load_mapping(name: str) -> Mapping:
     try:
         return Mapping.model_validate(document)
     except ValidationError as error:
-        # An unknown field is often the reason for a missing one.
-        problem = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
-        where = ".".join(str(part) for part in problem["loc"])
-        known_keys = _keys_at(problem["loc"][:-1])
-        last = str(problem["loc"][-1]) if problem["loc"] else ""
-        unknown = problem["type"] == "extra_forbidden"
-        what = "unknown field" if unknown else problem["msg"].removeprefix("Value error, ")
-        raise ParameterError(
-            f"{where}: {what}" if where else what,
-            where=str(path),
-            valid=", ".join(known_keys) if unknown else "",
-            suggestion=did_you_mean(last, known_keys) if unknown else "",
-        ) from error
-
-
-def _keys_at(location: tuple[int | str, ...]) -> list[str]:
-    """Return the fields of the part of a mapping at `location`."""
-    kinds: dict[str, type[BaseModel]] = {
-        "fields": Fields, "registers": Registers, "cir": CirSource, "truth": TruthSource, "poses": Poses,
-        "anchors": AnchorSource, "odometry": Motion, "join": Join, "drop": Drop,
-    }  # fmt: skip
-    names = [part for part in location if isinstance(part, str)]
-    kind = kinds.get(names[-1], Value) if names else Mapping
-    return list(kind.model_fields)
+        problem = error.errors()[0]
+        where = "".join(f"{part}: " for part in [".".join(map(str, problem["loc"]))] if part)
+        what = problem["msg"].removeprefix("Value error, ")
+        raise ParameterError(f"{where}{what}", where=str(path)) from error

@@ -11,14 +11,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import Record, Truth
-from uwb_mitigation.sources.csv_rows import id_cell, number_cell, read_rows
+from uwb_mitigation.sources.conversion import read_csv
 
-MAX_CSV_BYTES = 1 << 20
 MAX_RANGE_M = 1e6
-
-_REQUIRED = ("tag_id", "anchor_id", "range_m")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +35,23 @@ def load_truth(path: Path) -> list[TruthSegment]:
     """Read the rows of a truth table; each row without a configuration name is a separate configuration.
 
     Raises:
-        RecordingError: the file is missing, too large or malformed; the message names the line.
+        RecordingError: the file is missing, too large or malformed; the message names the row.
     """
-    found = [_segment(row, path, line) for line, row in read_rows(path, _REQUIRED, MAX_CSV_BYTES)]
-    if not found:
-        raise RecordingError(
-            "the truth table has no rows", where=str(path), valid="one row for each configuration"
-        )
-    return found
+    numbers = {"range_m": (0.0, MAX_RANGE_M), "start_s": (0.0, MAX_RANGE_M), "stop_s": (0.0, math.inf)}
+    texts = ("label", "configuration")
+    found = read_csv(path, ("tag_id", "anchor_id"), numbers, texts, ("start_s", "stop_s", *texts))
+    starts = np.nan_to_num(found["start_s"])
+    stops = np.where(np.isnan(found["stop_s"]), math.inf, found["stop_s"])
+    if bad := np.flatnonzero(starts >= stops).tolist():
+        what = f"start_s = {starts[bad[0]]} is not before stop_s = {stops[bad[0]]}"
+        raise RecordingError(what, where=f"{path}: row {bad[0] + 1}")
+    segments = []
+    for row, range_m in enumerate(found["range_m"].tolist()):
+        name = found["configuration"][row] or f"{path.name} row {row + 1}"
+        truth = Truth(range_m, found["label"][row], name)
+        ids = int(found["tag_id"][row]), int(found["anchor_id"][row])
+        segments.append(TruthSegment(*ids, float(starts[row]), float(stops[row]), truth))
+    return segments
 
 
 def with_truth(records: Iterable[Record], segments: Sequence[TruthSegment]) -> Iterator[Record]:
@@ -61,18 +69,3 @@ def with_truth(records: Iterable[Record], segments: Sequence[TruthSegment]) -> I
             record,
             truth=next((item.truth for item in candidates if item.start_s <= elapsed_s < item.stop_s), None),
         )
-
-
-def _segment(row: dict[str, str], path: Path, line: int) -> TruthSegment:
-    where = f"{path}: line {line}"
-    start_s = number_cell(row, "start_s", where, 0.0, MAX_RANGE_M, 0.0)
-    stop_s = number_cell(row, "stop_s", where, 0.0, math.inf, math.inf)
-    if start_s >= stop_s:
-        raise RecordingError(f"start_s = {start_s} is not before stop_s = {stop_s}", where=where)
-    truth = Truth(
-        number_cell(row, "range_m", where, 0.0, MAX_RANGE_M),
-        (row.get("label") or "").strip(),
-        (row.get("configuration") or "").strip() or f"{path.name} line {line}",
-    )
-    tag_id, anchor_id = (id_cell(row, name, where) for name in ("tag_id", "anchor_id"))
-    return TruthSegment(tag_id, anchor_id, start_s, stop_s, truth)
