@@ -16,6 +16,7 @@ from drives import HALL, NANOSECONDS, Robot, drive, wrapped
 from uwb_mitigation.positioning.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
 from uwb_mitigation.positioning.filter import FIRST_ERROR, RangeFilter
 from uwb_mitigation.positioning.geometry import Area
+from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.robot_estimator import RobotEstimator
@@ -165,6 +166,52 @@ def test_estimates_stay_inside_the_area():
     track = RobotEstimator(replace(robot.config, area=area)).run(robot.ranges())
     assert np.isfinite(track.yaw[:, 0]).any()
     assert area.holds(track.position).all()
+
+
+HUGE = (math.nan, math.inf, -math.inf, 1e300, -1e300, 1e38, 1e9, 1e5, 0.0, -1.0, 1e-300)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_hostile_input_leaves_finite_estimates(seed: int):
+    robot, rng = Robot(seconds=12.0), np.random.default_rng(seed)
+    height = robot.config.height if seed % 2 else None
+    config = replace(robot.config, height=height, robot=RobotData(lever_arm=(0.3, 0.1, 0.2)))
+    estimator, ranges, measured = MultiTagEstimator(config), robot.ranges(seconds=12.0), robot.odometry
+
+    def spoiled(*values: float) -> list[float]:
+        return [float(rng.choice(HUGE)) if rng.random() < 0.05 else value for value in values]
+
+    def late(stamp_ns: int) -> int:
+        return stamp_ns + (int(rng.choice([0, -1, 5, -(10**9)])) * NANOSECONDS if rng.random() < 0.02 else 0)
+
+    rows = iter(range(len(measured)))
+    estimates = 0
+    for i, stamp in enumerate(ranges.stamp_ns.tolist()):
+        while (row := next(rows, None)) is not None and measured.stamp_ns[row] <= stamp:
+            at, rate = late(int(measured.stamp_ns[row])), float(measured.twist[row, 2])
+            estimator.odometry.add_yaw_rate(at, *spoiled(rate, 1e-4))
+            pose, twist = measured.pose[row].tolist(), measured.twist[row].tolist()
+            estimator.odometry.add(at, spoiled(*pose), spoiled(*twist), spoiled(4e-4, 4e-4, 4e-4))
+        if i % 10 == 0 and 7 in estimator.tags:
+            estimator.tags[7].add_height(*spoiled(1.2, 0.01))
+        anchor = HALL.anchors[ranges.anchor[i]].id
+        found = estimator.add(7, anchor, late(stamp), *spoiled(float(ranges.range_m[i]), 0.01))
+        if found is None:
+            continue
+        tag, estimate = found
+        # The second one is predicted over a time that no program should ask for.
+        for one in (
+            estimate,
+            tag.estimator.at(stamp + 10**18),
+            tag.smoother.estimate() if i % 20 == 0 else None,
+        ):
+            if one is not None:
+                estimates += 1
+                assert np.isfinite(one.position).all()
+                assert np.isfinite(one.covariance).all()
+                assert np.linalg.eigvalsh(one.covariance[:2, :2]).min() > 0.0
+    assert estimates > 50
+    assert estimator.invalid > 10
 
 
 def test_prediction_after_the_last_range_uses_the_motion():

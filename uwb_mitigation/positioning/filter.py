@@ -20,6 +20,9 @@ from uwb_mitigation.positioning.tracks import Estimate
 
 OFFSET = 6
 FIRST_ERROR = 7
+MIN_VARIANCE_M2 = 1e-6
+"""Of white noise: measurements with less would make the covariance singular."""
+
 SHORTEST_M = 0.05
 """Closer to an anchor, a range has no defined direction."""
 
@@ -184,6 +187,7 @@ class RangeFilter:
 
     def _correct(self, H: NDArray[np.float64], innovation: float, R: float) -> tuple[float, float]:
         """Robust update with a measurement with Jacobian H (n,) and noise variance R; return as `update`."""
+        R = max(R, MIN_VARIANCE_M2)
         PH = self.P @ H
         HPH = float(H @ PH)
         sd = math.sqrt(HPH + R)

@@ -14,7 +14,13 @@ from uwb_mitigation.positioning.filter import RangeFilter
 from uwb_mitigation.positioning.geometry import Shape, protection_levels, shape
 from uwb_mitigation.positioning.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
-from uwb_mitigation.positioning.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.tag_estimator import (
+    MAX_VALUE,
+    RANGE_TIMEOUT_S,
+    EstimatorConfig,
+    TagEstimator,
+    is_valid,
+)
 from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
 
 MAX_TAGS = 256
@@ -131,8 +137,9 @@ class Tag:
     latest_ns: int = 0
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
-        """Update with the tag's height at the time of its latest range; a height that is not finite is skipped."""
-        if not (math.isfinite(height_m) and math.isfinite(variance_m2)):
+        """Update with the tag's height at the time of its latest range; an implausible height is skipped."""
+        # Also false for NaN.
+        if not (abs(height_m) <= MAX_VALUE and abs(variance_m2) <= MAX_VALUE):
             return
         # A variance of 0 means unknown in ROS.
         variance_m2 = variance_m2 if variance_m2 > 0.0 else UNKNOWN_HEIGHT_SD_M**2
@@ -147,7 +154,7 @@ class MultiTagEstimator:
         anchors: those of the config.
         tags: {tag id: tag}, in the order of their first ranges.
         unknown_anchors: number of ranges from anchors that are not on the map, {anchor id: count}.
-        invalid: ranges that were not finite, or negative.
+        invalid: number of ranges that were skipped: not finite, negative, implausible, or of too many tags.
         odometry: motion of the robot of the config; add its messages.
         robot: estimator of the tag that this robot carries; None: it was not received yet.
 
@@ -182,14 +189,11 @@ class MultiTagEstimator:
             if anchor_id in self.unknown_anchors or len(self.unknown_anchors) < MAX_TAGS:
                 self.unknown_anchors[anchor_id] += 1
             return None
-        if not (math.isfinite(range_m) and range_m >= 0.0):
+        tag = self.tags.get(tag_id)
+        if not is_valid(range_m, variance_m2) or (tag is None and len(self.tags) >= MAX_TAGS):
             self.invalid += 1
             return None
-        tag = self.tags.get(tag_id)
         if tag is None:
-            if len(self.tags) >= MAX_TAGS:
-                self.invalid += 1
-                return None
             tag = self.tags[tag_id] = Tag(
                 tag_id, self._make_estimator(tag_id), FixedLagSmoother(self._config)
             )

@@ -33,6 +33,9 @@ DISAGREES = 1.5
 
 HEIGHT_AGE_NS = 200_000_000
 
+MAX_VALUE = 1e5
+"""Ranges and heights (m) and their variances (m^2) beyond this are invalid."""
+
 _BENDS_M = 0.5
 """A height that moves an estimate by more in plan is not a linear measurement: the position is searched again."""
 
@@ -477,8 +480,8 @@ class TagEstimator:
 
 
 def is_valid(range_m: float, variance_m2: float) -> bool:
-    """Return whether the range can be used."""
-    return math.isfinite(range_m) and range_m >= 0.0 and variance_m2 != math.inf
+    """Return whether a range can be used; a variance of NaN is valid."""
+    return 0.0 <= range_m <= MAX_VALUE and not variance_m2 > MAX_VALUE
 
 
 def _is_nonlinear(one: RangeFilter, height_m: float, variance_m2: float) -> bool:
