@@ -235,6 +235,11 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
         assert {message.child_frame_id for message in messages} == {frame}
     at, pose = found["uwb_tag", stamp_ns(poses[-1])].transform.translation, poses[-1].pose.pose.position
     assert (at.x, at.y, at.z) == (pose.x, pose.y, pose.z)
+    # A replay that starts again.
+    transforms.clear()
+    run.send(range(len(run.ranges) // 2))
+    half_ns = run.start_ns + 5 * NANOSECONDS
+    ros.spin_until(lambda: any(frame == "uwb_tag" and stamp < half_ns for frame, stamp in links()))
 
 
 @pytest.mark.parametrize("frame", ["tag_9", "map"])

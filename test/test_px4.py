@@ -114,12 +114,13 @@ def test_positions_are_sent_in_ned_without_orientation_and_velocity(
 
     ros.spin_until(next_arrived)
     start = next(stamps) - 10.0
-    # A repeated stamp, a position that is not finite, and a variance that is not positive, are not sent.
+    # Repeated and negative stamps, positions that are not finite, and variances that are not positive are not sent.
     for seconds, x, variance in (
         (0.05, 1.1, 0.04),
         (0.05, 9.9, 0.04),
         *((0.1, x, 0.04) for x in (math.nan, 1e39)),
         *((0.1, 1.2, variance) for variance in (0.0, -0.01, math.nan, math.inf)),
+        (-2.0 * start, 1.2, 0.04),
         (3.0, 5.0, 0.04),
         (-9.0, 4.0, 0.04),
     ):

@@ -278,6 +278,9 @@ class Locator(ManagedNode):
         outputs = self._outputs_of(tag)
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
         if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
+            if stamp_ns < outputs.published_ns - _NANOSECONDS:
+                # A replay starts again.
+                outputs.transform_ns = stamp_ns - 1
             outputs.published_ns = stamp_ns
             self._publish_estimate(outputs, estimate)
         now_ns = time.perf_counter_ns()

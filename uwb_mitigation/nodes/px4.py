@@ -18,7 +18,7 @@ CORRELATION_S = 1.0
 """Errors of positions within this time are correlated. EKF2 takes them as independent, so their variance is increased."""
 
 MAX_VALUE = 1e6
-"""Positions (m) and variances (m^2) beyond this, and NaN, are not sent."""
+"""Positions (m) and variances (m^2) beyond this, NaN, and stamps before 1970 are not sent."""
 
 _NAN3 = (math.nan,) * 3
 _NANOSECONDS = 1_000_000_000
@@ -63,9 +63,8 @@ class Px4(Node):
                 return
             increase = max(1.0, CORRELATION_S / abs(since_s))
             is_reset = abs(since_s) > CORRELATION_S
-        if not all(abs(value) < MAX_VALUE for value in values) or not all(
-            0.0 < v < MAX_VALUE for v in variances
-        ):
+        is_valid = stamp_ns >= 0 and all(0.0 < variance < MAX_VALUE for variance in variances)
+        if not is_valid or not all(abs(value) < MAX_VALUE for value in values):
             return
         # After a gap, or if a replay starts again, the position may be elsewhere: EKF2 must not reject it as an outlier.
         self._resets += is_reset
