@@ -396,7 +396,7 @@ def test_real_robot_reaches_the_documented_errors():
     _, errors = experiment["evaluate"](folder, with_odometry=True)
     assert errors.rmse <= 0.085 < without.rmse
     assert errors.coverage95 >= 0.85
-    assert errors.heading_rmse <= math.radians(15.0)
+    assert errors.heading_rmse_deg <= 15.0
 
 
 def test_twist_is_unknown_after_a_gap_of_the_odometry():

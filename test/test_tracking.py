@@ -33,8 +33,13 @@ from uwb_mitigation.sources.opening import open_recording
 from uwb_mitigation.sources.recorded_ranges import TagRecording
 
 
-def write_drive(bag: Path, ranges: Ranges, truth: TruePath, too_long_m: float = 0.0) -> Path:
-    """Write a bag with the ranges (raw ones longer, if `too_long_m`), true positions and heights, and its anchors file."""
+def write_drive(
+    bag: Path, ranges: Ranges, truth: TruePath, too_long_m: float = 0.0, other_tag: int = 7
+) -> Path:
+    """Write a bag with the ranges (raw ones longer, if `too_long_m`), true positions and heights, and its anchors file.
+
+    The last two ranges are one of another anchor, and one of another tag.
+    """
     empty = Cir(np.zeros(0, np.int16))
     with BagWriter(bag, {"simulated": "true"}) as writer:
         for i in range(len(ranges)):
@@ -51,6 +56,7 @@ def write_drive(bag: Path, ranges: Ranges, truth: TruePath, too_long_m: float = 
                 height = Estimate(stamp, at * (0, 0, 1), np.zeros(3), np.eye(6) * 0.0004)
                 writer.write_message("/height", POSE_TYPE, encode_pose(height), stamp)
         writer.write(Record(RangeMeasurement(stamp, 7, 99, len(ranges), 0, 1.0, empty)))
+        writer.write(Record(RangeMeasurement(stamp, other_tag, anchor, len(ranges), 0, good, empty)))
     anchors_path(bag).write_text(dump_anchors(HALL))
     return bag
 
@@ -124,6 +130,18 @@ def test_recording_that_cannot_be_tracked_is_refused(hall: Path, tmp_path: Path)
     assert not out.exists()
 
 
+def test_tag_without_a_position_does_not_stop_the_others(tmp_path: Path):
+    bag = write_drive(tmp_path / "two.mcap", *drive(seconds=10), other_tag=8)
+    arguments = ("track", bag, "-o", tmp_path / "track.mcap", "--tum", tmp_path / "track.tum")
+    done = run(*arguments, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "tag 8: no position can be determined from 1 ranges" in done.stderr
+    assert [path.name for path in tmp_path.glob("*.tum")] == ["track.tag_7.tum"]
+    (tmp_path / "track.mcap").unlink()
+    again = run(*arguments, folder=tmp_path)
+    assert "track.tag_7.tum: exists already" in again.stderr
+
+
 def test_survey_improves_the_anchor_positions(hall: Path, tmp_path: Path):
     guesses, found, result = tmp_path / "guesses.yaml", tmp_path / "found.yaml", tmp_path / "found.json"
     off = HALL.position.copy()
@@ -181,12 +199,13 @@ def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path):
         assert ran.returncode == 0, ran.stderr
         results.append(json.loads(report.read_text()))
     without, with_odometry, with_imu = results
-    assert without["live"]["heading_rmse_rad"] is None
+    assert without["live"]["heading_rmse_deg"] is None
+    assert 0.0 < with_odometry["live"]["heading_found_after_s"] < 15.0
     for kind in ("live", "smoothed"):
         assert with_odometry[kind]["horizontal_rmse_m"] < without[kind]["horizontal_rmse_m"]
-        assert with_odometry[kind]["heading_rmse_rad"] < 0.2
-        assert with_imu[kind]["heading_rmse_rad"] < 0.2
-        assert with_imu[kind]["heading_rmse_rad"] != with_odometry[kind]["heading_rmse_rad"]
+        assert with_odometry[kind]["heading_rmse_deg"] < 10.0
+        assert with_imu[kind]["heading_rmse_deg"] < 10.0
+        assert with_imu[kind]["heading_rmse_deg"] != with_odometry[kind]["heading_rmse_deg"]
     quaternions = np.loadtxt(tum)[:, 4:]
     assert np.abs(quaternions[:, 2]).max() > 0.5
     np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0, atol=1e-5)
@@ -202,6 +221,8 @@ def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path):
         (["--imu", "/imu"], "without --odometry"),
         (["--odometry", "/imu"], "sensor_msgs"),
         (["--odometry", "/odom", "--lever-arm", "1,2"], "three numbers"),
+        (["--odometry", "/odom", "--lever-arm", "0,0,nan"], "-100 to 100 m"),
+        (["--height-sd", "nan"], "height 0.0 with standard deviation nan"),
     ],
 )
 def test_unusable_odometry_options_are_refused(

@@ -10,7 +10,6 @@ on, as long as the heading takes to be found.
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 
@@ -86,7 +85,7 @@ def main() -> None:
         _, errors = evaluate(folder, with_odometry=with_odometry)
         print(
             f"{name}: RMSE {errors.rmse:.3f} m, in 95 % ellipse {errors.coverage95:.0%}, "
-            f"NEES {errors.nees_per_dof:.2f}, heading RMSE {math.degrees(errors.heading_rmse):.1f} degrees"
+            f"NEES {errors.nees_per_dof:.2f}, heading RMSE {errors.heading_rmse_deg:.1f} degrees"
         )
 
 

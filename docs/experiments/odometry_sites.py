@@ -89,8 +89,8 @@ def one(seed: int, seconds: float) -> list[float]:
         began = time.process_time()
         track = make_estimator(replace(config, robot=robot)).run(ranges)
         took_us = (time.process_time() - began) / len(ranges) * 1e6
-        heading = track_errors(track.take(track.stamp_ns >= after_ns), truth).heading_rmse
-        figures += [track_errors(track, truth).rmse, math.degrees(heading), took_us]
+        heading_deg = track_errors(track.take(track.stamp_ns >= after_ns), truth).heading_rmse_deg
+        figures += [track_errors(track, truth).rmse, heading_deg, took_us]
     with_odometry = replace(config, robot=replace(motion, imu=None))
     starts = [found_after_s(with_odometry, ranges, START_EVERY_S * number) for number in range(STARTS)]
     return [*figures, max(starts)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,13 +11,12 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.errors import ParameterError, RecordingError, check_name, format_id
+from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.positioning.anchors import AnchorMap
     from uwb_mitigation.positioning.survey import SurveyResult
-    from uwb_mitigation.positioning.tag_estimator import RobotData
-    from uwb_mitigation.positioning.tracks import Heights
+    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
     from uwb_mitigation.processing.tracking import HeldOut, TagTracks
     from uwb_mitigation.sources.recorded_ranges import RecordedRanges
 
@@ -28,7 +28,7 @@ _COLUMNS = {
     "nees_per_dof": ("NEES", "{:.2f}"),
     "exceeded": ("beyond", "{:.2%}"),
     "height_rmse": ("height", "{:.3f}"),
-    "heading_rmse": ("heading", "{:.3f}"),
+    "heading_rmse_deg": ("heading", "{:.1f}"),
 }
 """{field of `TrackErrors`: title and format of its column}."""
 
@@ -134,42 +134,43 @@ def track(
     """
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.files import write_atomically
-    from uwb_mitigation.positioning.geometry import Area, Height
-    from uwb_mitigation.positioning.noise_model import NoiseModel
-    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.processing.tracking import held_out, track_tag, tum_file, write_tracks
     from uwb_mitigation.processing.tracking import tum as tum_text
     from uwb_mitigation.sources.anchors_file import anchors_path, save_anchors
 
-    model = NoiseModel(acceleration=acceleration)
-    height_prior = None if height is None else Height(height, height_sd)
-    box = Area.parse(area)
-    known, recorded = _read(bag, anchors, stamp_offset)
-    measured = heights_of(bag, height_topic, height_sd, height, recorded)
-    robot = _robot_of(bag, odometry, imu, lever_arm, recorded)
-    config = EstimatorConfig(known, model, height_prior, box, measured, robot)
-    if tum is not None and tum.exists() and not force:
-        raise ParameterError("exists already", where=str(tum), valid="--force replaces it")
-    tracks = []
+    config, recorded = _read(bag, anchors, height, height_sd, height_topic, area, stamp_offset, acceleration)
+    config = replace(config, robot=_robot_of(bag, odometry, imu, lever_arm, recorded))
+    several = len(recorded.tags) > 1
+    tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
+    for file in tum_files.values():
+        if file.exists() and not force:
+            raise ParameterError("exists already", where=str(file), valid="--force replaces it")
+    tracks, failures = [], list[DatasetError]()
     origin = {"source": f"track of {bag.name}", "simulated": "false"}
     with BagWriter(output, origin, force=force) as out, console.progress() as bar:
         task = bar.add_task("tracking", total=len(recorded.tags))
         for tag in recorded.tags:
             bar.update(task, description=f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges")
-            tracks.append(track_tag(tag, config))
+            try:
+                tracks.append(track_tag(tag, config))
+            except DatasetError as error:
+                failures.append(error)
             bar.advance(task)
+        if not tracks:
+            raise failures[0]
         write_tracks(out, tracks)
+    for failure in failures:
+        warn(f"{failure}.")
     if force or not anchors_path(output).exists():
-        save_anchors(anchors_path(output), known, f"anchors of the track of {bag.name}", force=True)
-    _show_tracks(tracks, known)
+        save_anchors(anchors_path(output), config.anchors, f"anchors of the track of {bag.name}", force=True)
+    _show_tracks(tracks, config.anchors)
     residuals = held_out(tracks, config)
-    _show_residuals(residuals, known)
+    _show_residuals(residuals, config.anchors)
     print_line(f"Wrote {out.counts.total()} messages to {out.file}.")
-    if tum is not None:
-        for one in tracks:
-            write_atomically(tum_file(tum, one.recording.tag_id, len(tracks) > 1), tum_text(one.smoothed))
+    for one in tracks if tum is not None else []:
+        write_atomically(tum_files[one.recording.tag_id], tum_text(one.smoothed))
     console.write_json(
-        json, _result(tracks, recorded, known) | {"held_out": [one.as_json() for one in residuals]}
+        json, _result(tracks, recorded, config.anchors) | {"held_out": [one.as_json() for one in residuals]}
     )
 
 
@@ -201,47 +202,55 @@ def survey(
     not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
-    from uwb_mitigation.positioning.geometry import Area, Height
-    from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.survey import survey as find
-    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.sources.anchors_file import save_anchors
 
     if not 0.0 < off <= 100.0:
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
     if output.exists() and not force:
         raise ParameterError("exists already", where=str(output), valid="--force replaces it")
-    height_prior = None if height is None else Height(height, height_sd)
-    box = Area.parse(area)
-    known, recorded = _read(bag, anchors, stamp_offset)
-    measured = heights_of(bag, height_topic, height_sd, height, recorded)
-    ids = {
-        text: row for identity, row in known.index.items() for text in (str(identity), format_id(identity))
-    }
+    config, recorded = _read(bag, anchors, height, height_sd, height_topic, area, stamp_offset, acceleration)
+    index = config.anchors.index
+    ids = {text: row for identity, row in index.items() for text in (str(identity), format_id(identity))}
     for text in fixed or []:
-        check_name(
-            "anchor of --fixed:", text.lower(), ids, valid=f"one of {', '.join(map(format_id, known.index))}"
-        )
+        valid = f"one of {', '.join(map(format_id, index))}"
+        check_name("anchor of --fixed:", text.lower(), ids, valid=valid)
     rows = [ids[text.lower()] for text in fixed or []]
     tag = max(recorded.tags, key=lambda one: len(one.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
-        config = EstimatorConfig(known, NoiseModel(acceleration=acceleration), height_prior, box, measured)
         result = find(config, tag.ranges, off_m=off, fixed=frozenset(rows))
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
     )
     _show_survey(result)
-    print_line(f"Wrote {len(known)} anchors to {output}.")
+    print_line(f"Wrote {len(index)} anchors to {output}.")
     console.write_json(json, {"output": str(output)} | result.as_json())
 
 
-def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorMap, RecordedRanges]:
+def _read(
+    bag: Path,
+    anchors: Path | None,
+    height: float | None,
+    height_sd: float,
+    height_topic: str | None,
+    area: str | None,
+    stamp_offset: float,
+    acceleration: float,
+) -> tuple[EstimatorConfig, RecordedRanges]:
+    from uwb_mitigation.bag.pose_paths import read_heights
+    from uwb_mitigation.positioning.geometry import Area, Height
+    from uwb_mitigation.positioning.noise_model import NoiseModel
+    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
     from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
     from uwb_mitigation.sources.recorded_ranges import read_ranges
 
     if not abs(stamp_offset) <= 3600.0:
         raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
+    if height is not None and height_topic is not None:
+        raise ParameterError("--height and --height-topic", valid="one of the two")
+    # This also checks the standard deviation of measured heights.
+    prior, box, model = Height(height or 0.0, height_sd), Area.parse(area), NoiseModel(acceleration)
     if not bag.exists():
         raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
     known = load_anchors(anchors or anchors_path(bag))
@@ -252,23 +261,17 @@ def _read(bag: Path, anchors: Path | None, stamp_offset: float) -> tuple[AnchorM
         warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():
         warn(f"left out: {count} x {why}")
-    return known, recorded
+    heights = None
+    if height_topic is not None:
+        _check_one_tag("--height-topic", recorded)
+        heights = read_heights(bag, height_topic, height_sd)
+    return EstimatorConfig(known, model, None if height is None else prior, box, heights), recorded
 
 
-def heights_of(
-    bag: Path, topic: str | None, sd: float, height: float | None, recorded: RecordedRanges
-) -> Heights | None:
-    """Read the heights of --height-topic."""
-    if topic is None:
-        return None
-    if height is not None:
-        raise ParameterError("--height and --height-topic", valid="one of the two")
+def _check_one_tag(option: str, recorded: RecordedRanges) -> None:
     if len(recorded.tags) > 1:
         tags = ", ".join(format_id(tag.tag_id) for tag in recorded.tags)
-        raise ParameterError(f"--height-topic with the tags {tags}", valid="a bag with one tag")
-    from uwb_mitigation.bag.pose_paths import read_heights
-
-    return read_heights(bag, topic, sd)
+        raise ParameterError(f"{option} with the tags {tags}", valid="a bag with one tag")
 
 
 def _robot_of(
@@ -282,9 +285,7 @@ def _robot_of(
         if imu is not None or arm is not None:
             raise ParameterError("--imu or --lever-arm without --odometry", valid="with --odometry TOPIC")
         return None
-    if len(recorded.tags) > 1:
-        tags = ", ".join(format_id(tag.tag_id) for tag in recorded.tags)
-        raise ParameterError(f"--odometry with the tags {tags}", valid="a bag with one tag")
+    _check_one_tag("--odometry", recorded)
     from uwb_mitigation.bag.odometry import BASE_LINK, read_imu, read_odometry
     from uwb_mitigation.bag.pose_paths import read_lever_arm, read_range_frame
     from uwb_mitigation.positioning.tag_estimator import RobotData
@@ -297,8 +298,10 @@ def _robot_of(
 
 def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     rows = []
-    with_heading = any(math.isfinite(error.heading_rmse) for one in tracks for error in one.errors.values())
-    fields = {field: form for field, form in _COLUMNS.items() if with_heading or field != "heading_rmse"}
+    with_heading = any(
+        math.isfinite(error.heading_rmse_deg) for one in tracks for error in one.errors.values()
+    )
+    fields = {field: form for field, form in _COLUMNS.items() if with_heading or field != "heading_rmse_deg"}
     for one in tracks:
         kind = "corrected" if one.recording.corrected else "raw"
         names = {"snapshot": "snapshots, raw", "live": f"live, {kind}", "smoothed": f"smoothed, {kind}"}
@@ -311,7 +314,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
     console.out.print(
         "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. "
         "Beyond: errors beyond the protection levels. Height: RMSE of z."
-        + " Heading: RMSE of the yaw, rad."
+        + " Heading: RMSE of the yaw, degrees."
         * with_heading,
         style="dim",
     )

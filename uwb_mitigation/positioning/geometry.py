@@ -42,7 +42,8 @@ class Height:
     def __post_init__(self) -> None:
         if not (abs(self.value) <= 1e5 and 0.0 < self.sd <= 1e3):
             raise ParameterError(
-                f"height {self.value} with deviation {self.sd}", valid="metres, deviation over 0"
+                f"height {self.value} with standard deviation {self.sd}",
+                valid="in metres; the latter above 0",
             )
 
 

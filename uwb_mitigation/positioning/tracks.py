@@ -263,7 +263,8 @@ class TrackErrors:
             more is overconfident (Bar-Shalom et al., section 5.4); NaN without covariances.
         exceeded: share of epochs with an error in x or y above its protection level; NaN without covariances.
         height_rmse: RMSE of z.
-        heading_rmse: RMSE of the yaw where it is known, rad; NaN: never, or without a true yaw.
+        heading_rmse_deg: RMSE of the yaw where it is known, degrees; NaN: never, or without a true yaw.
+        heading_found_after_s: time from the first estimate to the first one with a yaw; NaN as above.
     """
 
     epochs: int
@@ -274,7 +275,8 @@ class TrackErrors:
     nees_per_dof: float
     exceeded: float
     height_rmse: float
-    heading_rmse: float = math.nan
+    heading_rmse_deg: float = math.nan
+    heading_found_after_s: float = math.nan
 
     def as_json(self) -> dict[str, float | int | None]:
         """Return the keys of `track --json`; unknown values are null."""
@@ -288,7 +290,6 @@ _JSON_KEYS = {
     "p95": "p95_m",
     "exceeded": "protection_exceeded",
     "height_rmse": "height_rmse_m",
-    "heading_rmse": "heading_rmse_rad",
 }
 NO_ERRORS = TrackErrors(0, *(math.nan,) * 7)
 
@@ -308,7 +309,14 @@ def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErro
     errors = errors_of(track.position[known], track.covariance[known], true[known])
     of_yaw = np.angle(np.exp(1j * (track.yaw[:, 0] - truth.yaw_at(track.stamp_ns + offset_ns))))
     of_yaw = of_yaw[np.isfinite(of_yaw)]
-    return replace(errors, heading_rmse=float(np.sqrt(np.mean(of_yaw**2)))) if len(of_yaw) else errors
+    if not len(of_yaw):
+        return errors
+    first = int(np.isfinite(track.yaw[:, 0]).argmax())
+    return replace(
+        errors,
+        heading_rmse_deg=math.degrees(np.sqrt(np.mean(of_yaw**2))),
+        heading_found_after_s=float(track.stamp_ns[first] - track.stamp_ns[0]) / 1e9,
+    )
 
 
 def errors_of(
