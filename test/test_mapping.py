@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -688,16 +687,20 @@ def test_a_decimal_comma_is_read(tmp_path: Path):
     assert ranges_of(read(PLAIN | {"separator": ";", "decimal": ","}, tmp_path / "x.csv")) == [4.7]
 
 
-def test_a_truncated_compressed_file_gives_what_is_before_the_damage(tmp_path: Path):
+def test_a_truncated_compressed_file_gives_what_is_before_the_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     import lzma
 
-    rows = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3}\n" for n in range(150_000))
+    monkeypatch.setattr("uwb_mitigation.sources.tables.CHUNK_ROWS", 1000)
+    rows = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3:.15f}\n" for n in range(20_000))
     data = lzma.compress(rows.encode())
     (tmp_path / "x.csv.xz").write_bytes(data[: len(data) - 1000])
-    records = iter(read(PLAIN, tmp_path / "x.csv.xz"))
-    assert len(list(islice(records, 100_000))) == 100_000
-    with pytest.raises(DamagedRecordingError, match="after row 100000"):
-        next(records)
+    ranges: list[float] = []
+    with pytest.raises(DamagedRecordingError) as caught:
+        ranges.extend(record.measurement.range_m for record in read(PLAIN, tmp_path / "x.csv.xz"))
+    assert 1000 <= len(ranges) < 20_000
+    assert caught.value.where.endswith(f"after row {len(ranges)}")
 
 
 @pytest.mark.parametrize(
@@ -738,7 +741,26 @@ def test_an_unknown_mapping_is_answered_with_a_similar_one():
         load_mapping("starlok")
 
 
-@pytest.mark.parametrize("name", ["x.mat", "x.h5", "x.npy", "x.npz", "x.parquet", "x.bag", "x.csv.xz"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 5000,
+        "~",
+        "7",
+        "a: &a [x, x, x]\nb: &b [*a, *a, *a]\n" + "".join(f"{n}: &{n} [*b, *b]\n" for n in range(9)),
+    ],
+)
+def test_a_hostile_yaml_file_is_a_typed_error(text: str, tmp_path: Path):
+    write(tmp_path / "anchors.yaml", text)
+    write(tmp_path / "x.csv", "t,a,r\n0,1,2\n")
+    anchors = {"files": "anchors.yaml", "id": "key", "position": ["x", "y", 0]}
+    with pytest.raises(RecordingError):
+        read(PLAIN | {"anchors": anchors}, tmp_path / "x.csv")
+
+
+@pytest.mark.parametrize(
+    "name", ["x.mat", "x.h5", "x.npy", "x.npz", "x.parquet", "x.bag", "x.csv.xz", "x.csv.gz", "x.yaml"]
+)
 def test_garbage_in_any_format_is_a_typed_error(name: str, tmp_path: Path):
     for module in {"x.h5": ["h5py"], "x.parquet": ["pyarrow"]}.get(name, []):
         pytest.importorskip(module)

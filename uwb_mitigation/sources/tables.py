@@ -8,6 +8,7 @@ import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,9 @@ CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 MAX_ARRAY_BYTES = 4 << 30
 """Largest size of a file that is loaded."""
 
-MAX_YAML_BYTES = 1 << 20
+MAX_YAML_BYTES, MAX_YAML_VALUES = 1 << 20, 1000
+"""Largest size of a YAML file, and largest number of values of an entry."""
+
 LOG_TIME = "@stamp"
 """Column with the time at which a message was recorded, ns."""
 
@@ -40,7 +43,8 @@ _SUFFIXES = {
     ".yaml": "yaml", ".yml": "yaml",
 }  # fmt: skip
 UNREADABLE = (
-    OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError, MemoryError,
+    OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError, MemoryError, RecursionError,
+    yaml.YAMLError,
 )  # fmt: skip
 
 
@@ -197,11 +201,7 @@ def _csv(table: Table, path: Path, choose: _Choose) -> _Rows:
 
 
 def _parquet(table: Table, path: Path, choose: _Choose) -> _Rows:
-    try:
-        import pyarrow.parquet as parquet
-    except ImportError as error:
-        raise not_installed("pyarrow") from error
-    file = parquet.ParquetFile(path)
+    file = _installed("pyarrow.parquet").ParquetFile(path)
     chosen = choose(file.schema_arrow.names)
     for batch in file.iter_batches(batch_size=CHUNK_ROWS // 10, columns=list(chosen.values())):
         found = {name: batch.column(column) for name, column in chosen.items()}
@@ -214,7 +214,10 @@ def _arrays(table: Table, path: Path, choose: _Choose) -> _Rows:
         arrays = _as_columns(_load(table, path, stack), table, path)
         chosen = choose([str(name) for name in arrays if not str(name).startswith("__")])
         found = {name: arrays[column] for name, column in chosen.items()}
-        found = {name: each if np.ndim(each) else np.atleast_1d(each) for name, each in found.items()}
+        # Slices of large files are read later, other values are arrays of one row at least.
+        found = {
+            name: each if getattr(each, "ndim", 0) else np.atleast_1d(each) for name, each in found.items()
+        }
         lengths = {name: len(each) for name, each in found.items()}
         if len(set(lengths.values())) > 1:
             raise RecordingError("columns of different length", where=str(path), valid=str(lengths))
@@ -243,11 +246,7 @@ def _load(table: Table, path: Path, stack: contextlib.ExitStack) -> Any:
         with contextlib.suppress(NotImplementedError):
             found = loadmat(path, simplify_cells=True)
     if is_hdf5 := found is None:
-        try:
-            import h5py
-        except ImportError as error:
-            raise not_installed("h5py") from error
-        found = stack.enter_context(h5py.File(path, "r"))
+        found = stack.enter_context(_installed("h5py").File(path, "r"))
     if table.group and not isinstance(found, np.ndarray):
         if table.group not in found:
             raise RecordingError(
@@ -258,8 +257,17 @@ def _load(table: Table, path: Path, stack: contextlib.ExitStack) -> Any:
         return _yaml_rows(found)
     if is_hdf5 and kind == "matlab":
         # MATLAB writes the transposed array.
+        if hasattr(found, "dtype"):
+            return found[()].T
         return {name: np.squeeze(item[()].T) for name, item in found.items() if hasattr(item, "dtype")}
     return found
+
+
+def _installed(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise not_installed(name.partition(".")[0]) from error
 
 
 def _as_columns(arrays: Any, table: Table, path: Path) -> Mapping[str, Any]:
@@ -282,7 +290,7 @@ def _as_columns(arrays: Any, table: Table, path: Path) -> Mapping[str, Any]:
 def _yaml_rows(document: Any) -> dict[str, NDArray[Any]]:
     """Return the entries of a mapping or list as rows: `key`, and nested names joined with dots."""
     entries = document.items() if isinstance(document, dict) else enumerate(document)
-    rows = [{"key": str(key), **dict(_flat(value, ""))} for key, value in entries]
+    rows = [{"key": str(key), **dict(islice(_flat(value, ""), MAX_YAML_VALUES))} for key, value in entries]
     names = sorted(set.intersection(*map(set, rows))) if rows else []
     return {name: np.array([row[name] for row in rows], object) for name in names}
 
