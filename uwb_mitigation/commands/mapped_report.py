@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -66,8 +65,8 @@ def show_preview(source: MappedRecording) -> None:
         ["time s", *(f"{(int(values['stamp'][row]) - first) / 1e9:.3f}" for row in shown)],
         *([name, *(format_id(int(values[name][row])) for row in shown)] for name in ("tag", "anchor")),
         *(
-            [name, *(_cell(float(values[key][row]), digits) for row in shown)]
-            for name, key, digits in _FIELDS
+            [name, *(f"{values[key][row]:.{n}f}".replace("nan", "-") for row in shown)]
+            for name, key, n in _FIELDS
         ),
         ["CIR samples", *(str(len(source.cir(row)) or "-") for row in shown)],
         ["label", *(values["label"][row] or "-" for row in shown)],
@@ -87,26 +86,31 @@ def missing(source: MappedRecording) -> list[str]:
     def unknown(name: str) -> bool:
         return not np.isfinite(source.values[name]).any()
 
-    texts = {
-        f"{count - with_cir} of {count} ranges have no CIR: networks pass them through with status NO_CIR; "
-        "constants and linear models can correct them": with_cir < count,
-        "no first-path index: networks need it (status BAD_CIR)": with_cir and unknown("first_path_index"),
-        "no preamble count: `universal` needs it; use `universal_amplitude`": with_cir
-        and unknown("preamble_count"),
-        "no receive or first-path level: no linear model, no out-of-distribution check of levels": unknown(
-            "rx_power"
-        )
-        or unknown("first_path_power"),
-        "no true range: `evaluate`, `train` and `offset` cannot use it; `calibrate` needs a drive and anchors": not len(
-            source.errors_m
+    cases = (
+        (
+            with_cir < count,
+            f"{count - with_cir} of {count} ranges have no CIR: networks pass them through with status NO_CIR; constants "
+            "and linear models can correct them",
         ),
-        "no positions of the anchors: `track` and `calibrate` need --anchors": not hasattr(source, "anchors"),
-    }
-    return [text for text, applies in texts.items() if applies]
-
-
-def _cell(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+        (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
+        (
+            with_cir and unknown("preamble_count"),
+            "no preamble count: `universal` needs it; use `universal_amplitude`",
+        ),
+        (
+            unknown("rx_power") or unknown("first_path_power"),
+            "no receive or first-path level: no linear model, no out-of-distribution check of levels",
+        ),
+        (
+            not len(source.errors_m),
+            "no true range: `evaluate`, `train` and `offset` cannot use it; `calibrate` needs a drive and anchors",
+        ),
+        (
+            not hasattr(source, "anchors"),
+            "no positions of the anchors: `track` and `calibrate` need --anchors",
+        ),
+    )
+    return [text for applies, text in cases if applies]
 
 
 def _show_errors(errors: Any) -> None:

@@ -377,37 +377,28 @@ def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDA
 
 
 def read_csv(
-    path: Path,
-    ids: Sequence[str],
-    numbers: Mapping[str, tuple[float, float]],
-    texts: Sequence[str] = (),
-    optional: Sequence[str] = (),
+    path: Path, ids: Sequence[str], numbers: Mapping[str, tuple[float, float]], optional: Sequence[str] = ()
 ) -> Columns:
-    """Read a CSV file of at most `CHUNK_ROWS` rows.
+    """Read a CSV file of at most `CHUNK_ROWS` rows; `.xz` is decompressed.
 
     Args:
-        path: the file; `.xz` is decompressed.
+        path: the file.
         ids: columns with ids.
         numbers: columns with numbers, and their limits.
-        texts: `label`, `configuration`, or none.
-        optional: columns, and values of them, that may be missing.
+        optional: names of numbers or texts that may be missing.
 
     Raises:
         RecordingError: a column or a value is missing or invalid; `where` gives the row.
     """
-    values = {name: Value(column=name, optional=name in optional) for name in (*ids, *numbers, *texts)}
+    values = {name: Value(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
     converter = Converter(values, {name: {} for name in ids})
     chunks = list(islice(read_chunks(Table(format="csv"), path, converter.columns, converter.optional), 2))
     if len(chunks) != 1 or not chunks[0].count:
         raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
     found = converter.convert(chunks[0])
-    for name in (*ids, *numbers):
-        low, high = numbers.get(name, (0, UNKNOWN_ID - 1))
+    for name, (low, high) in [*((name, (0, UNKNOWN_ID - 1)) for name in ids), *numbers.items()]:
         bad = ~((found[name] >= low) & (found[name] <= high))
-        if name in optional:
-            bad &= ~np.isnan(found[name])
-        for row in np.flatnonzero(bad)[:1].tolist():
-            raise RecordingError(
-                f"{name} = {found[name][row]}", where=chunks[0].where(row), valid=f"{low:g} to {high:g}"
-            )
+        for row in np.flatnonzero(bad & ~(np.isnan(found[name]) & (name in optional)))[:1].tolist():
+            what, where = f"{name} = {found[name][row]}", chunks[0].where(row)
+            raise RecordingError(what, where=where, valid=f"{low:g} to {high:g}")
     return found

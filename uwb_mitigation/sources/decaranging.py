@@ -371,14 +371,12 @@ def find_survey(folder: Path) -> Survey | None:
     if not (folder / "pairs.csv").is_file():
         return None
 
-    def table(name: str, *ids: str, axes: tuple[str, ...] = (), texts: tuple[str, ...] = ()) -> Columns:
+    def table(name: str, *ids: str, axes: str = "", texts: tuple[str, ...] = ()) -> Columns:
         found = read_csv(folder / name, ids, dict.fromkeys(axes, (-1e6, 1e6)), texts)
-        known, first = np.unique(found[ids[0]], return_index=True)
-        if len(known) < len(found[ids[0]]):
-            row = min(set(range(len(found[ids[0]]))) - set(first.tolist()))
-            raise RecordingError(
-                f"{ids[0]} {found[ids[0]][row]} is repeated", where=f"{folder / name}: row {row + 1}"
-            )
+        first = np.unique(found[ids[0]], return_index=True)[1]
+        for row in sorted(set(range(len(found[ids[0]]))) - set(first.tolist()))[:1]:
+            what, where = f"{ids[0]} {found[ids[0]][row]} is repeated", f"{folder / name}: row {row + 1}"
+            raise RecordingError(what, where=where)
         return found
 
     labels, surveyed = {}, {}
@@ -386,7 +384,7 @@ def find_survey(folder: Path) -> Survey | None:
         found = table("labels.csv", "file_id", texts=("label",))
         labels = dict(zip(found["file_id"].tolist(), found["label"].tolist(), strict=True))
     for kind in ("anchor", "tag"):
-        found = table(f"{kind}s.csv", "location", axes=("x", "y"))
+        found = table(f"{kind}s.csv", "location", axes="xy")
         places = zip(found["x"].tolist(), found["y"].tolist(), strict=True)
         surveyed[kind] = dict(zip(found["location"].tolist(), places, strict=True))
     pairs = table("pairs.csv", "file_number", "anchor_location", "tag_location")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,6 +26,7 @@ from uwb_mitigation.errors import ParameterError, did_you_mean
 from uwb_mitigation.files import read_bounded
 
 MAX_BYTES = 1 << 20
+_FOLDER = Path(__file__).parents[1] / "mappings"
 
 TIME = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "iso8601": 1}
 """Nanoseconds per unit of time."""
@@ -36,8 +36,6 @@ SCALES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "samples": 1.0, "10.6": 1 / 64, "dB
 
 LIST_INDEX = "#"
 """Column with the index of an element in the list of a message."""
-
-_SERIES = re.compile(r"(.*)\{(\d{1,5})\.\.(\d{1,5})\}")
 
 
 class _Strict(BaseModel):
@@ -346,19 +344,13 @@ def axes(name: str, point: Point | None) -> dict[str, Value | None]:
 
 def series(column: str) -> list[str]:
     """Return the columns of `CIR{0..1015}`; another name is returned alone."""
-    match = _SERIES.fullmatch(column)
+    match = re.fullmatch(r"(.*)\{(\d{1,5})\.\.(\d{1,5})\}", column)
     return [f"{match[1]}{n}" for n in range(int(match[2]), int(match[3]) + 1)] if match else [column]
 
 
 def shipped_mappings() -> list[str]:
     """Return the names of the mappings of this package."""
-    return sorted(
-        entry.name.removesuffix(".yaml") for entry in _folder().iterdir() if entry.name.endswith(".yaml")
-    )
-
-
-def _folder() -> Any:
-    return resources.files("uwb_mitigation") / "mappings"
+    return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
 def load_mapping(name: str) -> Mapping:
@@ -367,10 +359,9 @@ def load_mapping(name: str) -> Mapping:
     Raises:
         ParameterError: it cannot be read, or is not a mapping; the message names the field and what is valid.
     """
-    path = Path(name).expanduser()
-    known = shipped_mappings()
+    path, known = Path(name).expanduser(), shipped_mappings()
     if name in known:
-        path = Path(str(_folder() / f"{name}.yaml"))
+        path = _FOLDER / f"{name}.yaml"
     elif not path.exists():
         valid, suggestion = f"a file, or one of {', '.join(known)}", did_you_mean(name, known)
         raise ParameterError(f"no mapping {name!r}", valid=valid, suggestion=suggestion)
@@ -383,6 +374,5 @@ def load_mapping(name: str) -> Mapping:
         return Mapping.model_validate(document)
     except ValidationError as error:
         problem = error.errors()[0]
-        where = "".join(f"{part}: " for part in [".".join(map(str, problem["loc"]))] if part)
-        what = problem["msg"].removeprefix("Value error, ")
-        raise ParameterError(f"{where}{what}", where=str(path)) from error
+        parts = [".".join(map(str, problem["loc"])), problem["msg"].removeprefix("Value error, ")]
+        raise ParameterError(": ".join(filter(None, parts)), where=str(path)) from error

@@ -38,8 +38,8 @@ def load_truth(path: Path) -> list[TruthSegment]:
         RecordingError: the file is missing, too large or malformed; the message names the row.
     """
     numbers = {"range_m": (0.0, MAX_RANGE_M), "start_s": (0.0, MAX_RANGE_M), "stop_s": (0.0, math.inf)}
-    texts = ("label", "configuration")
-    found = read_csv(path, ("tag_id", "anchor_id"), numbers, texts, ("start_s", "stop_s", *texts))
+    optional = ("start_s", "stop_s", "label", "configuration")
+    found = read_csv(path, ("tag_id", "anchor_id"), numbers, optional)
     starts = np.nan_to_num(found["start_s"])
     stops = np.where(np.isnan(found["stop_s"]), math.inf, found["stop_s"])
     if bad := np.flatnonzero(starts >= stops).tolist():
