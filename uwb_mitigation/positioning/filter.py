@@ -8,8 +8,10 @@ as in Brink, "Partial-Update Schmidt-Kalman Filter", 2017). Covariances in Josep
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,8 @@ MIN_VARIANCE_M2 = 1e-6
 
 SHORTEST_M = 0.05
 """Closer to an anchor, a range has no defined direction."""
+
+_Filter = TypeVar("_Filter", bound="RangeFilter")
 
 
 class RangeFilter:
@@ -85,17 +89,12 @@ class RangeFilter:
         errors = np.arange(FIRST_ERROR, n)
         self.P[errors, errors] = self._error_variance
 
-    def copy(self) -> RangeFilter:
+    def copy(self: _Filter) -> _Filter:
         """Return an independent copy."""
-        other = object.__new__(RangeFilter)
-        other._copy_from(self)
-        return other
-
-    def _copy_from(self, other: RangeFilter) -> None:
-        for name in ("_anchors", "_level", "_model", "time_s", "updates_consider_states"):
-            setattr(self, name, getattr(other, name))
+        other = copy.copy(self)
         for name in ("P", "_H", "_error_variance", "x"):
-            setattr(self, name, getattr(other, name).copy())
+            setattr(other, name, getattr(self, name).copy())
+        return other
 
     def predict(self, time_s: float) -> None:
         """Predict the state at a later time; an earlier time has no effect."""

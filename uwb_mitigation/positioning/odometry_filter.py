@@ -56,7 +56,9 @@ class OdometryFilter(RangeFilter):
         yaw: float,
         yaw_sd: float,
     ) -> None:
-        self._copy_from(start)
+        start = start.copy()
+        for name in RangeFilter.__slots__:
+            setattr(self, name, getattr(start, name))
         self.point, self._lever_arm = point, lever_arm
         self.updates_consider_states = True
         self._H[:] = 0.0
@@ -69,13 +71,6 @@ class OdometryFilter(RangeFilter):
         x[:3] -= arm_x, arm_y, lever_arm[2]
         P[:2] += np.multiply.outer((arm_y, -arm_x), P[YAW])
         P[:, :2] += np.multiply.outer(P[:, YAW], (arm_y, -arm_x))
-
-    def copy(self) -> OdometryFilter:
-        """Return an independent copy."""
-        other = object.__new__(OdometryFilter)
-        other._copy_from(self)
-        other.point, other._lever_arm = self.point, self._lever_arm
-        return other
 
     def advance(self, time_s: float, point: PathPoint) -> None:
         """Predict the state at a later time, with the motion of the odometry; an earlier time has no effect."""

@@ -18,7 +18,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import directions
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
-from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.positioning.tracks import Columns, Ranges
 
 GAP_S = 0.5
 """In longer gaps of the localisation the pose is unknown."""
@@ -58,19 +58,14 @@ _MODEL = NoiseModel(long=1.5, short=1.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PosePath:
+class PosePath(Columns):
     """Poses of a robot's frame.
 
-    Contains int64 (n,) stamps in order, float64 (n, 3) positions in m, and (n, 4) unit quaternions x, y, z, w that
-    rotate the robot's axes to the map's.
+    Contains float64 (n, 3) positions in m, and (n, 4) unit quaternions x, y, z, w that rotate the robot's axes to the map's.
     """
 
-    stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
     orientation: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
 
     def shifted(self, by_ns: int) -> PosePath:
         """Return the poses at stamps later by the given time."""
@@ -102,12 +97,8 @@ class PosePath:
     def joined(cls, paths: Sequence[PosePath]) -> PosePath:
         """Return all poses in the order of time."""
         stamp_ns = np.concatenate([path.stamp_ns for path in paths])
-        order = np.argsort(stamp_ns, kind="stable")
-        return cls(
-            stamp_ns[order],
-            np.concatenate([path.position for path in paths])[order],
-            np.concatenate([path.orientation for path in paths])[order],
-        )
+        columns = (np.concatenate([getattr(path, name) for path in paths]) for name in cls.__slots__)
+        return cls(stamp_ns, *columns).take(np.argsort(stamp_ns, kind="stable"))
 
     def interpolated(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], Rotation]:
         """Return positions (k, 3) and rotations (k,) at stamps; outside, those of the first or last pose.

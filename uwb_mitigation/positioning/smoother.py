@@ -25,7 +25,7 @@ from uwb_mitigation.positioning.geometry import directions
 from uwb_mitigation.positioning.least_squares import LeastSquares, Solution
 from uwb_mitigation.positioning.robot_estimator import make_estimator
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
-from uwb_mitigation.positioning.tracks import Heights, Ranges, Track
+from uwb_mitigation.positioning.tracks import Ranges, Track
 
 KNOT_S = 0.1
 BATCH_BIAS_M = 0.2
@@ -254,19 +254,13 @@ def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
     """
     stamp_ns = int(ranges.stamp_ns[0]) + knots_of(ranges.stamp_ns)[0]
     end_ns, backwards = int(ranges.stamp_ns[-1]), slice(None, None, -1)
-    reversed_ranges = ranges.take(backwards)
-    mirrored = replace(reversed_ranges, stamp_ns=end_ns - reversed_ranges.stamp_ns)
-    heights = config.heights and Heights(
-        end_ns - config.heights.stamp_ns[backwards],
-        config.heights.height_m[backwards],
-        config.heights.variance_m2[backwards],
-    )
+    heights = config.heights and config.heights.reversed(end_ns)
     robot = config.robot and replace(
         config.robot,
         odometry=config.robot.odometry and config.robot.odometry.reversed(end_ns),
         imu=config.robot.imu and config.robot.imu.reversed(end_ns),
     )
-    track = make_estimator(replace(config, heights=heights, robot=robot)).run(mirrored)
+    track = make_estimator(replace(config, heights=heights, robot=robot)).run(ranges.reversed(end_ns))
     later = _at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip

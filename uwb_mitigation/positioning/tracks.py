@@ -4,51 +4,65 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.geometry import protection_levels
 
+_Columns = TypeVar("_Columns", bound="Columns")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ranges:
-    """n ranges of one tag, in the order of their times.
+class Columns:
+    """Base of classes with n rows in the order of their times: arrays (n, ...).
 
     Attributes:
         stamp_ns: int64 (n,).
+    """
+
+    stamp_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self: _Columns, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> _Columns:
+        """Return the rows at `index`."""
+        columns = {one.name: getattr(self, one.name) for one in fields(self)}
+        taken = {name: column[index] for name, column in columns.items() if isinstance(column, np.ndarray)}
+        return replace(self, **taken)
+
+    def reversed(self: _Columns, end_ns: int) -> _Columns:
+        """Return the rows backwards in time, from `end_ns` on."""
+        back = self.take(slice(None, None, -1))
+        return replace(back, stamp_ns=end_ns - back.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges(Columns):
+    """n ranges of one tag.
+
+    Attributes:
         anchor: int (n,), rows of an `AnchorMap`.
         range_m: float64 (n,), finite.
         variance_m2, rx_power_dbm: float64 (n,); NaN: unknown.
         tag_id: of all of them.
     """
 
-    stamp_ns: NDArray[np.int64]
     anchor: NDArray[np.intp]
     range_m: NDArray[np.float64]
     variance_m2: NDArray[np.float64]
     rx_power_dbm: NDArray[np.float64]
     tag_id: int = 0
 
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
-
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Ranges:
-        """Return the ranges at `index`."""
-        return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})
-
     @classmethod
     def joined(cls, parts: Sequence[Ranges]) -> Ranges:
         """Concatenate ranges; the tag id is 0."""
-        columns: dict[str, Any] = {
-            name: np.concatenate([getattr(one, name) for one in parts]) for name in _COLUMNS
-        }
-        return cls(**columns)
-
-
-_COLUMNS = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
+        names = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
+        columns: Any = (np.concatenate([getattr(one, name) for one in parts]) for name in names)
+        return cls(*columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,17 +100,15 @@ _UNKNOWN_HEADING = (math.nan,) * 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
-    """n estimates in the order of their times.
+class Track(Columns):
+    """n estimates.
 
     Attributes:
-        stamp_ns: int64 (n,).
         position, velocity: float64 (n, 3).
         covariance: float64 (n, 6, 6), of position and velocity.
         yaw: float64 (n, 5), heading of the robot (rad) and its covariance as in `Heading`; NaN: unknown.
     """
 
-    stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -105,9 +117,6 @@ class Track:
     def __post_init__(self) -> None:
         if len(self.yaw) != len(self.stamp_ns):
             object.__setattr__(self, "yaw", np.full((len(self.stamp_ns), 5), np.nan))
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
 
     @classmethod
     def of(cls, estimates: list[Estimate]) -> Track:
@@ -132,21 +141,13 @@ class Track:
             heading = Heading(float(yaw[0]), yaw[1:]) if np.isfinite(yaw[0]) else None
             yield Estimate(stamp_ns, position, velocity, covariance, heading)
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Track:
-        """Return the estimates at `index`."""
-        return Track(*(getattr(self, name)[index] for name in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TruePath:
-    """True positions of a tag: int64 (n,) stamps in order, float64 (n, 3) positions in m, and yaws (n,) in rad if known."""
+class TruePath(Columns):
+    """True positions of a tag: float64 (n, 3) positions in m, and yaws (n,) in rad if known."""
 
-    stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
     yaw: NDArray[np.float64] | None = None
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
 
     def at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return positions float64 (k, 3) at other times, by interpolation; NaN outside, and in gaps of over 1 s."""
@@ -170,21 +171,16 @@ class TruePath:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heights:
+class Heights(Columns):
     """Measured heights of a tag in the anchors' frame.
 
     Attributes:
-        stamp_ns: int64 (n,), ascending.
         height_m: float64 (n,), finite.
         variance_m2: float64 (n,), positive.
     """
 
-    stamp_ns: NDArray[np.int64]
     height_m: NDArray[np.float64]
     variance_m2: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
 
     def at(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return height and variance at each stamp, linearly interpolated; NaN outside and in gaps of over 1 s."""
@@ -194,57 +190,43 @@ class Heights:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
+class Odometry(Columns):
     """Motion of a robot's base in the plane, measured by its wheels or by another sensor.
 
     Attributes:
-        stamp_ns: int64 (n,), ascending.
         pose: float64 (n, 3), x and y in m and yaw in rad, in the odometry frame, which drifts.
         pose_covariance: float64 (n, 3, 3); zero: unknown.
         twist: float64 (n, 3), velocities in m/s and yaw rate in rad/s, in the axes of the base.
         twist_covariance: float64 (n, 3, 3); zero: unknown.
     """
 
-    stamp_ns: NDArray[np.int64]
     pose: NDArray[np.float64]
     pose_covariance: NDArray[np.float64]
     twist: NDArray[np.float64]
     twist_covariance: NDArray[np.float64]
 
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
-
     def reversed(self, end_ns: int) -> Odometry:
-        """Return the motion backwards in time, that starts at `end_ns`."""
-        back = slice(None, None, -1)
-        columns = (self.pose[back], self.pose_covariance[back], -self.twist[back])
-        return Odometry(end_ns - self.stamp_ns[back], *columns, self.twist_covariance[back])
+        """Return the motion backwards in time, from `end_ns` on."""
+        return replace(Columns.reversed(self, end_ns), twist=-self.twist[::-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Imu:
+class Imu(Columns):
     """Yaw rates, and if known yaws, of an IMU whose z axis points up.
 
     Attributes:
-        stamp_ns: int64 (n,), ascending.
         yaw_rate: float64 (n,), rad/s. yaw_rate_variance: float64 (n,), rad^2/s^2; zero: unknown.
         yaw: float64 (n,), rad; NaN: unknown. yaw_variance: float64 (n,), rad^2; zero: unknown.
     """
 
-    stamp_ns: NDArray[np.int64]
     yaw_rate: NDArray[np.float64]
     yaw_rate_variance: NDArray[np.float64]
     yaw: NDArray[np.float64]
     yaw_variance: NDArray[np.float64]
 
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
-
     def reversed(self, end_ns: int) -> Imu:
-        """Return the rotation backwards in time, that starts at `end_ns`."""
-        back = slice(None, None, -1)
-        rates = (-self.yaw_rate[back], self.yaw_rate_variance[back])
-        return Imu(end_ns - self.stamp_ns[back], *rates, self.yaw[back], self.yaw_variance[back])
+        """Return the rotation backwards in time, from `end_ns` on."""
+        return replace(Columns.reversed(self, end_ns), yaw_rate=-self.yaw_rate[::-1])
 
 
 ELLIPSE95 = 5.991
