@@ -143,10 +143,9 @@ class RobotMotion:
             return
         rate, variance = message.angular_velocity.z, message.angular_velocity_covariance[8]
         # The same mark for orientations.
-        if self._uses_orientation and message.orientation_covariance[0] != -1.0:
-            self.path.add_imu_yaw(_stamp_ns(message), yaw_of(message.orientation), rate, variance)
-        else:
-            self.path.add_yaw_rate(_stamp_ns(message), rate, variance)
+        uses_yaw = self._uses_orientation and message.orientation_covariance[0] != -1.0
+        yaw = yaw_of(message.orientation) if uses_yaw else math.nan
+        self.path.add_imu(_stamp_ns(message), rate, variance, yaw)
 
     def _on_static(self, message: Any) -> None:
         for one in message.transforms:

@@ -83,7 +83,8 @@ class DeadReckoning:
         self.twist_variance = (SPEED_SD**2, YAW_RATE_SD**2)
         self._samples: deque[_Sample] = deque(maxlen=_NUM_SAMPLES)
         self._part = 0
-        self._imu: tuple[int, float, float, float] | None = None
+        # Stamp, yaw rate and its variance, integrated yaw, and yaw of the latest message.
+        self._imu: tuple[int, float, float, float, float] | None = None
         self._imu_yaw: float | None = None
 
     def add(
@@ -162,35 +163,30 @@ class DeadReckoning:
         point = _moved(last.point, rates, dt)._replace(source=source)
         self._samples.append(_Sample(stamp_ns, point, rates, pose))
 
-    def add_yaw_rate(self, stamp_ns: int, yaw_rate: float, variance: float = 0.0) -> None:
-        """Add a yaw rate of an IMU, rad/s, and its variance (0: unknown); an invalid one is rejected."""
-        if not abs(yaw_rate) <= MAX_YAW_RATE or (
-            self._imu is not None and 0 <= self._imu[0] - stamp_ns < _SECOND_NS
-        ):
+    def add_imu(self, stamp_ns: int, yaw_rate: float, variance: float = 0.0, yaw: float = math.nan) -> None:
+        """Add a message of an IMU; an invalid one is rejected.
+
+        Args:
+            stamp_ns: later than the latest one, otherwise it is rejected.
+            yaw_rate: rad/s.
+            variance: of the yaw rate; 0: unknown.
+            yaw: in a frame of its own, rad; its differences replace the yaw rates. NaN: unknown.
+        """
+        turned, latest = 0.0, self._imu
+        gap_ns = 1 if latest is None else stamp_ns - latest[0]
+        if not abs(yaw_rate) <= MAX_YAW_RATE or -_SECOND_NS < gap_ns <= 0:
             self.rejected += 1
             return
-        yaw = 0.0
-        if self._imu is not None:
-            before_ns, before, _, yaw = self._imu
-            yaw += 0.5 * (before + yaw_rate) * (stamp_ns - before_ns) / _SECOND_NS
-        self._set_imu(stamp_ns, yaw_rate, variance, yaw)
-
-    def add_imu_yaw(self, stamp_ns: int, yaw: float, yaw_rate: float, variance: float = 0.0) -> None:
-        """Add the yaw of an IMU in a frame of its own, rad, of which only differences are used, as `add_yaw_rate`."""
-        if self._imu is not None and math.isfinite(yaw):
-            yaw = self._imu[3] + math.remainder(yaw - self._imu[3], math.tau)
-        is_late = self._imu is not None and 0 <= self._imu[0] - stamp_ns < _SECOND_NS
-        if is_late or not (math.isfinite(yaw) and abs(yaw_rate) <= MAX_YAW_RATE):
-            self.rejected += 1
-            return
-        self._set_imu(stamp_ns, yaw_rate, variance, yaw)
-
-    def _set_imu(self, stamp_ns: int, yaw_rate: float, variance: float, yaw: float) -> None:
-        known = 0.0 < variance < _MAX_VARIANCE
-        if self._imu is not None and not 0 < stamp_ns - self._imu[0] <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
-            # The rotation in a gap is unknown, also after a wrong stamp.
-            self._imu_yaw = None
-        self._imu = stamp_ns, yaw_rate, variance if known else YAW_RATE_SD**2, yaw
+        if latest is not None:
+            turned = 0.5 * (latest[1] + yaw_rate) * gap_ns / _SECOND_NS
+            if math.isfinite(difference := yaw - latest[4]):
+                turned = math.remainder(difference, math.tau)
+            turned += latest[3]
+            if not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
+                # The rotation in a gap is unknown, also after a wrong stamp.
+                self._imu_yaw = None
+        of_rate = variance if 0.0 < variance < _MAX_VARIANCE else YAW_RATE_SD**2
+        self._imu = stamp_ns, yaw_rate, of_rate, turned, yaw
 
     def is_available(self, stamp_ns: int) -> bool:
         """Return whether the motion at a time is known."""
@@ -231,7 +227,7 @@ class DeadReckoning:
     def _yaw_of_imu(self, stamp_ns: int) -> float | None:
         if self._imu is None:
             return None
-        at_ns, rate, _, yaw = self._imu
+        at_ns, rate, _, yaw, _ = self._imu
         dt = (stamp_ns - at_ns) / _SECOND_NS
         return yaw + rate * dt if abs(dt) <= IMU_TIMEOUT_S else None
 

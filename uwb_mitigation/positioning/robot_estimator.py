@@ -10,7 +10,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from uwb_mitigation.positioning.dead_reckoning import DeadReckoning, PathPoint
 from uwb_mitigation.positioning.initialization import IMPLAUSIBLE
@@ -22,7 +26,7 @@ from uwb_mitigation.positioning.tag_estimator import (
     TagEstimator,
     is_valid,
 )
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.positioning.tracks import Estimate, rows_of
 
 NUM_YAWS = 8
 """Number of initial yaws."""
@@ -72,11 +76,15 @@ class RobotEstimator(TagEstimator):
         self._last_yaw: float | None = None
         self.rejects_odometry = False
         self._evidence = self._outlier_share = 0.0
-        self._recorded: deque[tuple[int, int, int]] = deque()
-        for kind, data in enumerate((self._robot.imu, self._robot.odometry)):
-            if data is not None:
-                self._recorded.extend((stamp, kind, row) for row, stamp in enumerate(data.stamp_ns.tolist()))
-        self._recorded = deque(sorted(self._recorded))
+        recorded: list[tuple[int, Callable[..., None], Any]] = []
+        if (imu := self._robot.imu) is not None:
+            rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
+            recorded += [(stamp_ns, self.odometry.add_imu, values) for stamp_ns, *values in rows]
+        if (motion := self._robot.odometry) is not None:
+            variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
+            rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
+            recorded += [(stamp_ns, self.odometry.add, values) for stamp_ns, *values in rows]
+        self._recorded = deque(sorted(recorded, key=lambda one: one[0]))
         super().__init__(config)
 
     @property
@@ -107,7 +115,8 @@ class RobotEstimator(TagEstimator):
         if not is_valid(range_m, variance_m2):
             return None
         while self._recorded and self._recorded[0][0] <= stamp_ns:
-            self._add_recorded(*self._recorded.popleft())
+            recorded_ns, add, values = self._recorded.popleft()
+            add(recorded_ns, *values)
         estimate = super().add(stamp_ns, anchor, range_m, variance_m2)
         self._update_robot(anchor, range_m, variance_m2)
         return estimate if self._known is None else self._estimate(self._known, stamp_ns)
@@ -138,20 +147,6 @@ class RobotEstimator(TagEstimator):
         if self._area is None:
             return estimate
         return replace(estimate, position=self._area.clip(estimate.position))
-
-    def _add_recorded(self, stamp_ns: int, kind: int, row: int) -> None:
-        odometry, imu = self._robot.odometry, self._robot.imu
-        if kind == 0 and imu is not None:
-            rate, variance = float(imu.yaw_rate[row]), float(imu.yaw_rate_variance[row])
-            if self._robot.imu_orientation:
-                self.odometry.add_imu_yaw(stamp_ns, float(imu.yaw[row]), rate, variance)
-            else:
-                self.odometry.add_yaw_rate(stamp_ns, rate, variance)
-        elif odometry is not None:
-            variance_of = odometry.twist_covariance[row].diagonal().tolist()
-            self.odometry.add(
-                stamp_ns, odometry.pose[row].tolist(), odometry.twist[row].tolist(), variance_of
-            )
 
     def _update_robot(self, anchor: int, range_m: float, variance_m2: float) -> None:
         time_s = self._time_s

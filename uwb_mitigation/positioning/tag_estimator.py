@@ -17,7 +17,7 @@ from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.geometry import Area, Geometry, Height, geometry
 from uwb_mitigation.positioning.initialization import IMPLAUSIBLE, CandidatePosition, candidate_positions
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.tracks import Estimate, Heights, Imu, Odometry, Ranges, Track
+from uwb_mitigation.positioning.tracks import Estimate, Heights, Imu, Odometry, Ranges, Track, rows_of
 
 WINDOW_S = 1.0
 """A position is searched from the ranges of this time: every anchor had its turn, and a robot has moved by a metre."""
@@ -59,13 +59,11 @@ class RobotData:
     Attributes:
         odometry, imu: recorded; None: none, or live.
         lever_arm: the antenna in the frame of the base, m.
-        imu_orientation: use differences of the IMU's orientation instead of its yaw rate.
     """
 
     odometry: Odometry | None = None
     imu: Imu | None = None
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    imu_orientation: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,13 +193,12 @@ class TagEstimator:
     def run(self, ranges: Ranges) -> Track:
         """Process recorded ranges, and the measured heights of the config; return an estimate for each range with one."""
         estimates: list[Estimate] = []
-        heights: deque[tuple[int, float, float]] = deque()
+        heights = deque[tuple[int, float, float]]()
         if (known := self._config.heights) is not None:
-            columns = (known.stamp_ns, known.height_m, known.variance_m2)
-            heights.extend(zip(*(column.tolist() for column in columns), strict=True))
+            heights.extend(rows_of(known.stamp_ns, known.height_m, known.variance_m2))
         latest_ns = None
-        of_ranges = (ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.variance_m2)
-        for stamp_ns, anchor, range_m, variance_m2 in zip(*(one.tolist() for one in of_ranges), strict=True):
+        rows = rows_of(ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.variance_m2)
+        for stamp_ns, anchor, range_m, variance_m2 in rows:
             while heights and heights[0][0] <= stamp_ns:
                 height_ns, *height = heights.popleft()
                 # A height is valid at the time of the latest range: skip those in a gap of the ranges.

@@ -40,6 +40,11 @@ class Columns:
         return replace(back, stamp_ns=end_ns - back.stamp_ns)
 
 
+def rows_of(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
+    """Return the rows of arrays (n, ...) as Python numbers and lists."""
+    return zip(*(column.tolist() for column in columns), strict=True)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Ranges(Columns):
     """n ranges of one tag.
