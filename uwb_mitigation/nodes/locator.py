@@ -102,13 +102,13 @@ class Locator(ManagedNode):
         self._ranges: Subscription | None = None
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None
-        self._make_tf: Callable[[list[Any]], Any] = list
+        self._tf_type: Any = None
         self._decode: Callable[[bytes], tuple[MeasurementKey, CorrectedRange]] = decode_corrected
         self._make_estimator: Callable[[AnchorMap], MultiTagEstimator]
         self._outputs: dict[int, _Outputs] = {}
         self._timer: Timer | None = None
         self._robot: RobotMotion | None = None
-        self.lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._malformed = self._lost = 0
         self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
@@ -126,8 +126,8 @@ class Locator(ManagedNode):
         model = NoiseModel(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
         area = Area.parse(self.value("area"))
-        self.lever_arm = parse_lever_arm(self.value("lever_arm")) or (0.0, 0.0, 0.0)
-        robot = RobotData(lever_arm=self.lever_arm) if self.value("odometry") else None
+        self._lever_arm = parse_lever_arm(self.value("lever_arm")) or (0.0, 0.0, 0.0)
+        robot = RobotData(lever_arm=self._lever_arm) if self.value("odometry") else None
         path_of_base = DeadReckoning()
         self._make_estimator = lambda anchors: MultiTagEstimator(
             EstimatorConfig(anchors, model, height, area, robot=robot), self.value("tag"), path_of_base
@@ -145,7 +145,13 @@ class Locator(ManagedNode):
             )
         self._tolerance_ns = round(self.value("transform_tolerance") * _NANOSECONDS)
         if self.value("publish_tf"):
-            self._open_tf()
+            self._tf_type = transform_type()
+            if self._tf_type is None:
+                raise MissingDependencyError(
+                    "publish_tf needs tf2_msgs, which is not installed",
+                    valid="apt install ros-jazzy-tf2-msgs, or publish_tf:=false",
+                )
+            self._tf = self.publisher(self._tf_type, topics.TF, QoSProfile(depth=100))
         if robot is not None:
             check_frames(self)
             self._robot = RobotMotion(self, path_of_base)
@@ -195,16 +201,6 @@ class Locator(ManagedNode):
         values |= diagnostics.percentiles("processing", durations_ns)
         return "host", level, text, values
 
-    def _open_tf(self) -> None:
-        message = transform_type()
-        if message is None:
-            raise MissingDependencyError(
-                "publish_tf needs tf2_msgs, which is not installed",
-                valid="apt install ros-jazzy-tf2-msgs, or publish_tf:=false",
-            )
-        self._tf = self.publisher(message, topics.TF, QoSProfile(depth=100))
-        self._make_tf = lambda transforms: message(transforms=transforms)
-
     def _subscribe_to_mapping(self, name: str) -> bool:
         """Subscribe to the topics of a mapping; return False if `name` is that of a topic."""
         # Mapping files need pandas and pydantic, which other ranges do not.
@@ -218,7 +214,7 @@ class Locator(ManagedNode):
 
         def on_range(measurement: RangeMeasurement) -> None:
             if self._estimator is not None and self.is_active:
-                self._update_lever_arm(self._estimator, measurement.tag_id, lambda: measurement.frame_id)
+                self._update_lever_arm(measurement.tag_id, lambda: measurement.frame_id)
                 self._add(self._estimator, *_uncorrected(measurement, variance_m2))
 
         source_topics = TopicRanges(self, mapping, "", on_range, self.now_ns)
@@ -260,7 +256,7 @@ class Locator(ManagedNode):
             self._malformed += 1
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return
-        self._update_lever_arm(estimator, key.tag_id, lambda: decode_frame_id(data))
+        self._update_lever_arm(key.tag_id, lambda: decode_frame_id(data))
         self._add(estimator, key, corrected)
 
     def _add(self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange) -> None:
@@ -303,56 +299,52 @@ class Locator(ManagedNode):
             self.get_logger().info(f"tag {format_id(tag.tag_id)} on {outputs.pose.topic_name}")
         return outputs
 
-    def _update_lever_arm(self, estimator: MultiTagEstimator, tag_id: int, frame: Callable[[], str]) -> None:
+    def _update_lever_arm(self, tag_id: int, frame: Callable[[], str]) -> None:
         """Set the lever arm of the robot's antenna when the frame of its ranges is known on /tf_static."""
-        if self._robot is None or estimator.robot is None or self._robot.lever_arm_is_set:
+        outputs, motion = self._outputs.get(tag_id), self._robot
+        if outputs is None or outputs.robot is None or motion is None or motion.lever_arm_is_set:
             return
-        tag = estimator.tags.get(tag_id)
-        is_of_robot = tag is not None and tag.estimator is estimator.robot
-        if is_of_robot and (arm := self._robot.lever_arm(frame())) is not None:
-            estimator.robot.lever_arm = self.lever_arm = arm
-            self._robot.lever_arm_is_set = True
+        if (arm := motion.lever_arm(frame())) is not None:
+            outputs.robot.lever_arm, motion.lever_arm_is_set = arm, True
             self.get_logger().info(f"lever arm of the antenna: {arm[0]:.3f}, {arm[1]:.3f}, {arm[2]:.3f} m")
 
     def _publish_estimate(self, outputs: _Outputs, estimate: Estimate) -> None:
         outputs.picture.add(estimate)
-        base, robot = self._at_base(outputs, estimate), self._robot
+        base, robot = self._at_base(outputs, estimate), outputs.robot
         outputs.pose.publish(encode_pose(base, self._map))
-        if robot is None or outputs.robot is None:
-            robot = None
+        if self._robot is None or robot is None:
             outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
         else:
-            twist = BodyTwist() if outputs.robot.rejects_odometry else robot.twist(estimate.stamp_ns)
-            outputs.odometry.publish(encode_odometry(base, self._map, robot.base_frame or "base_link", twist))
+            twist = BodyTwist() if robot.rejects_odometry else self._robot.twist(estimate.stamp_ns)
+            frame = self._robot.base_frame or "base_link"
+            outputs.odometry.publish(encode_odometry(base, self._map, frame, twist))
         # tf warns of a repeated stamp.
         if self._tf is None or estimate.stamp_ns <= outputs.transform_ns:
             return
-        if robot is None:
+        if self._robot is not None and robot is not None:
+            transform = self._robot.map_to_odom(base, self._tolerance_ns)
+        else:
             x, y, z = estimate.position.tolist()
             transform = TransformStamped(
                 header=topics.header(estimate.stamp_ns, self._map),
                 child_frame_id=outputs.frame,
                 transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
             )
-        elif (transform := robot.map_to_odom(base, self._tolerance_ns)) is None:
-            return
-        outputs.transform_ns = estimate.stamp_ns
-        self._tf.publish(self._make_tf([transform]))
+        self._publish_transform(outputs, transform, estimate.stamp_ns)
 
-    def _repeat_transform(self, outputs: _Outputs, stamp_ns: int) -> None:
-        """Publish the last map to odom again while there is no estimate."""
-        if self._tf is None or self._robot is None or stamp_ns - outputs.transform_ns < _REPEAT_AFTER_NS:
-            return
-        if (transform := self._robot.last_map_to_odom(stamp_ns, self._tolerance_ns)) is not None:
+    def _publish_transform(
+        self, outputs: _Outputs, transform: TransformStamped | None, stamp_ns: int
+    ) -> None:
+        if self._tf is not None and transform is not None:
             outputs.transform_ns = stamp_ns
-            self._tf.publish(self._make_tf([transform]))
+            self._tf.publish(self._tf_type(transforms=[transform]))
 
     def _at_base(self, outputs: _Outputs, estimate: Estimate) -> Estimate:
         """Return the estimate of the robot's origin. With an unknown heading, a horizontal lever arm may point anywhere."""
-        x, y, z = self.lever_arm
-        # With odometry the lever arm is that of the robot's tag.
-        if not (x or y or z) or (self._robot is not None and outputs.robot is None):
+        if self._robot is not None and outputs.robot is None:
+            # The lever arm is that of the robot's tag.
             return estimate
+        x, y, z = self._lever_arm if outputs.robot is None else outputs.robot.lever_arm
         covariance, heading = estimate.covariance.copy(), estimate.heading
         if heading is None:
             covariance[[0, 1], [0, 1]] += (x * x + y * y) / 2.0
@@ -372,14 +364,14 @@ class Locator(ManagedNode):
         )
 
     def _on_timer(self) -> None:
-        estimator, now_ns = self._estimator, self.now_ns()
+        estimator, stamp_ns = self._estimator, self.now_ns() + self._offset_ns
         if estimator is None or not self.is_active:
             return
         for tag in list(estimator.tags.values()):
             outputs = self._outputs_of(tag)
-            age_s = (now_ns + self._offset_ns - tag.latest_ns) / _NANOSECONDS
+            age_s = (stamp_ns - tag.latest_ns) / _NANOSECONDS
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
-                ahead = tag.estimator.at(now_ns + self._offset_ns)
+                ahead = tag.estimator.at(stamp_ns)
                 if ahead is not None:
                     self._publish_estimate(outputs, ahead)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
@@ -387,8 +379,10 @@ class Locator(ManagedNode):
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
                     outputs.smoothed.publish(encode_pose(self._at_base(outputs, smoothed), self._map))
-            if outputs.robot is not None:
-                self._repeat_transform(outputs, now_ns + self._offset_ns)
+            is_due = stamp_ns - outputs.transform_ns >= _REPEAT_AFTER_NS
+            if self._robot is not None and outputs.robot is not None and is_due:
+                last = self._robot.last_map_to_odom(stamp_ns, self._tolerance_ns)
+                self._publish_transform(outputs, last, stamp_ns)
         if self._anchors_out is not None and estimator.tags and self._anchors_out.get_subscription_count():
             self._show_anchors()
 
