@@ -56,6 +56,17 @@ class Browser:
         finally:
             self.driver.execute_cdp_cmd(emulate, {"enabled": False})
 
+    @contextmanager
+    def dark_mode(self) -> Iterator[None]:
+        """Emulate a user who prefers dark pages."""
+        emulate = "Emulation.setEmulatedMedia"
+        dark = {"name": "prefers-color-scheme", "value": "dark"}
+        self.driver.execute_cdp_cmd(emulate, {"features": [dark]})
+        try:
+            yield
+        finally:
+            self.driver.execute_cdp_cmd(emulate, {"features": []})
+
     def scroll_to(self, name: str) -> float:
         """Scroll a named Bokeh figure into the middle; return the scroll position of the page."""
         return self.run(

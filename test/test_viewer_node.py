@@ -50,7 +50,7 @@ def test_page_shows_published_messages(ros: ros_harness.Ros, browser: Browser, t
 
     def seen() -> bool:
         ros.spin_for(0.05)
-        shown = browser.column("pairs", "range")
+        shown = browser.column("pairs", "corrected")
         values = {round(message.range, 6) for message in published}
         return bool(shown) and all(round(value, 6) in values for value in shown)
 
@@ -65,7 +65,7 @@ def test_page_shows_published_messages(ros: ros_harness.Ros, browser: Browser, t
     viewer.signal(signal.SIGKILL)
     ros.start("viewer", f"port:={url.rsplit(':')[-1].strip('/')}")
     browser.wait("the page to come back by itself", lambda: not browser.run("return window.before ?? false"))
-    browser.wait("ranges of the new one", lambda: len(browser.column("pairs", "range")) >= 2)
+    browser.wait("ranges of the new one", lambda: len(browser.column("pairs", "corrected")) >= 2)
 
 
 def test_killed_nodes_become_stale_and_missing_nodes_are_named(ros: ros_harness.Ros, browser: Browser):

@@ -99,13 +99,13 @@ def test_page_shows_the_scene(browser: Browser, view: View, server: ViewerServer
     fill_scene(view)
     open_page(browser, server)
     assert browser.column("pairs", "anchor") == ["1", "2"]
-    assert browser.column("pairs", "range") == pytest.approx([5.1, 5.3])
+    assert browser.column("pairs", "corrected") == pytest.approx([5.1, 5.3])
     assert browser.column("pairs", "rate") == pytest.approx([10.0, 10.0])
     assert browser.column("pairs", "status") == ["OK", "OUT_OF_DISTRIBUTION"]
     assert max(browser.column("cir", "magnitude")) == 1000.0
     assert sum(browser.column("errors", "raw")) == 100
     assert len(browser.column("strip", "raw")) == 50
-    assert browser.column("map", "range") == pytest.approx([math.sqrt(5.1**2 - 1), math.sqrt(5.3**2 - 1)])
+    assert browser.column("map", "corrected") == pytest.approx([math.sqrt(5.1**2 - 1), math.sqrt(5.3**2 - 1)])
     assert "mean absolute error 0.350 m raw, 0.250 m corrected" in browser.text()
     assert browser.console_messages() == []
 
@@ -128,7 +128,7 @@ def test_pairs_tags_and_nodes_without_data_are_grey(
     assert browser.column("pairs", "rate") == [0.0, 0.0]
     browser.wait("the row", lambda: "no data" in browser.table("Pairs")[0]["status"])
     assert browser.column("map", "name")[-1] == "tag: no data for 12 s"
-    assert browser.column("map", "range") == []
+    assert browser.column("map", "corrected") == []
     assert "STALE" in browser.text()
     assert "no diagnostics for 12 s; last: 10.0 Hz" in browser.text()
     assert "damaged" in browser.text(), "it is not of a node"
@@ -205,7 +205,7 @@ def test_page_can_be_paused_and_resumed(browser: Browser, view: View, server: Vi
     open_page(browser, server)
 
     def shown(value: float) -> bool:
-        return browser.column("pairs", "range")[0] == pytest.approx(value)
+        return browser.column("pairs", "corrected")[0] == pytest.approx(value)
 
     for value in (9.5, 9.6):
         with view.lock:
@@ -227,7 +227,7 @@ def test_row_updated_during_a_click_is_selected(browser: Browser, view: View, se
     ActionChains(browser.driver).click_and_hold(row).perform()
     with view.lock:
         view.scene.add_sample((2, 7), Sample(1005.0, 9.9, 9.5, 0.1, Status.OUT_OF_DISTRIBUTION))
-    browser.wait("the new range", lambda: browser.column("pairs", "range")[1] == pytest.approx(9.5))
+    browser.wait("the new range", lambda: browser.column("pairs", "corrected")[1] == pytest.approx(9.5))
     ActionChains(browser.driver).release().perform()
     browser.wait("the other CIR", lambda: max(browser.column("cir", "magnitude")) == 2000.0)
     browser.wait("it in the table", lambda: browser.table("Pairs")[1]["corrected, m"] == "9.500")
@@ -274,8 +274,8 @@ def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, 
     open_page(browser, server)
     assert browser.console_messages() == []
     shown = [cell for row in browser.table("Pairs") for cell in row.values() if "e+" in cell]
-    assert shown == ["-3.0e+38", "3.0e+38"]
-    assert browser.column("map", "range") == []
+    assert shown == ["3.0e+38", "-3.0e+38"]
+    assert browser.column("map", "corrected") == []
     ends = browser.run(
         "return ['strip', 'map'].flatMap((name) => ['x_range', 'y_range'].flatMap((range) => {"
         "  const {start, end} = Bokeh.documents[0].get_model_by_name(name)[range]; return [start, end]}))"
@@ -447,19 +447,22 @@ def test_pairs_can_be_sorted_and_selected(browser: Browser, view: View, server: 
     browser.wait("the rows", lambda: anchors() == ["1, 7", "2, 7"])
     first = browser.table("Pairs")[0]
     values = [
-        first[name] for name in ("corrected, m", "raw, m", "correction, m", "not OK, %", "rate, Hz", "lost")
+        first[name]
+        for name in ("corrected, m", "raw, m", "mean correction, m", "not OK, %", "rate, Hz", "lost")
     ]
     assert values == ["5.100", "5.300", "0.200", "0", "10.0", "0"]
-    browser.click("button", "correction, m")
+    browser.click("button", "mean correction, m")
     browser.wait("the smallest correction first", lambda: anchors() == ["2, 7", "1, 7"])
-    assert browser.find("columnheader", "correction, m").get_attribute("aria-sort") == "ascending"
+    assert browser.find("columnheader", "mean correction, m").get_attribute("aria-sort") == "ascending"
     browser.find("searchbox", "search").send_keys("1,")
     browser.wait("one row", lambda: anchors() == ["1, 7"])
     browser.find("searchbox", "search").clear()
     browser.find("combobox", "show").send_keys("not OK")
     browser.wait("the bad pair", lambda: anchors() == ["2, 7"])
     browser.find("button", "Select anchor 2, tag 7").send_keys("\ue007")
-    browser.wait("its CIR", lambda: browser.find("heading", "CIR: anchor 2, tag 7"))
+    browser.wait(
+        "its CIR", lambda: browser.find("heading", "Channel impulse response (CIR): anchor 2, tag 7")
+    )
     pressed = browser.find("button", "Select anchor 2, tag 7").get_attribute("aria-pressed")
     assert pressed == "true"
     browser.wait("it in the URL", lambda: "#anchor=2&tag=7" in browser.driver.current_url)
@@ -475,20 +478,18 @@ def test_map_shows_and_exports_tracks_and_rays(browser: Browser, view: View, ser
     tracks = dict(view.scene.tracks)
     assert {kind for _, kind in tracks} == {TrackKind.CORRECTED, TrackKind.TRUE}
     svg = browser.export("Map as SVG")
-    for text in ("corrected", "ground truth", "OUT_OF_DISTRIBUTION", "protection level", "anchor"):
+    for text in ("corrected", "true", "OUT_OF_DISTRIBUTION", "protection level", "anchor", "selected anchor"):
         assert f">{text}<" in svg
     assert f">{TrackKind.SMOOTHED.value}<" not in svg, "the legend lists what the map contains"
     assert "PNG" in browser.export("Map as PNG")[:8]
     csv = browser.export("Map as CSV")
-    assert "x,y,raw,range,colour,x1,y1\n0,0,5.2" in csv
-    assert browser.export("Pairs as CSV").splitlines()[1].startswith("1,7,")
+    assert "data,x,y,raw,corrected,x1,y1,status\nranges,0,0,5.2" in csv
+    assert browser.export("Pairs as CSV").splitlines()[1].startswith("pairs,1,7,")
     browser.click("checkbox", "correction heat map")
     browser.wait("cells", lambda: len(browser.column("map", "mean")) > 0)
 
 
-def test_map_is_moved_by_keys_and_follows_the_tag_and_a_tap_shows_values(
-    browser: Browser, view: View, server: ViewerServer
-) -> None:
+def test_map_is_moved_by_keys_and_follows_the_tag(browser: Browser, view: View, server: ViewerServer) -> None:
     fill_scene(view)
     open_page(browser, server)
 
@@ -515,8 +516,56 @@ def test_map_is_moved_by_keys_and_follows_the_tag_and_a_tap_shows_values(
     browser.click("button", "Fit")
     browser.wait("the anchors", lambda: x_range()[0] < 0)
     assert browser.find("button", "Follow").get_attribute("aria-pressed") == "false"
-    browser.wait("the figure", lambda: browser.run("return document.getElementById('strip')")).click()
-    browser.wait("values", lambda: "raw 5.300; corrected 5.100; true 5.100" in browser.text())
+
+
+def test_click_shows_values_and_selects_an_anchor(browser: Browser, view: View, server: ViewerServer) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    fill_scene(view)
+    open_page(browser, server)
+
+    def click(name: str, x: float, y: float) -> None:
+        """Click at coordinates of a figure."""
+        browser.scroll_to(name)
+        left, top = browser.run(
+            "const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name(arguments[0])), {x_scale, y_scale} = view.frame;"
+            "const {left, top} = view.el.getBoundingClientRect();"
+            "return [left + x_scale.compute(arguments[1]), top + y_scale.compute(arguments[2])]",
+            name, x, y,
+        )  # fmt: skip
+        actions = ActionChains(browser.driver)
+        actions.w3c_actions.pointer_action.move_to_location(round(left), round(top)).click()
+        actions.perform()
+
+    for name, x, y, text in (
+        ("strip", -40.0, 5.2, "-4.90 (seconds); raw 5.300; corrected 5.100; true 5.100"),
+        ("cir", 0.0, 500.0, "0.00 (samples (1 ns) from the first path); CIR 1000.000"),
+        ("errors", 0.52, 10.0, "0.50 to 0.55 (measured - true, m); raw 50; corrected 50"),
+    ):
+        click(name, x, y)
+        browser.wait(name, lambda text=text: text in browser.text())
+    click("map", 8.0, 0.0)
+    browser.wait("the other anchor", lambda: browser.find("heading", "Range: anchor 2, tag 7"))
+    assert browser.console_messages() == []
+
+
+def test_dark_page_and_labels_are_readable(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+
+    def colours() -> list[str]:
+        return browser.run(
+            "const {renderers, right} = Bokeh.documents[0].get_model_by_name('map');"
+            "const texts = renderers.filter((r) => r.glyph.type === 'Text');"
+            "return [...texts.flatMap(({level, glyph: g}) => [level, g.text_color.value, g.background_fill_color.value]),"
+            " right.find((part) => part.title).title_text_color]"
+        )
+
+    with browser.dark_mode():
+        open_page(browser, server, 400)
+        browser.wait(
+            "labels above the tracks", lambda: colours() == ["annotation", PAPER, NIGHT] * 2 + [PAPER]
+        )
+        browser.wait("a hint", lambda: "scroll the table sideways" in browser.text())
 
 
 def test_raw_fix_and_innovation_follow_from_raw_ranges() -> None:
@@ -583,18 +632,21 @@ def test_floor_plan_is_read_as_map_server_does(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "cause"),
     [
-        "",
-        "[1]",
-        "{image: absent.pgm, resolution: 0.1, origin: [0, 0, 0]}",
-        "{image: plan.yaml, resolution: 0.1, origin: [0, 0, 0]}",
-        "{image: plan.yaml, resolution: .nan, origin: [0, 0, 0]}",
-        "{image: plan.yaml, resolution: 0.1, origin: [0, 0]}",
+        ("{", "not YAML"),
+        ("", "empty"),
+        ("[1]", "invalid fields"),
+        ("{image: plan.pgm, resolution: 0.1, origin: [0, 0]}", "invalid fields"),
+        ("{image: plan.pgm, resolution: .nan, origin: [0, 0, 0]}", "implausible resolution"),
+        ("{image: plan.pgm, resolution: 0.1, origin: [1e9, 0, 0]}", "implausible resolution or origin"),
+        ("{image: absent.pgm, resolution: 0.1, origin: [0, 0, 0]}", "absent.pgm"),
+        ("{image: plan.yaml, resolution: 0.1, origin: [0, 0, 0]}", "not a readable image"),
     ],
 )
-def test_invalid_floor_plan_is_refused(tmp_path: Path, text: str) -> None:
+def test_invalid_floor_plan_is_refused(tmp_path: Path, text: str, cause: str) -> None:
+    Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "plan.pgm")
     path = tmp_path / "plan.yaml"
     path.write_text(text)
-    with pytest.raises(ParameterError):
+    with pytest.raises(ParameterError, match=cause):
         load_floor_plan(path)

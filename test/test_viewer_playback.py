@@ -370,7 +370,7 @@ def test_slider_can_be_dragged_during_playback(browser: Browser, tmp_path: Path)
 
 def test_recording_plays_on_the_page(browser: Browser, bag: Path):
     def ranges() -> list[float]:
-        return sorted(browser.column("pairs", "range"))
+        return sorted(browser.column("pairs", "corrected"))
 
     with serve_recording(bag) as (running, url):
         browser.open(url + "#anchor=2&tag=7&t=1.0")

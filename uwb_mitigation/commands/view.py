@@ -107,7 +107,7 @@ def view(
         lock,
         title=names,
         player=first,
-        compared=scenes[1] if second is not None else None,
+        second=scenes[1] if second is not None else None,
         plan=None if floor_plan is None else load_floor_plan(floor_plan),
         missing=first.missing,
     )

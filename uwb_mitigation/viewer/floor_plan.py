@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.files import read_bounded
@@ -67,14 +67,8 @@ def load_floor_plan(path: Path) -> FloorPlan:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError("too many pixels")
             grey = image.convert("L")
-    except (
-        UnidentifiedImageError,
-        OSError,
-        ValueError,
-        SyntaxError,
-        Warning,
-        Image.DecompressionBombError,
-    ) as error:
+    # Pillow raises various types for damaged images; UnidentifiedImageError is an OSError.
+    except (OSError, ValueError, SyntaxError, Warning, Image.DecompressionBombError) as error:
         raise ParameterError(
             f"not a readable image: {error!s:.80}", where=str(path.parent / name), valid="PGM or PNG"
         ) from error

@@ -22,18 +22,20 @@ class Look(NamedTuple):
 
     Attributes:
         colour: None: the ink of the page, black or white.
-        marker: name of the marker in Bokeh. symbol: character of the same shape.
+        marker: name of the marker in Bokeh. symbol: character of the same shape. meaning: explanation for users.
         triangles: corners of the same shape within the unit circle, three for each triangle.
     """
 
     colour: str | None
     marker: str
     symbol: str
+    meaning: str
     triangles: tuple[tuple[float, float], ...]
 
 
 _SQUARE = ((-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (0.8, 0.8), (-0.8, 0.8))
 _DIAMOND = ((-1.0, 0.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+_TRIANGLE = ((-1.0, 0.8), (0.0, -1.0), (1.0, 0.8))
 _CROSS = (
     (-1.0, -0.7), (-0.7, -1.0), (1.0, 0.7), (-1.0, -0.7), (1.0, 0.7), (0.7, 1.0),
     (-1.0, 0.7), (0.7, -1.0), (1.0, -0.7), (-1.0, 0.7), (1.0, -0.7), (-0.7, 1.0),
@@ -41,32 +43,33 @@ _CROSS = (
 _HEXAGON = ((1.0, 0.0), (0.5, 0.87), (-0.5, 0.87), (-1.0, 0.0), (-0.5, -0.87), (0.5, -0.87))
 _DISC = tuple(corner for n in range(1, 5) for corner in (_HEXAGON[0], _HEXAGON[n], _HEXAGON[n + 1]))
 
+_RAW = ": only the offset is subtracted"
 STATUS_LOOKS = {
-    Status.OK: Look(BLUE, "circle", "\u25cf", _DISC),
-    Status.NO_CIR: Look(GREY, "square", "\u25a0", _SQUARE),
-    Status.BAD_CIR: Look(PURPLE, "diamond", "\u25c6", _DIAMOND),
+    Status.OK: Look(BLUE, "circle", "\u25cf", "corrected by the model", _DISC),
+    Status.NO_CIR: Look(GREY, "square", "\u25a0", "no channel impulse response (CIR)" + _RAW, _SQUARE),
+    Status.BAD_CIR: Look(PURPLE, "diamond", "\u25c6", "the CIR is invalid" + _RAW, _DIAMOND),
     Status.OUT_OF_DISTRIBUTION: Look(
-        VERMILLION, "inverted_triangle", "\u25bc", ((-1.0, 0.8), (0.0, -1.0), (1.0, 0.8))
+        VERMILLION, "inverted_triangle", "\u25bc", "unlike the training data of the model" + _RAW, _TRIANGLE
     ),
-    Status.MODEL_ERROR: Look(None, "x", "\u2716", _CROSS),
+    Status.MODEL_ERROR: Look(None, "x", "\u2716", "the network failed" + _RAW, _CROSS),
 }
 
 
 class TrackKind(Enum):
     """Kinds of tracks; the value is the name in legends."""
 
-    RAW = "raw fixes"
+    RAW = "raw"
     CORRECTED = "corrected"
     SMOOTHED = "smoothed"
-    COMPARED = "second"
-    TRUE = "ground truth"
+    SECOND = "second recording"
+    TRUE = "true"
 
 
 TRACK_COLOURS = {
     TrackKind.RAW: VERMILLION,
     TrackKind.CORRECTED: BLUE,
     TrackKind.SMOOTHED: GREEN,
-    TrackKind.COMPARED: PURPLE,
+    TrackKind.SECOND: PURPLE,
     TrackKind.TRUE: None,
 }
 """None: the ink of the page."""

@@ -50,6 +50,7 @@ from uwb_mitigation.viewer.scene import (
     HISTORY_S,
     MAX_MESSAGES,
     MAX_TRACK,
+    SPEEDS,
     MissingData,
     NodeStatus,
     Pair,
@@ -174,6 +175,22 @@ class BagPlayer:
         thread = threading.Thread(target=run, name="index", daemon=True)
         thread.start()
         return thread
+
+    def command(self, name: str, *arguments: Any) -> Pair | None:
+        """Execute a command of the page; return the pair to select, if any."""
+        if name == "play":
+            self.play(bool(arguments[0]))
+        elif name == "seek" and math.isfinite(position_s := float(arguments[0])):
+            self.seek(position_s)
+        elif name == "speed" and float(arguments[0]) in SPEEDS:
+            self.speed = float(arguments[0])
+        elif name == "step":
+            self.step()
+        elif name == "next_bad" and self.timeline is not None:
+            return self.jump(self.timeline.next_bad(self.position_s))
+        elif name == "largest" and self.timeline is not None:
+            return self.jump(self.timeline.largest_error())
+        return None
 
     def step(self) -> None:
         """Advance to the next range."""

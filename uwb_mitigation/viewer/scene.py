@@ -12,7 +12,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,15 +193,15 @@ class History:
         self._sequence = sequence
 
     def statistics(self) -> dict[str, float]:
-        """Return means and shares of the latest ranges and CIRs; NaN: unknown."""
+        """Return means and shares (%) of the latest ranges and CIRs; NaN: unknown."""
         samples = list(islice(reversed(self.samples), STATISTICS))
         cirs = [trace.cir for trace in self.traces]
         gap_db = _known([cir.power_gap_db for cir in cirs])
         correction_m = _known([sample.raw_m - sample.range_m for sample in samples])
         return {
             "lost": float(self.lost),
-            "not_ok": _mean(np.array([sample.status is not Status.OK for sample in samples], float)),
-            "nlos": _mean((gap_db >= LINE_OF_SIGHT_DB).astype(float)),
+            "not_ok": _mean(np.array([100.0 * (sample.status is not Status.OK) for sample in samples])),
+            "nlos": _mean(100.0 * (gap_db >= LINE_OF_SIGHT_DB)),
             "correction": _mean(correction_m),
             "spread": float(correction_m.std()) if len(correction_m) else math.nan,
             "innovation": _mean(_known([sample.innovation_m for sample in samples])),
@@ -416,7 +416,7 @@ class Scene:
             add_heat(self.heat, pose.x, pose.y, correction_m)
         if anchor is None:
             return
-        height_m = _finite_or_zero(pose.z - anchor.z)
+        height_m = finite_or_zero(pose.z - anchor.z)
         sample.innovation_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
         if sample.time_s >= tag.raw_fix_s + RAW_FIX_S or sample.time_s < tag.raw_fix_s:
             tag.raw_fix_s = sample.time_s
@@ -427,7 +427,7 @@ class Scene:
         for (anchor_id, other), history in self.pairs.items():
             anchor, latest = self.anchors.get(anchor_id), history.latest
             if other == tag_id and anchor and latest and abs(time_s - latest.time_s) <= RAW_AGE_S:
-                height_m = _finite_or_zero(pose.z - anchor.z)
+                height_m = finite_or_zero(pose.z - anchor.z)
                 rows.append((anchor.x, anchor.y, height_m, latest.raw_m))
         known = np.array([row for row in rows if 0.0 <= row[3] < MAX_RANGE_M])
         if len(known) < 3:
@@ -501,11 +501,12 @@ def _known(values: list[float]) -> NDArray[np.float64]:
     return array[np.abs(array) < MAX_RANGE_M]
 
 
-def _mean(values: NDArray[np.float64]) -> float:
+def _mean(values: NDArray[Any]) -> float:
     return float(values.mean()) if len(values) else math.nan
 
 
-def _finite_or_zero(value: float) -> float:
+def finite_or_zero(value: float) -> float:
+    """Return 0 for NaN and infinity."""
     return value if math.isfinite(value) else 0.0
 
 

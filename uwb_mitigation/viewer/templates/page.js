@@ -18,10 +18,15 @@ function start(doc) {
   const send = (name, ...args) => { controls.command = [name, args, ++commands]; };
   const on = (name, show) => { controls.properties[name].change.connect(show); show(); };
 
-  // Colours of the figures follow those of the page.
-  const night = matchMedia("(prefers-color-scheme: dark)");
-  night.addEventListener("change", () => send("dark", night.matches));
-  if (night.matches) send("dark", true);
+  // The style sheet colours the frames of the figures; glyphs in the colours of the light page are inverted here.
+  const night = matchMedia("(prefers-color-scheme: dark)"), inks = ["#111827", "#ffffff"];
+  const invert = (colour) => inks[1 - inks.indexOf(colour)] ?? colour;
+  night.addEventListener("change", () => location.reload());
+  if (night.matches) for (const model of doc.all_models) for (const property of model) {
+    const value = property.is_unset ? undefined : property.get_value();
+    if (inks.includes(value?.value ?? value)) model.setv({[property.attr]: value.value ? {value: invert(value.value)} : invert(value)}, {sync: false});
+    else if (property.attr === "palette" && value.length < 10) model.setv({palette: value.map(invert)}, {sync: false});
+  }
 
   // Texts.
   on("summary", () => setText($("summary"), controls.summary));
@@ -30,9 +35,9 @@ function start(doc) {
     div.textContent = line;
     return div;
   })));
-  on("nodes", () => $("nodes").replaceChildren(...controls.nodes.map(([name, level, symbol, message]) => {
+  on("nodes", () => $("nodes").replaceChildren(...controls.nodes.map((texts) => {
     const row = document.createElement("tr");
-    for (const text of [name, `${symbol} ${level}`, message]) row.insertCell().textContent = text;
+    for (const text of texts) row.insertCell().textContent = text;
     return row;
   })));
 
@@ -68,14 +73,9 @@ function start(doc) {
       row.querySelector("button").setAttribute("aria-pressed", selected);
       fields.forEach((field, cell) => {
         if (field === "pair") return;
-        const element = row.cells[cell];
-        if (field !== "status") return setText(element, number(data[field][i], DIGITS[field]));
-        const text = `${data.symbol[i]} ${data.status[i]}`;
-        if (element.textContent === text) return;
-        const symbol = document.createElement("span");
-        symbol.style.color = data.colour[i] || "inherit";
-        symbol.textContent = data.symbol[i];
-        element.replaceChildren(symbol, ` ${data.status[i]}`);
+        const value = data[field][i];
+        setText(row.cells[cell], field === "status" ? value : number(value, DIGITS[field]));
+        if (field === "status") row.cells[cell].className = `text ${data.no_data[i] ? "" : value}`;
       });
       return row;
     });
@@ -84,7 +84,8 @@ function start(doc) {
       body.replaceChildren(...drawn);
       if (body.contains(focus)) focus.focus();
     }
-    setText($("pairs-count"), `${shown.length} of ${count} pairs`);
+    const box = body.closest(".scroll"), hint = box.scrollWidth > box.clientWidth ? "; scroll the table sideways for more columns \u2192" : "";
+    setText($("pairs-count"), `${shown.length} of ${count} pairs${hint}`);
   };
   let pressed = false;
   const updatePairs = () => { if (!pressed) drawPairs(); };
@@ -95,7 +96,7 @@ function start(doc) {
     drawPairs();
     const [anchor, tag] = controls.selected ?? [];
     const title = anchor == null ? "" : `: anchor ${anchor}, tag ${tag}`;
-    for (const [name, head] of [["strip", "Range"], ["cir", "CIR"]]) setText($(`${name}-title`), head + title);
+    for (const [name, head] of [["strip", "Range"], ["cir", "Channel impulse response (CIR)"]]) setText($(`${name}-title`), head + title);
   });
   for (const name of ["search", "filter"]) $(name).addEventListener("input", drawPairs);
   for (const button of document.querySelectorAll("[data-sort]")) button.addEventListener("click", () => {
@@ -118,7 +119,7 @@ function start(doc) {
     });
     view.update_range({xrs: new Map([moved[0]]), yrs: new Map([moved[1]])}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
-  const tags = map.renderers.map((r) => r.data_source).find((s) => "protection" in s.data);
+  const tags = map.renderers.map((r) => r.data_source).find((s) => "heading" in s.data);
   tags.properties.data.change.connect(() => {
     if ($("follow").getAttribute("aria-pressed") !== "true") return;
     const i = Math.max(tags.data.name.findIndex((name) => name === `tag_${controls.selected?.[1]}`), 0);
@@ -129,10 +130,7 @@ function start(doc) {
   $("fit").addEventListener("click", fit);
   $("follow").addEventListener("click", (event) =>
     event.target.setAttribute("aria-pressed", event.target.getAttribute("aria-pressed") !== "true"));
-  $("circles").addEventListener("change", (event) => {
-    for (const name of ["raw_circles", "range_circles"]) model(name).visible = event.target.checked;
-  });
-  $("heat").addEventListener("change", (event) => send("heat", event.target.checked));
+  for (const name of ["circles", "heat"]) $(name).addEventListener("change", (event) => send("show", name, event.target.checked));
   const keys = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1], "+": [0, 0, 0.8], "-": [0, 0, 1.25]};
   $("map").addEventListener("keydown", (event) => {
     if (event.key === "0") fit(); else if (keys[event.key]) pan(...keys[event.key]); else return;
@@ -143,23 +141,34 @@ function start(doc) {
   if (matchMedia("(pointer: coarse)").matches)
     for (const figure of figures) for (const tool of figure.toolbar.tools) if (tool.event_types?.includes("pan")) tool.active = false;
 
-  new ResizeObserver(([{contentRect}]) => { map.below.find((part) => part.items).ncols = contentRect.width < 500 ? 2 : 4; }).observe($("map"));
+  const legend = (figure) => [...figure.above, ...figure.below].find((part) => part.items);
+  for (const figure of figures) if (legend(figure)) new ResizeObserver(([{contentRect: {width}}]) => {
+    legend(figure).ncols = Math.max(2, Math.floor(width / (figure === map ? 140 : 110)));
+  }).observe($(figure.name));
 
-  // Values at a click or tap.
-  const lines = (figure) => figure.renderers.filter((r) => r.glyph?.type === "Line" || r.glyph?.type === "Quad");
+  // Values at a click or tap: the nearest point of the first line or bar, and the values of all others there.
   for (const figure of figures) if (figure.name !== "waterfall") $(figure.name).addEventListener("click", (event) => {
-    const view = Bokeh.index.find_one(figure), box = view.el.getBoundingClientRect();
-    const frame = view.frame, x = frame.x_scale.invert(event.clientX - box.left), y = frame.y_scale.invert(event.clientY - box.top);
-    const axis = figure.below.find((part) => part.axis_label)?.axis_label;
-    const parts = figure.name === "map" ? [`x ${number(x, 2)} m, y ${number(y, 2)} m`] : [`${number(x, 2)} (${axis})`];
-    if (figure.name !== "map") for (const {glyph, data_source: {data}} of lines(figure)) {
-      const quad = glyph.type === "Quad", column = quad ? glyph.top.field : glyph.y.field, xs = data[quad ? "left" : glyph.x.field];
-      if (!data[column]?.length) continue;
-      let best = 0;
-      for (let i = 1; i < xs.length; i++) if (quad ? xs[i] <= x : Math.abs(xs[i] - x) < Math.abs(xs[best] - x)) best = i;
-      if (!quad || data.right[best] >= x) parts.push(`${column === "range" ? "corrected" : column} ${number(data[column][best])}`);
+    const view = Bokeh.index.find_one(figure), box = view.el.getBoundingClientRect(), {x_scale, y_scale, bbox} = view.frame;
+    const at = [event.clientX - box.left, event.clientY - box.top];
+    if (!bbox.contains(...at)) return;
+    const [x, y] = [x_scale.invert(at[0]), y_scale.invert(at[1])], show = (text) => setText($(`${figure.name}-values`), text);
+    if (figure === map) {
+      const data = map.renderers.map((r) => r.data_source).find((s) => "id" in s.data).data;
+      const i = data.id.findIndex((_, i) => Math.hypot(x_scale.compute(data.x[i]) - at[0], y_scale.compute(data.y[i]) - at[1]) < 15);
+      if (i >= 0) send("select_anchor", data.id[i]);
+      return show(`x ${number(x, 2)} m, y ${number(y, 2)} m`);
     }
-    setText($(`${figure.name}-values`), parts.join("; "));
+    const parts = [];
+    for (const {label: {value}, renderers: [{glyph, data_source: {data}}]} of legend(figure).items) {
+      if (glyph.type !== "Line" && glyph.type !== "Quad") continue;
+      const bar = glyph.type === "Quad", xs = data[(bar ? glyph.left : glyph.x).field], ys = data[(bar ? glyph.top : glyph.y).field];
+      if (!xs.length) continue;
+      let best = 0;
+      for (let i = 1; i < xs.length; i++) if (bar ? xs[i] <= x : Math.abs(xs[i] - x) < Math.abs(xs[best] - x)) best = i;
+      if (!parts.length) parts.push(`${number(xs[best], 2)}${bar ? ` to ${number(data.right[best], 2)}` : ""} (${figure.below.find((part) => part.axis_label).axis_label})`);
+      parts.push(`${value} ${number(ys[best], bar ? 0 : 3)}`);
+    }
+    show(parts.join("; ") || "No data.");
   });
 
   // Recording.
@@ -216,13 +225,13 @@ function start(doc) {
 
   // Export.
   const quote = (value) => /[",\n]/.test(value) ? `"${String(value).replaceAll('"', '""')}"` : String(value);
-  const table = (name) => name === "pairs" ? {pairs: source.data}
-    : Object.fromEntries(model(name).renderers.filter((r) => r.visible && !("corner_x" in r.data_source.data) && r.glyph.type !== "ImageURL")
-      .map((r) => [r.data_source.id, r.data_source.data]));
-  const csv = (name) => Object.values(table(name)).filter((data) => Object.values(data)[0]?.length).map((data) => {
-    const columns = Object.keys(data).filter((column) => column !== "image"), length = data[columns[0]]?.length ?? 0;
-    return [columns.join(","), ...Array.from({length}, (_, i) => columns.map((column) => quote(data[column][i])).join(","))].join("\n");
-  }).join("\n\n") + "\n";
+  const csv = (name) => {
+    const shown = name === "pairs" ? [source] : new Set(model(name).renderers.filter((r) => r.visible && r.data_source.name).map((r) => r.data_source));
+    return [...shown].map(({name: title, data}) => {
+      const columns = Object.keys(data), rows = Array.from(data[columns[0]], (_, i) => columns.map((column) => quote(data[column][i])));
+      return rows.length ? [["data", ...columns], ...rows.map((row) => [title, ...row])].map((row) => row.join(",")).join("\n") + "\n" : "";
+    }).filter(Boolean).join("\n");
+  };
   window.exported = {};
   for (const button of document.querySelectorAll("[data-export]")) button.addEventListener("click", async () => {
     const {export: name, format} = button.dataset;
