@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import uci
-from benchmarks.uci_board import FIRST_PATH, UciBoardModel, UciFaults, taps_of
+from benchmarks.uci_board import FIRST_PATH, UciBoardModel, UciFaults, _Session, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterError, RecordingError
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.measurement import RadioType, RangeMeasurement, Segment
@@ -461,3 +461,170 @@ def test_a_board_that_starts_slowly_after_a_reset_gets_its_window():
     run = Bench(Slow(), window=157).start()
     assert run.session.window == (157, 5)
     assert run.session.starts == 1
+
+
+class OneKey(UciBoardModel):
+    """Sets one calibration key per command."""
+
+    def _set_calibration(self, payload):
+        return payload[0] == 1 and super()._set_calibration(payload)
+
+
+class Unnamed(UciBoardModel):
+    """Refuses a whole packet of parameters without naming the one that it does not know."""
+
+    def _command(self, name, payload, now_s):
+        if name == messages.SET_APP_CONFIG and (payload[4] > 1 or payload[5] == 0x35):
+            return self._respond(name, b"\x04")
+        return super()._command(name, payload, now_s)
+
+
+class OneByOne(UciBoardModel):
+    """Names only the first of several unknown parameters."""
+
+    def _command(self, name, payload, now_s):
+        if name == messages.SET_APP_CONFIG:
+            for tag in (0x2C, 0x32, 0x35):
+                if bytes([tag, 2 if tag == 0x32 else 1]) in payload:
+                    return self._respond(name, bytes([0x04, 1, tag, 0x04]))
+        return super()._command(name, payload, now_s)
+
+
+class NoReset(UciBoardModel):
+    """Refuses the reset while the session of an earlier host exists."""
+
+    def _command(self, name, payload, now_s):
+        number = struct.unpack_from("<I", payload)[0] if len(payload) >= 4 else 0
+        existing = [handle for handle, session in self.sessions.items() if session.number == number]
+        if name == messages.RESET:
+            return self._respond(name, b"\x01")
+        if name == messages.SESSION_INIT and existing:
+            return self._respond(name, b"\x13")
+        if name == messages.SESSION_DEINIT and existing:
+            payload = struct.pack("<I", existing[0])
+        return super()._command(name, payload, now_s)
+
+
+class OnlyReady(UciBoardModel):
+    """Answers a reset only with the status of the device."""
+
+    def _command(self, name, payload, now_s):
+        answer = super()._command(name, payload, now_s)
+        return answer[:5] if name == messages.RESET else answer
+
+
+class Numbers(UciBoardModel):
+    """Puts the number of the session into notifications, not its handle."""
+
+    def _notify(self, name, payload):
+        sent = super()._notify(name, payload)
+        at = {messages.RANGE_START: 8, messages.RANGE_DIAGNOSTICS: 4, messages.SESSION_STATUS: 4}.get(name)
+        if at is None:
+            return sent
+        (handle,) = struct.unpack_from("<I", sent, at)
+        number = self.sessions[handle].number if handle in self.sessions else handle
+        return sent[:at] + struct.pack("<I", number) + sent[at + 4 :]
+
+
+class Late(UciBoardModel):
+    """Answers 0.3 s after each command."""
+
+    def receive(self, data, now_s):
+        answers, self.answers = getattr(self, "answers", []), []
+        self.answers = [(due, answer) for due, answer in answers if due > now_s]
+        if answer := super().receive(data, now_s):
+            self.answers.append((now_s + 0.3, answer))
+        return b"".join(answer for due, answer in answers if due <= now_s)
+
+
+class Chatty(UciBoardModel):
+    """Sends notifications and fields that no source describes, and bytes after the ranges."""
+
+    def _notify(self, name, payload):
+        if name == messages.RANGE_START:
+            payload += b"\1\2\3"
+        if name == messages.RANGE_DIAGNOSTICS:
+            payload = payload[:12] + bytes([payload[12] + 1, 0x77, 3, 0, 1, 2, 3]) + payload[13:]
+        return encode(0xA, 0x3E, b"new", Kind.NOTIFICATION) + super()._notify(name, payload)
+
+
+class Extended(UciBoardModel):
+    """Reports addresses of eight bytes."""
+
+    def _notify(self, name, payload):
+        if name == messages.RANGE_START:
+            payload = payload[:15] + b"\1" + payload[16:27] + bytes(6) + payload[27:-6]
+        return super()._notify(name, payload)
+
+
+@pytest.mark.parametrize(
+    "board", [OneKey, Unnamed, OneByOne, NoReset, OnlyReady, Numbers, Late, Chatty, Extended]
+)
+def test_boards_that_the_facts_allow_range_with_their_cir(board: type[UciBoardModel]):
+    model = board(count_bytes=1) if board is OneKey else board()
+    model.sessions[7] = _Session(1 << 16 | 2, {})
+    run = Bench(model, window=157).start()
+    assert run.session.window == (157, 5)
+    assert run.session.starts == 1
+    handle = max(model.sessions)
+    for sequence in range(1, 20):
+        run.step(model.exchange(handle, sequence, 3.0), 18)
+    assert [m.range_m for m in run.found] == [3.0] * 19
+    for measured in run.found:
+        assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 157, 5))
+    rejected = {Unnamed: {0x35}, OneByOne: {0x2C, 0x32, 0x35}}.get(board, set())
+    assert run.session.rejected.keys() == rejected
+
+
+@pytest.mark.parametrize("order", ["range first", "range between", "range last"])
+def test_diagnostics_in_two_notifications_are_joined(order: str):
+    run = Bench().start()
+    (handle,) = run.board.sessions
+    for sequence in range(1, 60):
+        parts = []
+        for mask in (0x38, 0x40):
+            run.board.sessions[handle].config[0xE9] = bytes([mask])
+            parts.append(run.board.diagnostics_packet(handle, sequence))
+        parts.insert(
+            {"range first": 0, "range between": 1, "range last": 2}[order],
+            run.board.range_packet(handle, sequence, 3.0),
+        )
+        for part in parts:
+            run.step(part, 6)
+    assert len(run.found) >= 58
+    for measured in run.found[5:]:
+        assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 16, 5))
+        assert measured.cir.start_index == FIRST_PATH - 5
+    # A board that reports them in one notification again, after other firmware was loaded.
+    run.board.sessions[handle].config[0xE9] = b"\x78"
+    count = len(run.found)
+    for sequence in range(60, 120):
+        run.exchange(sequence)
+    assert run.found[-1].sequence == 119
+    assert all(len(m.cir) == 16 for m in run.found[count + 8 :])
+
+
+def test_a_cir_of_an_unknown_layout_is_skipped_but_its_levels_are_used():
+    run = Bench(UciBoardModel(tap_bytes=10)).start()
+    run.exchange(1)
+    (measured,) = run.found
+    assert len(measured.cir) == 0
+    assert measured.cir.rx_power_dbm == -80.5
+    assert run.session.totals()["damaged"] == 0
+
+
+def test_an_anchor_without_its_tag_waits_if_the_board_cannot_report_its_state():
+    class Old(UciBoardModel):
+        def _command(self, name, payload, now_s):
+            if name == messages.GET_SESSION_STATE:
+                return self._respond(name, b"\x08")
+            return super()._command(name, payload, now_s)
+
+    run = Bench(Old(), role=Role.ANCHOR, address=2, peers=(1,)).start()
+    for _ in range(2000):
+        run.step()
+    assert run.session.starts == 1
+    run.exchange(1)
+    for _ in range(2000):
+        run.step()
+    assert run.session.starts == 2

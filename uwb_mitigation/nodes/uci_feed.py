@@ -169,10 +169,15 @@ def _values(report: UciReport) -> dict[str, object]:
 def _warning(report: UciReport) -> str:
     """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
     counts = report.counts
+    if not counts["ranges"] and counts.get("transmission_failed"):
+        return "the board cannot transmit: load its calibration again, as after a chip erase"
     if report.settings.role is Role.TAG and not counts["ranges"]:
         return "no range yet: are the anchors on, with the same channel, addresses and interval?"
     if counts["ranges"] >= 20 and counts["without_cir"] > counts["ranges"] / 2:
         return "most ranges have no CIR: the firmware may not support it; ranges are not corrected"
     if counts["ranges"] >= 20 and counts["inconsistent_cir"] > counts["ranges"] / 2:
         return "the reported first path contradicts the samples of most CIRs; they are not used"
+    if report.rejected:
+        tags = ", ".join(f"0x{tag:02x}" for tag in sorted(report.rejected))
+        return f"ranging without the parameters that the board rejected: {tags}"
     return ""

@@ -48,6 +48,7 @@ class UciReport:
         problem: reason why the board does not range; empty while it works.
         settings: active settings.
         window: taps and lead of the CIR that the board has confirmed; None = unknown.
+        rejected: parameters that the board did not accept, {tag: status}.
         device_info: identity of the board, not decoded.
         clock_offset_ppm: median carrier frequency offset of the peers; NaN = unknown.
         counts: {name: count}.
@@ -57,6 +58,7 @@ class UciReport:
     problem: str
     settings: UciSettings
     window: tuple[int, int] | None
+    rejected: dict[int, int]
     device_info: bytes
     clock_offset_ppm: float
     counts: dict[str, int]
@@ -115,6 +117,7 @@ class UciDriver(Connection[UciEvent]):
                 self._problem or session.state,
                 session.settings,
                 session.window,
+                session.rejected,
                 session.device_info,
                 statistics.median(session.clock_offsets_ppm or [math.nan]),
                 session.totals() | {"openings": self.openings, "overflowed": self.overflowed},

@@ -7,10 +7,10 @@ or damaged, equal numbers alone do not prove that two notifications belong toget
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
-from uwb_mitigation.radio.uci.messages import Diagnostics, RangeRecord
+from uwb_mitigation.radio.uci.messages import Diagnostics, RangeRecord, merge
 
 STRICT_MESSAGES = 64
 """Number of messages without losses or damage after which equal sequence numbers are sufficient again."""
@@ -24,6 +24,9 @@ MAX_WAITING = 8
 
 UNSUPPORTED_RANGES = 32
 """Number of ranges without diagnostics after which ranges no longer wait for them."""
+
+SPLIT_EXCHANGES = 2
+"""Number of exchanges with two notifications of diagnostics after which a range waits for both."""
 
 MIN_TIMEOUT_NS = 50 * 10**6
 """Minimum time that a range waits for its diagnostics; otherwise two intervals."""
@@ -58,6 +61,7 @@ class _Waiting(Generic[_Content]):
         strict: notifications were lost or damaged shortly before.
         follows: the message before it belongs to the previous exchange.
         damages: number of damaged places in the stream before it.
+        parts: number of notifications in the content.
     """
 
     content: _Content
@@ -66,6 +70,7 @@ class _Waiting(Generic[_Content]):
     strict: bool
     follows: bool
     damages: int
+    parts: int = 1
 
 
 class Joiner:
@@ -74,6 +79,7 @@ class Joiner:
     After losses or damage, two notifications are joined only if they arrived one after the other, after a notification
     of the previous exchange, and either at nearly the same time, or in the order that is usual for the board without
     damage between them. A single damaged sequence number then cannot join notifications of different exchanges.
+    A board may report the diagnostics of an exchange in two notifications.
 
     Args:
         interval_ns: time between two exchanges.
@@ -89,6 +95,9 @@ class Joiner:
         self._timeout_ns = max(2 * interval_ns, MIN_TIMEOUT_NS)
         self._ranges: dict[int, _Waiting[RangeArrival]] = {}
         self._diagnostics: dict[int, _Waiting[Diagnostics]] = {}
+        self._held: dict[int, tuple[int, RangeArrival, Diagnostics]] = {}
+        self._split = 0
+        self._completed: int | None = None
         self._latest: tuple[bool, int] | None = None
         self._latest_ns = 0
         self._latest_of: dict[bool, int] = {}
@@ -119,20 +128,30 @@ class Joiner:
         elif waiting is None and self._unanswered < UNSUPPORTED_RANGES and sequence not in self._ranges:
             self._ranges[sequence] = _Waiting(arrival, now_ns, gap_ns, strict, follows, damages)
             return self.expire(now_ns)
-        return [*self.expire(now_ns), self._joined(sequence, arrival, diagnostics)]
+        parts = waiting.parts if waiting is not None else 0
+        return [*self.expire(now_ns), *self._complete(sequence, arrival, diagnostics, parts, now_ns)]
 
     def add_diagnostics(self, diagnostics: Diagnostics, damages: int, now_ns: int) -> list[Joined]:
         """Add diagnostics; see `add_range`."""
         sequence = diagnostics.sequence
         adjacent, strict, follows, gap_ns = self._observe(False, sequence, damages, now_ns)
         self._unanswered = 0
+        if (held := self._held.pop(sequence, None)) is not None:
+            _, arrival, first = held
+            whole = first if strict else merge(first, diagnostics)
+            return [*self.expire(now_ns), self._joined(sequence, arrival, whole)]
         waiting = self._ranges.pop(sequence, None)
         if waiting is None:
-            self._diagnostics[sequence] = _Waiting(diagnostics, now_ns, gap_ns, strict, follows, damages)
+            arrived = _Waiting(diagnostics, now_ns, gap_ns, strict, follows, damages)
+            if sequence == self._completed and not strict:
+                self._split = min(self._split + 1, 2 * SPLIT_EXCHANGES)
+            elif (before := self._diagnostics.get(sequence)) is not None and not strict:
+                arrived = replace(before, content=merge(before.content, diagnostics), parts=2)
+            self._diagnostics[sequence] = arrived
             return self.expire(now_ns)
         accepted = self._accept(waiting, adjacent, strict, damages, gap_ns, range_first=True)
-        joined = self._joined(sequence, waiting.content, diagnostics if accepted else None)
-        return [*self.expire(now_ns), joined]
+        complete = self._complete(sequence, waiting.content, diagnostics if accepted else None, 1, now_ns)
+        return [*self.expire(now_ns), *complete]
 
     def expire(self, now_ns: int) -> list[Joined]:
         """Return the ranges that have waited too long for their diagnostics."""
@@ -140,6 +159,11 @@ class Joiner:
             if now_ns - old.at_ns > self._timeout_ns or len(self._diagnostics) > MAX_WAITING:
                 del self._diagnostics[sequence]
         expired = []
+        for sequence, (at_ns, arrival, diagnostics) in list(self._held.items()):
+            if now_ns - at_ns > self._timeout_ns or len(self._held) > MAX_WAITING:
+                del self._held[sequence]
+                self._split -= 1
+                expired.append(self._joined(sequence, arrival, diagnostics))
         for sequence, waiting in list(self._ranges.items()):
             if now_ns - waiting.at_ns > self._timeout_ns or len(self._ranges) > MAX_WAITING:
                 del self._ranges[sequence]
@@ -152,7 +176,8 @@ class Joiner:
     ) -> tuple[bool, bool, bool, int]:
         """Return whether a message follows its counterpart, may be damaged, follows the previous exchange; and the gap."""
         before = self._latest_of.get(is_range)
-        gap = before is not None and sequence != before + 1
+        second = not is_range and sequence == before
+        gap = before is not None and sequence != before + 1 and not second
         self.counts["gaps"] += gap
         if gap or damages != self._damages:
             self._strict = STRICT_MESSAGES
@@ -161,7 +186,7 @@ class Joiner:
         latest, self._latest = self._latest, (is_range, sequence)
         gap_ns, self._latest_ns = now_ns - self._latest_ns, now_ns
         self._latest_of[is_range], self._damages = sequence, damages
-        adjacent = latest == (not is_range, sequence)
+        adjacent = latest == (not is_range, sequence) and not second
         if adjacent:
             self._range_first[not is_range] += 1
         return adjacent, self._strict > 0, latest is not None and latest[1] == sequence - 1, gap_ns
@@ -185,6 +210,17 @@ class Joiner:
         self.counts["refused"] += not accepted
         return accepted
 
+    def _complete(
+        self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None, parts: int, now_ns: int
+    ) -> list[Joined]:
+        """Return a range with its diagnostics, or keep it until their second part."""
+        if diagnostics is not None and parts == 1 and self._split >= SPLIT_EXCHANGES:
+            self._held[sequence] = now_ns, arrival, diagnostics
+            return []
+        return [self._joined(sequence, arrival, diagnostics)]
+
     def _joined(self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None) -> Joined:
+        if diagnostics is not None:
+            self._completed = sequence
         self.counts["joined" if diagnostics is not None else "without_diagnostics"] += 1
         return Joined(sequence, arrival, diagnostics)

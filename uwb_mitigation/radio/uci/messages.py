@@ -9,8 +9,9 @@ from __future__ import annotations
 import enum
 import math
 import struct
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,6 +197,8 @@ _INVALID_CM = 0xFFFF
 def parse_ranges(payload: bytes) -> RangeNotification:
     """Parse a range notification.
 
+    Bytes after the last range are ignored, unless they look like the next packet: then the length is damaged.
+
     Raises:
         LinkError: its length does not fit its number of ranges.
     """
@@ -203,9 +206,10 @@ def parse_ranges(payload: bytes) -> RangeNotification:
         raise LinkError(f"range notification of {len(payload)} bytes", valid=f"{_RANGE_HEADER.size} or more")
     sequence, handle, _, _, extended, _, count = _RANGE_HEADER.unpack_from(payload)
     expected = _RANGE_HEADER.size + count * _RANGE_RECORD_BYTES
-    if len(payload) != expected:
+    rest = payload[expected : expected + 1]
+    if len(payload) < expected or (rest and rest[0] >> 5 in (Kind.RESPONSE, Kind.NOTIFICATION)):
         raise LinkError(f"range notification of {len(payload)} bytes", valid=f"{expected}")
-    width = 8 if extended == 1 else 2
+    width = 8 if extended else 2
     records = []
     for at in range(_RANGE_HEADER.size, expected, _RANGE_RECORD_BYTES):
         status, _, distance_cm = struct.unpack_from("<BBH", payload, at + width)
@@ -234,13 +238,13 @@ def parse_diagnostics(payload: bytes) -> Diagnostics:
         for _ in range(count):
             frame, action, _, fields = _REPORT.unpack_from(payload, at)
             at += _REPORT.size
-            found: dict[int, bytes] = {}
+            found: defaultdict[int, bytes] = defaultdict(bytes)
             for _ in range(fields):
                 kind, size = _FIELD.unpack_from(payload, at)
                 at += _FIELD.size
                 if at + size > len(payload):
                     raise LinkError(f"diagnostics field {kind} of {size} bytes ends after the notification")
-                found[kind] = payload[at : at + size]
+                found[kind] += payload[at : at + size]
                 at += size
             frames.append(_frame(frame, action, found))
     except struct.error as error:
@@ -250,13 +254,31 @@ def parse_diagnostics(payload: bytes) -> Diagnostics:
     return Diagnostics(handle, sequence, tuple(frames))
 
 
+def merge(first: Diagnostics, second: Diagnostics) -> Diagnostics:
+    """Return the diagnostics of an exchange that a board reports in two notifications."""
+    frames = {(frame.frame, frame.received): frame for frame in first.frames}
+    for frame in second.frames:
+        old = frames.get((frame.frame, frame.received), frame)
+        if old is not frame:
+            frame = replace(
+                old,
+                emitter=old.emitter if frame.emitter is None else frame.emitter,
+                clock_offset_ppm=min(old.clock_offset_ppm, frame.clock_offset_ppm, key=math.isnan),
+                metrics=old.metrics + frame.metrics,
+                cirs=old.cirs + frame.cirs,
+                confidence=old.confidence or frame.confidence,
+            )
+        frames[frame.frame, frame.received] = frame
+    return replace(first, frames=tuple(frames.values()))
+
+
 def _frame(frame: int, action: int, fields: Mapping[int, bytes]) -> FrameReport:
     # A field of a size that its type does not have is skipped, like a field of an unknown type.
     emitter, offset, metrics = fields.get(5, b""), fields.get(4, b""), fields.get(6, b"")
     return FrameReport(
         frame,
         action == 0,
-        int.from_bytes(emitter, "little") if len(emitter) == 2 else None,
+        int.from_bytes(emitter, "little") if len(emitter) in (2, 8) else None,
         int.from_bytes(offset, "little", signed=True) / (1 << 26) * 1e6 if len(offset) == 4 else math.nan,
         tuple(_metrics(metrics, at) for at in range(0, len(metrics), _METRICS.size))
         if len(metrics) % _METRICS.size == 0
@@ -282,11 +304,12 @@ def _metrics(data: bytes, at: int) -> SegmentMetrics:
 
 def _cir_blocks(data: bytes) -> tuple[CirBlock, ...]:
     blocks, at = [], 0
-    while at < len(data):
+    # A field of another layout is skipped: the frame keeps its metrics.
+    while at + _CIR.size <= len(data):
         receiver, offset, count, tap_bytes = _CIR.unpack_from(data, at)
         at += _CIR.size
         if tap_bytes not in _TAP_BYTES or at + count * tap_bytes > len(data):
-            raise LinkError(f"CIR of {count} taps of {tap_bytes} bytes", valid="taps of 4, 6 or 8 bytes")
+            return ()
         taps = _taps(data[at : at + count * tap_bytes], tap_bytes // 2)
         at += count * tap_bytes
         blocks.append(CirBlock(receiver >> 4, receiver & 7, bool(receiver & 8), offset, taps))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radio.uci import messages
-from uwb_mitigation.radio.uci.messages import Diagnostics, Group, Kind, RangeNotification
+from uwb_mitigation.radio.uci.messages import Diagnostics, Kind, RangeNotification
 
 COMMAND_BYTES = 250
 """Maximum payload of a command packet; a longer command is sent in fragments."""
@@ -20,12 +20,11 @@ COMMAND_BYTES = 250
 MAX_MESSAGE_BYTES = 1 << 16
 """Maximum size of an assembled message. 157 taps of 8 bytes on each frame take 9 kB."""
 
-MAX_GAP_NS = 100 * 10**6
+MAX_GAP_NS = 250 * 10**6
 """Maximum time between the parts of a packet, after which its header is considered damaged."""
 
 _HEADER_BYTES = 4
 _MORE = 0x10
-_GROUPS = frozenset(Group)
 _RANGES = (Kind.NOTIFICATION, *messages.RANGE_START)
 _DIAGNOSTICS = (Kind.NOTIFICATION, *messages.RANGE_DIAGNOSTICS)
 _NOTIFICATIONS = frozenset(
@@ -160,9 +159,7 @@ class PacketDecoder:
     def _is_header(self, at: int) -> bool:
         first, opcode, reserved = self._buffer[at : at + 3]
         kind, group = first >> 5, first & 0xF
-        plausible = (
-            kind in (Kind.RESPONSE, Kind.NOTIFICATION) and group in _GROUPS and opcode < 64 and not reserved
-        )
+        plausible = kind in (Kind.RESPONSE, Kind.NOTIFICATION) and opcode < 64 and not reserved
         if not plausible or not self._lost:
             return plausible
         # Among damaged bytes, only believe in the packets that the host needs.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter, deque
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 
 from uwb_mitigation.errors import ParameterError
@@ -46,8 +46,14 @@ TAP_INTERVAL_MS = 0.5
 """Increase of the default interval per further tap: 157 taps take four packets per frame."""
 
 _MS = 10**6
-ANSWER_NS = 150 * _MS
+ANSWER_NS = 500 * _MS
 """Timeout of a command."""
+
+RESET_NS = 150 * _MS
+"""Timeout of a reset, which a board that is starting ignores."""
+
+RESET_TRIES = 5
+"""Number of resets after which a board that refuses them is used without."""
 
 READY_NS = 600 * _MS
 """Timeout of the notification that a board is ready after a reset; it ignores commands before."""
@@ -137,6 +143,7 @@ class _Command:
     name: tuple[int, int] | None
     payload: bytes = b""
     tries: int = TRIES
+    timeout_ns: int = ANSWER_NS
     left: int = 0
     due_ns: int = 0
 
@@ -156,6 +163,7 @@ class UciSession:
     Attributes:
         state: problem, or an empty string while the board ranges.
         window: number of taps and lead that the board has confirmed; None = it did not answer.
+        rejected: parameters that the board did not accept, {tag: status}.
         device_info: answer of the board to the request for its identity, not decoded.
         counts: numbers of messages, ranges and problems.
         starts: how often ranging was started.
@@ -167,6 +175,7 @@ class UciSession:
         self.settings = settings
         self.state = "not connected"
         self.window: tuple[int, int] | None = None
+        self.rejected: dict[int, int] = {}
         self.device_info = b""
         self.starts = 0
         self.counts: Counter[str] = Counter(
@@ -179,10 +188,12 @@ class UciSession:
         self._steps: _Steps | None = None
         self._pending: _Command | None = None
         self._handles: dict[int, int] = {}
+        self._handle_of: dict[int, int] = {}
         self._joiners: dict[int, Joiner] = {}
         self._active: set[int] = set()
         self._ready = False
         self._boot_due = False
+        self._has_ranged = False
         self._received_ns = self._ended_ns = 0
         self._asked = False
 
@@ -236,20 +247,26 @@ class UciSession:
         self.state = "no answer to the reset: is this a board with UCI firmware?"
         self._steps = self._start_up()
         self._received_ns = now_ns
-        self._asked = False
+        self._asked = self._has_ranged = False
         self._advance(None, now_ns)
 
     def _end_sessions(self) -> None:
         for joiner in self._joiners.values():
             self._joined_before.update(joiner.counts)
-        self._handles, self._joiners, self._active = {}, {}, set()
+        self._handles, self._handle_of, self._joiners, self._active = {}, {}, {}, set()
 
     def _start_up(self) -> _Steps:
         """Send the commands that start ranging; return the problem, or an empty string."""
         # A board that is starting answers late: repeat the reset for as long as it takes.
+        errors, tries = self.counts["error_answers"], 0
         self._ready = False
-        yield _Command(messages.RESET, b"\0", tries=1 << 30)
-        yield _Command(None)
+        while (yield _Command(messages.RESET, b"\0", tries=1, timeout_ns=RESET_NS)) is None:
+            tries += 1
+            if tries >= RESET_TRIES and (self._ready or self.counts["error_answers"] > errors):
+                break
+            self._ready = False
+        yield _Command(None, tries=1, timeout_ns=READY_NS)
+        self.rejected = {}
         self.state = "the board does not accept its settings"
         yield from self._set_window()
         for peer in self.settings.peers:
@@ -269,10 +286,10 @@ class UciSession:
         self.window = None
         if not self.settings.window:
             return ""
-        for count_bytes in (2, 1):
-            answer = yield _Command(
-                messages.SET_CALIBRATION, messages.set_calibration(wanted, count_bytes), tries=1
-            )
+        for count_bytes, packets in ((2, [wanted]), (1, [{k: v} for k, v in wanted.items()])):
+            for values in packets:
+                payload = messages.set_calibration(values, count_bytes)
+                yield _Command(messages.SET_CALIBRATION, payload, tries=1)
             values = {}
             answer = yield _Command(messages.GET_CALIBRATION, messages.get_calibration(list(wanted)), tries=2)
             if answer is not None:
@@ -286,26 +303,50 @@ class UciSession:
     def _open(self, peer: int) -> _Steps:
         number = struct.pack("<I", self.settings.session_id(peer))
         answer = yield _Command(messages.SESSION_INIT, number + b"\0")
+        if answer is not None and answer.status != STATUS_OK:
+            # The session may exist from before, on a board that has refused the reset.
+            yield _Command(messages.SESSION_DEINIT, number, tries=1)
+            answer = yield _Command(messages.SESSION_INIT, number + b"\0")
         if answer is None or answer.status != STATUS_OK:
             return _refused("SESSION_INIT", answer)
         # FiRa 1.3 firmware answers without a handle: it uses the session's number.
         (handle,) = struct.unpack("<I", answer.payload[1:5] if len(answer.payload) >= 5 else number)
-        entries = self._app_config(peer)
-        for _ in range(2):
-            answer = yield _Command(messages.SET_APP_CONFIG, messages.app_config(handle, entries))
-            rejected = messages.rejected_tags(answer.payload) if answer is not None else {}
-            if answer is None or answer.status == STATUS_OK or not rejected or _NEEDED & set(rejected):
-                break
-            # Optional parameters differ between firmware versions: try without them.
-            self.counts["rejected_settings"] += len(rejected)
-            entries = [entry for entry in entries if entry[0] not in rejected]
-        if answer is None or answer.status != STATUS_OK:
-            return _refused("SET_APP_CONFIG", answer)
+        problem = yield from self._configure(handle, self._app_config(peer))
+        if problem:
+            return problem
         interval_ns = self.settings.effective_interval_ms * _MS
         # The first range may arrive before the answer to the start.
         self._handles[handle], self._joiners[handle] = peer, Joiner(interval_ns)
+        # Notifications may contain the handle, or the number of the session.
+        self._handle_of |= {self.settings.session_id(peer): handle, handle: handle}
         answer = yield _Command(messages.RANGE_START, struct.pack("<I", handle))
         return "" if answer is not None and answer.status == STATUS_OK else _refused("RANGE_START", answer)
+
+    def _configure(self, handle: int, entries: list[tuple[int, bytes]]) -> _Steps:
+        """Set the parameters of a session without those that the board rejects: firmware versions differ."""
+        waiting, repeats = [entries], 1
+        while waiting:
+            packet = waiting.pop(0)
+            answer = yield _Command(messages.SET_APP_CONFIG, messages.app_config(handle, packet))
+            if answer is None:
+                return _refused("SET_APP_CONFIG", answer)
+            named = messages.rejected_tags(answer.payload)
+            rejected = {tag: named[tag] for tag, _ in packet if tag in named}
+            failed = answer.status != STATUS_OK
+            if failed and not rejected and repeats:
+                repeats -= 1
+                waiting.insert(0, packet)
+                continue
+            if failed and not rejected and len(packet) == 1:
+                rejected = {packet[0][0]: answer.status}
+            if _NEEDED & rejected.keys():
+                return _refused("SET_APP_CONFIG", answer, rejected)
+            self.rejected |= rejected
+            left = [entry for entry in packet if entry[0] not in rejected]
+            if failed and left:
+                # An answer that names no parameter: set each one with its own command.
+                waiting = [left] if rejected else [[entry] for entry in left]
+        return ""
 
     def _app_config(self, peer: int) -> list[tuple[int, bytes]]:
         """Return the parameters of a session, {tag, value}: those that worked on a real board, in their order."""
@@ -363,7 +404,7 @@ class UciSession:
         command = self._pending
         assert command is not None
         command.left -= 1
-        command.due_ns = now_ns + (ANSWER_NS if command.name is not None else READY_NS)
+        command.due_ns = now_ns + command.timeout_ns
         if command.name is not None:
             if len(self._outgoing) > MAX_OUTGOING_BYTES:
                 # The port accepts no bytes.
@@ -400,8 +441,12 @@ class UciSession:
             self._received_ns = now_ns
             self._asked = False
         if message.kind is Kind.RESPONSE:
-            if name == messages.GET_SESSION_STATE and message.payload[:2] != bytes([0, SessionState.ACTIVE]):
-                self._boot_due = True
+            if name == messages.GET_SESSION_STATE and self._steps is None:
+                if message.status == STATUS_OK:
+                    self._boot_due = message.payload[1:2] != bytes([SessionState.ACTIVE])
+                else:
+                    # The firmware has no such command, or no such session any more.
+                    self._boot_due = self._has_ranged
             self._answer(name, message, now_ns)
         elif name == messages.GENERIC_ERROR:
             if self._pending is not None and self._pending.name is not None:
@@ -433,8 +478,9 @@ class UciSession:
         """Restart the board if a session that was active has ended."""
         if len(message.payload) < 5:
             return
-        handle, state = struct.unpack_from("<IB", message.payload)
-        if handle not in self._handles:
+        number, state = struct.unpack_from("<IB", message.payload)
+        handle = self._handle_of.get(number)
+        if handle is None:
             return
         if state == SessionState.ACTIVE:
             self._active.add(handle)
@@ -443,26 +489,28 @@ class UciSession:
 
     def _ranges(self, content: RangeNotification, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
         found: list[RangeMeasurement] = []
-        peer = self._handles.get(content.handle)
+        handle = self._handle_of.get(content.handle)
         for record in content.records:
-            if record.peer != peer:
+            if handle is None or record.peer != self._handles[handle]:
                 self.counts["unknown_session"] += 1
                 continue
-            if record.status in RANGE_STATUSES:
-                self.counts[RANGE_STATUSES[record.status].replace(" ", "_")] += 1
-            joiner, arrival = self._joiners[content.handle], RangeArrival(record, stamp_ns)
+            self._has_ranged = True
+            if record.status != STATUS_OK:
+                name = RANGE_STATUSES.get(record.status, f"status 0x{record.status:02x}")
+                self.counts[name.replace(" ", "_")] += 1
+            joiner, arrival = self._joiners[handle], RangeArrival(record, stamp_ns)
             complete = joiner.add_range(content.sequence, arrival, self._decoder.damages, now_ns)
-            found += self._measurements(content.handle, complete)
+            found += self._measurements(handle, complete)
         return found
 
     def _diagnostics(self, content: Diagnostics, now_ns: int) -> list[RangeMeasurement]:
-        peer = self._handles.get(content.handle)
+        handle = self._handle_of.get(content.handle)
         emitters = {frame.emitter for frame in content.frames if frame.received}
-        if peer is None or emitters & (set(self.settings.peers) - {peer}):
+        if handle is None or emitters & (set(self.settings.peers) - {self._handles[handle]}):
             self.counts["unknown_session"] += 1
             return []
-        complete = self._joiners[content.handle].add_diagnostics(content, self._decoder.damages, now_ns)
-        return self._measurements(content.handle, complete)
+        complete = self._joiners[handle].add_diagnostics(content, self._decoder.damages, now_ns)
+        return self._measurements(handle, complete)
 
     def _measurements(self, handle: int, complete: list[Joined]) -> list[RangeMeasurement]:
         """Return the measurements of successful exchanges."""
@@ -487,9 +535,8 @@ class UciSession:
         return found
 
 
-def _refused(command: str, answer: Message | None) -> str:
+def _refused(command: str, answer: Message | None, rejected: Mapping[int, int] = {}) -> str:
     if answer is None:
         return f"the board does not answer {command}"
-    rejected = messages.rejected_tags(answer.payload) if command == "SET_APP_CONFIG" else {}
     tags = "".join(f", parameter 0x{tag:02x}: 0x{status:02x}" for tag, status in rejected.items())
     return f"the board refuses {command} with status 0x{answer.status:02x}{tags}"
