@@ -537,7 +537,11 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
             "median range is 0.0020 m .*set unit: m",
         ),
         ("t,a,r\n0,1,two\n", {}, "row 1: range = 'two' is not a number"),
-        ("t,a,r,i\n0,1,2,46350\n", {"first_path_index": "i"}, "first-path index is 46,350.*unit: '10.6'"),
+        (
+            "t,a,r,i\n0,1,2,46350\n",
+            {"first_path_index": "i"},
+            "first_path_index is 46,350 samples.*unit: '10.6'",
+        ),
         ("t;a;r\n0;1;2\n", {}, "there is one column 't;a;r'; set separator: ';'"),
         ('t,a,r\n0,1,"4,7"\n', {}, "range = '4,7' is not a number .*decimal: ','"),
         ("t,a,r\n0,1,nan\n", {}, "no ranges .*range is not a number"),

@@ -86,25 +86,19 @@ def missing(source: MappedRecording) -> list[str]:
     def unknown(name: str) -> bool:
         return not np.isfinite(source.values[name]).any()
 
+    no_cir = f"{count - with_cir} of {count} ranges have no CIR"
     cases = (
         (
             with_cir < count,
-            f"{count - with_cir} of {count} ranges have no CIR: networks pass them through with status NO_CIR; constants "
-            "and linear models can correct them",
+            f"{no_cir}: only constants and linear models correct them (networks: status NO_CIR)",
         ),
         (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
-        (
-            with_cir and unknown("preamble_count"),
-            "no preamble count: `universal` needs it; use `universal_amplitude`",
-        ),
+        (with_cir and unknown("preamble_count"), "no preamble count: use the model `universal_amplitude`"),
         (
             unknown("rx_power") or unknown("first_path_power"),
-            "no receive or first-path level: no linear model, no out-of-distribution check of levels",
+            "no receive or first-path level: no linear model",
         ),
-        (
-            not len(source.errors_m),
-            "no true range: `evaluate`, `train` and `offset` cannot use it; `calibrate` needs a drive and anchors",
-        ),
+        (not len(source.errors_m), "no true range: `evaluate`, `train` and `offset` cannot use it"),
         (
             not hasattr(source, "anchors"),
             "no positions of the anchors: `track` and `calibrate` need --anchors",

@@ -83,8 +83,8 @@ class TopicRanges:
         self._node, self._mapping, self._on_range, self._now_ns = node, mapping, on_range, now_ns
         self._type = message_type(mapping.type)
         self._converter = Converter(mapping.values)
-        columns = [*self._converter.columns, *mapping.cir_columns, *(rule.column for rule in mapping.drop)]
-        self._rows = MessageRows(mapping, columns, self._converter.optional)
+        others = [*mapping.cir_columns, *(rule.column for rule in mapping.drop)]
+        self._rows = MessageRows(mapping, self._converter.columns | dict.fromkeys(others, False))
         self._subscriptions: list[Subscription] = []
 
     def open(self) -> None:

@@ -45,7 +45,8 @@ def joined(parts: list[Columns]) -> Columns:
 
 def take(columns: Columns, rows: NDArray[Any]) -> Columns:
     """Return the chosen rows."""
-    return {name: values[rows] for name, values in columns.items()}
+    everything = rows.dtype == bool and rows.all()
+    return columns if everything else {name: values[rows] for name, values in columns.items()}
 
 
 def measurement(columns: Columns, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
@@ -95,15 +96,12 @@ class Converter:
     names: Mapping[str, dict[str, int]] = field(default_factory=lambda: {"tag": {}, "anchor": {}})
 
     @property
-    def columns(self) -> list[str]:
-        """Return the columns of the table that are needed, except those in `optional`."""
-        return list(dict.fromkeys(name for value in self.values.values() if value for name in value.columns))
-
-    @property
-    def optional(self) -> list[str]:
-        """Return the columns that may be missing."""
-        given = (value for value in self.values.values() if value and value.optional)
-        return [name for value in given for name in value.columns]
+    def columns(self) -> dict[str, bool]:
+        """Return the columns of the table that are needed, and whether they may be missing."""
+        found: dict[str, bool] = {}
+        for value in filter(None, self.values.values()):
+            found |= {name: value.optional and found.get(name, True) for name in value.columns}
+        return found
 
     def convert(self, chunk: Chunk, file: str = "") -> Columns:
         """Return the values of all rows of a chunk; `file`: its path for `file_name`.
@@ -352,15 +350,14 @@ def kept_rows(rules: list[Drop], chunk: Chunk, dropped: Counter[str], prefix: st
     for rule in rules:
         raw = np.asarray(chunk.columns[rule.column])
         bad = np.zeros(chunk.count, bool)
-        for wanted, opposite in ((rule.equals, False), (rule.differs, True)):
+        for wanted, is_bad in ((rule.equals, True), (rule.differs, False)):
             if wanted is not None:
                 listed = wanted if isinstance(wanted, list) else [wanted]
-                texts = {f"{each:g}" if isinstance(each, float) else each for each in listed}
-                values = [each for each in listed if not isinstance(each, str)]
-                same = np.isin(raw.astype(str), list(texts)) | (
-                    np.isin(raw, values) if raw.dtype.kind in "iuf" else False
-                )
-                bad |= ~same if opposite else same
+                texts = [f"{each:g}" if isinstance(each, float) else each for each in listed]
+                same = np.isin(raw.astype(str), texts)
+                if raw.dtype.kind in "iuf":
+                    same |= np.isin(raw, [each for each in listed if isinstance(each, float)])
+                bad |= same == is_bad
         if rule.below is not None or rule.above is not None:
             found = _floats(raw, chunk, rule.column, rule.column)
             bad |= found < (-np.inf if rule.below is None else rule.below)
@@ -392,7 +389,7 @@ def read_csv(
     """
     values = {name: Value(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
     converter = Converter(values, {name: {} for name in ids})
-    chunks = list(islice(read_chunks(Table(format="csv"), path, converter.columns, converter.optional), 2))
+    chunks = list(islice(read_chunks(Table(format="csv"), path, converter.columns), 2))
     if len(chunks) != 1 or not chunks[0].count:
         raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
     found = converter.convert(chunks[0])

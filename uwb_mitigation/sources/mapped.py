@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -157,19 +158,16 @@ class MappedRecording(Source):
         medians = {f"{what}{rule}": rule for rule in table.drop if rule.from_median is not None}
         values = values | {name: Value(column=rule.column) for name, rule in medians.items()}
         converter, parts, before = Converter(values, self._names), [], 0
-        columns = [*converter.columns, *(series(cir.column) if cir else ())]
+        columns = converter.columns | dict.fromkeys(series(cir.column) if cir else (), False)
         for number, path in enumerate(paths):
-            name = (
-                path.relative_to(self._folder).as_posix() if path.is_relative_to(self._folder) else path.name
-            )
-            first = before
+            name = Path(os.path.relpath(path, self._folder)).as_posix()
             try:
-                for chunk in read_chunks(table, path, columns, converter.optional):
+                for chunk in read_chunks(table, path, columns, before):
                     before += chunk.count
                     if before > MAX_RANGES:
                         raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
                     chunk = chunk.take(kept_rows(table.drop, chunk, self.dropped, what))
-                    part = converter.convert(replace(chunk, before=first), name)
+                    part = converter.convert(chunk, name)
                     part["cir"] = self._cirs.add(cir, chunk) if cir else np.full(chunk.count, -1)
                     parts.append(part | {"row": chunk.rows, "file": np.full(chunk.count, number)})
             except DamagedRecordingError as error:
@@ -187,12 +185,9 @@ class MappedRecording(Source):
         """Return the files of a table in the folder of the ranges; topics are in the same bag."""
         if table.topics or not table.files:
             return [file]
-        try:
+        with contextlib.suppress(*[RecordingError] if optional else []):
             return find_files(table, file.parent, file)
-        except RecordingError:
-            if optional:
-                return []
-            raise
+        return []
 
     def _keep(self, rules: dict[str, NDArray[np.bool_]]) -> None:
         """Drop and count the ranges that do not satisfy all rules."""
@@ -202,8 +197,7 @@ class MappedRecording(Source):
         if not kept.any():
             where, valid = str(self._files[0]), f"dropped: {dict(self.dropped) or 'none'}"
             raise self._damage or RecordingError("no ranges", where=where, valid=valid)
-        if not kept.all():
-            self.values = take(self.values, kept)
+        self.values = take(self.values, kept)
 
     def _add_other_cirs(self, source: CirSource) -> None:
         """Join the CIRs of other files, by row or by time and ids."""
@@ -312,21 +306,18 @@ class MappedRecording(Source):
 
     def _check_units(self) -> None:
         """Raise RecordingError for wrong units."""
-        for name in ("range", "true range"):
+        for name, low, high, unit, other in (
+            ("range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm"),
+            ("true range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm"),
+            ("first_path_index", 0.0, MAX_INDEX, "samples", "'10.6'"),
+        ):
             median = _median(np.abs(self.values[name]))
-            if median > MAX_PLAUSIBLE_M or 0 < median < MIN_PLAUSIBLE_M:
-                unit = "mm" if median > MAX_PLAUSIBLE_M else "m"
+            if median > high or 0 < median < low:
                 raise RecordingError(
-                    f"the median {name} is {median:,.{0 if unit == 'mm' else 4}f} m",
+                    f"the median {name} is {median:,.{0 if median > high else 4}f} {unit}",
                     where=self.name,
-                    valid=f"the unit is probably {unit}: set unit: {unit}",
+                    valid=f"{low:g} to {high:g}; probably set unit: {other if median > high else unit}",
                 )
-        if (median := _median(self.values["first_path_index"])) > MAX_INDEX:
-            raise RecordingError(
-                f"the median first-path index is {median:,.0f}, above {MAX_INDEX}",
-                where=self.name,
-                valid="10.6 fixed-point numbers of the DW1000: set unit: '10.6'",
-            )
 
     def _warn(self) -> None:
         """Collect warnings of implausible values."""

@@ -7,7 +7,6 @@ The mappings in `uwb_mitigation/mappings` are found by their names. docs/guides/
 from __future__ import annotations
 
 import re
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -93,7 +92,11 @@ class Value(_Strict):
         if sum(map(bool, sources)) + (self.constant is not None) != 1:
             raise ValueError("give one of column, constant, sum, file_name, topic_name, rate_hz")
         for text in filter(None, (self.pattern, self.file_name, self.topic_name)):
-            if _compiled(text).groups < 1:
+            try:
+                groups = re.compile(text).groups
+            except re.error as error:
+                raise ValueError(f"not a regular expression: {text!r}: {error}") from error
+            if not groups:
                 raise ValueError(f"the pattern {text!r} has no group (...)")
         if self.unit == "iso8601" and self.scale != 1:
             raise ValueError("a date has no scale")
@@ -103,14 +106,6 @@ class Value(_Strict):
     def columns(self) -> tuple[str, ...]:
         """Return the columns that it reads."""
         return (*self.sum, *([self.column] if self.column and self.column != LIST_INDEX else ()))
-
-
-@cache
-def _compiled(pattern: str) -> re.Pattern[str]:
-    try:
-        return re.compile(pattern)
-    except re.error as error:
-        raise ValueError(f"not a regular expression: {pattern!r}: {error}") from error
 
 
 def _value(given: Any) -> Any:
@@ -321,7 +316,8 @@ class Mapping(Table):
         """Return everything that is in a row of the ranges, by the names of `conversion.Columns`."""
         truth, registers = self.truth, self.registers
         found: dict[str, Value | None] = dict(self.fields)
-        found |= {"true range": truth.range} | {name: getattr(truth, name) for name in _TRUTH}
+        found |= {"true range": truth.range, "error": truth.error}
+        found |= {"label": truth.label, "configuration": truth.configuration}
         if registers:
             found |= {"cir_power": registers.cir_power, "prf": registers.prf}
             found |= {f"amplitude {n}": value for n, value in enumerate(registers.amplitudes, 1)}
@@ -332,9 +328,6 @@ class Mapping(Table):
     def cir_columns(self) -> list[str]:
         """Return the columns of the ranges that contain the CIR."""
         return series(self.cir.column) if self.cir and not self.cir.files else []
-
-
-_TRUTH = ("error", "label", "configuration")
 
 
 def axes(name: str, point: Point | None) -> dict[str, Value | None]:

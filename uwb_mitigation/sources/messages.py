@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,13 +26,11 @@ class MessageRows:
 
     Args:
         table: the mapping.
-        columns: paths of fields, such as `header.stamp`, `nodes[].dis` or `cir`.
-        optional: columns that are left out if a message does not contain them.
+        columns: {path of a field, such as `nodes[].dis`: whether it is left out if a message does not contain it}.
     """
 
-    def __init__(self, table: Table, columns: Collection[str], optional: Collection[str] = ()) -> None:
-        self._table = table
-        self._optional = frozenset(optional)
+    def __init__(self, table: Table, columns: Mapping[str, bool]) -> None:
+        self._table, self._columns = table, columns
         self._paths = {
             column: [part for part in re.split(r"\.|(\[\])", column) if part]
             for column in columns
@@ -49,7 +47,7 @@ class MessageRows:
             message = self._parsed(_step(message, self._table.text_field, self._table.text_field))
         found = {}
         for column, path in self._paths.items():
-            with contextlib.suppress(*([RecordingError] if column in self._optional else [])):
+            with contextlib.suppress(*([RecordingError] if self._columns[column] else [])):
                 found[column] = _walk(message, path, column)
         many = [column for column in found if "[]" in self._paths[column]]
         count = min((len(found[column]) for column in many), default=1)

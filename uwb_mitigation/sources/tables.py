@@ -8,6 +8,7 @@ import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -123,37 +124,31 @@ _Choose = Callable[[Sequence[str]], dict[str, str]]
 """Returns {wanted column: column of the file}, from all columns of the file."""
 
 
-def read_chunks(
-    table: Table, path: Path, columns: Sequence[str], optional: Sequence[str] = ()
-) -> Iterator[Chunk]:
+def read_chunks(table: Table, path: Path, columns: Mapping[str, bool], before: int = 0) -> Iterator[Chunk]:
     """Yield the rows of a file, only the given columns and those of the rules to drop rows.
 
     Args:
         table: format of the file.
         path: the file.
-        columns: names of the columns; all must exist, except those in `optional`.
-        optional: columns that are left out if they are missing.
+        columns: {name: whether it is left out if it is missing}.
+        before: number of rows in the files before.
 
     Raises:
         RecordingError: the file cannot be read, or a column is missing; the message names similar columns.
         DamagedRecordingError: the file is truncated, after yielding the rows before.
     """
     kind = ("" if path.is_dir() else table.format) or _kind_of(path)
-    wanted = list(dict.fromkeys([*columns, *(rule.column for rule in table.drop)]))
+    wanted = {**columns, **{rule.column: False for rule in table.drop}}
     first = 0
-
-    def choose(known: Sequence[str]) -> dict[str, str]:
-        return _choose(known, wanted, optional, path)
-
     try:
         if kind == "messages":
-            rows = _messages(table, path, wanted, optional)
+            rows = _messages(table, path, wanted)
         elif kind in _READERS:
-            rows = _READERS[kind](table, path, choose)
+            rows = _READERS[kind](table, path, partial(_choose, wanted, path))
         else:
             raise RecordingError("unknown format", where=str(path), valid=f"format: {', '.join(_FORMATS)}")
         for found, count in rows:
-            yield Chunk(found, count, path, np.arange(first, first + count))
+            yield Chunk(found, count, path, np.arange(first, first + count), before)
             first += count
     except (EOFError, lzma.LZMAError, zlib.error) as error:
         raise DamagedRecordingError(
@@ -163,14 +158,12 @@ def read_chunks(
         raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
 
 
-def _choose(
-    known: Sequence[str], columns: Sequence[str], optional: Sequence[str], path: Path
-) -> dict[str, str]:
+def _choose(columns: Mapping[str, bool], path: Path, known: Sequence[str]) -> dict[str, str]:
     """Return the columns that exist, also with other case; raise RecordingError if a required one is missing."""
     folded = {name.strip().lower(): name for name in known}
     chosen = {name: name if name in known else folded.get(name.lower(), "") for name in columns}
     for name, found in chosen.items():
-        if not found and name not in known and name not in optional:
+        if not found and name not in known and not columns[name]:
             valid = f"columns: {', '.join(known[:40])}"
             if len(known) == 1 and (other := next((mark for mark in ";\t|," if mark in known[0]), "")):
                 valid = f"there is one column {known[0]!r:.60}; set separator: {other!r}"
@@ -313,12 +306,12 @@ _READERS = {"csv": _csv, "parquet": _parquet} | dict.fromkeys(("numpy", "matlab"
 _FORMATS = (*_READERS, "messages")
 
 
-def _messages(table: Table, path: Path, columns: Sequence[str], optional: Sequence[str]) -> _Rows:
+def _messages(table: Table, path: Path, columns: Mapping[str, bool]) -> _Rows:
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.serde import SerdeError
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-    reader = MessageRows(table, columns, optional)
+    reader = MessageRows(table, columns)
     store = get_typestore(Stores.ROS2_JAZZY)
     try:
         for name, text in table.definitions.items():
