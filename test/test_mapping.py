@@ -672,6 +672,13 @@ def test_a_date_without_value_is_unknown_with_any_offset(tmp_path: Path):
     assert source.dropped == {"stamp is not a number": 1}
 
 
+@pytest.mark.parametrize("files", ["/x.csv", "", {"((": "x.csv"}, "**x/\0"])
+def test_an_invalid_glob_is_a_typed_error(files: Any, tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r\n0,1,2\n")
+    with pytest.raises(RecordingError, match=r"files =|no file"):
+        read(PLAIN | {"files": files}, tmp_path)
+
+
 def test_all_files_do_not_contain_the_mapping(tmp_path: Path):
     write(tmp_path / "log.csv", "t,a,r\n0,1,2\n")
     write(tmp_path / "README.md", "t,a,r\n")

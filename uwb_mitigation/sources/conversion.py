@@ -51,32 +51,30 @@ def take(columns: Columns, rows: NDArray[Any]) -> Columns:
 
 def measurement(columns: Columns, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
     """Return one range with the samples of `cir` and its own levels; `sequence` is used if the columns have none."""
-    number = {name: columns[name][row] for name in _NUMBERS}
-    given = number["sequence"]
+
+    def number(name: str) -> float:
+        return float(columns[name][row])
+
+    given = number("sequence")
     return RangeMeasurement(
         int(columns["stamp"][row]),
         int(columns["tag"][row]),
         int(columns["anchor"][row]),
         (int(given) if math.isfinite(given) else sequence) & 0xFFFFFFFF,
         0,
-        float(number["range"]),
+        number("range"),
         Cir(
             cir.samples,
             cir.encoding,
             cir.start_index,
-            float(number["first_path_index"]),
+            number("first_path_index"),
             scale=cir.scale,
-            preamble_count=_whole(number["preamble_count"], 65535),
-            rx_power_dbm=float(number["rx_power"]),
-            first_path_power_dbm=float(number["first_path_power"]),
-            channel=_whole(number["channel"], 255),
+            preamble_count=_whole(number("preamble_count"), 65535),
+            rx_power_dbm=number("rx_power"),
+            first_path_power_dbm=number("first_path_power"),
+            channel=_whole(number("channel"), 255),
         ),
     )
-
-
-_NUMBERS = (
-    "range", "sequence", "rx_power", "first_path_power", "first_path_index", "preamble_count", "channel",
-)  # fmt: skip
 
 
 def _whole(value: float, most: int) -> int:
@@ -274,11 +272,7 @@ def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int6
 
 
 def _read_ids(value: Value, chunk: Chunk, name: str, file: str, names: dict[str, int]) -> NDArray[np.uint64]:
-    """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`.
-
-    Raises:
-        RecordingError: a value is not an id; `where` names its row.
-    """
+    """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`."""
     raw = _raw(value, chunk, file)
     if raw is None:
         raise RecordingError(f"no column {value.column} for the {name}", where=str(chunk.path))

@@ -146,15 +146,7 @@ class MappedRecording(Source):
         what: str = "",
         cir: CirSource | None = None,
     ) -> Columns:
-        """Read the rows of files that no rule drops.
-
-        Args:
-            table: format of the files, and rules.
-            paths: the files.
-            values: columns of the result; `cir`, `row` and `file` are added.
-            what: name of the rows for the counts.
-            cir: the CIRs of the rows.
-        """
+        """Return the rows of files that no rule drops: `values`, `cir`, `row`, `file`; `what` names them in counts."""
         medians = {f"{what}{rule}": rule for rule in table.drop if rule.from_median is not None}
         values = values | {name: Value(column=rule.column) for name, rule in medians.items()}
         converter, parts, before = Converter(values, self._names), [], 0
@@ -277,6 +269,8 @@ class MappedRecording(Source):
 
     def _add_poses(self, poses: Poses) -> None:
         """Interpolate the true positions of the antennas of all tags."""
+        from scipy.spatial.transform import Rotation
+
         values, files_by_poses = self.values, defaultdict[tuple[Path, ...], list[int]](list)
         for number, file in enumerate(self._files):
             files_by_poses[tuple(self._beside(poses, file))].append(number)
@@ -297,7 +291,7 @@ class MappedRecording(Source):
             for tag in np.unique(values["tag"][here]).tolist():
                 arm = poses.lever_arm
                 offset = np.array(arm.get(tag, (0.0, 0.0, 0.0)) if isinstance(arm, dict) else arm)
-                antenna = place[order] + (_turned(turn[order], offset) if turns else offset)
+                antenna = place[order] + (Rotation.from_quat(turn[order]).apply(offset) if turns else offset)
                 path = TruePath(found["stamp"][order], antenna)
                 self.truth = path if len(self.truth) == 0 else self.truth
                 rows = np.flatnonzero(here & (values["tag"] == tag))
@@ -372,10 +366,3 @@ def _median(numbers: NDArray[np.float64]) -> float:
 
 def _stacked(columns: Columns, names: Sequence[str]) -> NDArray[np.float64]:
     return np.stack([columns[name] for name in names], axis=1)
-
-
-def _turned(quaternions: NDArray[np.float64], arm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a lever arm in the frame of the poses, for each quaternion x, y, z, w."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_quat(quaternions).apply(arm))

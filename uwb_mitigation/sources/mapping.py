@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
+    WrapValidator,
     model_validator,
 )
 
@@ -108,26 +108,23 @@ class Value(_Strict):
         return (*self.sum, *([self.column] if self.column and self.column != LIST_INDEX else ()))
 
 
-def _value(given: Any) -> Any:
-    if isinstance(given, str):
-        return {"column": given}
-    return {"constant": given} if isinstance(given, int | float) else given
-
-
-def _with_unit(*units: str) -> AfterValidator:
-    def check(value: Value) -> Value:
+def _value(*units: str) -> WrapValidator:
+    def read(given: Any, validate: Any) -> Any:
+        if isinstance(given, str | int | float):
+            given = {"column" if isinstance(given, str) else "constant": given}
+        value = validate(given)
         if value.unit and value.unit not in units:
             raise ValueError(f"unit {value.unit!r}; valid: {', '.join(units) or 'none'}")
         return value
 
-    return AfterValidator(check)
+    return WrapValidator(read)
 
 
-Number = Annotated[Value, BeforeValidator(_value), _with_unit()]
-Time = Annotated[Value, BeforeValidator(_value), _with_unit(*TIME)]
-Length = Annotated[Value, BeforeValidator(_value), _with_unit("m", "cm", "mm")]
-Level = Annotated[Value, BeforeValidator(_value), _with_unit("dBm")]
-Index = Annotated[Value, BeforeValidator(_value), _with_unit("samples", "10.6")]
+Number = Annotated[Value, _value()]
+Time = Annotated[Value, _value(*TIME)]
+Length = Annotated[Value, _value("m", "cm", "mm")]
+Level = Annotated[Value, _value("dBm")]
+Index = Annotated[Value, _value("samples", "10.6")]
 Point = tuple[Length, Length, Length]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.bag.codec import decode_corrected, decode_range
+from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_range, measurement_key
 from uwb_mitigation.bag.pose_paths import read_truth
 from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.bag.topics import (
@@ -56,7 +56,6 @@ class RecordedRanges:
     skipped: Counter[str]
 
 
-_Key = tuple[int, int, int, int]
 _Row = tuple[int, int, float, float, float]
 _DTYPE = np.dtype([("s", "i8"), ("a", "i8"), ("r", "f8"), ("v", "f8"), ("p", "f8")])
 
@@ -75,13 +74,15 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
     bag, offset_ns = BagReader(path), round(stamp_offset_s * 1e9)
     raw, corrected = defaultdict[int, list[_Row]](list), defaultdict[int, list[_Row]](list)
     unknown_anchors, skipped, checked = Counter[int](), Counter[str](), set[int]()
-    powers: dict[_Key, float] = {}
+    powers: dict[MeasurementKey, float] = {}
 
-    def add(table: dict[int, list[_Row]], key: _Key, value: float, variance: float, power: float) -> bool:
-        row = anchors.index.get(key[2])
+    def add(
+        table: dict[int, list[_Row]], key: MeasurementKey, value: float, variance: float, power: float
+    ) -> bool:
+        row = anchors.index.get(key.anchor_id)
         if row is None or not (math.isfinite(value) and value >= 0.0) or variance == math.inf:
             return False
-        table[key[1]].append((key[0] + offset_ns, row, value, variance, power))
+        table[key.tag_id].append((key.stamp_ns + offset_ns, row, value, variance, power))
         return True
 
     for message in bag.messages((RANGE_RAW, RANGE_CORRECTED)):
@@ -92,12 +93,11 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
         try:
             if is_raw:
                 measured = decode_range(message.data)
-                key = (measured.stamp_ns, measured.tag_id, measured.anchor_id, measured.sequence)
+                key = measurement_key(measured)
                 powers[key] = measured.cir.rx_power_dbm
                 row = (measured.range_m, math.nan, powers[key])
             else:
-                key_fields, corrected_range = decode_corrected(message.data)
-                key = (key_fields.stamp_ns, key_fields.tag_id, key_fields.anchor_id, key_fields.sequence)
+                key, corrected_range = decode_corrected(message.data)
                 row = (corrected_range.range_m, corrected_range.variance_m2, powers.get(key, math.nan))
                 if key not in powers:
                     # A bag without raw ranges: corrected ranges contain the measured ones.
@@ -107,8 +107,8 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
             continue
         if not add(raw if is_raw else corrected, key, *row):
             is_new = is_raw or not raw
-            if key[2] not in anchors.index:
-                unknown_anchors[key[2]] += is_new
+            if key.anchor_id not in anchors.index:
+                unknown_anchors[key.anchor_id] += is_new
             else:
                 skipped["invalid range"] += is_new
     if not raw and not corrected:

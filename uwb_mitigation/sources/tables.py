@@ -102,15 +102,13 @@ def find_files(table: Table, root: Path, ranges: Path | None = None) -> list[Pat
     if root.is_file() or (root / "metadata.yaml").is_file():
         return [root]
     pattern = table.files
-    if isinstance(pattern, dict):
-        absolute = (ranges or root).resolve().as_posix()
-        pattern = next((glob for rule, glob in pattern.items() if re.search(rule, absolute)), "")
     try:
+        if isinstance(pattern, dict):
+            absolute = (ranges or root).resolve().as_posix()
+            pattern = next((glob for rule, glob in pattern.items() if re.search(rule, absolute)), "")
         found = sorted(path for path in root.glob(pattern) if path.is_file()) if pattern else []
-    except (ValueError, NotImplementedError, OSError) as error:
-        raise RecordingError(
-            f"files = {pattern!r}: {error}", where=str(root), valid="a relative glob"
-        ) from error
+    except (ValueError, NotImplementedError, OSError, re.error) as error:
+        raise RecordingError(f"files = {pattern!r}: {error}", where=str(root), valid="a glob") from error
     if pattern == "*":
         found = [path for path in found if (_kind_of(path) or table.format or "yaml") != "yaml"]
     if not found:
