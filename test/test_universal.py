@@ -35,6 +35,7 @@ def test_result_does_not_depend_on_the_number_of_workers(small: UniversalModel) 
 
 
 def test_evaluation_by_condition_uses_other_buildings(small: UniversalModel) -> None:
+    assert small.card.source == "DW1000 IPATOV"
     for row in ("raw", "float", "int8"):
         assert set(small.held_out[row]) == {"all", "LOS", "NLOS", "NDP NLOS"}
     assert small.held_out["raw"]["LOS"].mae < small.held_out["raw"]["NDP NLOS"].mae
@@ -43,12 +44,15 @@ def test_evaluation_by_condition_uses_other_buildings(small: UniversalModel) -> 
 def test_command_writes_both_bundles(tmp_path: Path) -> None:
     words = ["train-universal", "-o", str(tmp_path / "a.onnx"), "--float", str(tmp_path / "b.onnx")]
     words += ["--samples", "8", "--scaling", "max", "--blocks", "1", "--json", str(tmp_path / "a.json")]
+    words += ["--radio", "dw3000"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     made, floating = (load_bundle(tmp_path / name) for name in ("a.onnx", "b.onnx"))
     assert made.quantised
     assert not floating.quantised
     assert made.preprocessing.scaling is Scaling.MAX
+    assert made.card.source == "DW3000 STS"
+    assert "experimental, no real recording was available" in made.card.origin
     ood_bands = made.card.ood_bands
     assert ood_bands is not None
     assert not ood_bands.needs_levels
@@ -56,6 +60,9 @@ def test_command_writes_both_bundles(tmp_path: Path) -> None:
     result = json.loads((tmp_path / "a.json").read_text())
     assert result["model_id"] == made.model_id
     assert result["simulated"]
+    assert list(result["held_out"]) == ["raw", "constant", "line in levels", "float", "int8"]
+    mae_m = {row: by["all"]["mae"] for row, by in result["held_out"].items()}
+    assert mae_m["line in levels"] < mae_m["constant"] < mae_m["raw"]
 
 
 @pytest.mark.parametrize(
@@ -63,6 +70,7 @@ def test_command_writes_both_bundles(tmp_path: Path) -> None:
     [
         (["--samples", "2000"], "1016"),
         (["--scaling", "loud"], "preamble"),
+        (["--radio", "dw1001"], "dw1000"),
         (["--seed", "-1"], "seed"),
         (["--blocks", "0"], "blocks"),
         (["--workers", "0"], "workers"),

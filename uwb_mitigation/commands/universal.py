@@ -12,7 +12,7 @@ import typer
 from uwb_mitigation.commands import console, model_tables
 from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
 from uwb_mitigation.commands.console import JsonOption
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, check_name
 
 MAX_BLOCKS = 10_000
 
@@ -24,6 +24,7 @@ def train_universal(
     scaling: Annotated[
         str, typer.Option(help="preamble, or max for windows without preamble counts.")
     ] = "preamble",
+    radio: Annotated[str, typer.Option(help="dw1000, or dw3000 for windows of an STS.")] = "dw1000",
     blocks: Annotated[
         int | None, typer.Option(help="Number of blocks of 256 placements for training.")
     ] = None,
@@ -44,12 +45,18 @@ def train_universal(
         uwb-mitigation train-universal --seed 0 -o universal.onnx
 
         uwb-mitigation train-universal --seed 0 --scaling max -o universal_amplitude.onnx
+
+        uwb-mitigation train-universal --radio dw3000 --samples 13 --scaling max -o dw3000_sts.onnx
     """
     from uwb_mitigation.model import graph
     from uwb_mitigation.model.bundle import save_bundle
     from uwb_mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.sources.simulation.buildings import RADIO
+    from uwb_mitigation.sources.simulation.radio import DW3000_STS
 
     preprocessing = Preprocessing(samples, scaling_of(scaling))
+    radios = {"dw1000": RADIO, "dw3000": DW3000_STS}
+    check_name("radio", radio, radios)
     for name, value, low, high in (
         ("seed", seed, 0, 2**31),
         ("blocks", blocks, 1, MAX_BLOCKS),
@@ -62,7 +69,9 @@ def train_universal(
     with needs_torch():
         from uwb_mitigation.training import universal
 
-    plan = universal.TrainingPlan(seed=seed, samples=samples, scaling=preprocessing.scaling)
+    plan = universal.TrainingPlan(
+        seed=seed, samples=samples, scaling=preprocessing.scaling, radio=radios[radio]
+    )
     if blocks is not None:
         plan = replace(plan, blocks=blocks)
     with console.progress() as bar:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,7 @@ from uwb_mitigation.measurement import Encoding, RangeColumns
 from uwb_mitigation.preprocessing import Preprocessing
 from uwb_mitigation.sources.simulation.antenna_pairs import label
 from uwb_mitigation.sources.simulation.buildings import RADIO, block_of
-from uwb_mitigation.sources.simulation.radio import Reception
+from uwb_mitigation.sources.simulation.radio import Radio, Reception
 
 
 def building_dataset(
@@ -25,25 +26,26 @@ def building_dataset(
     on_block: Callable[[], None] = lambda: None,
     *,
     wide: bool = False,
+    radio: Radio = RADIO,
 ) -> Dataset:
     """Return one range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
 
     Ranges that are not received, or whose window is not usable, are omitted. The result does not depend on the number
-    of `workers` (processes); `on_block` is called after each block. `wide`: see `block_of`.
+    of `workers` (processes); `on_block` is called after each block. `wide`, `radio`: see `block_of`.
     """
-    simulate = partial(_block, seed, preprocessing, wide)
+    simulate = partial(_block, seed, preprocessing, wide, radio)
     parts = []
     # Do not fork: the caller may run threads (torch, a progress bar).
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
         for part in pool.imap(simulate, range(blocks)):
             parts.append(part)
             on_block()
-    return Dataset.joined(parts)
+    return replace(Dataset.joined(parts), radios=(radio.kind,), segments=(radio.segment,))
 
 
-def _block(seed: int, preprocessing: Preprocessing, wide: bool, number: int) -> Dataset:
-    block, rng = block_of(seed, number, wide=wide)
-    reception = RADIO.receive(block.pairs.multipath(rng), rng, block.boards)
+def _block(seed: int, preprocessing: Preprocessing, wide: bool, radio: Radio, number: int) -> Dataset:
+    block, rng = block_of(seed, number, wide=wide, radio=radio)
+    reception = radio.receive(block.pairs.multipath(rng), rng, block.boards)
     distance = block.pairs.distance_m
     received = np.flatnonzero(np.isfinite(reception.first_path_index))
     faults, inputs = preprocessing.apply(_columns(reception, distance, received))

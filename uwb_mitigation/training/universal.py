@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.evaluation.dataset import Dataset
+from uwb_mitigation.evaluation.linear_fit import fit_linear_bias_to_rows
 from uwb_mitigation.evaluation.metrics import ErrorStatistics
 from uwb_mitigation.model import floating
 from uwb_mitigation.model.architecture import Remnet
@@ -21,7 +22,8 @@ from uwb_mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.sources.simulation.buildings import PLACEMENTS
+from uwb_mitigation.sources.simulation.buildings import PLACEMENTS, RADIO
+from uwb_mitigation.sources.simulation.radio import Radio
 from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary_channel, vary_receiver
 from uwb_mitigation.training.cards import card_of, ood_bands_of
 from uwb_mitigation.training.fitting import fit
@@ -48,6 +50,7 @@ class TrainingPlan:
         scaling: preamble, or max for windows without preamble counts.
         blocks, held_out_blocks: number of blocks of 256 placements for training and for evaluation.
         fit: training options; the seed is that of the plan.
+        radio: type of the radios.
     """
 
     seed: int = 0
@@ -56,6 +59,7 @@ class TrainingPlan:
     blocks: int = 200
     held_out_blocks: int = 40
     fit: FitOptions = RECIPE
+    radio: Radio = RADIO
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +69,8 @@ class UniversalModel:
     Attributes:
         card: card of the float network; for int8 only `quantised` differs.
         network, integers: float and int8.
-        held_out: {row: {label: statistics}} of `raw`, `float` and `int8` in the held-out simulated buildings.
+        held_out: {row: {label: statistics}} in the held-out simulated buildings: `raw`; two baselines that are fitted to
+            the training data, `constant` and `line in levels`; `float` and `int8`.
     """
 
     card: Card
@@ -89,7 +94,13 @@ def train(
     # With levels, other receivers and sites are detected as out of distribution. Without, train on them.
     has_levels = plan.scaling is Scaling.PREAMBLE
     train_data = building_dataset(
-        plan.seed, plan.blocks, level_preprocessing, workers, count_block, wide=not has_levels
+        plan.seed,
+        plan.blocks,
+        level_preprocessing,
+        workers,
+        count_block,
+        wide=not has_levels,
+        radio=plan.radio,
     )
     held_out = building_dataset(
         plan.seed + HELD_OUT_SEED,
@@ -98,6 +109,7 @@ def train(
         workers,
         count_block,
         wide=not has_levels,
+        radio=plan.radio,
     )
     count_epoch = step_counter(plan.fit.epochs, lambda share: on_share(0.2 + 0.75 * share, "training"))
     options = replace(plan.fit, seed=plan.seed)
@@ -114,16 +126,29 @@ def train(
     subset = train_data.inputs[:: max(1, len(train_data) // CALIBRATION_INPUTS)]
     integers = quantize(network, calibration_inputs(subset, plan.scaling))
     on_share(1.0, "evaluating")
-    return _evaluate(plan, name, network, integers, held_out)
+    return _evaluate(plan, name, network, integers, train_data, held_out)
 
 
 def _evaluate(
-    plan: TrainingPlan, name: str, network: FloatWeights, integers: Int8Weights, test: Dataset
+    plan: TrainingPlan,
+    name: str,
+    network: FloatWeights,
+    integers: Int8Weights,
+    train_data: Dataset,
+    test: Dataset,
 ) -> UniversalModel:
     """Return intervals, limits and in-distribution bands from the held-out buildings `test`."""
     error = test.error_m
+    line = fit_linear_bias_to_rows(
+        train_data.rx_power_dbm,
+        train_data.first_path_power_dbm,
+        train_data.error_m,
+        train_data.labels == "LOS",
+    )
     errors = {
         "raw": error,
+        "constant": error - np.median(train_data.error_m),
+        "line in levels": error - line.predict_m(test.rx_power_dbm, test.first_path_power_dbm),
         "float": error - floating.predict_m(network, test.inputs).astype(float),
         "int8": error - IntegerNetwork(integers).predict_m(test.inputs).astype(float),
     }
@@ -134,6 +159,9 @@ def _evaluate(
         row: {label: ErrorStatistics.of(values[rows]) for label, rows in conditions.items()}
         for row, values in errors.items()
     }
+    evidence = "no radio was involved"
+    if plan.radio is not RADIO:
+        evidence = "experimental, no real recording was available"
     balanced = _balanced_rows(test.labels)
     card = card_of(
         name,
@@ -143,15 +171,15 @@ def _evaluate(
         test.rows(balanced),
         errors["float"][balanced],
         {
-            "data": f"simulated buildings, seed {plan.seed}: no radio was involved",
-            "boards": "simulated DW1000s whose powers, antennas and preambles differ; no site",
+            "data": f"simulated buildings, seed {plan.seed}: {evidence}",
+            "boards": f"simulated {plan.radio.kind.name}s whose powers, antennas and preambles differ; no site",
             "placements": plan.blocks * PLACEMENTS,
             "split": f"graded in simulated buildings, seed {plan.seed + HELD_OUT_SEED}",
             "seed": plan.seed,
             "recipe": asdict(replace(plan.fit, seed=plan.seed)),
             "metrics_m": {
-                row: {key: round(value, 4) for key, value in asdict(by_label["all"]).items()}
-                for row, by_label in statistics.items()
+                row: {key: round(value, 4) for key, value in asdict(statistics[row]["all"]).items()}
+                for row in ("raw", "float", "int8")
             },
         },
         # The correction shrinks to zero out of distribution, because an offset depends on the radio, not on the channel.

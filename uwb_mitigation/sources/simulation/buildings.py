@@ -114,10 +114,6 @@ TILTED_SHARE, TILTED_LOSS_DB = 0.3, (2.0, 6.0)
 number of dB, with a mean between these bounds; reflections do not."""
 
 NOISE_FIGURE_DB, WIDE_NOISE_FIGURE_DB = (8.0, 12.0), (7.0, 14.0)
-PREAMBLES = (128, 256, 512, 1024)
-DETECTION_SYMBOLS = 24
-"""Symbols used for preamble detection, which are not accumulated (the logs: 1000 of 1024 are)."""
-
 DETOUR_M = 4.0
 MAX_DELAY_FACTOR = 3.0
 """Behind obstacles, the delay of the first cluster is proportional to the distance, because detours scale with it. It
@@ -204,13 +200,13 @@ def _screen(name: str, length_m: float, size: tuple[float, float], rng: np.rando
     return Screen(name, (x - half[0], y - half[1]), (x + half[0], y + half[1]))
 
 
-def draw_boards(n: int, rng: np.random.Generator, *, wide: bool = False) -> Boards:
-    """Draw n pairs of boards: transmit power and antennas, noise, preamble length."""
+def draw_boards(n: int, rng: np.random.Generator, *, wide: bool = False, radio: Radio = RADIO) -> Boards:
+    """Draw n pairs of boards: transmit power and antennas, noise, number of accumulated symbols."""
     gain_db = WIDE_GAIN_DB if wide and rng.random() < WIDE_GAIN_SHARE else GAIN_DB
     return Boards(
         rng.uniform(*gain_db, n),
         rng.uniform(*(WIDE_NOISE_FIGURE_DB if wide else NOISE_FIGURE_DB), n),
-        rng.choice(np.array(PREAMBLES, np.float64), n) - DETECTION_SYMBOLS,
+        rng.choice(np.array(radio.symbol_counts, np.float64), n),
     )
 
 
@@ -229,7 +225,9 @@ class Block:
         return f"simulated buildings seed {seed}/{self.kind} {building}/placement {number * PLACEMENTS + placement}"
 
 
-def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.random.Generator]:
+def block_of(
+    seed: int, number: int, *, wide: bool = False, radio: Radio = RADIO
+) -> tuple[Block, np.random.Generator]:
     """Draw a block of `PLACEMENTS` placements in one type of building; also return the generator for fading and noise.
 
     About a third of the placements each is in line of sight, behind obstacles, and behind obstacles with a lost direct path.
@@ -240,6 +238,7 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
         seed: seed of all blocks.
         number: number of the block, from 0.
         wide: also open sites, tilted antennas, and wider gains and noise figures.
+        radio: type of all radios.
     """
     rng = np.random.default_rng([seed, number])
     kinds = WIDE_KINDS if wide else KINDS
@@ -253,11 +252,11 @@ def block_of(seed: int, number: int, *, wide: bool = False) -> tuple[Block, np.r
         [plan.direct_path(anchor, tag) for plan, (anchor, tag) in zip(plans, places, strict=True)]
     )
     anchor, tag = (np.concatenate(ends) for ends in zip(*places, strict=True))
-    boards = draw_boards(len(anchor), rng, wide=wide)
+    boards = draw_boards(len(anchor), rng, wide=wide, radio=radio)
     if wide and rng.random() < TILTED_SHARE:
         loss_db = rng.exponential(rng.uniform(*TILTED_LOSS_DB), len(anchor))
         path = replace(path, loss_db=path.loss_db + loss_db)
-    chosen = _balanced(_conditions(environments, anchor, tag, path, boards), PLACEMENTS, rng)
+    chosen = _balanced(_conditions(environments, anchor, tag, path, boards, radio), PLACEMENTS, rng)
     anchor, tag = anchor[chosen], tag[chosen]
     delay_factor = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, MAX_DELAY_FACTOR)
     fields = draw_fields(environments, PLACEMENTS, rng, delay_factor)
@@ -282,13 +281,14 @@ def _conditions(
     tag: NDArray[np.float64],
     path: DirectPath,
     boards: Boards,
+    radio: Radio,
 ) -> NDArray[np.int64]:
     """Predict the condition of each candidate from mean levels."""
     direct, diffuse = _mean_powers_db(environments, anchor, tag, path)
-    is_detected = RADIO.direct_margin_db(direct, diffuse, boards) > 0
+    is_detected = radio.direct_margin_db(direct, diffuse, boards) > 0
     condition = np.where(path.crossings == 0, LOS, np.where(is_detected, NLOS, NDP_NLOS))
-    level = mean_level_dbm(environments, anchor, tag, path, boards)
-    condition[level < RADIO.sensitivities_dbm(boards)] = WEAK
+    level = mean_level_dbm(environments, anchor, tag, path, boards, radio)
+    condition[level < radio.sensitivities_dbm(boards)] = WEAK
     return condition
 
 
@@ -298,11 +298,12 @@ def mean_level_dbm(
     tag: NDArray[np.float64],
     path: DirectPath,
     boards: Boards,
+    radio: Radio = RADIO,
 ) -> NDArray[np.float64]:
     """Return the mean receive level, dBm (n,), of pairs between antennas at float64 (n, 2) in m with obstacles `path`."""
     powers = _mean_powers_db(environments, anchor, tag, path)
     level: NDArray[np.float64] = (
-        RADIO.tx_power_dbm
+        radio.tx_power_dbm
         + boards.gain_db
         + 10.0 * np.log10(10.0 ** (powers[0] / 10.0) + 10.0 ** (powers[1] / 10.0))
     )

@@ -2,7 +2,7 @@
 
 Channel 2, PRF 64 MHz. The range error is not drawn from a distribution: it is the difference between the first path of
 the leading-edge detector and the straight-line path. docs/background/how_it_works.md describes the parameters that
-were fitted to the EVK1000 logs, and the quality of the fit.
+were fitted to the EVK1000 logs, and the quality of the fit. `DW3000_STS` is a variant with assumed parameters.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.measurement import SAMPLE_PERIOD_S
+from uwb_mitigation.measurement import SAMPLE_PERIOD_S, RadioType, Segment
 from uwb_mitigation.sources.simulation.channel import SPEED_OF_LIGHT_M_PER_NS, Multipath, check_range
 
 TAPS = 1016
@@ -39,6 +39,13 @@ RAYLEIGH_VARIANCE = 1.0 - math.pi / 4.0
 NOISE_TAPS = slice(64, 576)
 FIRST_SEARCHED_TAP = 640
 """The noise is measured well before the earliest first path; the search begins after this region."""
+
+PULSE_SPACING_TAPS = 16
+"""Spacing of the pulses of an STS: one in 8 chips (IEEE 802.15.4z, BPRF)."""
+
+SIDE_LOBE_SIGMAS = 5.0
+"""Minimum of the detection threshold in standard deviations of the side lobes of the strongest tap. An assumption: with
+a threshold that only follows the noise, 0.3 % of simulated LOS frames are detected at a side lobe."""
 
 _SPAN = 8
 _PHASES = 64
@@ -145,6 +152,11 @@ class Radio:
         noise_multiplier: NTM of LDE_CFG1, the factor from the noise's standard deviation to the threshold.
         range_offset_m: mean error of uncalibrated antenna delays, from the logs.
         timestamp_std_m: standard deviation of ranges without changes of the channel.
+        symbol_counts: numbers of accumulated symbols of different boards; a preamble less 24 symbols for its detection
+            (the logs: 1000 of 1024 are accumulated).
+        pulses_per_symbol: pulses of a pseudo-random sequence, whose correlation has side lobes at multiples of
+            `PULSE_SPACING_TAPS`; 0: a preamble, whose periodic correlation is perfect.
+        kind, segment: source of the CIRs.
 
     Raises:
         ParameterError: a value is not finite or is out of its range.
@@ -160,6 +172,10 @@ class Radio:
     noise_multiplier: float = 13.0
     range_offset_m: float = 0.22
     timestamp_std_m: float = 0.02
+    symbol_counts: tuple[int, ...] = (104, 232, 488, 1000)
+    pulses_per_symbol: int = 0
+    kind: RadioType = RadioType.DW1000
+    segment: Segment = Segment.IPATOV
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
@@ -218,11 +234,15 @@ class Radio:
         direct, diffuse = (10.0 ** ((sent + power) / 10.0) for power in (direct_db, diffuse_db))
         power = direct + diffuse
         # The strongest of the other paths has about a tenth of their power.
-        peak = PULSE_PEAK * np.sqrt(np.maximum(direct, 0.1 * diffuse)) * self.compression(power)
+        strongest = np.maximum(direct, 0.1 * diffuse)
+        peak = PULSE_PEAK * np.sqrt(strongest) * self.compression(power)
         count = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
         thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
         noise = thermal / np.maximum(count, 1.0) + power * 10.0 ** (self.self_noise_db / 10.0)
         threshold = self.noise_multiplier**2 * RAYLEIGH_VARIANCE * noise
+        if self.pulses_per_symbol:
+            side_lobes = PULSE_PEAK**2 * strongest / (self.pulses_per_symbol * np.maximum(count, 1.0))
+            threshold = np.maximum(threshold, SIDE_LOBE_SIGMAS**2 * side_lobes)
         margin: NDArray[np.float64] = 10.0 * np.log10(PULSE_PEAK**2 * direct / threshold)
         return margin
 
@@ -253,6 +273,8 @@ class Radio:
         count = np.maximum(max_count, 1.0).astype(np.int64)
 
         thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
+        if self.pulses_per_symbol:
+            symbol += _side_lobes(symbol, self.pulses_per_symbol * count, rng)
         # Over the symbols, thermal noise adds up in power, the residue of the preamble in amplitude.
         noise = thermal * count * gain * gain + power * count**2.0 * 10.0 ** (self.self_noise_db / 10.0)
         accumulator = rng.standard_normal(components.shape, dtype=np.float32)
@@ -275,6 +297,9 @@ class Radio:
         taps = quantised.view(np.complex64)
         magnitude = np.abs(taps)
         threshold = noise_threshold(magnitude, self.noise_multiplier)
+        if self.pulses_per_symbol:
+            side_lobe = magnitude.max(axis=1) / np.sqrt(self.pulses_per_symbol * count)
+            threshold = np.maximum(threshold, np.rint(SIDE_LOBE_SIGMAS * side_lobe).astype(np.int64))
         index = np.where(above_sensitivity, detect_first_path(taps, magnitude, threshold), np.nan)
         rx_power, first_path_power = power_levels(magnitude, index, count)
         error = (index + EDGE_LEAD_TAPS - place) * TAP_NS * SPEED_OF_LIGHT_M_PER_NS
@@ -282,6 +307,33 @@ class Radio:
         return Reception(
             samples, index, count, threshold, rx_power, first_path_power, direct >= threshold, error
         )
+
+
+DW3000_STS = Radio(
+    tx_power_dbm=-19.3,
+    self_noise_db=-60.0,
+    sensitivity_dbm=-94.0,
+    preamble_symbols=64,
+    range_offset_m=0.0,
+    symbol_counts=(32, 64, 128),
+    pulses_per_symbol=64,
+    kind=RadioType.DW3000,
+    segment=Segment.STS,
+)
+"""STS of a DW3000. Assumed: 5 dB more path loss than on channel 2, and pulse, noise figure, compression and first-path
+detector of the DW1000. No real recording was available (models/dw3000_sts.md)."""
+
+
+def _side_lobes(
+    symbol: NDArray[np.complex64], pulses: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.complex64]:
+    """Return the side lobes of the correlation of random sequences of `pulses` (n,) with a channel (n, TAPS)."""
+    lobes = np.arange(PULSE_SPACING_TAPS, TAPS // 2, PULSE_SPACING_TAPS)
+    kernel = np.zeros(symbol.shape, np.float32)
+    # Each lobe is the mean of products of random signs; an autocorrelation is symmetric.
+    kernel[:, lobes] = rng.standard_normal((len(symbol), len(lobes))) / np.sqrt(pulses)[:, None]
+    kernel[:, -lobes] = kernel[:, lobes]
+    return np.fft.ifft(np.fft.fft(symbol) * np.fft.fft(kernel)).astype(np.complex64)
 
 
 def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) -> NDArray[np.complex64]:
