@@ -180,6 +180,7 @@ def test_weights_read_back_from_either_graph():
         default_model_path(),
         shipped_model_path("evk1000_apartment"),
         default_model_path(Scaling.MAX),
+        shipped_model_path("dw3000_sts"),
     ],
     ids=lambda path: path.stem,
 )

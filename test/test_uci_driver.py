@@ -14,6 +14,8 @@ from uwb_mitigation_msgs.msg import Cir, RangeCir, RangeCorrected
 from benchmarks.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.link.layout import Role
+from uwb_mitigation.model.bundle import load_bundle
+from uwb_mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.nodes.parameter_tables import DRIVER
 from uwb_mitigation.nodes.uci_feed import uci_settings
 
@@ -49,6 +51,13 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert {m.status for m in corrected} == {RangeCorrected.OUT_OF_DISTRIBUTION}
     assert all(m.range == pytest.approx(m.range_raw - 0.5) for m in corrected)
     assert {(m.cir.radio, m.cir.segment) for m in raw} == {(Cir.DW3000, Cir.STS)}
+
+    assert ros.set_parameter("mitigator", "model", "dw3000_sts").successful
+    experimental = load_bundle(shipped_model_path("dw3000_sts")).model_id
+    ros.spin_until(lambda: sum(m.model_id == experimental for m in corrected) > 20)
+    named = [m for m in corrected if m.model_id == experimental]
+    assert {m.status for m in named} == {RangeCorrected.OK}
+    assert all(0 < abs(m.range - (m.range_raw - 0.5)) < 0.1 for m in named)
 
     boards.unplug(1)
     ros.diagnosis("driver", lambda status: "uci1" in status.message)

@@ -13,7 +13,7 @@ import typer
 
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption, Table, print_line
-from uwb_mitigation.errors import ParameterError, check_name, parse_id
+from uwb_mitigation.errors import ModelError, ParameterError, check_name, parse_id
 from uwb_mitigation.files import write_atomically
 
 if TYPE_CHECKING:
@@ -261,10 +261,14 @@ def export_c(
     It contains weights, constants and golden vectors.
     """
     from uwb_mitigation.firmware_export.export import GOLDEN_VECTORS, export_bundle
+    from uwb_mitigation.measurement import RadioType
     from uwb_mitigation.model.bundle import load_bundle
     from uwb_mitigation.model.shipped import model_path
 
     bundle = load_bundle(model_path(model))
+    if RadioType.DW1000 not in bundle.card.radios:
+        trained_for = f"the firmware drives a DW1000, and the model was trained for {bundle.card.source}"
+        raise ModelError(trained_for, where=str(bundle.path), valid="a model for the DW1000")
     header = export_bundle(bundle, output)
     result = {
         "header": str(header),

@@ -13,8 +13,11 @@ if TYPE_CHECKING:
     # `doctor` must work without NumPy.
     from uwb_mitigation.preprocessing import Scaling
 
-DEFAULT, AMPLITUDE, SITE = SHIPPED = ("universal", "universal_amplitude", "evk1000_apartment")
-"""Models for unknown sites and boards, with and without preamble counts, and an example of a surveyed site."""
+DEFAULT, AMPLITUDE = "universal", "universal_amplitude"
+"""Models for unknown sites and boards, with and without preamble counts."""
+
+SHIPPED = (DEFAULT, AMPLITUDE, "evk1000_apartment", "dw3000_sts")
+"""All models; an example of a surveyed site and an experimental one for the DW3000 are used only if they are named."""
 
 _SHARE = Path("share", "uwb_mitigation")
 

@@ -180,7 +180,7 @@ DRIVER = (
 
 MITIGATOR = (
     Parameter("model", "", "Model bundle to correct with: a file, or the name of a shipped one (universal, universal_amplitude, "
-              "evk1000_apartment); empty: universal. An invalid bundle is refused, and the previous one "
+              "evk1000_apartment, dw3000_sts); empty: universal. An invalid bundle is refused, and the previous one "
               "stays in use.", live=True),
     Parameter("offsets", "", "Offset of ranges due to antenna delays, subtracted before the model: a number in "
               "metres, or a file by anchor, tag or pair (docs/guides/calibration.md); empty: 0. Invalid "

@@ -1,0 +1,111 @@
+"""The experimental model for STS windows of a DW3000: simulated receiver, window lengths, and never chosen by default."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_material import measurement
+from typer.testing import CliRunner
+
+from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.commands.bundles import bundle_for
+from uwb_mitigation.commands.cli import app
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status
+from uwb_mitigation.mitigation import Mitigation
+from uwb_mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.sources.simulation.buildings import block_of
+from uwb_mitigation.sources.simulation.channel import Multipath
+from uwb_mitigation.sources.simulation.radio import DW3000_STS, PULSE_SPACING_TAPS, TAPS
+
+UNUSED_SEED = 424_242
+STS = {"radio": RadioType.DW3000, "segment": Segment.STS}
+
+
+@pytest.fixture(scope="module")
+def sts() -> Bundle:
+    return load_bundle(shipped_model_path("dw3000_sts"))
+
+
+@pytest.fixture(scope="module")
+def received() -> tuple[list[RangeMeasurement], np.ndarray]:
+    """Ranges with the whole CIR, and their errors, in buildings that were not used for the training or its evaluation."""
+    ranges, errors = [], []
+    for number in range(3):
+        block, rng = block_of(UNUSED_SEED, number, wide=True, radio=DW3000_STS)
+        reception = DW3000_STS.receive(block.pairs.multipath(rng), rng, block.boards)
+        for row in np.flatnonzero(np.isfinite(reception.first_path_index)):
+            cir = Cir(reception.samples[row], first_path_index=float(reception.first_path_index[row]), **STS)
+            range_m = float(block.pairs.distance_m[row] + reception.error_m[row])
+            ranges.append(RangeMeasurement(0, 1, 2, 0, 0, range_m, cir))
+            errors.append(reception.error_m[row])
+    return ranges, np.array(errors)
+
+
+def windows(ranges: list[RangeMeasurement], taps: int, lead: int = 5) -> list[RangeMeasurement]:
+    """Return the ranges with windows as a UCI board delivers them."""
+    cut = []
+    for each in ranges:
+        start = int(each.cir.first_path_index) - lead
+        samples = each.cir.samples[2 * start : 2 * (start + taps)]
+        cut.append(replace(each, cir=replace(each.cir, samples=samples, start_index=start)))
+    return cut
+
+
+def test_windows_of_all_lengths_get_the_same_useful_correction(sts, received) -> None:
+    ranges, error_m = received
+    reference = Mitigation(sts).correct(windows(ranges, 157))
+    for taps, lead in ((16, 5), (32, 5), (64, 5), (16, 8)):
+        assert Mitigation(sts).correct(windows(ranges, taps, lead)) == reference
+    residual_m = error_m - [each.correction_m for each in reference]
+    assert np.mean([each.status is Status.OK for each in reference]) > 0.95
+    assert np.abs(residual_m).mean() < 0.85 * np.abs(error_m - np.median(error_m)).mean()
+
+
+def test_short_windows_and_other_sources_pass_through(sts, received) -> None:
+    few = received[0][:5]
+    other = [
+        measurement(),
+        measurement(radio=RadioType.DW3000, segment=Segment.IPATOV),
+        measurement(radio=RadioType.QM35, segment=Segment.STS),
+    ]
+    for expected, ranges in ((Status.BAD_CIR, windows(few, 12)), (Status.OUT_OF_DISTRIBUTION, other)):
+        results = Mitigation(sts).correct(ranges)
+        assert {each.status for each in results} == {expected}
+        assert all(each.range_m == each.range_raw_m for each in results)
+
+
+def test_it_is_used_only_if_it_is_named(sts, received, tmp_path: Path) -> None:
+    ranges = windows(received[0][:5], 16)
+    recording = tmp_path / "sts.mcap"
+    with BagWriter(recording, {"source": "a test", "simulated": "true"}) as bag:
+        for each in ranges:
+            bag.write(Record(each))
+    chosen = [load_bundle(default_model_path(scaling)) for scaling in (None, *Scaling)]
+    for bundle in (*chosen, bundle_for(None, recording)):
+        assert bundle.model_id != sts.model_id
+        assert {each.status for each in Mitigation(bundle).correct(ranges)} == {Status.OUT_OF_DISTRIBUTION}
+    assert "experimental, no real recording was available" in sts.card.origin
+    assert sts.card.source == "DW3000 STS"
+
+
+def test_firmware_of_a_dw1000_gets_no_model_for_a_dw3000(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["board", "export-c", "--model", "dw3000_sts", "-o", str(tmp_path / "c")])
+    assert isinstance(done.exception, ModelError)
+    assert "DW3000 STS" in str(done.exception)
+
+
+def test_side_lobes_of_the_sts_are_at_multiples_of_the_pulse_spacing() -> None:
+    one_path = Multipath(np.zeros((400, 1)), np.full((400, 1), 1e-3 + 0j))
+    reception = DW3000_STS.receive(one_path, np.random.default_rng(1))
+    power = (reception.samples.astype(float).reshape(400, TAPS, 2) ** 2).sum(axis=2)
+    rows, peaks = np.arange(400), power.argmax(axis=1)
+    at_lobe, between = (power[rows, peaks - PULSE_SPACING_TAPS // part].mean() for part in (1, 2))
+    # 64 symbols of 64 pulses: the lobes are 1/4096 of the peak.
+    assert 10 * np.log10(at_lobe / power[rows, peaks].mean()) == pytest.approx(-36.1, abs=1.0)
+    assert between < 0.3 * at_lobe
