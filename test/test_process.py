@@ -26,11 +26,7 @@ from uwb_mitigation.bag.reader import BagReader
 from uwb_mitigation.bag.topics import RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import (
-    RangeMeasurement,
-    Record,
-    Truth,
-)
+from uwb_mitigation.measurement import RadioType, RangeMeasurement, Record, Segment, Truth
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import shipped_model_path
@@ -216,6 +212,20 @@ def test_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     assert result["ranges_per_s"] > 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.mcap", "out.json", "out.mcap"]
     assert corrected_of(tmp_path / "out.mcap") == one_by_one(exchanges(40))
+
+
+def test_ranges_of_a_radio_without_model_are_counted_with_their_reason(tmp_path: Path) -> None:
+    other = {"radio": RadioType.DW3000, "segment": Segment.STS}
+    measured = [replace(each, cir=replace(each.cir, **other)) for each in exchanges(12)]
+    write_bag(tmp_path / "in.mcap", [*exchanges(3), *measured])
+    words = "process in.mcap -o out.mcap --model evk1000_apartment --json out.json"
+    done = run(*words.split(), folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    text = " ".join(done.stderr.split())
+    assert "12 ranges are not corrected: their CIRs are of DW3000 STS" in text
+    assert "trained for DW1000 IPATOV" in text
+    (counts,) = [bag["mismatches"] for bag in json.loads((tmp_path / "out.json").read_text())["bags"]]
+    assert list(counts.values()) == [12]
 
 
 def test_offsets_of_a_file_are_subtracted_for_each_pair(tmp_path: Path) -> None:

@@ -134,6 +134,7 @@ def _bag(outcome: Outcome) -> dict[str, Any]:
         **counts,
         "statuses": dict(outcome.statuses),
         "skipped": dict(outcome.skipped),
+        "mismatches": dict(outcome.mismatches),
         "error": str(outcome.error) if outcome.error else None,
     }
 
@@ -155,11 +156,9 @@ def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
     console.out.print(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s", highlight=False)
     for outcome in outcomes:
         for kind, count in outcome.skipped.items():
-            _note(outcome.job.source, f"{count} x {kind}")
-
-
-def _note(path: Path, text: str) -> None:
-    console.warn(f"{path}: {text}")
+            console.warn(f"{outcome.job.source}: {count} x {kind}")
+        for reason, count in outcome.mismatches.items():
+            console.warn(f"{outcome.job.source}: {count} ranges are not corrected: {reason}")
 
 
 def _raise_failures(outcomes: list[Outcome]) -> None:

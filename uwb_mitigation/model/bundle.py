@@ -89,6 +89,10 @@ class Card:
         """Radios and segments of the training data, human-readable."""
         return " ".join("/".join(each.name for each in names) for names in (self.radios, self.segments))
 
+    def mismatch(self, other: str) -> str:
+        """Return why ranges with CIRs of another radio and segment are not corrected."""
+        return f"their CIRs are of {other}, and model {self.name} was trained for {self.source}; only offsets are subtracted"
+
     @property
     def origin(self) -> str:
         """Boards and site of the training data, human-readable."""

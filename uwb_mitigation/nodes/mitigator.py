@@ -166,11 +166,8 @@ class Mitigator(ManagedNode):
         entries |= self._meter.entries()
         other, self.health.other_source = self.health.other_source, ""
         if other and (mitigation := self._mitigation) is not None and not failed:
-            card = mitigation.bundle.card
-            level, text = diagnostics.WARN, (
-                f"ranges are not corrected: their CIRs are of {other}, and model {card.name} was trained for "
-                f"{card.source}; only offsets are subtracted"
-            )  # fmt: skip
+            reason = mitigation.bundle.card.mismatch(other)
+            level, text = diagnostics.WARN, f"ranges are not corrected: {reason}"
         if (mitigation := self._mitigation) is not None:
             entries |= {
                 "model": mitigation.bundle.name,

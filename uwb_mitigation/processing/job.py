@@ -66,6 +66,7 @@ class Outcome:
         statuses: corrected ranges by status, {name: count}.
         replaced: corrected ranges of the input, which are not copied.
         skipped: warnings, {kind: count}.
+        mismatches: why ranges were passed through for their radio or segment, {reason: count}.
         seconds: wall time of reading, correcting and writing.
         error: why the output is missing or (damaged input) incomplete; None = success.
         written: whether there is an output.
@@ -77,6 +78,7 @@ class Outcome:
     statuses: Counter[str] = field(default_factory=Counter)
     replaced: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
+    mismatches: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
     error: UwbMitigationError | None = None
     written: bool = False
@@ -153,6 +155,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         statuses=corrector.statuses,
         replaced=corrector.replaced,
         skipped=corrector.skipped + bag.warnings,
+        mismatches=corrector.mismatches,
         seconds=seconds,
         error=damage,
         written=True,
@@ -171,6 +174,7 @@ class _Corrector:
         self._corrected = out.corrected_channel()
         self.statuses: Counter[str] = Counter()
         self.skipped: Counter[str] = Counter()
+        self.mismatches: Counter[str] = Counter()
         self.replaced = 0
 
     def write(self, batch: list[RawMessage]) -> None:
@@ -204,8 +208,12 @@ class _Corrector:
                 decoded[number] = decode_range(message)
             except RecordingError as error:  # noqa: PERF203
                 self.skipped[error.what] += 1
+        card = self._mitigation.bundle.card
         corrected = self._mitigation.correct([*decoded.values()])
         for (number, measurement), result in zip(decoded.items(), corrected, strict=True):
             encoded[number] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
+            cir = measurement.cir
+            if not card.fits(cir.radio, cir.segment, len(cir) > 0):
+                self.mismatches[card.mismatch(f"{cir.radio.name} {cir.segment.name}")] += 1
         return encoded
