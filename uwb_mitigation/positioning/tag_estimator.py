@@ -185,9 +185,9 @@ class TagEstimator:
         self._recent.append((time_s, anchor, range_m, variance_m2))
         self._states[anchor].received_s = time_s
         if self.filter is None:
-            self._search(time_s, anchor, range_m, variance_m2)
+            self._search(anchor, range_m, variance_m2)
         else:
-            self._follow(self.filter, time_s, anchor, range_m, variance_m2)
+            self._follow(self.filter, anchor, range_m, variance_m2)
         return None if self.filter is None else self.filter.estimate(stamp_ns)
 
     def run(self, ranges: Ranges) -> Track:
@@ -217,9 +217,7 @@ class TagEstimator:
             found = self._candidate_positions()
             if found and len(found) <= _MAX_CANDIDATES:
                 self._last_known = self.filter or self._last_known
-                self.filter = None
-                self._start(found, self._time_s)
-                self._settle()
+                self._start(found)
                 return
         for one in self._filters():
             z = one.update_height(height_m, variance_m2)
@@ -273,10 +271,8 @@ class TagEstimator:
     def _filters(self) -> list[RangeFilter]:
         return [self.filter] if self.filter is not None else [c.filter for c in self._hypotheses]
 
-    def _follow(
-        self, known: RangeFilter, time_s: float, anchor: int, range_m: float, variance_m2: float
-    ) -> None:
-        known.predict(time_s)
+    def _follow(self, known: RangeFilter, anchor: int, range_m: float, variance_m2: float) -> None:
+        known.predict(self._time_s)
         z, sd = known.update(anchor, range_m, variance_m2)
         self._latest_loss = self._model.loss_of(z, sd)
         if self._area is not None and self._confine(known):
@@ -287,8 +283,8 @@ class TagEstimator:
         state = self._states[anchor]
         state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
-        if time_s - self._checked_s >= _RETRY_S:
-            self._checked_s = time_s
+        if self._time_s - self._checked_s >= _RETRY_S:
+            self._checked_s = self._time_s
             received = self.received_anchors()
             known.updates_consider_states = len(received) >= self._dims + _SPARE_ANCHORS
             num_contradicting = sum(self._states[i].outliers > 0.5 for i in received)
@@ -327,9 +323,7 @@ class TagEstimator:
         if loss > best.loss + IMPLAUSIBLE and apart @ apart > 9.0 * known.horizontal_sd**2:
             self.counts["lost"] += 1
             self._last_known = None
-            self.filter = None
-            self._start(found, self._time_s)
-            self._settle()
+            self._start(found)
 
     def _restart_search(self, time_s: float) -> None:
         """Search the position again, with the present one as prior."""
@@ -340,7 +334,8 @@ class TagEstimator:
         self._search_began_s = time_s
         self._next_try_s = -math.inf
 
-    def _search(self, time_s: float, anchor: int, range_m: float, variance_m2: float) -> None:
+    def _search(self, anchor: int, range_m: float, variance_m2: float) -> None:
+        time_s = self._time_s
         if self._search_began_s == -math.inf:
             self._search_began_s = time_s
         if self._hypotheses:
@@ -362,8 +357,7 @@ class TagEstimator:
             return
         found = self._candidate_positions()
         if found and len(found) <= _MAX_CANDIDATES:
-            self._start(found, time_s)
-            self._settle()
+            self._start(found)
 
     def _settle(self) -> None:
         """Remove candidates that are implausible or equal; follow the last one."""
@@ -407,10 +401,10 @@ class TagEstimator:
         if not found:
             return True
         nearest = min(found, key=lambda candidate: float(np.linalg.norm(candidate.position - one.position)))
-        here = self._prior_loss(nearest, self._time_s)
+        here = self._prior_loss(nearest)
         for candidate in found:
             z = (np.linalg.norm(anchors - candidate.position, axis=1) - range_m) / sd_m
-            apart = 2.0 * (self._prior_loss(candidate, self._time_s) - here) + float(z @ z)
+            apart = 2.0 * (self._prior_loss(candidate) - here) + float(z @ z)
             if candidate is nearest:
                 largest = float(np.linalg.eigvalsh(candidate.covariance[:2, :2])[-1])
                 self.undetermined = self._last_known is None and largest > _UNDETERMINED_M**2
@@ -439,9 +433,9 @@ class TagEstimator:
             anchors, range_m, sd_m, self._model, height=self._known_height(), area=self._area
         )
 
-    def _start(self, found: list[CandidatePosition], time_s: float) -> None:
+    def _start(self, found: list[CandidatePosition]) -> None:
         """Start a filter at each position, with the correlation between the position and the errors of the ranges."""
-        self._hypotheses, self._ambiguous_with = [], []
+        self.filter, self._hypotheses, self._ambiguous_with = None, [], []
         # The next check whether the position is unique must not wait.
         self._next_try_s = -math.inf
         model, height = self._model, self._height
@@ -455,21 +449,23 @@ class TagEstimator:
                 position[2] = height.value
                 covariance[2] = covariance[:, 2] = 0.0
                 covariance[2, 2] = height.sd**2
-            one = RangeFilter(self.anchors, model, time_s, position, covariance, level=height is not None)
+            level = height is not None
+            one = RangeFilter(self.anchors, model, self._time_s, position, covariance, level=level)
             errors = FIRST_ERROR + np.array(self._rows)
             one.P[:3, errors] = candidate.gain * one.P[errors, errors]
             one.P[:3, OFFSET] = offset * model.offset_sd**2
             if height is not None:
                 one.P[2, OFFSET:] = 0.0
             one.P[OFFSET:, :3] = one.P[:3, OFFSET:].T
-            self._hypotheses.append(_Hypothesis(one, candidate.loss + self._prior_loss(candidate, time_s)))
+            self._hypotheses.append(_Hypothesis(one, candidate.loss + self._prior_loss(candidate)))
+        self._settle()
 
-    def _prior_loss(self, candidate: CandidatePosition, time_s: float) -> float:
+    def _prior_loss(self, candidate: CandidatePosition) -> float:
         """Return minus the log likelihood of a position after the last known one."""
         if self._last_known is None:
             return 0.0
         before = self._last_known.copy()
-        before.predict(time_s)
+        before.predict(self._time_s)
         apart = candidate.position[:2] - before.position[:2]
         spread = before.P[:2, :2] + candidate.covariance[:2, :2]
         # Limited, so that a kidnapped tag is also found.
