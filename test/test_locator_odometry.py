@@ -225,6 +225,7 @@ def test_modes_ranges_only_odometry_odometry_lost_and_odometry_wrong(ros: Ros, a
     live.play(44.0)
     assert live.odometry[-1].twist.covariance[0] >= 1e5
     assert live.odometry[-1].twist.twist.linear.x == 0.0
+    ros.spin_until(lambda: "odometry contradicts the ranges" in live.values()[""])
 
 
 def _check_lookups(live: LiveRobot, transforms: list[TransformStamped]) -> None:

@@ -222,8 +222,15 @@ class MultiTagEstimator:
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
             if not estimator.is_known:
                 found.append(f"{name}: {self._unknown_reason(estimator)}")
-            if isinstance(estimator, RobotEstimator) and not estimator.odometry.is_available(tag.latest_ns):
-                found.append(f"{name}: no odometry at the times of the ranges: estimated from ranges only")
+            if isinstance(estimator, RobotEstimator):
+                if not estimator.odometry.is_available(tag.latest_ns):
+                    found.append(
+                        f"{name}: no odometry at the times of the ranges: estimated from ranges only"
+                    )
+                elif estimator.rejects_odometry:
+                    found.append(
+                        f"{name}: odometry contradicts the ranges (slip, or moved by hand): not used"
+                    )
             contradicting = [self.anchors.anchors[row] for row in estimator.disagreeing()]
             found += [
                 f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
@@ -266,7 +273,7 @@ class MultiTagEstimator:
             }
             if isinstance(estimator, RobotEstimator):
                 found |= {
-                    f"{name} heading": _heading_text(estimator),
+                    f"{name} heading": estimator.heading,
                     f"{name} heading found, odometry missing, wrong": ", ".join(
                         str(counts[key]) for key in ("heading found", "odometry missing", "odometry wrong")
                     ),
@@ -281,8 +288,3 @@ class MultiTagEstimator:
                     f"{name} protection level m": ", ".join(f"{level:.2f}" for level in levels),
                 }
         return found
-
-
-def _heading_text(estimator: RobotEstimator) -> str:
-    count = estimator.yaw_hypotheses
-    return "known" if count == 1 else f"{count} hypotheses" if count else "unknown"

@@ -104,9 +104,11 @@ class RobotEstimator(TagEstimator):
         return self._known is not None or super().is_known
 
     @property
-    def yaw_hypotheses(self) -> int:
-        """The number of plausible headings; 1: the heading is known, 0: it is not searched."""
-        return 1 if self._known is not None else len(self._yaws)
+    def heading(self) -> str:
+        """The state of the heading as text: known, unknown, or the number of hypotheses."""
+        if self._known is not None:
+            return "known"
+        return f"{len(self._yaws)} hypotheses" if self._yaws else "unknown"
 
     def add(
         self, stamp_ns: int, anchor: int, range_m: float, variance_m2: float = math.nan
