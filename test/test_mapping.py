@@ -243,6 +243,15 @@ def test_rows_without_an_id_are_dropped_and_counted(tmp_path: Path):
     assert source.dropped == {"tag or anchor is unknown": 2}
 
 
+def test_missing_numbers_of_any_form_are_unknown(tmp_path: Path):
+    cells = ["", "-", "nan", " ", "NULL", "-80.5"]
+    write(tmp_path / "x.csv", "t,a,r,l\n" + "".join(f"{n},1,2,{cell}\n" for n, cell in enumerate(cells)))
+    source = read(with_fields(rx_power="l"), tmp_path / "x.csv")
+    levels = [record.measurement.cir.rx_power_dbm for record in source]
+    assert np.isnan(levels[:-1]).all()
+    assert levels[-1] == -80.5
+
+
 def test_files_are_merged_by_time_and_their_names_give_ids(tmp_path: Path):
     write(tmp_path / "a1.csv", "t,r\n0,1\n2,3\n")
     write(tmp_path / "a2.csv", "t,r\n1,2\n3,4\n")

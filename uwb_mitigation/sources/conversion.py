@@ -179,7 +179,7 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
             pass
     import pandas as pd
 
-    texts = pd.Series(raw).astype(str).str.strip()
+    texts = pd.Series([str(item).strip() for item in raw.tolist()], dtype=object)
     found = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
     for row in np.flatnonzero(np.isnan(found) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
         comma = re.fullmatch(r"[-+]?\d+,\d+", texts[row])
