@@ -108,7 +108,7 @@ def write_robot(bag: BagWriter, odometry: Odometry, imu: Imu | None, row: int, u
 
 
 def read_odometry(path: Path, topic: str) -> Odometry:
-    """Read a topic of `nav_msgs/Odometry`; messages with values that are not finite are skipped.
+    """Read a topic of `nav_msgs/Odometry`; messages with values that are not finite, except for the pose, are skipped.
 
     Raises:
         RecordingError: The bag cannot be read, has no such topic of this type, or it contains no valid message.
@@ -120,7 +120,8 @@ def read_odometry(path: Path, topic: str) -> Odometry:
         values += [twist.linear.x, twist.linear.y, twist.angular.z]
         covariances = [_three(one.covariance).ravel() for one in (decoded.pose, decoded.twist)]
         rows[_stamp_ns(decoded)] = np.concatenate([values, *covariances])
-    stamp_ns, columns = _columns(rows, path, topic)
+    # Some robots publish twists only: their orientation is zero, and the yaw NaN.
+    stamp_ns, columns = _columns(rows, path, topic, slice(3, None))
     pose, twist, of_pose, of_twist = np.split(columns, [3, 6, 15], axis=1)
     return Odometry(stamp_ns, pose, of_pose.reshape(-1, 3, 3), twist, of_twist.reshape(-1, 3, 3))
 
@@ -163,10 +164,10 @@ def _messages(path: Path, topic: str, kind: str) -> Any:
 
 
 def _columns(
-    rows: dict[int, NDArray[np.float64]], path: Path, topic: str
+    rows: dict[int, NDArray[np.float64]], path: Path, topic: str, checked: slice = slice(None)
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return stamps and values of the finite rows, in the order of time."""
-    finite = {stamp: row for stamp, row in rows.items() if np.isfinite(row).all()}
+    """Return stamps and values of the rows whose `checked` values are finite, in the order of time."""
+    finite = {stamp: row for stamp, row in rows.items() if np.isfinite(row[checked]).all()}
     if not finite:
         raise RecordingError(
             "no valid message", where=f"{path}, topic {topic}", valid="finite values and covariances"

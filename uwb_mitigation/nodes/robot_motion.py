@@ -80,7 +80,7 @@ class RobotMotion:
 
     def twist(self, stamp_ns: int) -> BodyTwist:
         """Return the velocity of the base at a time; unobserved without odometry, or just after it started."""
-        if not self.path.is_available(stamp_ns) or self.path.twist is None:
+        if self.path.at(stamp_ns) is None or self.path.twist is None:
             return BodyTwist()
         return BodyTwist(*self.path.twist, *self.path.twist_variance)
 

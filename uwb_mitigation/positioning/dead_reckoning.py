@@ -132,13 +132,8 @@ class DeadReckoning:
             ):
                 vx, vy, yaw_rate = poses
                 speed = math.hypot(vx, vy)
-        of_speed, of_yaw_rate = (
-            value if 0.0 < value < _MAX_VARIANCE else default**2
-            for value, default in (
-                (max(twist_variance[:2]), SPEED_SD),
-                (twist_variance[2], YAW_RATE_SD),
-            )
-        )
+        of_speed = _known_variance(max(twist_variance[:2]), SPEED_SD)
+        of_yaw_rate = _known_variance(twist_variance[2], YAW_RATE_SD)
         drift = WHEEL_DRIFT * speed
         share = 2.0 * CORRELATION_S * MOTION_SHARE**2
         yaw_density = of_yaw_rate * dt + share * yaw_rate**2
@@ -185,12 +180,7 @@ class DeadReckoning:
             if not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
                 # The rotation in a gap is unknown, also after a wrong stamp.
                 self._imu_yaw = None
-        of_rate = variance if 0.0 < variance < _MAX_VARIANCE else YAW_RATE_SD**2
-        self._imu = stamp_ns, yaw_rate, of_rate, turned, yaw
-
-    def is_available(self, stamp_ns: int) -> bool:
-        """Return whether the motion at a time is known."""
-        return self._before(stamp_ns) is not None
+        self._imu = stamp_ns, yaw_rate, _known_variance(variance, YAW_RATE_SD), turned, yaw
 
     def at(self, stamp_ns: int) -> PathPoint | None:
         """Return the path at a time, by interpolation, or by extrapolation of the latest motion; None: unknown."""
@@ -230,6 +220,10 @@ class DeadReckoning:
         at_ns, rate, _, yaw, _ = self._imu
         dt = (stamp_ns - at_ns) / _SECOND_NS
         return yaw + rate * dt if abs(dt) <= IMU_TIMEOUT_S else None
+
+
+def _known_variance(variance: float, default_sd: float) -> float:
+    return variance if 0.0 < variance < _MAX_VARIANCE else default_sd**2
 
 
 def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:

@@ -223,7 +223,7 @@ class MultiTagEstimator:
             if not estimator.is_known:
                 found.append(f"{name}: {self._unknown_reason(estimator)}")
             if isinstance(estimator, RobotEstimator):
-                if not estimator.odometry.is_available(tag.latest_ns):
+                if estimator.odometry.at(tag.latest_ns) is None:
                     found.append(
                         f"{name}: no odometry at the times of the ranges: estimated from ranges only"
                     )

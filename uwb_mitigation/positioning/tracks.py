@@ -199,7 +199,7 @@ class Odometry(Columns):
     """Motion of a robot's base in the plane, measured by its wheels or by another sensor.
 
     Attributes:
-        pose: float64 (n, 3), x and y in m and yaw in rad, in the odometry frame, which drifts.
+        pose: float64 (n, 3), x and y in m and yaw in rad, in the odometry frame, which drifts; NaN: unknown.
         pose_covariance: float64 (n, 3, 3); zero: unknown.
         twist: float64 (n, 3), velocities in m/s and yaw rate in rad/s, in the axes of the base.
         twist_covariance: float64 (n, 3, 3); zero: unknown.
