@@ -106,14 +106,22 @@ def test_good_evb1000s_pass_and_a_low_supply_fails(report: Report, tmp_path: Pat
         checks = report("evb1000")
         assert not failed(checks)
         assert checks["read back: device id"]["value"] == "0xdeca0130"
-        assert checks["read back: antenna delay"]["verdict"] == "pass"
+        assert checks["read back: antenna delay (15.65 ps)"]["verdict"] == "pass"
         boards._boards[0].chip.set_environment(30.0, 2.6)
         assert failed(report("evb1000")) == {"supply"}
 
 
-def test_missing_board_gives_a_report(report: Report, monkeypatch: pytest.MonkeyPatch):
+def test_missing_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("uwb_mitigation.radio.field_test.START_TIMEOUT_S", 0.5)
-    assert {"problem of the driver", "ranges per second", "ids"} <= failed(report("uci", 1))
+    checks = report("uci", 1)
+    assert {"problem of the driver", "ranges per second", "ids"} <= failed(checks)
+    assert "PATH" in checks["problem of the driver"]["value"]
+    page = zipfile.Path(tmp_path / "out.zip", "report.html").read_text()
+    assert "<h1>Field report: board with UCI firmware</h1>" in page
+    assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC; 0 ranges at 3.00 m in 3 s", page)
+    with zipfile.ZipFile(tmp_path / "out.zip") as archive:
+        for name in archive.namelist():
+            assert tmp_path.name.encode() not in archive.read(name)
 
 
 @pytest.mark.parametrize(
@@ -163,3 +171,8 @@ def test_texts_are_anonymised():
     assert "/dev/" not in cleaned
     assert not re.search(rf"\b{socket.gethostname()}\b", cleaned)
     assert cleaned.endswith("60 Hz, a/b")
+    problem = "/data/ann b/uci 0 was lost: [Errno 5] '/scratch/ann/uci1', //srv/ann and ports/uci2"
+    cleaned = field_report.anonymise(problem, ["/data/ann b/uci 0", "ports/uci2"])
+    assert "ann" not in cleaned
+    assert "uci" not in cleaned
+    assert "was lost: [Errno 5]" in cleaned

@@ -10,8 +10,10 @@ import socket
 import tempfile
 import zipfile
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,10 +68,9 @@ def field_report(
         with console.share_bar("ranging") as advance:
             observe(source, ports, observation, folder / "capture.txt", _ask if unplug else None, advance)
         _correct(observation)
-        checks = [
-            replace(check, value=anonymise(check.value), remedy=anonymise(check.remedy))
-            for check in run_checks(observation)
-        ]
+        observation.problem = anonymise(observation.problem, ports)
+        observation.identity = {name: anonymise(text, ports) for name, text in observation.identity.items()}
+        checks = run_checks(observation)
         _write(folder, source, observation, checks)
         _pack(folder, output)
     rows = [(check.name, check.verdict.value, check.value, check.limit, check.remedy) for check in checks]
@@ -106,15 +107,17 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
     from uwb_mitigation.bag.writer import BagWriter
     from uwb_mitigation.evaluation.page import render_page
     from uwb_mitigation.measurement import Record, Truth
+    from uwb_mitigation.radio.field_test import SOURCES
 
     system = {
         "uwb_mitigation": uwb_mitigation.__version__,
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "Python": platform.python_version(),
-        **{name: anonymise(text) for name, text in observation.identity.items()},
+        **observation.identity,
     }
     counts = Counter(check.verdict.value for check in checks)
     values = {
+        "date": f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
         "source": source,
         "distance_m": observation.distance_m,
         "seconds": observation.seconds,
@@ -125,7 +128,9 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
     shown = {name: counts[name] for name in ("pass", "warning", "fail")}
     severity = ("fail", "warning", "pass")
     first_failed = sorted(checks, key=lambda check: severity.index(check.verdict.value))
-    page = render_page("field_report.html.j2", templates, checks=first_failed, counts=shown, **values)
+    page = render_page(
+        "field_report.html.j2", templates, title=SOURCES[source], checks=first_failed, counts=shown, **values
+    )
     (folder / "report.html").write_text(page, encoding="utf-8")
     values["checks"] = [asdict(check) for check in checks]
     (folder / "report.json").write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
@@ -149,12 +154,12 @@ def _pack(folder: Path, output: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def anonymise(text: str) -> str:
-    """Replace host name, user name and paths of devices and folders."""
-    text = re.sub(
-        r"(?<![\w<])~?/(?:dev|home|root|tmp|run|media|mnt|usr|var|opt|etc|work)/[^\s\"'<>,;:)]*", "PATH", text
-    )
-    names = [socket.gethostname()]
+def anonymise(text: str, ports: Sequence[str] = ()) -> str:
+    """Replace ports, paths, host name and user name."""
+    for path in sorted((*ports, str(Path.home()), str(Path.cwd())), key=len, reverse=True):
+        text = text.replace(path, "PATH") if len(path) > 1 else text
+    text = re.sub(r"(?<![\w.<])~?/*(?:/[\w.~+@-]+){2,}[^\s\"'<>,;:)]*", "PATH", text)
+    names = [socket.gethostname(), Path.home().name]
     with suppress(Exception):  # a container may have no user
         names.append(getpass.getuser())
     for name in names:

@@ -108,7 +108,7 @@ def run_checks(o: Observation) -> list[Check]:
     damage = o.damaged / max(len(o.ranges), 1)
     checks.append(_judge("damaged packets per range", damage, 0.01, 0.1, "", "use another cable or USB port"))
     if not math.isnan(o.temperature_c):
-        checks.append(_judge("temperature", o.temperature_c, 60, 80, "C", "let the board cool down"))
+        checks.append(_judge("temperature", o.temperature_c, 60, 80, "°C", "let the board cool down"))
     if not math.isnan(o.voltage):
         remedy = "supply the radio with 3.3 V; use another cable or a powered hub"
         checks.append(_judge("supply", o.voltage, 3.0, 2.8, "V", remedy, low=True))
@@ -140,8 +140,9 @@ def _judge(
     elif sign * value > sign * warn:
         verdict = Verdict.WARNING
     bound = "at least" if low else "at most"
-    limit = "none" if text else f"{bound} {warn:g} {unit}".rstrip()
-    shown = text or f"{value:.3g} {unit}".rstrip()
+    scale = 100 if unit == "%" else 1
+    limit = "none" if text else f"{bound} {scale * warn:g} {unit}".rstrip()
+    shown = text or f"{scale * value:.3g} {unit}".rstrip()
     return Check(name, shown, limit, verdict, "" if verdict is Verdict.PASS else remedy)
 
 
@@ -191,7 +192,7 @@ def _cirs(o: Observation) -> Iterator[Check]:
     cirs = [measured.cir for measured in o.ranges]
     filled = [cir for cir in cirs if np.any(cir.samples)]
     remedy = "the firmware reports no CIR: use the image of the hardware page"
-    yield _judge("share of ranges with CIR", len(filled) / len(cirs), 0.95, 0.5, "", remedy, low=True)
+    yield _judge("share of ranges with CIR", len(filled) / len(cirs), 0.95, 0.5, "%", remedy, low=True)
     if not filled:
         return
     inside = sum(
@@ -200,12 +201,12 @@ def _cirs(o: Observation) -> Iterator[Check]:
         if math.isfinite(cir.first_path_index)
     )
     yield _judge(
-        "share of first paths in the CIR", inside / len(filled), 0.95, 0.5, "", "send this report", low=True
+        "share of first paths in the CIR", inside / len(filled), 0.95, 0.5, "%", "send this report", low=True
     )
     clipped = sum(int(np.abs(cir.samples.astype(np.int32)).max()) >= SATURATED for cir in filled) / len(
         filled
     )
-    yield _judge("share of saturated CIRs", clipped, 0.05, 0.5, "", "increase the distance")
+    yield _judge("share of saturated CIRs", clipped, 0.05, 0.5, "%", "increase the distance")
     ratios = [
         float(np.abs(cir.samples.astype(np.int32)).max() / max(_noise(cir.samples), 1e-9))
         for cir in filled[:500]
@@ -215,7 +216,7 @@ def _cirs(o: Observation) -> Iterator[Check]:
         float(np.median(ratios)),
         10,
         4,
-        "",
+        "times",
         "reduce the distance",
         low=True,
     )
@@ -241,6 +242,6 @@ def _model(o: Observation) -> Iterator[Check]:
         refused,
         0.2,
         0.8,
-        "",
+        "%",
         "the model does not fit this radio or site",
     )

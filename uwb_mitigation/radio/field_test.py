@@ -25,7 +25,14 @@ from uwb_mitigation.radio.uci.capture import CaptureWriter
 from uwb_mitigation.radio.uci.driver import UciDriver
 from uwb_mitigation.radio.uci.session import UciSettings
 
-SOURCES = ("uci", "evb1000", "spi", "serial")
+SOURCES = {
+    "uci": "board with UCI firmware",
+    "evb1000": "EVB1000",
+    "spi": "DW1000 on SPI",
+    "serial": "board with the firmware of uwb_mitigation",
+}
+"""Names of the kinds of radios."""
+
 START_TIMEOUT_S = 30.0
 UNPLUG_TIMEOUT_S = 60.0
 
@@ -37,6 +44,7 @@ _REGISTERS = (
     ("RX antenna delay", 0x2E, 0x1804, 2),
 )
 _DW1000_ID = 0xDECA0130
+_ANTENNA_DELAY = "antenna delay (15.65 ps)"
 
 
 def observe(
@@ -130,7 +138,11 @@ def _open(source: str, ports: list[str], capture: Path, stack: ExitStack) -> lis
 
 
 def _values(settings: RadioSettings) -> dict[str, object]:
-    return {"channel": settings.channel, "PRF": settings.prf_mhz, "CIR samples": settings.window}
+    return {
+        "channel": settings.channel,
+        "PRF (MHz)": settings.prf_mhz,
+        "CIR samples": settings.window,
+    }
 
 
 def _describe(source: str, drivers: list[Any], o: Observation) -> None:
@@ -158,7 +170,7 @@ def _describe(source: str, drivers: list[Any], o: Observation) -> None:
         o.written = _values(RadioSettings(window=_WINDOW))
         o.temperature_c, o.voltage = report.status.temperature_c, report.status.voltage
         if report.settings is not None:
-            o.written["antenna delay"] = report.settings.antenna_delay
+            o.written[_ANTENNA_DELAY] = report.settings.antenna_delay
             other = drivers[1].report().settings if len(drivers) > 1 else None
             o.expected_ids = None if other is None else (report.settings.address, other.address)
 
@@ -187,7 +199,7 @@ def _read_registers(source: str, port: str, o: Observation) -> None:
     if "RX antenna delay" in values:
         o.read |= {
             "device id": f"0x{values['device id']:08x}",
-            "antenna delay": values["TX antenna delay"] + values["RX antenna delay"],
+            _ANTENNA_DELAY: values["TX antenna delay"] + values["RX antenna delay"],
         }
 
 
