@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -23,6 +21,7 @@ from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from visualization_msgs.msg import MarkerArray
 
+from uwb_mitigation.bag import topics as bag_topics
 from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import VIEWER
@@ -75,10 +74,10 @@ class Viewer(ManagedNode):
             self._feed.anchors(self._anchors)
             self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
         else:
-            self._subscribe(MarkerArray, topics.ANCHORS, self._feed.markers, topics.LATCHED)
-        self._subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._feed.diagnostics)
-        self._subscribe(PoseWithCovarianceStamped, topics.POSE, partial(self._feed.pose, DEFAULT_TAG))
-        self._subscribe(Odometry, topics.ODOMETRY_TRUTH, self._feed.true_position)
+            self._subscribe(MarkerArray, topics.ANCHORS, bag_topics.ANCHORS, qos=topics.LATCHED)
+        self._subscribe(DiagnosticArray, topics.DIAGNOSTICS, topics.DIAGNOSTICS)
+        self._subscribe(PoseWithCovarianceStamped, topics.POSE, bag_topics.POSE)
+        self._subscribe(Odometry, topics.ODOMETRY_TRUTH, bag_topics.ODOMETRY_TRUTH)
         # No executor spins this node: waking up for every range would take CPU time from the mitigator.
         range_node = Node(
             f"_{self.get_name()}_ranges",
@@ -131,10 +130,11 @@ class Viewer(ManagedNode):
         return url, diagnostics.OK, f"serving {pages} page{'' if pages == 1 else 's'}", values
 
     def _subscribe(
-        self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile = _QOS
+        self, kind: type, topic: str, plain: str, tag: str = DEFAULT_TAG, qos: QoSProfile = _QOS
     ) -> None:
+        """Subscribe to a topic; `plain` is its name in a bag."""
         if topic not in self._subscribed:
-            made = self.create_subscription(kind, topic, callback, qos)
+            made = self.create_subscription(kind, topic, partial(self._feed.add, plain, tag=tag), qos)
             self._subscribed[topic] = self.destroy_at_close(made, self.destroy_subscription)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
@@ -152,13 +152,13 @@ class Viewer(ManagedNode):
             list(topics.take_queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
             for topic in (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
         )
-        for take, take_queued in (
-            (self._feed.range_truth, truths),
-            (self._feed.range_raw, raw),
-            (self._feed.range_corrected, corrected),
+        for topic, queued in (
+            (bag_topics.RANGE_TRUTH, truths),
+            (bag_topics.RANGE_RAW, raw),
+            (bag_topics.RANGE_CORRECTED, corrected),
         ):
-            for data, _ in take_queued:
-                take(data)
+            for data, _ in queued:
+                self._feed.add_encoded(topic, data)
 
     def _discover_topics(self) -> None:
         """Subscribe to topics that have become available or necessary."""
@@ -174,7 +174,7 @@ class Viewer(ManagedNode):
         own = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():
             if (found := own.fullmatch(topic)) and len(self._subscribed) < MAX_TAGS:
-                self._subscribe(PoseWithCovarianceStamped, topic, partial(self._feed.pose, found[1]))
+                self._subscribe(PoseWithCovarianceStamped, topic, bag_topics.POSE, found[1])
 
     def _missing(self) -> MissingData:
         """Return the reasons for an empty page, such as a node that is not running."""

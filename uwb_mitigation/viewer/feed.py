@@ -1,17 +1,19 @@
 """Convert messages to a scene, for live topics and for recordings.
 
-Ranges are CDR bytes, all others are message objects; those of rclpy and of rosbags have the same fields.
+Ranges are decoded by this package, all others are message objects; those of rclpy and of rosbags have the same fields.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
+from uwb_mitigation.bag import topics
 from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Truth
@@ -20,6 +22,7 @@ from uwb_mitigation.positioning.geometry import PROTECTION
 from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
+    DEFAULT_TAG,
     MAX_ID_DIGITS,
     MAX_TEXT,
     MAX_TRUTHS,
@@ -33,7 +36,13 @@ from uwb_mitigation.viewer.scene import (
     Trace,
 )
 
-Decoded = TypeVar("Decoded")
+DIAGNOSTICS = "/diagnostics"
+
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    topics.RANGE_RAW: decode_range,
+    topics.RANGE_TRUTH: decode_truth,
+    topics.RANGE_CORRECTED: decode_corrected,
+}
 
 CHI2_95 = 5.991
 """Squared radius of the 95 % ellipse in two dimensions."""
@@ -54,6 +63,17 @@ class Feed:
         self.malformed = 0
         self.scene = scene
         self.lock = lock
+        self._adders: dict[str, Callable[[str, Any], None]] = {
+            topics.RANGE_RAW: lambda _, measurement: self.measurement(measurement),
+            topics.RANGE_TRUTH: lambda _, found: self._truth(*found),
+            topics.RANGE_CORRECTED: lambda _, found: self.corrected(*found),
+            topics.POSE: self._pose,
+            topics.ODOMETRY: self._pose,
+            topics.POSE_SMOOTHED: partial(self._position, TrackKind.SMOOTHED),
+            topics.ODOMETRY_TRUTH: lambda _, m: self._position(TrackKind.TRUE, str(m.child_frame_id), m),
+            topics.ANCHORS: lambda _, message: self.markers(message),
+            DIAGNOSTICS: lambda _, message: self._diagnostics(message),
+        }
         self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
         self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
@@ -68,9 +88,20 @@ class Feed:
         with self.lock:
             self.scene.set_node_status(name, report)
 
-    def range_raw(self, data: bytes) -> None:
-        if (measurement := self._decoded(decode_range, data)) is not None:
-            self.measurement(measurement)
+    def add_encoded(self, topic: str, data: bytes) -> None:
+        """Decode and add a range."""
+        try:
+            message = DECODERS[topic](data)
+        except RecordingError:
+            message = None
+        self.add(topic, message)
+
+    def add(self, topic: str, message: Any, tag: str = DEFAULT_TAG) -> None:
+        """Add a message of a topic without its namespace and tag; None: it could not be decoded."""
+        if message is None:
+            self.malformed += 1
+        else:
+            self._adders[topic](tag, message)
 
     def measurement(self, measurement: RangeMeasurement) -> None:
         trace = Trace.of(measurement.cir)
@@ -78,19 +109,12 @@ class Feed:
             with self.lock:
                 self.scene.add_trace((measurement.anchor_id, measurement.tag_id), trace)
 
-    def range_truth(self, data: bytes) -> None:
-        if (decoded := self._decoded(decode_truth, data)) is None:
-            return
-        key, truth = decoded
+    def _truth(self, key: MeasurementKey, truth: Truth) -> None:
         if (sample := self._without_truth.pop(key, None)) is None:
             self._truths.add(key, truth)
             return
         with self.lock:
             self.scene.set_truth(sample, truth)
-
-    def range_corrected(self, data: bytes) -> None:
-        if (decoded := self._decoded(decode_corrected, data)) is not None:
-            self.corrected(*decoded)
 
     def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
@@ -103,8 +127,7 @@ class Feed:
         if truth is None:
             self._without_truth.add(key, sample)
 
-    def pose(self, tag: str, message: Any) -> None:
-        """Add a geometry_msgs/PoseWithCovarianceStamped or a nav_msgs/Odometry."""
+    def _pose(self, tag: str, message: Any) -> None:
         position = message.pose.pose.position
         if not math.isfinite(position.x + position.y):
             self.malformed += 1
@@ -123,15 +146,7 @@ class Feed:
         with self.lock:
             self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance[:2, :2])))
 
-    def smoothed(self, tag: str, message: Any) -> None:
-        """Add a smoothed geometry_msgs/PoseWithCovarianceStamped."""
-        self._position(tag, TrackKind.SMOOTHED, message)
-
-    def true_position(self, message: Any) -> None:
-        """Add a nav_msgs/Odometry whose child frame is the tag."""
-        self._position(str(message.child_frame_id), TrackKind.TRUE, message)
-
-    def _position(self, tag: str, kind: TrackKind, message: Any) -> None:
+    def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position
         if math.isfinite(position.x + position.y):
             with self.lock:
@@ -162,19 +177,12 @@ class Feed:
         with self.lock:
             self.scene.set_anchors(places)
 
-    def diagnostics(self, message: Any) -> None:
+    def _diagnostics(self, message: Any) -> None:
         """Add a diagnostic_msgs/DiagnosticArray."""
         for status in message.status:
             # An octet is bytes in rclpy and int in rosbags.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             self.report(str(status.name), NodeStatus(level, str(status.message), self.scene.clock()))
-
-    def _decoded(self, decode: Callable[[bytes], Decoded], data: bytes) -> Decoded | None:
-        try:
-            return decode(data)
-        except RecordingError:
-            self.malformed += 1
-            return None
 
 
 def _bounds(covariance: np.ndarray[Any, Any]) -> tuple[tuple[float, float, float], float]:

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import contextlib
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.bag import schemas
-from uwb_mitigation.bag.codec import (
-    MeasurementKey,
-    decode_corrected,
-    decode_range,
-    decode_truth,
-    measurement_key,
-)
+from uwb_mitigation.bag.codec import MeasurementKey, measurement_key
 from uwb_mitigation.bag.poses import tag_frame
-from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE, RANGE_CORRECTED, RANGE_RAW, RANGE_TRUTH
+from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, POSE_SMOOTHED, RANGE_CORRECTED, RANGE_RAW, RANGE_TRUTH
 from uwb_mitigation.errors import DatasetError, RecordingError
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.mitigation import Backend
@@ -31,13 +22,16 @@ from uwb_mitigation.positioning.smoother import smooth
 from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.tracks import Estimate, Ranges
 from uwb_mitigation.viewer.palette import TrackKind
+from uwb_mitigation.viewer.recording import POSITIONS, Recording
 from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_RANGE_M, MAX_TAGS, BoundedDict, Pair, add_heat
 
 MAX_RANGES = 500_000
 """Maximum number of indexed ranges; the rest of the recording has no marks."""
 BINS = 300
 """Maximum number of points of the error over time."""
-_BATCH = 256
+BATCH = 256
+"""Number of raw ranges that are corrected at once."""
+_KINDS = {ODOMETRY_TRUTH: TrackKind.TRUE, POSE_SMOOTHED: TrackKind.SMOOTHED}
 
 
 @dataclass(slots=True)
@@ -100,161 +94,104 @@ class Timeline:
         return {name: column.astype(np.float32) for name, column in columns.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """What a recording contains.
+def index_recording(
+    recording: Recording, anchors: AnchorMap | None, height: Height | None, backend: Backend | None
+) -> Timeline:
+    """Read a recording.
 
-    Attributes:
-        prefix: namespace of its topics. start_ns: time of its beginning.
-        positions: {topic: (type, tag, kind)} of estimated positions.
+    Args:
+        recording: the bag.
+        anchors: for tracks; None: unknown.
+        height: of the tags; None: the median of the true heights, or unknown.
+        backend: corrects raw ranges; None: the recording contains corrected ranges.
     """
+    ranges: list[tuple[MeasurementKey, CorrectedRange]] = []
+    batch: list[RangeMeasurement] = []
+    truths: dict[MeasurementKey, float] = {}
+    points: dict[tuple[str, TrackKind], list[tuple[float, float, float, float]]] = {}
 
-    path: Path
-    prefix: str
-    start_ns: int
-    positions: Mapping[str, tuple[str, str, TrackKind]]
+    def seconds(stamp_ns: Any) -> Any:
+        return (stamp_ns - recording.start_ns) / 1e9
 
-    def index(self, anchors: AnchorMap | None, height: Height | None, backend: Backend | None) -> Timeline:
-        """Read the recording.
+    def flush() -> None:
+        if backend is not None and batch:
+            ranges.extend(zip(map(measurement_key, batch), backend.correct(batch), strict=True))
+            batch.clear()
 
-        Args:
-            anchors: for tracks; None: unknown.
-            height: of the tags; None: the median of the true heights, or unknown.
-            backend: corrects raw ranges; None: the recording contains corrected ranges.
-        """
-        topics = {self.prefix + name for name in (RANGE_CORRECTED, RANGE_TRUTH, ODOMETRY_TRUTH)}
-        topics |= self.positions.keys()
-        if backend is not None:
-            topics.add(self.prefix + RANGE_RAW)
-        ranges: list[tuple[MeasurementKey, CorrectedRange]] = []
-        batch: list[RangeMeasurement] = []
-        truths: dict[MeasurementKey, float] = {}
-        points: dict[tuple[str, TrackKind], list[tuple[float, float, float, float]]] = {}
-
-        def flush() -> None:
-            if backend is not None and batch:
-                ranges.extend(zip(map(measurement_key, batch), backend.correct(batch), strict=True))
-                batch.clear()
-
-        for topic, data in self._messages(topics):
+    wanted = {RANGE_CORRECTED if backend is None else RANGE_RAW, RANGE_TRUTH, ODOMETRY_TRUTH, *POSITIONS}
+    # The player reports the damage of a bag when it reaches it.
+    with contextlib.suppress(RecordingError):
+        for _, topic, message, tag in recording.events(wanted):
             if len(ranges) >= MAX_RANGES:
                 break
-            try:
-                if topic == self.prefix + RANGE_CORRECTED:
-                    ranges.append(decode_corrected(data))
-                elif topic == self.prefix + RANGE_RAW:
-                    batch.append(decode_range(data))
-                    if len(batch) == _BATCH:
-                        flush()
-                elif topic == self.prefix + RANGE_TRUTH:
-                    key, truth = decode_truth(data)
-                    truths[key] = truth.range_m
-                else:
-                    default = ODOMETRY_TYPE, "", TrackKind.TRUE
-                    self._add_point(points, *self.positions.get(topic, default), data)
-            except RecordingError:
+            if message is None:
                 continue
-        flush()
-        timeline = self._timeline(ranges, truths, points)
-        if anchors is not None and ranges:
-            self._add_tracks(timeline, ranges, anchors, height)
+            if topic == RANGE_CORRECTED:
+                ranges.append(message)
+            elif topic == RANGE_RAW:
+                batch.append(message)
+                if len(batch) == BATCH:
+                    flush()
+            elif topic == RANGE_TRUTH:
+                truths[message[0]] = message[1].range_m
+            else:
+                kind = _KINDS.get(topic, TrackKind.CORRECTED)
+                name = str(message.child_frame_id) if kind is TrackKind.TRUE else tag
+                at, stamp = message.pose.pose.position, message.header.stamp
+                if np.isfinite([at.x, at.y]).all() and (len(points) < 4 * MAX_TAGS or (name, kind) in points):
+                    time_s = seconds(stamp.sec * 1_000_000_000 + stamp.nanosec)
+                    points.setdefault((name, kind), []).append((time_s, at.x, at.y, at.z))
+    flush()
+    ranges.sort(key=lambda row: row[0].stamp_ns)
+    keys = [key for key, _ in ranges]
+    timeline = Timeline(
+        seconds(np.array([key.stamp_ns for key in keys], np.int64)),
+        [(key.anchor_id, key.tag_id) for key in keys],
+        np.array([corrected.status is not Status.OK for _, corrected in ranges], bool),
+        np.array([corrected.range_raw_m for _, corrected in ranges], np.float64),
+        np.array([corrected.range_m for _, corrected in ranges], np.float64),
+        np.array([truths.get(key, np.nan) for key in keys], np.float64),
+    )
+    for one, rows in points.items():
+        columns = np.array(sorted(rows))
+        timeline.tracks[one] = columns[:, 0], columns[:, 1:]
+    if anchors is None or not ranges:
         return timeline
-
-    def _messages(self, topics: set[str]) -> Iterator[tuple[str, bytes]]:
-        try:
-            for message in BagReader(self.path).messages(topics):
-                yield message.channel.topic, message.data
-        except RecordingError:
-            # The player reports the damage when it reaches it.
-            return
-
-    def _add_point(
-        self, points: dict[Any, list[Any]], kind: str, tag: str, track: TrackKind, data: bytes
-    ) -> None:
-        try:
-            message: Any = schemas.typestore().deserialize_cdr(data, kind)
-        except Exception:  # rosbags raises various types.
-            return
-        name = str(getattr(message, "child_frame_id", "")) if track is TrackKind.TRUE else tag
-        at, stamp = message.pose.pose.position, message.header.stamp
-        if np.isfinite([at.x, at.y]).all() and (len(points) < 4 * MAX_TAGS or (name, track) in points):
-            time_s = self._seconds(stamp.sec * 1_000_000_000 + stamp.nanosec)
-            points.setdefault((name, track), []).append((time_s, at.x, at.y, at.z))
-
-    def _seconds(self, stamp_ns: Any) -> Any:
-        return (stamp_ns - self.start_ns) / 1e9
-
-    def _timeline(
-        self,
-        ranges: list[tuple[MeasurementKey, CorrectedRange]],
-        truths: dict[MeasurementKey, float],
-        points: dict[Any, list[Any]],
-    ) -> Timeline:
-        ranges.sort(key=lambda row: row[0].stamp_ns)
-        keys = [key for key, _ in ranges]
-        timeline = Timeline(
-            self._seconds(np.array([key.stamp_ns for key in keys], np.int64)),
-            [(key.anchor_id, key.tag_id) for key in keys],
-            np.array([corrected.status is not Status.OK for _, corrected in ranges], bool),
-            np.array([corrected.range_raw_m for _, corrected in ranges], np.float64),
-            np.array([corrected.range_m for _, corrected in ranges], np.float64),
-            np.array([truths.get(key, np.nan) for key in keys], np.float64),
-        )
-        for key, rows in points.items():
-            columns = np.array(sorted(rows))
-            timeline.tracks[key] = columns[:, 0], columns[:, 1:]
-        return timeline
-
-    def _add_tracks(
-        self,
-        timeline: Timeline,
-        ranges: list[tuple[MeasurementKey, CorrectedRange]],
-        anchors: AnchorMap,
-        height: Height | None,
-    ) -> None:
-        """Add positions from raw and corrected ranges, and the mean correction along the track."""
-        true_z = [xyz[:, 2] for (_, kind), (_, xyz) in timeline.tracks.items() if kind is TrackKind.TRUE]
-        if height is None and true_z:
-            height = Height(float(np.median(np.concatenate(true_z))))
-        config = EstimatorConfig(anchors, height=height)
-        for tag_id in sorted({key.tag_id for key, _ in ranges})[:MAX_TAGS]:
-            own = [row for row in ranges if row[0].tag_id == tag_id and row[0].anchor_id in anchors.index]
-            raw = _ranges([(key, found.range_raw_m, np.nan) for key, found in own], anchors)
-            corrected = _ranges([(key, found.range_m, found.variance_m2) for key, found in own], anchors)
-            name = tag_frame(tag_id)
-            try:
-                fixes = snapshot(anchors, raw, height)
-                timeline.tracks[name, TrackKind.RAW] = self._seconds(fixes.stamp_ns), fixes.position
-                if self.positions:
-                    continue
-                live = TagEstimator(config).run(corrected)
-                timeline.tracks[name, TrackKind.CORRECTED] = self._seconds(live.stamp_ns), live.position
+    true_z = [xyz[:, 2] for (_, kind), (_, xyz) in timeline.tracks.items() if kind is TrackKind.TRUE]
+    if height is None and true_z:
+        height = Height(float(np.median(np.concatenate(true_z))))
+    config = EstimatorConfig(anchors, height=height)
+    for tag_id in sorted({key.tag_id for key in keys})[:MAX_TAGS]:
+        own = [row for row in ranges if row[0].tag_id == tag_id and row[0].anchor_id in anchors.index]
+        raw = _ranges([(key, found.range_raw_m, np.nan) for key, found in own], anchors)
+        corrected = _ranges([(key, found.range_m, found.variance_m2) for key, found in own], anchors)
+        name, tracks = tag_frame(tag_id), {}
+        # There may be too few ranges for a track of this tag.
+        with contextlib.suppress(DatasetError, IndexError, ValueError):
+            tracks[TrackKind.RAW] = snapshot(anchors, raw, height)
+            if not recording.contents & POSITIONS:
+                tracks[TrackKind.CORRECTED] = live = TagEstimator(config).run(corrected)
                 timeline.estimates[name] = list(live)
-                smoothed = smooth(config, corrected, live)
-                timeline.tracks[name, TrackKind.SMOOTHED] = (
-                    self._seconds(smoothed.stamp_ns),
-                    smoothed.position,
-                )
-            except (DatasetError, IndexError, ValueError):
-                # Too few ranges for a track of this tag.
-                continue
-        self._add_heat(timeline)
+                tracks[TrackKind.SMOOTHED] = smooth(config, corrected, live)
+        for kind, track in tracks.items():
+            timeline.tracks[name, kind] = seconds(track.stamp_ns), track.position
+    _add_heat(timeline)
+    return timeline
 
-    def _add_heat(self, timeline: Timeline) -> None:
-        tracks = {
-            name: track for (name, kind), track in timeline.tracks.items() if kind is TrackKind.CORRECTED
-        }
-        for tag_id in {pair[1] for pair in timeline.pairs}:
-            track = tracks.get(tag_frame(tag_id)) or (
-                next(iter(tracks.values())) if len(tracks) == 1 else None
-            )
-            if track is None or not len(track[0]):
-                continue
-            rows = [row for row, pair in enumerate(timeline.pairs) if pair[1] == tag_id]
-            x, y = (np.interp(timeline.time_s[rows], track[0], axis) for axis in track[1][:, :2].T)
-            correction = timeline.raw_m[rows] - timeline.corrected_m[rows]
-            for row in np.flatnonzero(np.abs(correction) < MAX_RANGE_M):
-                add_heat(timeline.heat, float(x[row]), float(y[row]), float(correction[row]))
+
+def _add_heat(timeline: Timeline) -> None:
+    """Add the mean correction along the tracks."""
+    tracks = {name: track for (name, kind), track in timeline.tracks.items() if kind is TrackKind.CORRECTED}
+    only = next(iter(tracks.values())) if len(tracks) == 1 else None
+    for tag_id in {tag_id for _, tag_id in timeline.pairs}:
+        track = tracks.get(tag_frame(tag_id)) or only
+        if track is None or not len(track[0]):
+            continue
+        rows = [row for row, pair in enumerate(timeline.pairs) if pair[1] == tag_id]
+        x, y = (np.interp(timeline.time_s[rows], track[0], axis) for axis in track[1][:, :2].T)
+        correction = timeline.raw_m[rows] - timeline.corrected_m[rows]
+        for row in np.flatnonzero(np.abs(correction) < MAX_RANGE_M):
+            add_heat(timeline.heat, float(x[row]), float(y[row]), float(correction[row]))
 
 
 def _ranges(rows: list[tuple[MeasurementKey, float, float]], anchors: AnchorMap) -> Ranges:

@@ -1,0 +1,138 @@
+"""The topics of a bag that the viewer shows, in one namespace."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from uwb_mitigation.bag import schemas, topics
+from uwb_mitigation.bag.reader import BagReader, check_channel
+from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.viewer.feed import DECODERS, DIAGNOSTICS
+from uwb_mitigation.viewer.scene import DEFAULT_TAG
+
+POSITIONS = frozenset({topics.POSE, topics.ODOMETRY, topics.POSE_SMOOTHED})
+RANGES = frozenset({topics.RANGE_RAW, topics.RANGE_CORRECTED})
+
+_RANGE_TYPES = {
+    topics.RANGE_RAW: topics.RANGE_CIR_TYPE,
+    topics.RANGE_TRUTH: topics.RANGE_TRUTH_TYPE,
+    topics.RANGE_CORRECTED: topics.RANGE_CORRECTED_TYPE,
+}
+_TYPES = _RANGE_TYPES | {
+    topics.POSE: topics.POSE_TYPE,
+    topics.ODOMETRY: topics.ODOMETRY_TYPE,
+    topics.POSE_SMOOTHED: topics.POSE_TYPE,
+    topics.ODOMETRY_TRUTH: topics.ODOMETRY_TYPE,
+    topics.ANCHORS: topics.MARKERS_TYPE,
+    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+}
+_POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odometry|pose_smoothed)")
+
+
+class Event(NamedTuple):
+    """A decoded message.
+
+    Attributes:
+        time_ns: log time since the beginning of the recording.
+        topic: without namespace and tag.
+        message: None: it cannot be decoded.
+        tag: of a position; otherwise `DEFAULT_TAG`.
+    """
+
+    time_ns: int
+    topic: str
+    message: Any
+    tag: str
+
+
+class Recording:
+    """A bag with ranges or tracks.
+
+    Args:
+        path: an MCAP file or a rosbag2 folder.
+        namespace: namespace of the topics, such as `/board1`; None: the only namespace with ranges (or tracks) in the bag.
+
+    Attributes:
+        start_ns: time of the first message. seconds: duration.
+        prefix: the namespace.
+        contents: topics without namespace and tag.
+
+    Raises:
+        RecordingError: the path is not an MCAP bag, or contains neither ranges nor tracks, or ranges of another version.
+        ParameterError: the bag has several namespaces, and none was given.
+    """
+
+    def __init__(self, path: Path, namespace: str | None = None) -> None:
+        self.path, self._bag = path, BagReader(path)
+        known, bounds = self._bag.topics, self._bag.bounds_ns
+        self.prefix = prefix = _namespace(path, known) if namespace is None else namespace.rstrip("/")
+        for channel in self._bag.channels:
+            if kind := _RANGE_TYPES.get(channel.topic.removeprefix(prefix)):
+                check_channel(channel, kind, path)
+        self._topics: dict[str, tuple[str, str]] = {}
+        for topic, kind in known.items():
+            plain, tag = topic.removeprefix(prefix), DEFAULT_TAG
+            if match := _POSITION_TOPIC.fullmatch(topic):
+                plain, tag = f"/uwb/{match[3]}", match[2] or DEFAULT_TAG
+            is_own = match[1] == prefix if match else topic in (prefix + plain, DIAGNOSTICS)
+            if is_own and kind.replace("/msg/", "/") == _TYPES.get(plain, "").replace("/msg/", "/"):
+                self._topics[topic] = plain, tag
+        if topics.POSE in self.contents:
+            # Tracks (the output of `track`) are used only if there are no poses.
+            other = POSITIONS - {topics.POSE}
+            self._topics = {topic: found for topic, found in self._topics.items() if found[0] not in other}
+        if bounds is None or not self.contents & (RANGES | POSITIONS):
+            raise _no_ranges(path, known)
+        self.start_ns, self.seconds = bounds[0], (bounds[1] - bounds[0]) / 1e9
+        self.rate_hz = self._bag.message_count / max(self.seconds, 1e-9)
+
+    @property
+    def contents(self) -> set[str]:
+        return {plain for plain, _ in self._topics.values()}
+
+    @property
+    def corrects(self) -> bool:
+        """Whether the bag contains raw ranges only."""
+        return self.contents & RANGES == {topics.RANGE_RAW}
+
+    def events(self, wanted: Collection[str], start_ns: int = 0) -> Iterator[Event]:
+        """Yield the messages of topics from a time since the beginning.
+
+        Raises:
+            RecordingError: the bag is damaged; every message before the damage has been yielded.
+        """
+        names = [topic for topic, (plain, _) in self._topics.items() if plain in wanted]
+        for found in self._bag.messages(names, self.start_ns + start_ns):
+            plain, tag = self._topics[found.channel.topic]
+            yield Event(found.log_time_ns - self.start_ns, plain, _decode(plain, found.data), tag)
+
+
+def _decode(topic: str, data: bytes) -> Any:
+    try:
+        if topic in DECODERS:
+            return DECODERS[topic](data)
+        return schemas.typestore().deserialize_cdr(data, _TYPES[topic])
+    except Exception:  # rosbags raises various types.
+        return None
+
+
+def _namespace(path: Path, known: dict[str, str]) -> str:
+    """Return the only namespace with ranges, or with tracks if there are no ranges."""
+    found = {topic.removesuffix(name) for topic in known for name in RANGES if topic.endswith(name)}
+    found = found or {match[1] for topic in known if (match := _POSITION_TOPIC.fullmatch(topic))}
+    if len(found) > 1:
+        names = ", ".join(map(repr, sorted(found)))
+        raise ParameterError("several namespaces", where=str(path), valid=f"--namespace with one of: {names}")
+    if not found:
+        raise _no_ranges(path, known)
+    return found.pop()
+
+
+def _no_ranges(path: Path, known: dict[str, str]) -> RecordingError:
+    found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(known.items()))
+    return RecordingError(
+        "no ranges and no tracks", where=str(path), valid=f"the bag contains: {found or 'no topic'}"
+    )
