@@ -591,6 +591,9 @@ def test_an_error_column_of_the_opposite_sign_is_reported(tmp_path: Path):
     assert "set scale: -1" in warning
     with pytest.raises(RecordingError, match="the error is true - measured"):
         read(PLAIN | {"truth": {"error": "e", "range": "true"}}, tmp_path / "x.csv")
+    # Radios with a negative offset.
+    write(tmp_path / "low.csv", "t,a,r,e\n" + "\n".join(f"{n},1,5,{e - 2:.3f}" for n, e in enumerate(errors)))
+    assert not read(PLAIN | {"truth": {"error": "e"}}, tmp_path / "low.csv").warnings
     # The sign of errors from true ranges is known.
     write(
         tmp_path / "low.csv",

@@ -327,8 +327,8 @@ class MappedRecording(Source):
             low, middle, high = np.percentile(errors, (5, 50, 95))
             if middle - low > 2 * max(high - middle, 0.0) and low < -0.3 and middle < 0:
                 self.warnings.append(
-                    f"most errors are negative (median {middle:.2f} m, 5 % below {low:.2f} m): estimated from their "
-                    "distribution, the error column is true - measured; if so, set scale: -1"
+                    f"most errors are negative (median {middle:.2f} m, 5 % below {low:.2f} m): probably the error column is "
+                    "true - measured (set scale: -1), if not many ranges are too short; estimated from the distribution"
                 )
         if negative := int(np.count_nonzero(values["range"] < 0)):
             self.warnings.append(f"{negative} ranges are negative")
