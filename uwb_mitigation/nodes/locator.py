@@ -37,7 +37,7 @@ from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement,
 from uwb_mitigation.nodes import diagnostics, markers, topics
 from uwb_mitigation.nodes.lifecycle import ManagedNode
 from uwb_mitigation.nodes.parameter_tables import LOCATOR
-from uwb_mitigation.nodes.robot_motion import RobotMotion, check_frames, transform_type
+from uwb_mitigation.nodes.robot_motion import RobotMotion, transform_type
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
@@ -153,7 +153,6 @@ class Locator(ManagedNode):
                 )
             self._tf = self.publisher(self._tf_type, topics.TF, QoSProfile(depth=100))
         if robot is not None:
-            check_frames(self)
             self._robot = RobotMotion(self, path_of_base)
         self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
         if kind in markers.ANCHOR_TYPES:

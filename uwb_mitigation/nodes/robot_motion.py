@@ -8,6 +8,7 @@ from typing import Any
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from uwb_mitigation.bag.odometry import yaw_of
@@ -34,6 +35,9 @@ class RobotMotion:
         node: the locator, while it is configured.
         path: integrates the messages.
 
+    Raises:
+        ParameterError: the frames of the robot and the map are equal.
+
     Attributes:
         odom_frame: frame of the odometry; empty before its first message.
         base_frame: the parameter, or else the child frame of the odometry.
@@ -43,12 +47,17 @@ class RobotMotion:
     def __init__(self, node: ManagedNode, path: DeadReckoning) -> None:
         self.path, self.odom_frame, self.base_frame = path, "", node.value("base_frame")
         self._map, self._log = node.value("map_frame"), node.get_logger()
+        if self.base_frame == self._map:
+            raise ParameterError(
+                f"parameter base_frame = {self._map!r} is the frame of the map",
+                valid="the robot's frame, such as base_link",
+            )
         self._uses_orientation = node.value("imu_orientation")
         self._last: TransformStamped | None = None
         self._last_ns = 0
         self.lever_arm_is_set = bool(node.value("lever_arm"))
-        # {child frame: (parent frame, translation, quaternion x y z w)} of static transforms.
-        self._static: dict[str, tuple[str, Vector, tuple[float, float, float, float]]] = {}
+        # {child frame: (parent frame, translation, rotation)} of static transforms.
+        self._static: dict[str, tuple[str, Vector, Rotation]] = {}
 
         def subscribe(kind: type, topic: str, callback: Any) -> None:
             received = topics.create_subscription(node, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT)
@@ -74,7 +83,7 @@ class RobotMotion:
             if frame not in self._static:
                 return None
             frame, (x, y, z), rotation = self._static[frame]
-            dx, dy, dz = _rotate(rotation, point)
+            dx, dy, dz = rotation.apply(point).tolist()
             point = x + dx, y + dy, z + dz
         return None
 
@@ -156,7 +165,7 @@ class RobotMotion:
                 and all(map(math.isfinite, (t.x, t.y, t.z)))
                 and 0.9 < norm < 1.1  # false for NaN
             ):
-                rotation = r.x / norm, r.y / norm, r.z / norm, r.w / norm
+                rotation = Rotation.from_quat((r.x, r.y, r.z, r.w))
                 self._static[one.child_frame_id] = one.header.frame_id, (t.x, t.y, t.z), rotation
 
 
@@ -167,27 +176,6 @@ def transform_type() -> Any:
     except ImportError:
         return None
     return TFMessage
-
-
-def check_frames(node: ManagedNode) -> None:
-    """Raise ParameterError if the frames of the robot and the map are equal."""
-    if node.value("base_frame") == node.value("map_frame"):
-        raise ParameterError(
-            f"parameter base_frame = {node.value('base_frame')!r} is the frame of the map",
-            valid="the robot's frame, such as base_link",
-        )
-
-
-def _rotate(q: tuple[float, float, float, float], v: Vector) -> Vector:
-    """Return a vector rotated by a quaternion."""
-    x, y, z, w = q
-    # v + 2 w (q x v) + 2 q x (q x v)
-    cx, cy, cz = y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0]
-    return (
-        v[0] + 2.0 * (w * cx + y * cz - z * cy),
-        v[1] + 2.0 * (w * cy + z * cx - x * cz),
-        v[2] + 2.0 * (w * cz + x * cy - y * cx),
-    )
 
 
 def _stamp_ns(message: Any) -> int:
