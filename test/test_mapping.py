@@ -109,6 +109,16 @@ def _hdf5(path: Path) -> None:
             file[f"log/{name}"] = values
 
 
+def _matlab_7_3(path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in TABLE.items():
+            # MATLAB stores columns, so that the shape is reversed.
+            file[f"log/{name}"] = np.reshape(values, (5, -1)).T
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+
+
 def _parquet(path: Path) -> None:
     pa = pytest.importorskip("pyarrow")
     import pyarrow.parquet as parquet
@@ -127,6 +137,7 @@ def _matlab(path: Path) -> None:
     [
         ("x.npz", lambda path: np.savez(path, **TABLE), ""),
         ("x.mat", _matlab, "log"),
+        ("seven.mat", _matlab_7_3, "log"),
         ("x.h5", _hdf5, "log"),
         ("x.parquet", _parquet, ""),
     ],
@@ -790,3 +801,21 @@ def test_garbage_in_any_format_is_a_typed_error(name: str, tmp_path: Path):
     (tmp_path / name).write_bytes(b"\x93NUMPY garbage \x00\xff" * 40)
     with pytest.raises(RecordingError):
         read(PLAIN | {"topics": ["/x"]}, tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "old", "new"),
+    [
+        ("x.npz", lambda path: np.savez(path, **TABLE), b"t.npy", b"u.npy"),
+        ("x.h5", _hdf5, b"HEAP", b"HEAD"),
+    ],
+)
+def test_a_damaged_file_of_a_library_is_a_typed_error(
+    name: str, make: Any, old: bytes, new: bytes, tmp_path: Path
+):
+    make(tmp_path / name)
+    data = (tmp_path / name).read_bytes()
+    assert old in data
+    (tmp_path / name).write_bytes(data.replace(old, new, 1))
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read(PLAIN | {"group": "log" if name == "x.h5" else "", "cir": {"column": "cir"}}, tmp_path / name)

@@ -18,7 +18,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DamagedRecordingError, RecordingError, did_you_mean, not_installed
+from uwb_mitigation.errors import (
+    DamagedRecordingError,
+    RecordingError,
+    UwbMitigationError,
+    did_you_mean,
+    not_installed,
+)
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.sources.mapping import LIST_INDEX, Table
 from uwb_mitigation.sources.messages import MessageRows
@@ -43,10 +49,8 @@ _SUFFIXES = {
     ".mat": "matlab", ".h5": "hdf5", ".hdf5": "hdf5", ".bag": "messages", ".db3": "messages", ".mcap": "messages",
     ".yaml": "yaml", ".yml": "yaml",
 }  # fmt: skip
-UNREADABLE = (
-    OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError, MemoryError, RecursionError,
-    yaml.YAMLError,
-)  # fmt: skip
+UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError)
+"""Errors of values that do not have the expected form."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +156,10 @@ def read_chunks(table: Table, path: Path, columns: Mapping[str, bool], before: i
         raise DamagedRecordingError(
             f"truncated or corrupt: {error}", where=f"{path}: after row {first}"
         ) from error
-    except UNREADABLE as error:
+    except UwbMitigationError:
+        raise
+    except Exception as error:
+        # For damaged files the libraries raise many other types, such as BadZipFile or ZeroDivisionError.
         raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
 
 
@@ -305,33 +312,29 @@ _FORMATS = (*_READERS, "messages")
 
 
 def _messages(table: Table, path: Path, columns: Mapping[str, bool]) -> _Rows:
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.serde import SerdeError
-    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     reader = MessageRows(table, columns)
     store = get_typestore(Stores.ROS2_JAZZY)
-    try:
-        for name, text in table.definitions.items():
-            store.register(get_types_from_msg(text, name))
-        with AnyReader([path], default_typestore=store) as bag:
-            topics = {connection.topic: connection.msgtype for connection in bag.connections}
-            if missing := [topic for topic in table.topics if topic not in topics]:
-                known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:40])
-                raise RecordingError(f"no topic {missing[0]}", where=str(path), valid=f"the bag has: {known}")
-            messages = bag.messages([each for each in bag.connections if each.topic in table.topics])
-            while batch := list(islice(messages, 1000)):
-                rows: dict[str, list[Any]] = {}
-                for connection, stamp_ns, data in batch:
-                    try:
-                        found = reader.rows(bag.deserialize(data, connection.msgtype))
-                    except RecordingError as error:
-                        where = f"{path}: {connection.topic}"
-                        raise RecordingError(error.what, where=where, valid=error.valid) from error
-                    count = len(found[LIST_INDEX])
-                    found |= {LOG_TIME: [stamp_ns] * count, TOPIC: [connection.topic] * count}
-                    for name, values in found.items():
-                        rows.setdefault(name, []).extend(values)
-                yield rows, len(rows[LIST_INDEX])
-    except (AnyReaderError, SerdeError, TypesysError) as error:
-        raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
+    for name, text in table.definitions.items():
+        store.register(get_types_from_msg(text, name))
+    with AnyReader([path], default_typestore=store) as bag:
+        topics = {connection.topic: connection.msgtype for connection in bag.connections}
+        if missing := [topic for topic in table.topics if topic not in topics]:
+            known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:40])
+            raise RecordingError(f"no topic {missing[0]}", where=str(path), valid=f"the bag has: {known}")
+        messages = bag.messages([each for each in bag.connections if each.topic in table.topics])
+        while batch := list(islice(messages, 1000)):
+            rows: dict[str, list[Any]] = {}
+            for connection, stamp_ns, data in batch:
+                try:
+                    found = reader.rows(bag.deserialize(data, connection.msgtype))
+                except RecordingError as error:
+                    where = f"{path}: {connection.topic}"
+                    raise RecordingError(error.what, where=where, valid=error.valid) from error
+                count = len(found[LIST_INDEX])
+                found |= {LOG_TIME: [stamp_ns] * count, TOPIC: [connection.topic] * count}
+                for name, values in found.items():
+                    rows.setdefault(name, []).extend(values)
+            yield rows, len(rows[LIST_INDEX])
