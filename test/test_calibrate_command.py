@@ -16,7 +16,7 @@ from uwb_mitigation.bag.poses import encode_odometry
 from uwb_mitigation.bag.topics import TF_TYPE
 from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.mitigation import Mitigation
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.offsets import read_offsets
@@ -429,3 +429,58 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
     done = run("quantize", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert load_bundle(tmp_path / "int8.onnx").quantised
+
+
+@pytest.mark.parametrize(("taps", "slope", "chosen"), [(16, 0.06, "offsets + line"), (157, 0.06, "offsets + line"), (157, 0.0, "offsets")])  # fmt: skip
+def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps, slope, chosen):
+    """NLOS makes simulated STS ranges longer by `slope` m per dB between receive and first-path level, or not at all."""
+    from drives import HALL
+
+    from benchmarks.uci_board import taps_of
+
+    def measure(seed):
+        ranges, _ = drive(seconds=80, rate_hz=20.0, offset_m=0.0)
+        rng, n = np.random.default_rng(seed), len(ranges)
+        nlos = (rng.random((41, 5)) < 0.3)[ranges.stamp_ns // 2_000_000_000, ranges.anchor]
+        gap = np.where(nlos, rng.normal(12, 2, n), rng.normal(3.5, 1, n))
+        level = -80 - rng.normal(0, 3, n) - 3 * nlos
+        value = ranges.range_m + OWN[ranges.anchor] + slope * np.maximum(gap - 5, 0)
+        cirs = [
+            Cir(
+                taps_of(i, taps, 5).astype(np.int16).reshape(-1),
+                start_index=357,
+                first_path_index=362.5,
+                rx_power_dbm=float(level[i]),
+                first_path_power_dbm=float(level[i] - gap[i]),
+                radio=RadioType.DW3000,
+                segment=Segment.STS,
+                preamble_count=64,
+            )
+            for i in range(n)
+        ]
+        ids = [HALL.anchors[row].id for row in ranges.anchor]
+        columns = zip(ranges.stamp_ns.tolist(), ids, value.tolist(), cirs, strict=True)
+        measured = [
+            RangeMeasurement(at, 7, anchor, i, 0, m, cir) for i, (at, anchor, m, cir) in enumerate(columns)
+        ]
+        return measured, ranges.range_m
+
+    save_anchors(tmp_path / "anchors.yaml", HALL)
+    with BagWriter(tmp_path / "drive.mcap", {"simulated": "true"}) as bag:
+        for measured in measure(1)[0]:
+            bag.write(Record(measured))
+    done = run("calibrate", "drive.mcap", *LEVEL, "-o", "site.onnx", "--json", "r.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "r.json").read_text())
+    assert result["chosen"] == chosen
+    bundle, offsets = load_bundle(tmp_path / "site.onnx"), read_offsets(str(tmp_path / "site.offsets.yaml"))
+    assert bundle.card.source == "DW3000 STS"
+    # Another drive, with other walls.
+    held_out, true_m = measure(2)
+    corrected = Mitigation(bundle, offsets).correct(held_out)
+    assert {each.status for each in corrected} == {0}
+    error = np.abs([each.range_m for each in corrected] - true_m).mean()
+    only_offsets = np.array(
+        [each.range_m - offsets.of(np.array([7]), np.array([each.anchor_id]))[0] for each in held_out]
+    )
+    assert error < (0.7 if slope else 1.05) * np.abs(only_offsets - true_m).mean()

@@ -139,7 +139,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
     anchors = 4 + seed % 5
     drive, other = (Drive(seed, which, anchors, seconds, flat) for which in (0, 1))
     records = list(drive)
-    site = read_site([records], drive.anchors, universal.preprocessing)
+    site = read_site([records], drive.anchors, universal.card)
     began = time.perf_counter()
     height = Height(0.0, 0.05)
     if truth_topic:
@@ -219,7 +219,7 @@ def speed(minutes: float) -> dict[str, object]:
     """Measure time and memory for one long drive."""
     universal = load_bundle(default_model_path())
     drive = Drive(1, 0, 6, 60.0 * minutes)
-    site = read_site([drive], drive.anchors, universal.preprocessing)
+    site = read_site([drive], drive.anchors, universal.card)
     began, cpu = time.perf_counter(), time.process_time()
     solution = site_solution.solve_without_truth(site, universal, height=Height(0.0, 0.05), area=None)
     found = site_calibration.calibrate(site, universal, solution, seed=0)

@@ -47,7 +47,7 @@ def calibrated(
     records: Iterable[Record], anchors: AnchorMap, source: Bundle, height: Height
 ) -> SiteCalibration:
     """Calibrate a site from one recording, without ground truth."""
-    site = read_site([records], anchors, source.preprocessing)
+    site = read_site([records], anchors, source.card)
     return calibrate(site, source, solve_without_truth(site, source, height=height, area=None), seed=0)
 
 

@@ -42,7 +42,7 @@ def corrected_drive(seed: int, seconds: float) -> tuple[EstimatorConfig, Ranges,
     """Return the configuration, corrected ranges, truth and motion of the second drive at a calibrated site."""
     universal, anchors = load_bundle(default_model_path()), 4 + seed % 5
     first, second = (Drive(seed, number, anchors, seconds) for number in (0, 1))
-    site = read_site([list(first)], first.anchors, universal.preprocessing)
+    site = read_site([list(first)], first.anchors, universal.card)
     solution = site_solution.solve_without_truth(site, universal, height=HEIGHT, area=None)
     calibration = site_calibration.calibrate(site, universal, solution, seed=0)
     records = list(second)

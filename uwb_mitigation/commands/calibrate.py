@@ -218,7 +218,7 @@ def _gather(
         return read_site(
             [stack.enter_context(open_recording(bag)) for bag in bags],
             anchors,
-            source.preprocessing,
+            source.card,
             on_record,
             stamp_offset_s=stamp_offset,
             heights=heights,

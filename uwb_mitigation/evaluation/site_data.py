@@ -15,6 +15,7 @@ from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.evaluation.dataset import CirSources, Dataset
 from uwb_mitigation.measurement import Record
 from uwb_mitigation.mitigation import MAX_RANGE_M
+from uwb_mitigation.model.bundle import Card
 from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.tracks import Heights, Ranges
 from uwb_mitigation.preprocessing import Preprocessing
@@ -128,7 +129,7 @@ class SiteData:
 def read_site(
     recordings: Iterable[Iterable[Record]],
     anchors: AnchorMap,
-    preprocessing: Preprocessing,
+    card: Card,
     on_record: Callable[[], None] = lambda: None,
     *,
     stamp_offset_s: float = 0.0,
@@ -139,7 +140,7 @@ def read_site(
     Args:
         recordings: records of each recording, in the order of time.
         anchors: anchors of the site; other anchors are skipped.
-        preprocessing: preprocessing of the model.
+        card: of the universal model. CIRs that it was not trained for are not used, but their levels are.
         on_record: called for each record that was read.
         stamp_offset_s: time offset added to the stamps of ranges: -0.2 if they are 0.2 s late.
         heights: heights of the tags for each recording. Ranges without a height are excluded.
@@ -175,13 +176,15 @@ def read_site(
                 skipped["no height at that time"] += 1
             else:
                 frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
-                (fault,), (window,) = preprocessing.windows_of([measured])
+                (fault,), (window,) = card.preprocessing.windows_of([measured])
                 stamp_ns += shift
                 last_stamp_ns = stamp_ns if last_stamp_ns is None else max(last_stamp_ns, stamp_ns)
-                powers = measured.cir.rx_power_dbm, measured.cir.first_path_power_dbm
-                rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *powers, height, fault == 0))
+                cir = measured.cir
+                powers = cir.rx_power_dbm, cir.first_path_power_dbm
+                usable = fault == 0 and card.fits(cir.radio, cir.segment, len(cir) > 0)
+                rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *powers, height, usable))
                 windows.append(window)
-                sources.add(measured.cir)
+                sources.add(cir)
         shifts.append(shift or 0)
     for anchor_id, count in unknown.items():
         skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
@@ -214,7 +217,7 @@ def read_site(
     return SiteData(
         anchors=anchors,
         tags=tags,
-        preprocessing=preprocessing,
+        preprocessing=card.preprocessing,
         inputs=np.stack([windows[index] for index in order]),
         rx_power_dbm=rx.astype(np.float32),
         first_path_power_dbm=first_path.astype(np.float32),

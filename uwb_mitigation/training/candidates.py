@@ -318,7 +318,11 @@ def site_models(
     )
     if not has_cirs:
         line = Candidate(SITE_LINE, lambda data, seed: FittedModel(_site_line(data, data.error_m)))
-        return data, [offsets, line], ["no networks: the recording has no CIRs"]
+        return (
+            data,
+            [offsets, line],
+            ["no networks: the recording has no CIRs that the universal model was trained for"],
+        )
     start = float_network(universal)
     data = replace(data, headers=network_m(start, data.inputs)[:, None].astype(np.float32))
 
