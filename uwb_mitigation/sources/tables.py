@@ -148,7 +148,7 @@ def read_chunks(table: Table, path: Path, columns: Mapping[str, bool], before: i
         elif kind in _READERS:
             rows = _READERS[kind](table, path, partial(_choose, wanted, path))
         else:
-            raise RecordingError("unknown format", where=str(path), valid=f"format: {', '.join(_FORMATS)}")
+            raise RecordingError("unknown format", where=str(path), valid=", ".join([*_READERS, "messages"]))
         for found, count in rows:
             yield Chunk(found, count, path, np.arange(first, first + count), before)
             first += count
@@ -308,7 +308,6 @@ def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 _READERS = {"csv": _csv, "parquet": _parquet} | dict.fromkeys(("numpy", "matlab", "hdf5", "yaml"), _arrays)
-_FORMATS = (*_READERS, "messages")
 
 
 def _messages(table: Table, path: Path, columns: Mapping[str, bool]) -> _Rows:
