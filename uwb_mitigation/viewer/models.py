@@ -6,6 +6,7 @@ Figures use the colours of the light page; on a dark page its script exchanges `
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -118,7 +119,8 @@ class Models:
             factors=names, palette=[look.colour or NIGHT for look in looks], nan_color=GREY
         )
         self._colour = {"field": "status", "transform": colours}
-        self._marker = factor_mark("status", [look.marker for look in looks], names)
+        marker = factor_mark("status", [look.marker for look in looks], names)
+        self._symbols = {"marker": marker, "color": self._colour}
         self.controls = Controls(name="controls")
         self.pairs = _source("pairs", "anchor", "tag", "no_data", *COLUMNS)
         self.anchors = _source("anchors", "x", "y", "name", "id")
@@ -176,98 +178,70 @@ class Models:
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
         plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
-        items: dict[str, list[Any]] = {}
         if plan is not None:
             plot.image_url(
                 url=[plan.url], x=plan.x, y=plan.y, w=plan.width, h=plan.height, angle=plan.yaw, anchor="bottom_left"
             )  # fmt: skip
-            items["wall"] = [plot.scatter([math.nan], [math.nan], marker="square", size=12, color=GREY)]
+        walls = ColumnDataSource({name: [math.nan] * (plan is not None) for name in "xy"})
         self.heat_levels = LinearColorMapper("Viridis256", low=0.0, high=1.0)
-        heat = plot.rect(
-            "x", "y", width=CELL_M, height=CELL_M, source=self.heat, line_color=None, fill_alpha=0.8,
-            fill_color={"field": "mean", "transform": self.heat_levels}, visible=False,
-        )  # fmt: skip
         bar = _colour_bar(self.heat_levels, title="mean correction, m", visible=False)
         plot.add_layout(bar, "right")
-        circles = [
-            plot.circle(
-                "x", "y", radius=column, source=self.rays, fill_color=None, line_color=colour, line_width=width,
-                line_dash=dash, visible=False,
-            )
-            for column, colour, width, dash in (
-                ("raw", VERMILLION, 1.0, "dashed"), ("corrected", self._colour, 2.5, "solid"),
-            )
+        tag = CategoricalColorMapper(factors=["OK"], palette=[BLUE], nan_color=GREY)
+        on_request: dict[str, Any] = {"fill_color": None, "visible": False}
+        label = {
+            "text": "name", "x_offset": 11, "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "background_fill_color": PAPER, "background_fill_alpha": 0.8,
+        }  # fmt: skip
+        layers: list[tuple[str, str, ColumnDataSource, dict[str, Any]]] = [
+            ("wall", "scatter", walls, {"marker": "square", "size": 12, "color": GREY}),
+            ("mean correction", "rect", self.heat, on_request | {
+                "width": CELL_M, "height": CELL_M, "line_color": None, "fill_alpha": 0.8,
+                "fill_color": {"field": "mean", "transform": self.heat_levels},
+            }),
+            ("raw range", "circle", self.rays, on_request | {"radius": "raw", "line_color": VERMILLION, "line_dash": "dashed"}),
+            ("corrected range", "circle", self.rays, on_request | {
+                "radius": "corrected", "line_color": self._colour, "line_width": 2.5,
+            }),
+            ("", "segment", self.rays, {"x1": "x1", "y1": "y1", "line_color": self._colour, "line_alpha": 0.8}),
+            *((kind.value, "line", source, _stroke(kind)) for kind, source in self.tracks.items()),
+            ("raw", "scatter", self.tracks[TrackKind.RAW], {"marker": "cross", "size": 5, "color": VERMILLION}),
+            ("95 % ellipse", "ellipse", self.ellipses, {
+                "width": "width", "height": "height", "angle": "angle", "color": BLUE, "fill_alpha": 0.25,
+            }),
+            ("protection level", "circle", self.protection, {
+                "radius": "protection", "fill_color": None, "line_color": NIGHT, "line_dash": "dotted",
+            }),
+            ("", "ray", self.tags, {"length": "heading_size", "angle": "heading", "line_color": NIGHT, "line_width": 3}),
+            ("status", "scatter", self.statuses, self._symbols | {"size": 10, "line_width": 2}),
+            ("tag", "scatter", self.tags, {
+                "marker": "star", "size": 13, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
+            }),
+            ("anchor", "scatter", self.anchors, {"marker": "triangle", "size": 14, "color": NIGHT}),
+            ("selected anchor", "scatter", self.selected, {
+                "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
+            }),
+            ("", "text", self.anchors, label | {"y_offset": -6}),
+            ("", "text", self.tags, label | {"y_offset": 18}),
         ]  # fmt: skip
-        self.layers |= {"circles": circles, "heat": [heat, bar]}
-        plot.segment("x", "y", "x1", "y1", source=self.rays, line_color=self._colour, line_alpha=0.8)
-        for kind, source in self.tracks.items():
-            items[kind.value] = [_line(plot, "x", "y", source, kind)]
-        crosses = plot.scatter(
-            "x", "y", source=self.tracks[TrackKind.RAW], marker="cross", size=5, color=VERMILLION
-        )
-        items[TrackKind.RAW.value].append(crosses)
-        items["95 % ellipse"] = [
-            plot.ellipse(
-                "x", "y", width="width", height="height", angle="angle", source=self.ellipses,
-                fill_color=BLUE, fill_alpha=0.25, line_color=BLUE,
-            )
-        ]  # fmt: skip
-        items["protection level"] = [
-            plot.circle(
-                "x", "y", radius="protection", source=self.protection, fill_color=None, line_color=NIGHT, line_dash="dotted"
-            )
-        ]  # fmt: skip
-        plot.ray(
-            "x", "y", length="heading_size", angle="heading", source=self.tags, line_color=NIGHT, line_width=3
-        )
-        statuses = plot.scatter(
-            "x", "y", source=self.statuses, marker=self._marker, size=10, color=self._colour, line_width=2
-        )
-        tag = {
-            "field": "status",
-            "transform": CategoricalColorMapper(factors=["OK"], palette=[BLUE], nan_color=GREY),
-        }
-        items["tag"] = [
-            plot.scatter("x", "y", source=self.tags, size=13, marker="star", fill_color=tag, line_color=NIGHT)
-        ]
-        items["anchor"] = [
-            plot.scatter("x", "y", source=self.anchors, marker="triangle", size=14, color=NIGHT)
-        ]
-        items["selected anchor"] = [
-            plot.scatter(
-                "x", "y", source=self.selected, marker="circle", size=22, fill_color=None, line_color=GREEN, line_width=4
-            )
-        ]  # fmt: skip
-        items |= {"raw range": circles[:1], "corrected range": circles[1:], "mean correction": [heat]}
-        for source, y in ((self.anchors, -6), (self.tags, 18)):
-            plot.text(
-                "x", "y", "name", source=source, x_offset=11, y_offset=y, text_font_size="12px", text_color=NIGHT,
-                background_fill_color=PAPER, background_fill_alpha=0.8, level="annotation",
-            )  # fmt: skip
-        entries = [LegendItem(label=label, renderers=parts) for label, parts in items.items()]
-        entries.append(LegendItem(label={"field": "status"}, renderers=[statuses]))
-        self._legend = Legend(items=entries)
+        items = defaultdict[str, list[Any]](list)
+        for name, glyph, source, style in layers:
+            items[name].append(getattr(plot, glyph)("x", "y", source=source, **style))
+        del items[""]
+        self.layers["circles"] = items["raw range"] + items["corrected range"]
+        self.layers["heat"] = [*items["mean correction"], bar]
+        labels: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
+        self._legend = Legend(items=[LegendItem(label=labels[name], renderers=items[name]) for name in items])
         return _with_legend(plot, self._legend, "below")
 
     def _strip(self) -> figure:
         plot = _figure(230, "seconds", "m", x_range=Range1d(-HISTORY_S, 0))
         self._lines(plot, self.strip, "age", *self._kinds, TrackKind.TRUE)
-        plot.scatter(
-            "age",
-            "corrected",
-            source=self.bad,
-            marker=self._marker,
-            color=self._colour,
-            size=8,
-            legend_field="status",
-        )
+        plot.scatter("age", "corrected", source=self.bad, size=8, legend_field="status", **self._symbols)
         return _with_legend(plot)
 
     def _timeline(self, seconds: float) -> figure:
-        plot = _figure(
-            170, "time in the recording, s", "mean |error|, m", x_range=Range1d(0.0, max(seconds, 0.1))
-        )
-        plot.y_range = DataRange1d(start=0.0)
+        plot = _figure(170, "time in the recording, s", "mean |error|, m")
+        plot.x_range, plot.y_range = Range1d(0.0, max(seconds, 0.1)), DataRange1d(start=0.0)
         self._lines(plot, self.timeline, "time", *_LIVE[:2])
         self._lines(plot, self.second_timeline, "time", *self._kinds[2:])
         plot.vspan("time", source=self.position, line_color=NIGHT, line_width=2)
@@ -275,7 +249,7 @@ class Models:
 
     def _lines(self, plot: figure, source: ColumnDataSource, x: str, *kinds: TrackKind) -> None:
         for kind in kinds:
-            _line(plot, x, kind.name.lower(), source, kind, legend_label=kind.value)
+            plot.line(x, kind.name.lower(), source=source, legend_label=kind.value, **_stroke(kind))
 
     def _cir(self) -> figure:
         plot = _figure(230, _SAMPLES, "magnitude", x_range=_trace_range())
@@ -341,17 +315,9 @@ def _figure(
     return plot
 
 
-def _line(plot: figure, x: str, y: str, source: ColumnDataSource, kind: TrackKind, **options: Any) -> Any:
+def _stroke(kind: TrackKind) -> dict[str, Any]:
     width, dash = _STROKES[kind]
-    return plot.line(
-        x,
-        y,
-        source=source,
-        line_color=TRACK_COLOURS[kind] or NIGHT,
-        line_width=width,
-        line_dash=dash,
-        **options,
-    )
+    return {"line_color": TRACK_COLOURS[kind] or NIGHT, "line_width": width, "line_dash": dash}
 
 
 def _colour_bar(mapper: LinearColorMapper, **options: Any) -> ColorBar:

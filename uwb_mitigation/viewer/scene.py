@@ -11,6 +11,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -23,46 +24,35 @@ from uwb_mitigation.viewer.palette import TrackKind
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_ANCHORS = 256, 64, 64, 256
-MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
-"""Maximum number of truths without corrected ranges, and of corrected ranges without truths."""
-MAX_SAMPLES, MAX_TRACK = 6000, 1200
-"""Maximum points of a strip chart (100 ranges per second for a minute) and of a track."""
-MAX_CELLS = 4000
-"""Maximum number of cells of the heat map."""
-WATERFALL = 50
-"""Maximum number of CIRs of each pair."""
-MAX_VALUES = 2 * 1016
-"""Maximum number of values of a CIR: the DW1000's complete accumulator, real and imaginary."""
-MAX_TEXT = 400
-"""Maximum number of characters of a name or a message."""
-MAX_ID_DIGITS = 20
-"""Maximum number of decimal digits of a 64-bit id."""
-MAX_RANGE_M = 10_000.0
-"""A longer range is shown in the table only, and a larger error is not counted: both are implausible."""
-MAX_COORDINATE_M = 2e7
-"""Coordinates of any position on Earth; a position further away is ignored."""
-MAX_MESSAGES = 40_000
-"""Maximum number of messages that are read at a seek; older ones are skipped."""
+MAX_TRUTHS, MAX_WITHOUT_TRUTH = (
+    10_000,
+    1000,
+)  # truths without corrected ranges, corrected ranges without truths
+MAX_SAMPLES, MAX_TRACK = (
+    6000,
+    1200,
+)  # points of a strip chart (100 ranges per second for a minute), of a track
+MAX_CELLS = 4000  # of the heat map
+WATERFALL = 50  # CIRs of each pair
+MAX_VALUES = 2 * 1016  # of a CIR: the DW1000's complete accumulator, real and imaginary
+MAX_TEXT = 400  # characters of a name or a message
+MAX_ID_DIGITS = 20  # decimal digits of a 64-bit id
+MAX_RANGE_M = 10_000.0  # a longer range is shown in the table only; a larger error is not counted
+MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
+MAX_MESSAGES = 40_000  # read at a seek; older ones are skipped
 
-# Times.
 HISTORY_S = 60.0
 """Length of the strip chart of a pair."""
 NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
 """A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer."""
-STALE_S = 5.0
-"""A node is STALE if its last diagnostics are older than this, as in rqt_robot_monitor."""
-STALE = 3
-"""Diagnostic level STALE."""
-
+STALE_S, STALE = 5.0, 3
+"""A node has this diagnostic level if its last diagnostics are older, as in rqt_robot_monitor."""
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
 """Bins of the error histogram; larger errors count in the outermost bins."""
-
 SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 50.0)
 """Speeds of a player, recorded seconds per second."""
-STEP_M = 0.02
-"""Minimum distance of the points of a track."""
-CELL_M = 0.5
-"""Width of a cell of the heat map."""
+STEP_M, CELL_M = 0.02, 0.5
+"""Minimum distance of the points of a track; width of a cell of the heat map."""
 RAW_FIX_S, RAW_AGE_S = 0.2, 0.5
 """Interval of the positions from raw ranges, and maximum age of their ranges."""
 STATISTICS = 100
@@ -122,14 +112,11 @@ class Sample:
         return sample
 
 
+@dataclass(frozen=True, eq=False)
 class Trace:
     """One CIR; its magnitudes are computed only if it is shown."""
 
-    __slots__ = ("_magnitude", "cir")
-
-    def __init__(self, cir: Cir) -> None:
-        self.cir = cir
-        self._magnitude: NDArray[np.float32] | None = None
+    cir: Cir
 
     @classmethod
     def of(cls, cir: Cir) -> Trace | None:
@@ -145,15 +132,14 @@ class Trace:
         # Copy the samples: they may be a view into a large message.
         return cls(replace(cir, samples=cir.samples.copy()))
 
-    @property
+    @cached_property
     def magnitude(self) -> NDArray[np.float32]:
         """Magnitudes in accumulator units, float32 (n,)."""
-        if self._magnitude is None:
-            values = self.cir.samples.astype(np.float32)
-            if self.cir.encoding is Encoding.COMPLEX_INT16:
-                values = np.hypot(values[0::2], values[1::2])
-            self._magnitude = values * np.float32(self.cir.scale)
-        return self._magnitude
+        values = self.cir.samples.astype(np.float32)
+        if self.cir.encoding is Encoding.COMPLEX_INT16:
+            values = np.hypot(values[0::2], values[1::2])
+        magnitude: NDArray[np.float32] = values * np.float32(self.cir.scale)
+        return magnitude
 
     @property
     def origin(self) -> int:

@@ -73,14 +73,7 @@ class ViewerServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _run(
-        self,
-        outcome: Future[int],
-        view: View,
-        host: str,
-        port: int,
-        origins: tuple[str, ...],
-    ) -> None:
+    def _run(self, outcome: Future[int], view: View, host: str, port: int, origins: tuple[str, ...]) -> None:
         asyncio.set_event_loop(asyncio.new_event_loop())
         # Bokeh warns if a tab is closed while data is sent to it.
         logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)

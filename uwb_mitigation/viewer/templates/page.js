@@ -171,6 +171,11 @@ function start(doc) {
     show(parts.join("; ") || "No data.");
   });
 
+  const counts = model("errors").renderers[0].data_source;
+  const titleErrors = () => setText($("errors-title"), `Error histogram${counts.data.raw.some(Boolean) ? "" : ": no true ranges"}`);
+  counts.properties.data.change.connect(titleErrors);
+  titleErrors();
+
   // Recording.
   const position = $("position");
   let held = false, saved_s = 0;
@@ -193,17 +198,10 @@ function start(doc) {
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
-      const {bad, count, largest, truth} = controls.marks, marks = $("bad-marks");
-      const draw = (share, text, colour) => {
-        const mark = document.createElementNS("http://www.w3.org/2000/svg", "text");
-        for (const [name, value] of Object.entries({x: `${100 * share}%`, y: 11, fill: colour, "font-size": 11, "text-anchor": "middle"}))
-          mark.setAttribute(name, value);
-        mark.textContent = text;
-        return mark;
-      };
-      marks.style.overflow = "visible";
-      marks.replaceChildren(...bad.map((share) => draw(share, "|", "#d55e00")));
-      if (largest != null) marks.append(draw(largest, "\u25b2", "currentColor"));
+      const {bad, count, largest, truth} = controls.marks;
+      const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
+      $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
+        + (largest == null ? "" : mark(largest, "currentColor", "\u25b2"));
       $("marks-legend").textContent = `| ranges that are not OK: ${count || "none"}; \u25b2 largest ${truth ? "error" : "correction"}`;
     });
   }
