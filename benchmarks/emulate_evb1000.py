@@ -19,6 +19,7 @@ from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
     from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
+    from benchmarks.uci_board import EmulatedUciBoards
 
 _UNPLUG_DURATION_S = 0.5
 
@@ -104,7 +105,7 @@ def emulate_evb1000(
             for number, port in enumerate(emulated.ports):
                 what = "tag" if number == 0 else f"anchor {number}"
                 console.out.print(f"{what} at {port}", soft_wrap=True, highlight=False)
-            _keep_running(emulated, received_signals, duration, unplug_every)
+            keep_running(emulated, received_signals, duration, unplug_every)
     console.write_json(json, {"requests": list(emulated.requests)})
     if emulated.failure is not None:
         raise emulated.failure
@@ -121,12 +122,13 @@ def _signals() -> Iterator[list[int]]:
         signal.signal(signal.SIGUSR1, before)
 
 
-def _keep_running(
-    emulated: EmulatedEvb1000s,
+def keep_running(
+    emulated: EmulatedEvb1000s | EmulatedUciBoards,
     received_signals: list[int],
     duration: float | None,
     unplug_every: float | None,
 ) -> None:
+    """Wait until the end, and unplug the boards in turn."""
     started_s = unplugged_s = time.monotonic()
     board_numbers = itertools.cycle(range(len(emulated.ports)))
     while emulated.failure is None and (duration is None or time.monotonic() - started_s < duration):

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
-import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from benchmarks.emulate_evb1000 import keep_running
 from uwb_mitigation.commands import console
 from uwb_mitigation.commands.console import JsonOption
 from uwb_mitigation.errors import ParameterError
-
-_UNPLUGGED_S = 0.5
 
 
 def emulate_uci(
     boards: Annotated[int, typer.Option(help="Number of boards.")] = 2,
     link: Annotated[
-        Path | None,
-        typer.Option(metavar="PREFIX", help="Symbolic links to the ports: PREFIX0, PREFIX1, ..."),
+        Path | None, typer.Option(metavar="PREFIX", help="Symbolic links to the ports: PREFIX0, PREFIX1, ...")
     ] = None,
     distance: Annotated[float, typer.Option(help="Distance between the boards, m.")] = 3.0,
     max_taps: Annotated[int, typer.Option(help="Largest CIR window that the firmware accepts.")] = 255,
@@ -67,18 +63,5 @@ def emulate_uci(
     ) as emulated:
         for number, port in enumerate(emulated.ports):
             console.out.print(f"board {number} at {port}", soft_wrap=True, highlight=False)
-        began = pulled = time.monotonic()
-        turns = itertools.cycle(range(boards))
-        while duration is None or time.monotonic() - began < duration:
-            time.sleep(0.05)
-            if unplug_every is not None and time.monotonic() - pulled > unplug_every:
-                number = next(turns)
-                emulated.unplug(number)
-                time.sleep(_UNPLUGGED_S)
-                emulated.plug(number)
-                pulled = time.monotonic()
-                port = emulated.ports[number]
-                console.out.print(
-                    f"board {number} plugged in again at {port}", soft_wrap=True, highlight=False
-                )
+        keep_running(emulated, [], duration, unplug_every)
     console.write_json(json, {"exchanges": emulated.exchanges})

@@ -14,6 +14,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -308,8 +309,8 @@ class EmulatedUciBoards:
         boards: number of boards.
         distance_m: distance between the boards.
         links: prefix of symbolic links to the ports, followed by the board's number.
-        max_taps, tap_bytes, count_bytes, faults: see `UciBoardModel`.
         seed: seed of the faults and of the ranges.
+        board: arguments of `UciBoardModel`.
     """
 
     def __init__(
@@ -318,11 +319,8 @@ class EmulatedUciBoards:
         boards: int = 2,
         distance_m: float = 3.0,
         links: Path | None = None,
-        max_taps: int = 255,
-        tap_bytes: int = 6,
-        count_bytes: int = 2,
-        faults: UciFaults = UciFaults(),
         seed: int = 1,
+        **board: Any,
     ) -> None:
         if not 1 <= boards <= 33:
             raise ParameterError(f"boards = {boards}", valid="1 to 33")
@@ -330,16 +328,8 @@ class EmulatedUciBoards:
         self._random = np.random.default_rng(seed)
         self._lock = threading.RLock()
         self._stop = threading.Event()
-        self._models = [
-            UciBoardModel(
-                max_taps=max_taps,
-                tap_bytes=tap_bytes,
-                count_bytes=count_bytes,
-                faults=faults,
-                seed=seed + number,
-            )
-            for number in range(boards)
-        ]
+        self.failure = None
+        self._models = [UciBoardModel(seed=seed + number, **board) for number in range(boards)]
         names = [
             links.with_name(f"{links.name}{number}") if links is not None else None
             for number in range(boards)

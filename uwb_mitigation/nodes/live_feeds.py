@@ -91,6 +91,7 @@ class LiveFeed:
         self._on_range = on_range
         self._now_ns = now_ns
         self._publishing = threading.Lock()
+        self._problems: dict[Connection[Any], tuple[str, float, bool]] = {}
         self._threads = [
             threading.Thread(target=self._run, args=(port,), name="feed", daemon=True) for port in ports
         ]
@@ -111,8 +112,19 @@ class LiveFeed:
         """Handle an event that is not a range."""
         raise NotImplementedError
 
-    def check(self, port: Any) -> None:
-        """Check the state; called after every event, and at least every `EVENT_TIMEOUT_S`."""
+    def check(self, port: Connection[Any]) -> None:
+        """Log a problem once if it lasts longer than `EVENT_TIMEOUT_S`; a handshake is shorter.
+
+        Called after every event, and at least every `EVENT_TIMEOUT_S`.
+        """
+        problem, now_s = port.problem, time.monotonic()
+        known, since_s, logged = self._problems.get(port, ("", now_s, False))
+        if problem != known:
+            since_s, logged = now_s, False
+        if problem and not logged and now_s - since_s >= EVENT_TIMEOUT_S and not port.closed:
+            self._logger.warning(f"{problem}; waiting for the board")
+            logged = True
+        self._problems[port] = problem, since_s, logged
 
     def _run(self, port: Connection[Any]) -> None:
         while not port.closed:
@@ -150,8 +162,6 @@ class BoardFeed(LiveFeed):
         self._status: BoardStatus | None = None
         self._radio: RadioSettings | None = None
         self._radio_status: RadioStatus | None = None
-        self._problem = self._logged = ""
-        self._checked_s = 0.0
         self._on_correction = on_correction
         # Refused settings and the reasons.
         self._refused: dict[str, str] = {}
@@ -199,18 +209,7 @@ class BoardFeed(LiveFeed):
             problems.append(_STATES.get(status.state, ""))
             warning = radio_warning(radio, status)
         problem = next(filter(None, problems), "")
-        return hardware, *_level(problem, warning, "connected"), entries
-
-    def check(self, port: BoardDriver) -> None:
-        """Log a problem once if it lasts longer than `EVENT_TIMEOUT_S`; a handshake is shorter."""
-        now_s = time.monotonic()
-        if now_s - self._checked_s < EVENT_TIMEOUT_S:
-            return
-        self._checked_s = now_s
-        before, self._problem = self._problem, port.problem
-        if self._problem and self._problem == before != self._logged and not port.closed:
-            self._logger.warning(f"{self._problem}; waiting for the board")
-            self._logged = self._problem
+        return hardware, *level_of(problem, warning, "connected"), entries
 
     def handle(self, event: Event, port: BoardDriver) -> None:
         log = self._logger
@@ -233,7 +232,6 @@ class BoardFeed(LiveFeed):
                 log.error(f"{_RADIO_PROBLEM}: {text}")
             case Connected(hello=hello):
                 self._refused.clear()
-                self._logged = ""
                 self._radio = self._radio_status = None
                 model, mode = diagnostics.model_id(hello.model_id), hello.mode.name
                 log.info(f"connected to board {format_id(hello.board_id)}, model {model}, mode {mode}")
@@ -293,8 +291,11 @@ class RadioFeed(LiveFeed):
         problem = "; ".join(report.problem for report in reports if report.problem)
         warnings = (radio_warning(report.settings, report.status) for report in reports)
         is_tag = first.settings is not None and first.settings.role is Role.TAG
-        level = _level(problem, next(filter(None, warnings), ""), "ranging" if is_tag else "answering")
+        level = level_of(problem, next(filter(None, warnings), ""), "ranging" if is_tag else "answering")
         return hardware, *level, entries
+
+    def check(self, port: Connection[Any]) -> None:
+        """Do nothing: the events of a radio contain its problems."""
 
     def handle(self, event: RadioEvent, port: RadioDriver) -> None:
         match event:
@@ -395,7 +396,7 @@ def settings_text(settings: RadioSettings) -> str:
     )
 
 
-def _level(problem: str, warning: str, ok: str) -> tuple[bytes, str]:
+def level_of(problem: str, warning: str, ok: str) -> tuple[bytes, str]:
     """Return level and message of a diagnostic status."""
     if problem:
         return diagnostics.ERROR, problem

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,9 +11,8 @@ from uwb_mitigation.errors import ParameterError, format_id, parse_id
 from uwb_mitigation.link.connection import PortAddress
 from uwb_mitigation.link.layout import Role
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.nodes import diagnostics
 from uwb_mitigation.nodes.diagnostics import Description
-from uwb_mitigation.nodes.live_feeds import EVENT_TIMEOUT_S, PREFIX, LiveFeed, Value
+from uwb_mitigation.nodes.live_feeds import PREFIX, LiveFeed, Value, level_of
 from uwb_mitigation.offsets import Offsets
 from uwb_mitigation.radio.uci.capture import CaptureWriter
 from uwb_mitigation.radio.uci.driver import UciDriver, UciReport, UciStarted
@@ -107,7 +105,6 @@ class UciFeed(LiveFeed):
                 drivers.append(driver)
             started.pop_all()
         super().__init__(drivers, on_range, now_ns, logger)
-        self._problems: dict[UciDriver, tuple[str, float, bool]] = {}
 
     def stop(self) -> None:
         super().stop()
@@ -128,11 +125,8 @@ class UciFeed(LiveFeed):
             values |= {f"{prefix}{name}": value for name, value in _values(report).items()}
         problem = "; ".join(report.problem for report in reports if report.problem)
         hardware = f"UCI board {format_id(reports[0].settings.address)}"
-        if problem:
-            return hardware, diagnostics.ERROR, problem, values
         warning = next(filter(None, map(_warning, reports)), "")
-        level = diagnostics.WARN if warning else diagnostics.OK
-        return hardware, level, warning or "ranging", values
+        return hardware, *level_of(problem, warning, "ranging"), values
 
     def handle(self, event: UciStarted, port: UciDriver) -> None:
         s, window = event.settings, event.window
@@ -141,17 +135,6 @@ class UciFeed(LiveFeed):
             f"UCI board {format_id(s.address)} at {port.report().port}: {s.role.name.lower()}, channel {s.channel}, "
             f"peers {', '.join(map(format_id, s.peers))}, {s.effective_interval_ms} ms, {taps}"
         )
-
-    def check(self, port: UciDriver) -> None:
-        """Log a problem once if it lasts longer than a start of the board."""
-        problem, now_s = port.report().problem, time.monotonic()
-        known, since_s, logged = self._problems.get(port, ("", now_s, False))
-        if problem != known:
-            since_s, logged = now_s, False
-        if problem and not logged and now_s - since_s >= EVENT_TIMEOUT_S and not port.closed:
-            self._logger.warning(f"{problem}; waiting for the board")
-            logged = True
-        self._problems[port] = (problem, since_s, logged)
 
 
 def _values(report: UciReport) -> dict[str, object]:

@@ -138,11 +138,7 @@ def _open(source: str, ports: list[str], capture: Path, stack: ExitStack) -> lis
 
 
 def _values(settings: RadioSettings) -> dict[str, object]:
-    return {
-        "channel": settings.channel,
-        "PRF (MHz)": settings.prf_mhz,
-        "CIR samples": settings.window,
-    }
+    return {"channel": settings.channel, "PRF (MHz)": settings.prf_mhz, "CIR samples": settings.window}
 
 
 def _describe(source: str, drivers: list[Any], o: Observation) -> None:

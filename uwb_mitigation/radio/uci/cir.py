@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from uwb_mitigation.measurement import Cir, RadioType, Segment
-from uwb_mitigation.radio.uci.messages import CirBlock, Diagnostics, Frame, FrameReport, SegmentMetrics
+from uwb_mitigation.radio.uci.messages import CirBlock, Diagnostics, Frame, FrameReport
 
 _PEAK_SHARE = 0.5
 """Minimum amplitude at the reported position of the peak, relative to the largest tap."""
@@ -16,6 +16,7 @@ _PEAK_SHARE = 0.5
 _MAX_COUNT = np.iinfo(np.int16).max - 1
 _NO_SAMPLES = np.zeros(0, np.int16)
 _EXCHANGE_FRAMES = frozenset(Frame)
+_SEGMENTS = {0: Segment.IPATOV} | dict.fromkeys(range(1, 5), Segment.STS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,48 +42,47 @@ def read_cir(diagnostics: Diagnostics | None, channel: int, rssi_dbm: float) -> 
         channel: UWB channel.
         rssi_dbm: receive level for an exchange without segment metrics.
     """
-    frames = [
+    received = [
         frame
         for frame in (diagnostics.frames if diagnostics is not None else ())
         if frame.received and frame.frame in _EXCHANGE_FRAMES
     ]
     # The final frame is the last one of the exchange, as in other recordings.
-    frames.sort(key=lambda frame: frame.frame)
-    with_cir = [frame for frame in frames if any(len(block.taps) for block in frame.cirs)]
-    chosen = (with_cir or [frame for frame in frames if frame.metrics] or frames)[-1:]
-    if not chosen:
-        return Reading(_cir(RadioType.DW3000, channel, rssi_dbm))
-    return _read(chosen[0], channel, rssi_dbm)
+    received.sort(key=lambda frame: frame.frame)
+    with_cir = [frame for frame in received if any(len(block.taps) for block in frame.cirs)]
+    chosen = (with_cir or [frame for frame in received if frame.metrics] or received)[-1:]
+    radio = RadioType.QM35 if chosen and chosen[0].confidence else RadioType.DW3000
+    cir = Cir(_NO_SAMPLES, rx_power_dbm=rssi_dbm, channel=channel, prf_mhz=64, radio=radio)
+    return _read(chosen[0], cir) if chosen else Reading(cir)
 
 
-def _read(frame: FrameReport, channel: int, rssi_dbm: float) -> Reading:
-    radio = RadioType.QM35 if frame.confidence else RadioType.DW3000
+def _read(frame: FrameReport, cir: Cir) -> Reading:
+    """Return the CIR with levels and samples of a frame."""
     blocks = sorted((block for block in frame.cirs if len(block.taps)), key=lambda block: not block.primary)
+    metrics = sorted(frame.metrics, key=lambda each: not each.primary)
+    if blocks:
+        source = blocks[0].receiver, blocks[0].segment
+        metrics = [each for each in metrics if (each.receiver, each.segment) == source]
+    levels = metrics[0] if metrics else None
+    if levels is not None:
+        rx_dbm = cir.rx_power_dbm if math.isnan(levels.rx_dbm) else levels.rx_dbm
+        cir = replace(cir, rx_power_dbm=rx_dbm, first_path_power_dbm=levels.first_path_dbm)
+    segment = blocks[0].segment if blocks else levels.segment if levels is not None else -1
+    cir = replace(cir, segment=_SEGMENTS.get(segment, Segment.UNKNOWN))
     if not blocks:
-        metrics = next(iter(sorted(frame.metrics, key=lambda each: not each.primary)), None)
-        cir = _cir(radio, channel, rssi_dbm, metrics)
         return Reading(cir, clock_offset_ppm=frame.clock_offset_ppm)
-    block = blocks[0]
-    metrics = next(
-        (each for each in frame.metrics if (each.receiver, each.segment) == (block.receiver, block.segment)),
-        None,
-    )
-    lead = abs(block.offset)
+    block, lead = blocks[0], abs(blocks[0].offset)
     consistent = lead < len(block.taps)
     start, first_path = 0, float(lead)
-    if metrics is not None:
-        start = metrics.first_path_index - lead
-        near = abs(metrics.first_path - metrics.first_path_index) <= 1
-        first_path = metrics.first_path if near else float(metrics.first_path_index)
-        consistent &= _peak_fits(block, lead + metrics.peak_index - metrics.first_path_index)
+    if levels is not None:
+        start = levels.first_path_index - lead
+        near = abs(levels.first_path - levels.first_path_index) <= 1
+        first_path = levels.first_path if near else float(levels.first_path_index)
+        consistent &= _peak_fits(block, lead + levels.peak_index - levels.first_path_index)
     samples, scale = _samples(block)
-    return Reading(
-        _cir(
-            radio, channel, rssi_dbm, metrics, block.segment, samples, scale, start, first_path if consistent else math.nan
-        ),
-        consistent,
-        frame.clock_offset_ppm,
-    )  # fmt: skip
+    first_path = first_path if consistent else math.nan
+    cir = replace(cir, samples=samples, scale=scale, start_index=start, first_path_index=first_path)
+    return Reading(cir, consistent, frame.clock_offset_ppm)
 
 
 def _peak_fits(block: CirBlock, expected: int) -> bool:
@@ -100,34 +100,3 @@ def _samples(block: CirBlock) -> tuple[np.ndarray, float]:
     largest = int(np.abs(taps.astype(np.int64)).max())
     shift = max(0, (largest // (_MAX_COUNT + 1)).bit_length())
     return (taps >> shift).astype(np.int16), float(1 << shift)
-
-
-def _cir(
-    radio: RadioType,
-    channel: int,
-    rssi_dbm: float,
-    metrics: SegmentMetrics | None = None,
-    segment: int | None = None,
-    samples: np.ndarray = _NO_SAMPLES,
-    scale: float = 1.0,
-    start: int = 0,
-    first_path: float = math.nan,
-) -> Cir:
-    if segment is None and metrics is not None:
-        segment = metrics.segment
-    kind = Segment.UNKNOWN
-    if segment is not None and segment <= 4:
-        kind = Segment.STS if segment else Segment.IPATOV
-    rx_dbm = metrics.rx_dbm if metrics is not None else math.nan
-    return Cir(
-        samples,
-        start_index=start,
-        first_path_index=first_path,
-        scale=scale,
-        rx_power_dbm=rssi_dbm if math.isnan(rx_dbm) else rx_dbm,
-        first_path_power_dbm=metrics.first_path_dbm if metrics is not None else math.nan,
-        channel=channel,
-        prf_mhz=64,
-        radio=radio,
-        segment=kind,
-    )

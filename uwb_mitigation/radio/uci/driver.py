@@ -108,6 +108,12 @@ class UciDriver(Connection[UciEvent]):
             if self._port:
                 self._begin()
 
+    @property
+    def problem(self) -> str:
+        """Reason why the board does not range; empty while it works."""
+        with self._lock:
+            return self._problem or self._session.state
+
     def report(self) -> UciReport:
         """Return the present state."""
         with self._lock:

@@ -34,8 +34,6 @@ class Group(enum.IntEnum):
     SESSION = 0x1
     RANGING = 0x2
     VENDOR = 0xB
-    ANDROID = 0xC
-    TEST = 0xD
     CALIBRATION = 0xE
 
 

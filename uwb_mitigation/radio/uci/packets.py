@@ -27,21 +27,8 @@ _HEADER_BYTES = 4
 _MORE = 0x10
 _RANGES = (Kind.NOTIFICATION, *messages.RANGE_START)
 _DIAGNOSTICS = (Kind.NOTIFICATION, *messages.RANGE_DIAGNOSTICS)
-_NOTIFICATIONS = frozenset(
-    (
-        _RANGES,
-        _DIAGNOSTICS,
-        *(
-            (Kind.NOTIFICATION, *name)
-            for name in (
-                messages.DEVICE_STATUS,
-                messages.GENERIC_ERROR,
-                messages.SESSION_STATUS,
-                messages.BOOT,
-            )
-        ),
-    )
-)
+_OTHERS = (messages.DEVICE_STATUS, messages.GENERIC_ERROR, messages.SESSION_STATUS, messages.BOOT)
+_NOTIFICATIONS = {_RANGES, _DIAGNOSTICS, *((Kind.NOTIFICATION, *name) for name in _OTHERS)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
