@@ -31,6 +31,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
+from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.bag.odometry import yaw_of
 from uwb_mitigation.positioning.anchors import dump_anchors
@@ -297,6 +298,35 @@ def test_transform_is_repeated_while_there_is_no_position(ros: Ros, anchors: Pat
     expected = stamp_ns(now) + NANOSECONDS
     ros.spin_until(lambda: stamp_ns(live.transforms[-1].transforms[0].header) == expected)
     assert stamp_ns(live.poses[-1].header) < live.start_ns + 16 * NANOSECONDS
+
+
+def test_predictions_and_transforms_end_30_s_after_the_last_range(ros: Ros, anchors: Path):
+    locator = start(ros, anchors, "lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
+    locator.wait_for_output("locating")
+    clock = ros.node.create_publisher(Clock, "/clock", 10)
+    markers = ros.collect(MarkerArray, "/uwb/anchors")
+    live = LiveRobot(ros, seconds=16.0)
+    live.wait()
+    live.play(16.0)
+
+    def wait_for_timer(seconds: float) -> int:
+        """Set the clock, wait until the locator has published everything at this time, and return it."""
+        now = live.header(round(seconds * NANOSECONDS))
+        ros.spin_until(
+            lambda: (
+                clock.publish(Clock(clock=now.stamp))
+                or (bool(markers) and stamp_ns(markers[-1].markers[0].header) == stamp_ns(now))
+            )
+        )
+        ros.spin_for(0.2)
+        return stamp_ns(now)
+
+    predicted_ns = wait_for_timer(16.35)
+    assert stamp_ns(live.poses[-1].header) == predicted_ns
+    assert stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS
+    wait_for_timer(46.2)
+    assert stamp_ns(live.poses[-1].header) == predicted_ns
+    assert stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS
 
 
 def test_lever_arm_of_zero_is_not_read_from_tf(ros: Ros, anchors: Path):

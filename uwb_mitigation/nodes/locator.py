@@ -378,7 +378,7 @@ class Locator(ManagedNode):
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
                     outputs.smoothed.publish(encode_pose(self._at_base(outputs, smoothed), self._map))
-            is_due = stamp_ns - outputs.transform_ns >= _REPEAT_AFTER_NS
+            is_due = age_s < PREDICT_UNTIL_S and stamp_ns - outputs.transform_ns >= _REPEAT_AFTER_NS
             if self._robot is not None and outputs.robot is not None and is_due:
                 last = self._robot.last_map_to_odom(stamp_ns, self._tolerance_ns)
                 self._publish_transform(outputs, last, stamp_ns)
