@@ -27,9 +27,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError
 from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.nodes.topic_feed import TopicRanges, message_type
+from uwb_mitigation.nodes.topic_feed import TopicFeed, message_type
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
-from uwb_mitigation.sources.mapping import Mapping, load_mapping
+from uwb_mitigation.sources.mapping import Drop, Mapping, Value, load_mapping
 
 CORNERS = {0: (0.0, 0.0, 2.0), 1: (8.0, 0.0, 2.0), 2: (8.0, 6.0, 2.0), 3: (0.0, 6.0, 2.0)}
 TAG = (3.0, 2.0, 0.4)
@@ -156,13 +156,13 @@ def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
 
 
 class Convert:
-    """Passes messages of a shipped mapping to `TopicRanges` without DDS."""
+    """Passes messages of a shipped mapping to `TopicFeed` without DDS."""
 
     def __init__(self, mapping: str | Mapping) -> None:
         self.found: list[RangeMeasurement] = []
         node: Any = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None))
         used = load_mapping(mapping) if isinstance(mapping, str) else mapping
-        self.ranges = TopicRanges(node, used, "", self.found.append, lambda: 5_000)
+        self.ranges = TopicFeed(node, used, "", self.found.append, lambda: 5_000)
 
     def take(self, message: Any, topic: str = "/x") -> list[tuple[int, int, float]]:
         self.ranges.take(message, topic)
@@ -255,3 +255,9 @@ def test_types_and_mappings_that_cannot_be_used_are_errors():
         message_type("os; rm/x")
     with pytest.raises(ParameterError, match="eWINE is for recordings"):
         Convert("ewine")
+    mapping = load_mapping("sensor_range")
+    names = Value(column="header.frame_id", names=True)
+    with pytest.raises(ParameterError, match="numbers texts"):
+        Convert(mapping.model_copy(update={"fields": mapping.fields.model_copy(update={"anchor": names})}))
+    with pytest.raises(ParameterError, match="from_median"):
+        Convert(mapping.model_copy(update={"drop": [Drop(column="range", from_median=1.0)]}))

@@ -198,8 +198,14 @@ class Driver(ManagedNode):
     def _prepare_topics(self) -> Callable[[], Feed]:
         # Mapping files need pandas and pydantic, which the other sources do not.
         from uwb_mitigation.nodes.topic_feed import TopicFeed
+        from uwb_mitigation.sources.mapping import load_mapping
 
-        feed = TopicFeed(self, self.value("map"), self.value("topic"), self._publish_topic_range, self.now_ns)
+        if not (name := self.value("map")):
+            raise ParameterError(
+                "parameter map is empty", valid="map:=FILE, or the name of a shipped mapping"
+            )
+        mapping = load_mapping(name)
+        feed = TopicFeed(self, mapping, self.value("topic"), self._publish_topic_range, self.now_ns)
         return lambda: feed
 
     def _prepare_replay(self) -> Callable[[], Feed]:

@@ -203,7 +203,7 @@ class Locator(ManagedNode):
     def _subscribe_to_mapping(self, name: str) -> bool:
         """Subscribe to the topics of a mapping; return False if `name` is that of a topic."""
         # Mapping files need pandas and pydantic, which other ranges do not.
-        from uwb_mitigation.nodes.topic_feed import TopicRanges
+        from uwb_mitigation.nodes.topic_feed import TopicFeed
         from uwb_mitigation.sources.mapping import load_mapping, shipped_mappings
 
         if name not in shipped_mappings() and not name.endswith((".yaml", ".yml")):
@@ -216,8 +216,8 @@ class Locator(ManagedNode):
                 self._update_lever_arm(measurement.tag_id, lambda: measurement.frame_id)
                 self._add(self._estimator, *_uncorrected(measurement, variance_m2))
 
-        source_topics = TopicRanges(self, mapping, "", on_range, self.now_ns)
-        self.destroy_at_close(source_topics, TopicRanges.close).open()
+        feed = TopicFeed(self, mapping, "", on_range, self.now_ns)
+        self.destroy_at_close(feed, TopicFeed.stop).start()
         return True
 
     def _subscribe_to_ranges(self, source: str) -> None:
