@@ -29,6 +29,7 @@ TYPES = {
     topics.ANCHORS: topics.MARKERS_TYPE,
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
+CIR_TYPE = "uwb_mitigation_msgs/msg/Cir"
 DISPLAYS = {
     "rviz_default_plugins/MarkerArray": topics.MARKERS_TYPE,
     "rviz_default_plugins/PoseWithCovariance": topics.POSE_TYPE,
@@ -92,7 +93,15 @@ def test_foxglove_layout_uses_existing_topics_and_fields():
             is_array = outputs[topic][field.removesuffix("[:]")].endswith("[]") if field else False
             assert is_array == field.endswith("[:]"), path
         else:
+            assert topic in TYPES, path
             assert not field or has(TYPES[topic], found["fields"]), path
+    fields = {kind: set(dict(schemas.typestore().fielddefs[kind][1])) for kind in (*TYPES.values(), CIR_TYPE)}
+    for script in layout["userNodes"].values():
+        source = script["sourceCode"]
+        inputs = json.loads(re.search(r"inputs = (\[.*\])", source)[1])
+        names = re.search(r"const \{ (.*) \} = event.message", source)[1].split(", ")
+        assert set(names) <= set.union(*(fields[TYPES[topic]] for topic in inputs))
+        assert set(re.findall(r"\bcir\.(\w+)", source)) <= fields[CIR_TYPE]
 
 
 def test_foxglove_scripts_filter_64_bit_ids_and_compute_magnitudes(browser: Browser):
