@@ -20,7 +20,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
@@ -106,7 +105,6 @@ class Locator(ManagedNode):
         self._decode: Callable[[bytes], tuple[MeasurementKey, CorrectedRange]] = decode_corrected
         self._make_estimator: Callable[[AnchorMap], MultiTagEstimator]
         self._outputs: dict[int, _Outputs] = {}
-        self._timer: Timer | None = None
         self._robot: RobotMotion | None = None
         self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._malformed = self._lost = 0
@@ -166,20 +164,17 @@ class Locator(ManagedNode):
                 self, PoseWithCovarianceStamped, topic, self._on_height, ReliabilityPolicy.BEST_EFFORT
             )
             self.destroy_at_close(heights, self.destroy_subscription)
+        timer = self.create_timer(PERIOD_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.destroy_at_close(timer, self.destroy_timer)
         if self._estimator is not None:
             self.get_logger().info(f"{len(self._estimator.anchors)} anchors from {path}")
 
     def begin(self) -> None:
         self._show_anchors()
-        self._timer = self.create_timer(
-            PERIOD_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
         self.get_logger().info("locating")
 
     def end(self) -> None:
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-            self._timer = None
+        """Do nothing: the callbacks check whether the node is active."""
 
     def close(self) -> None:
         super().close()
