@@ -548,6 +548,16 @@ class Chatty(UciBoardModel):
         return encode(0xA, 0x3E, b"new", Kind.NOTIFICATION) + super()._notify(name, payload)
 
 
+class Active(UciBoardModel):
+    """Does not answer the first start, and refuses the second one."""
+
+    def _command(self, name, payload, now_s):
+        if name == messages.RANGE_START and any(session.active for session in self.sessions.values()):
+            return self._respond(name, b"\x13")
+        answer = super()._command(name, payload, now_s)
+        return answer[5:] if name == messages.RANGE_START else answer
+
+
 class Extended(UciBoardModel):
     """Reports addresses of eight bytes."""
 
@@ -558,7 +568,7 @@ class Extended(UciBoardModel):
 
 
 @pytest.mark.parametrize(
-    "board", [OneKey, Unnamed, OneByOne, NoReset, OnlyReady, Numbers, Late, Chatty, Extended]
+    "board", [OneKey, Unnamed, OneByOne, NoReset, OnlyReady, Numbers, Late, Chatty, Active, Extended]
 )
 def test_boards_that_the_facts_allow_range_with_their_cir(board: type[UciBoardModel]):
     model = board(count_bytes=1) if board is OneKey else board()
@@ -628,3 +638,16 @@ def test_an_anchor_without_its_tag_waits_if_the_board_cannot_report_its_state():
     for _ in range(2000):
         run.step()
     assert run.session.starts == 2
+
+
+def test_sessions_that_share_a_counter_get_their_cirs():
+    run = Bench(peers=(2, 3)).start()
+    for sequence in range(1, 201):
+        handle = 1 + sequence % 2
+        run.step(run.board.exchange(handle, sequence, 3.0), 18)
+    assert {m.anchor_id for m in run.found[-2:]} == {2, 3}
+    assert all(len(m.cir) == 16 for m in run.found[-60:])
+    # A lost range is still a gap in the sequence.
+    gaps = run.session.totals()["gaps"]
+    run.step(run.board.exchange(1 + 205 % 2, 205, 3.0), 18)
+    assert run.session.totals()["gaps"] > gaps

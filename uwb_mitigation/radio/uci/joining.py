@@ -98,6 +98,8 @@ class Joiner:
         self._held: dict[int, tuple[int, RangeArrival, Diagnostics]] = {}
         self._split = 0
         self._completed: int | None = None
+        self._step = 1
+        self._steps = (1, 0)
         self._latest: tuple[bool, int] | None = None
         self._latest_ns = 0
         self._latest_of: dict[bool, int] = {}
@@ -177,7 +179,13 @@ class Joiner:
         """Return whether a message follows its counterpart, may be damaged, follows the previous exchange; and the gap."""
         before = self._latest_of.get(is_range)
         second = not is_range and sequence == before
-        gap = before is not None and sequence != before + 1 and not second
+        if is_range and before is not None:
+            # Sessions may share a counter: learn the step between the exchanges of this session.
+            step, count = self._steps
+            self._steps = (step, count + 1) if sequence - before == step else (sequence - before, 1)
+            if self._steps[1] >= ORDER_MESSAGES and self._steps[0] > 0:
+                self._step = self._steps[0]
+        gap = before is not None and sequence != before + self._step and not second
         self.counts["gaps"] += gap
         if gap or damages != self._damages:
             self._strict = STRICT_MESSAGES
@@ -189,7 +197,7 @@ class Joiner:
         adjacent = latest == (not is_range, sequence) and not second
         if adjacent:
             self._range_first[not is_range] += 1
-        return adjacent, self._strict > 0, latest is not None and latest[1] == sequence - 1, gap_ns
+        return adjacent, self._strict > 0, latest is not None and latest[1] == sequence - self._step, gap_ns
 
     def _accept(
         self,

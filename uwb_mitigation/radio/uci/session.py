@@ -320,7 +320,9 @@ class UciSession:
         # Notifications may contain the handle, or the number of the session.
         self._handle_of |= {self.settings.session_id(peer): handle, handle: handle}
         answer = yield _Command(messages.RANGE_START, struct.pack("<I", handle))
-        return "" if answer is not None and answer.status == STATUS_OK else _refused("RANGE_START", answer)
+        # The answer may be lost, and a repeated start is refused.
+        started = handle in self._active or (answer is not None and answer.status == STATUS_OK)
+        return "" if started else _refused("RANGE_START", answer)
 
     def _configure(self, handle: int, entries: list[tuple[int, bytes]]) -> _Steps:
         """Set the parameters of a session without those that the board rejects: firmware versions differ."""
