@@ -586,23 +586,21 @@ def test_boards_that_the_facts_allow_range_with_their_cir(board: type[UciBoardMo
     assert run.session.rejected.keys() == rejected
 
 
-@pytest.mark.parametrize("order", ["range first", "range between", "range last"])
-def test_diagnostics_in_two_notifications_are_joined(order: str):
+@pytest.mark.parametrize("masks", [(0x38, 0x40), (0x18, 0x20, 0x40)])
+@pytest.mark.parametrize("position", [0, 1, 2])
+def test_diagnostics_in_several_notifications_are_joined(masks: tuple[int, ...], position: int):
     run = Bench().start()
     (handle,) = run.board.sessions
     for sequence in range(1, 60):
         parts = []
-        for mask in (0x38, 0x40):
+        for mask in masks:
             run.board.sessions[handle].config[0xE9] = bytes([mask])
             parts.append(run.board.diagnostics_packet(handle, sequence))
-        parts.insert(
-            {"range first": 0, "range between": 1, "range last": 2}[order],
-            run.board.range_packet(handle, sequence, 3.0),
-        )
+        parts.insert(position, run.board.range_packet(handle, sequence, 3.0))
         for part in parts:
-            run.step(part, 6)
+            run.step(part, 18 / len(parts))
     assert len(run.found) >= 58
-    for measured in run.found[5:]:
+    for measured in run.found[6:]:
         assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 16, 5))
         assert measured.cir.start_index == FIRST_PATH - 5
     # A board that reports them in one notification again, after other firmware was loaded.

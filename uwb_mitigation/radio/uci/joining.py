@@ -25,8 +25,8 @@ MAX_WAITING = 8
 UNSUPPORTED_RANGES = 32
 """Number of ranges without diagnostics after which ranges no longer wait for them."""
 
-SPLIT_EXCHANGES = 2
-"""Number of exchanges with two notifications of diagnostics after which a range waits for both."""
+SPLIT_EXCHANGES, MAX_PARTS = 2, 3
+"""Number of exchanges with a further notification of diagnostics after which ranges wait for it; one for each frame."""
 
 MIN_TIMEOUT_NS = 50 * 10**6
 """Minimum time that a range waits for its diagnostics; otherwise two intervals."""
@@ -79,7 +79,7 @@ class Joiner:
     After losses or damage, two notifications are joined only if they arrived one after the other, after a notification
     of the previous exchange, and either at nearly the same time, or in the order that is usual for the board without
     damage between them. A single damaged sequence number then cannot join notifications of different exchanges.
-    A board may report the diagnostics of an exchange in two notifications.
+    A board may report the diagnostics of an exchange in several notifications.
 
     Args:
         interval_ns: time between two exchanges.
@@ -95,8 +95,8 @@ class Joiner:
         self._timeout_ns = max(2 * interval_ns, MIN_TIMEOUT_NS)
         self._ranges: dict[int, _Waiting[RangeArrival]] = {}
         self._diagnostics: dict[int, _Waiting[Diagnostics]] = {}
-        self._held: dict[int, tuple[int, RangeArrival, Diagnostics]] = {}
-        self._split = 0
+        self._held: dict[int, tuple[int, RangeArrival, Diagnostics, int]] = {}
+        self._parts, self._further = 1, 0
         self._completed: int | None = None
         self._step = 1
         self._steps = (1, 0)
@@ -139,16 +139,18 @@ class Joiner:
         adjacent, strict, follows, gap_ns = self._observe(False, sequence, damages, now_ns)
         self._unanswered = 0
         if (held := self._held.pop(sequence, None)) is not None:
-            _, arrival, first = held
-            whole = first if strict else merge(first, diagnostics)
-            return [*self.expire(now_ns), self._joined(sequence, arrival, whole)]
+            _, arrival, whole, parts = held
+            whole = whole if strict else merge(whole, diagnostics)
+            return [*self.expire(now_ns), *self._complete(sequence, arrival, whole, parts + 1, now_ns)]
         waiting = self._ranges.pop(sequence, None)
         if waiting is None:
             arrived = _Waiting(diagnostics, now_ns, gap_ns, strict, follows, damages)
             if sequence == self._completed and not strict:
-                self._split = min(self._split + 1, 2 * SPLIT_EXCHANGES)
+                self._further += 1
+                if self._further >= SPLIT_EXCHANGES:
+                    self._parts, self._further = min(self._parts + 1, MAX_PARTS), 0
             elif (before := self._diagnostics.get(sequence)) is not None and not strict:
-                arrived = replace(before, content=merge(before.content, diagnostics), parts=2)
+                arrived = replace(before, content=merge(before.content, diagnostics), parts=before.parts + 1)
             self._diagnostics[sequence] = arrived
             return self.expire(now_ns)
         accepted = self._accept(waiting, adjacent, strict, damages, gap_ns, range_first=True)
@@ -161,10 +163,10 @@ class Joiner:
             if now_ns - old.at_ns > self._timeout_ns or len(self._diagnostics) > MAX_WAITING:
                 del self._diagnostics[sequence]
         expired = []
-        for sequence, (at_ns, arrival, diagnostics) in list(self._held.items()):
+        for sequence, (at_ns, arrival, diagnostics, _) in list(self._held.items()):
             if now_ns - at_ns > self._timeout_ns or len(self._held) > MAX_WAITING:
                 del self._held[sequence]
-                self._split -= 1
+                self._parts = max(self._parts - 1, 1)
                 expired.append(self._joined(sequence, arrival, diagnostics))
         for sequence, waiting in list(self._ranges.items()):
             if now_ns - waiting.at_ns > self._timeout_ns or len(self._ranges) > MAX_WAITING:
@@ -221,9 +223,9 @@ class Joiner:
     def _complete(
         self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None, parts: int, now_ns: int
     ) -> list[Joined]:
-        """Return a range with its diagnostics, or keep it until their second part."""
-        if diagnostics is not None and parts == 1 and self._split >= SPLIT_EXCHANGES:
-            self._held[sequence] = now_ns, arrival, diagnostics
+        """Return a range with its diagnostics, or keep it until their last part."""
+        if diagnostics is not None and parts < self._parts:
+            self._held[sequence] = now_ns, arrival, diagnostics, parts
             return []
         return [self._joined(sequence, arrival, diagnostics)]
 
