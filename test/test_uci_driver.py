@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,9 @@ from uwb_mitigation.link.layout import Role
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.uci_feed import uci_settings
+from uwb_mitigation.nodes.uci_feed import _warning, uci_settings
+from uwb_mitigation.radio.uci.driver import UciReport
+from uwb_mitigation.radio.uci.session import UciSettings
 
 DEFAULTS = {row.name: row.default for row in DRIVER}
 
@@ -73,6 +76,15 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     ros.start("driver", "source:=uci", f"path:={capture}", "rate:=50.0")
     ros.spin_until(lambda: len(raw) > 50, 60.0)
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
+
+
+def test_rejected_parameters_and_a_missing_calibration_are_warnings():
+    counts = {"ranges": 30, "without_cir": 0, "inconsistent_cir": 0}
+    report = UciReport("p", "", UciSettings(), (16, 5), {0xE9: 4, 0x35: 4}, b"", 0.0, counts)
+    assert _warning(report).endswith("rejected: 0x35, 0xe9")
+    assert not _warning(replace(report, rejected={}))
+    failed = replace(report, rejected={}, counts={"ranges": 0, "transmission_failed": 9})
+    assert "load its calibration" in _warning(failed)
 
 
 def value_of(**changes: object):

@@ -148,7 +148,10 @@ def _describe(source: str, drivers: list[Any], o: Observation) -> None:
     if source == "uci":
         settings = report.settings
         o.expected_ids = (settings.address, settings.peers[0])
-        o.identity = {"device info": report.device_info.hex() or "not answered"}
+        o.identity = {
+            "device info": report.device_info.hex() or "not answered",
+            "rejected parameters": ", ".join(f"0x{tag:02x}" for tag in sorted(report.rejected)) or "none",
+        }
         o.written = {"CIR taps": settings.window, "CIR taps before the first path": 5}
         if report.window is not None:
             o.read = dict(zip(o.written, report.window, strict=True))
