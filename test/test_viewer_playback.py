@@ -223,6 +223,23 @@ def test_anchor_id_above_64_bits_is_ignored() -> None:
     assert list(scene.anchors) == [2**64 - 1]
 
 
+def test_implausible_values_of_standard_messages_are_ignored() -> None:
+    scene = Scene()
+    feed = Feed(scene, threading.Lock())
+    for covariance in (1.7e308, float("inf"), float("nan"), -1.0):
+        pose = SimpleNamespace(
+            position=SimpleNamespace(x=1.0, y=2.0, z=float("nan")),
+            orientation=SimpleNamespace(x=0.0, y=0.0, z=1e300, w=1e300),
+        )
+        message = SimpleNamespace(pose=SimpleNamespace(pose=pose, covariance=[covariance] * 36))
+        feed.add(POSE, message)
+        shown = scene.tags["tag"].pose
+        assert shown is not None
+        assert np.isnan([*shown.ellipse, shown.protection_m]).all()
+    feed.add(POSE, None)
+    assert feed.malformed == 1
+
+
 def test_bag_without_ranges_and_tracks_is_refused(tmp_path: Path):
     path = tmp_path / "one.mcap"
     with BagWriter(path, {}) as out:

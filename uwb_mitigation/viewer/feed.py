@@ -23,6 +23,7 @@ from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
+    MAX_COORDINATE_M,
     MAX_ID_DIGITS,
     MAX_TEXT,
     MAX_TRUTHS,
@@ -187,9 +188,8 @@ class Feed:
 
 def _bounds(covariance: np.ndarray[Any, Any]) -> tuple[tuple[float, float, float], float]:
     """Return half axes and angle of the 95 % ellipse of a 2 x 2 covariance, and the protection level; NaN if invalid."""
-    if not np.isfinite(covariance).all():
-        return (math.nan, math.nan, math.nan), math.nan
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    is_plausible = (np.abs(covariance) < MAX_COORDINATE_M**2).all()
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 if is_plausible else -np.eye(2))
     if values[0] < 0:
         return (math.nan, math.nan, math.nan), math.nan
     minor, major = np.sqrt(CHI2_95 * values)

@@ -157,9 +157,11 @@ def index_recording(
         timeline.tracks[one] = columns[:, 0], columns[:, 1:]
     if anchors is None or not ranges:
         return timeline
-    true_z = [xyz[:, 2] for (_, kind), (_, xyz) in timeline.tracks.items() if kind is TrackKind.TRUE]
-    if height is None and true_z:
-        height = Height(float(np.median(np.concatenate(true_z))))
+    true_z = [
+        z for (_, kind), (_, xyz) in timeline.tracks.items() if kind is TrackKind.TRUE for z in xyz[:, 2]
+    ]
+    if height is None and np.isfinite(true_z).any():
+        height = Height(float(np.nanmedian(true_z)))
     config = EstimatorConfig(anchors, height=height)
     for tag_id in sorted({key.tag_id for key in keys})[:MAX_TAGS]:
         own = [row for row in ranges if row[0].tag_id == tag_id and row[0].anchor_id in anchors.index]
