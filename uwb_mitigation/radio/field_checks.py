@@ -81,26 +81,14 @@ class Observation:
 
 def run_checks(o: Observation) -> list[Check]:
     """Return all checks that apply to an observation."""
+    verdict, remedy = Verdict.PASS, ""
+    if o.problem:
+        verdict, remedy = Verdict.FAIL, "see the troubleshooting of the board"
+    rate_hz = len(o.ranges) / o.seconds
     checks = [
-        _judge(
-            "problem of the driver",
-            0.0 if not o.problem else 1.0,
-            0,
-            0,
-            "",
-            o.problem,
-            text=o.problem or "none",
-        ),
-        *(_settings(o.written, o.read)),
-        _judge(
-            "ranges per second",
-            len(o.ranges) / o.seconds,
-            5,
-            1,
-            "Hz",
-            "see the troubleshooting of the board",
-            low=True,
-        ),
+        Check("problem of the driver", o.problem or "none", "none", verdict, remedy),
+        *_settings(o.written, o.read),
+        _judge("ranges per second", rate_hz, 5, 1, "Hz", "see the troubleshooting of the board", low=True),
         _ids(o),
     ]
     if o.ranges:
@@ -121,28 +109,19 @@ def run_checks(o: Observation) -> list[Check]:
 
 
 def _judge(
-    name: str,
-    value: float,
-    warn: float,
-    fail: float,
-    unit: str,
-    remedy: str,
-    *,
-    low: bool = False,
-    text: str = "",
+    name: str, value: float, warn: float, fail: float, unit: str, remedy: str, *, low: bool = False
 ) -> Check:
     """Return a check of a value that must not exceed limits, or with `low` not fall below them."""
     sign = -1 if low else 1
-    bad = math.isnan(value)
     verdict = Verdict.PASS
-    if bad or sign * value > sign * fail:
+    if math.isnan(value) or sign * value > sign * fail:
         verdict = Verdict.FAIL
     elif sign * value > sign * warn:
         verdict = Verdict.WARNING
     bound = "at least" if low else "at most"
     scale = 100 if unit == "%" else 1
-    limit = "none" if text else f"{bound} {scale * warn:g} {unit}".rstrip()
-    shown = text or f"{scale * value:.3g} {unit}".rstrip()
+    limit = f"{bound} {scale * warn:g} {unit}".rstrip()
+    shown = f"{scale * value:.3g} {unit}".rstrip()
     return Check(name, shown, limit, verdict, "" if verdict is Verdict.PASS else remedy)
 
 
@@ -175,15 +154,12 @@ def _ranges(o: Observation) -> Iterator[Check]:
     yield _judge("standard deviation of a range", (high - low) / 2, 0.1, 0.2, "m", remedy)
     gaps = [measured.cir.power_gap_db for measured in o.ranges if not math.isnan(measured.cir.power_gap_db)]
     if gaps:
-        remedy = "place the antennas in line of sight"
-        yield _judge(
-            "receive minus first-path level", float(np.median(gaps)), LINE_OF_SIGHT_DB, 10, "dB", remedy
-        )
+        name, remedy = "receive minus first-path level", "place the antennas in line of sight"
+        yield _judge(name, float(np.median(gaps)), LINE_OF_SIGHT_DB, 10, "dB", remedy)
     stamps_s = np.diff([measured.stamp_ns for measured in o.ranges]) / 1e9
     if len(stamps_s):
-        yield _judge(
-            "longest pause between ranges", float(stamps_s.max()), 1.0, 5.0, "s", "check cable and power"
-        )
+        pause_s = float(stamps_s.max())
+        yield _judge("longest pause between ranges", pause_s, 1.0, 5.0, "s", "check cable and power")
         backwards = int((stamps_s < 0).sum())
         yield _judge("stamps that go backwards", backwards, 0, 0, "", "send this report")
 
@@ -195,31 +171,16 @@ def _cirs(o: Observation) -> Iterator[Check]:
     yield _judge("share of ranges with CIR", len(filled) / len(cirs), 0.95, 0.5, "%", remedy, low=True)
     if not filled:
         return
-    inside = sum(
-        0 <= cir.first_path_index - cir.start_index < len(cir)
-        for cir in filled
-        if math.isfinite(cir.first_path_index)
-    )
-    yield _judge(
-        "share of first paths in the CIR", inside / len(filled), 0.95, 0.5, "%", "send this report", low=True
-    )
-    clipped = sum(int(np.abs(cir.samples.astype(np.int32)).max()) >= SATURATED for cir in filled) / len(
-        filled
-    )
+    # A comparison with NaN is false.
+    inside = np.mean([0 <= cir.first_path_index - cir.start_index < len(cir) for cir in filled])
+    remedy = "send this report"
+    yield _judge("share of first paths in the CIR", float(inside), 0.95, 0.5, "%", remedy, low=True)
+    peaks = np.array([np.abs(cir.samples.astype(np.int32)).max() for cir in filled])
+    clipped = float(np.mean(peaks >= SATURATED))
     yield _judge("share of saturated CIRs", clipped, 0.05, 0.5, "%", "increase the distance")
-    ratios = [
-        float(np.abs(cir.samples.astype(np.int32)).max() / max(_noise(cir.samples), 1e-9))
-        for cir in filled[:500]
-    ]
-    yield _judge(
-        "peak over the noise before the first path",
-        float(np.median(ratios)),
-        10,
-        4,
-        "times",
-        "reduce the distance",
-        low=True,
-    )
+    ratio = float(np.median(peaks / [max(_noise(cir.samples), 1e-9) for cir in filled]))
+    name, remedy = "peak over the noise before the first path", "reduce the distance"
+    yield _judge(name, ratio, 10, 4, "times", remedy, low=True)
 
 
 def _noise(samples: np.ndarray) -> float:
@@ -233,15 +194,8 @@ def _model(o: Observation) -> Iterator[Check]:
         yield Check("model", o.model, "trained for this radio", Verdict.WARNING, remedy)
         return
     residual_m = abs(float(np.median([each.range_m for each in o.corrected])) - o.distance_m)
-    yield _judge(
-        "error of the median corrected range", residual_m, 0.15, 0.3, "m", "calibrate the offset of the pair"
-    )
+    remedy = "calibrate the offset of the pair"
+    yield _judge("error of the median corrected range", residual_m, 0.15, 0.3, "m", remedy)
     refused = sum(each.status is not Status.OK for each in o.corrected) / len(o.corrected)
-    yield _judge(
-        "share of ranges without correction",
-        refused,
-        0.2,
-        0.8,
-        "%",
-        "the model does not fit this radio or site",
-    )
+    remedy = "the model does not fit this radio or site"
+    yield _judge("share of ranges without correction", refused, 0.2, 0.8, "%", remedy)
