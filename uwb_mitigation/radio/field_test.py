@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -37,11 +37,11 @@ START_TIMEOUT_S = 30.0
 UNPLUG_TIMEOUT_S = 60.0
 
 _WINDOW = 157
-# Registers of the DW1000: name, file, offset, octets (user manual, chapter 7).
+# Registers of the DW1000: name, header of a read, octets (user manual, chapters 2.2 and 7).
 _REGISTERS = (
-    ("device id", 0x00, 0, 4),
-    ("TX antenna delay", 0x18, 0, 2),
-    ("RX antenna delay", 0x2E, 0x1804, 2),
+    ("device id", b"\x00", 4),
+    ("TX antenna delay", b"\x18", 2),
+    ("RX antenna delay", b"\x6e\x84\x30", 2),  # file 0x2E, offset 0x1804
 )
 _DW1000_ID = 0xDECA0130
 _ANTENNA_DELAY = "antenna delay (15.65 ps)"
@@ -190,23 +190,11 @@ def _read_registers(source: str, port: str, o: Observation) -> None:
     values: dict[str, int] = {}
     with contextlib.suppress(UwbMitigationError), closing(bus_opener(source, port)()) as bus:
         bus.speed(False)
-        for name, register, offset, octets in _REGISTERS:
-            values[name] = int.from_bytes(
-                bus.transfer(bytes(_header(register, offset)), None, octets), "little"
-            )
+        for name, header, octets in _REGISTERS:
+            values[name] = int.from_bytes(bus.transfer(header, None, octets), "little")
     o.written |= {"device id": f"0x{_DW1000_ID:08x}"}
     if "RX antenna delay" in values:
         o.read |= {
             "device id": f"0x{values['device id']:08x}",
             _ANTENNA_DELAY: values["TX antenna delay"] + values["RX antenna delay"],
         }
-
-
-def _header(register: int, offset: int) -> Iterator[int]:
-    """Yield the header of a read: a sub-address has 7 or 15 bits."""
-    yield register | (0x40 if offset else 0)
-    if offset >= 0x80:
-        yield 0x80 | (offset & 0x7F)
-        yield offset >> 7
-    elif offset:
-        yield offset
