@@ -140,6 +140,35 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
     assert "no CIRs, which networks need" in refused.stderr
 
 
+def test_ranges_without_first_path_level_are_passed_through(tmp_path: Path):
+    with BagWriter(tmp_path / "some.mcap", {"source": "test", "simulated": "true"}) as bag:
+        for number, record in enumerate(ranges()):
+            cir = record.measurement.cir
+            if number % 5 == 0:
+                cir = replace(cir, first_path_power_dbm=np.nan)
+            bag.write(replace(record, measurement=replace(record.measurement, cir=cir)))
+    done = run("train", "--data", "some.mcap", "-o", "line.onnx", "--json", "t.json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    mae_m = {row["name"]: row["mae"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
+    assert 0.2 * mae_m["raw"] < mae_m["l1_line"] < 0.8 * mae_m["raw"]
+
+
+def test_offset_without_cirs_prefers_labels_to_levels():
+    universal = Mitigation(load_bundle(default_model_path()))
+    records = [
+        replace(
+            record,
+            measurement=replace(
+                record.measurement, cir=Cir(EMPTY, rx_power_dbm=-80.0, first_path_power_dbm=-82.0)
+            ),
+        )
+        for record in ranges(4)
+    ]
+    found = estimate_offset(universal, records)
+    assert {one.refused for one in found.placements} == {"", "not line of sight: labelled as NLOS"}
+    assert found.offset_m == pytest.approx(-0.05, abs=0.05)
+
+
 def test_offset_from_true_ranges_needs_no_levels():
     universal = Mitigation(load_bundle(default_model_path()))
     records = ranges(4, levels=False)

@@ -153,9 +153,10 @@ def estimate_offset(
                 predicted = result.correction_m - float(known_offset[0])
             offset, gap = measured.range_m - predicted - true_m, _power_gap_db(measured, preprocessing)
             is_los = float(gap < LINE_OF_SIGHT_DB) if math.isfinite(gap) else math.nan
-            if truth is not None and distance_m is None and math.isnan(is_los) and not len(measured.cir):
-                # Neither levels nor a CIR: the label decides; surveyed ranges without labels are used.
-                is_los = float(truth.label in ("", "LOS"))
+            label = truth.label if truth is not None and distance_m is None and not len(cir) else None
+            if label or (label is not None and math.isnan(is_los)):
+                # Without a CIR the label decides, then the levels; surveyed ranges with neither are used.
+                is_los = float(label in ("", "LOS"))
             sample = offset, predicted, gap, is_los, result.status.name
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
     if not groups:
@@ -205,7 +206,7 @@ def _placement_offset(
         refused = "the first-path power is unknown, so that line of sight cannot be checked"
     elif 2 * is_los.sum() < is_known.sum():
         refused = "not line of sight: labelled as NLOS"
-        if has_gap.any():
+        if median_gap >= LINE_OF_SIGHT_DB:
             refused = (
                 f"not line of sight: the first path is {median_gap:.1f} dB below the receive level "
                 f"(line of sight: less than {LINE_OF_SIGHT_DB:g} dB)"
