@@ -313,6 +313,8 @@ def firmware_demo(
 
 def nodes_result(figures: Mapping[str, SubjectResult]) -> dict[str, Any]:
     """Return figures by subject as plain values, with the ratios between the subjects under `ratios`."""
+    from benchmarks.nodes import rate_ratio
+
     result: dict[str, Any] = {}
     for name, of in figures.items():
         values = asdict(of)
@@ -320,9 +322,10 @@ def nodes_result(figures: Mapping[str, SubjectResult]) -> dict[str, Any]:
         result[name] = {"max_lossless_rate_hz": of.max_lossless_rate_hz} | values
     relay, mitigator, pipeline = (figures[name] for name in ("relay", "mitigator", "pipeline"))
     result["ratios"] = {
-        "mitigator_rate_over_relay": mitigator.max_lossless_rate_hz / (relay.max_lossless_rate_hz or 1.0),
-        "pipeline_rate_over_mitigator": pipeline.max_lossless_rate_hz
-        / (mitigator.max_lossless_rate_hz or 1.0),
+        "mitigator_rate_over_relay": rate_ratio(mitigator.max_lossless_rate_hz, relay.max_lossless_rate_hz),
+        "pipeline_rate_over_mitigator": rate_ratio(
+            pipeline.max_lossless_rate_hz, mitigator.max_lossless_rate_hz
+        ),
         "added_p99_us_at_500_hz": mitigator.latency_us[500].p99 - relay.latency_us[500].p99,
     }
     return result

@@ -224,7 +224,8 @@ class Subject:
 
         low, high = 0.0, _MIN_HZ
         # The next search begins below the previous results.
-        if self.figures.rates_hz and is_lossless(below := self.figures.max_lossless_rate_hz / _STEP):
+        below = self.figures.max_lossless_rate_hz / _STEP
+        if below > 0 and is_lossless(below):
             low, high = below, below * _STEP
         while high < _MAX_HZ and is_lossless(high):
             low, high = high, high * _STEP
@@ -356,6 +357,11 @@ def measure(repeats: int, slices: int, seconds: float, advance: ProgressCallback
 
 Step = tuple[str, float, Callable[[], None]]
 """Name of the step, approximate duration, s, and the function that measures."""
+
+
+def rate_ratio(rate_hz: float, baseline_hz: float) -> float | None:
+    """Return the ratio of two rates, or None if the baseline is 0: the lowest rate was not sustained."""
+    return rate_hz / baseline_hz if baseline_hz else None
 
 
 def searches(subjects: Sequence[Subject], repeats: int) -> list[Step]:

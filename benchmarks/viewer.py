@@ -17,6 +17,7 @@ from benchmarks.nodes import (
     Subject,
     open_bench,
     process_usage,
+    rate_ratio,
     run_steps,
     searches,
 )
@@ -50,10 +51,10 @@ class ViewerCosts:
     rates_hz: dict[str, list[float]]
 
     @property
-    def rate_ratios(self) -> dict[str, float]:
+    def rate_ratios(self) -> dict[str, float | None]:
         """Return the rates of the mitigator relative to that without a viewer."""
         medians_hz = {name: median(rates_hz) for name, rates_hz in self.rates_hz.items()}
-        return {name: rate_hz / (medians_hz[NO_VIEWER] or 1.0) for name, rate_hz in medians_hz.items()}
+        return {name: rate_ratio(rate_hz, medians_hz[NO_VIEWER]) for name, rate_hz in medians_hz.items()}
 
 
 def measure(repeats: int, seconds: float, advance: ProgressCallback) -> ViewerCosts:
