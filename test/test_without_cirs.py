@@ -151,6 +151,9 @@ def test_ranges_without_first_path_level_are_passed_through(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     mae_m = {row["name"]: row["mae"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
     assert 0.2 * mae_m["raw"] < mae_m["l1_line"] < 0.8 * mae_m["raw"]
+    command = ("evaluate", "--data", "some.mcap", "--cross-validate", "configuration", "--seeds", 1)
+    done = run(*command, folder=tmp_path)
+    assert "360 ranges without receive or first-path level are left out" in done.stdout, done.stderr
 
 
 def test_offset_without_cirs_prefers_labels_to_levels():

@@ -102,6 +102,8 @@ def show_comparison(result: Comparison) -> None:
         f"MAE after rejecting the share of ranges with the largest variances: {kept}\n"
         f"not corrected, because out of distribution: {result.passed_through:.1%}"
     )
+    if result.without_levels:
+        print_line(f"{result.without_levels} ranges without receive or first-path level are left out")
     if result.universal_coverage is not None:
         print_line(
             f"universal_los_offset: coverage of the 68 % and 95 % intervals: {covered(result.universal_coverage)}"

@@ -58,6 +58,7 @@ class Comparison:
         coverage: coverage of the shipped recipe, over seeds.
         rejection: (share rejected, MAE of the remaining ranges); ranges with the largest variance are rejected first.
         passed_through: share of held-out ranges that the shipped recipe does not correct.
+        without_levels: number of ranges that are left out, because baselines need both levels.
         group, folds, seeds, configurations: parameters of the splits.
         universal_coverage: coverage of `universal_los_offset`; None without a universal model.
     """
@@ -66,6 +67,7 @@ class Comparison:
     coverage: Coverage
     rejection: tuple[tuple[float, float], ...]
     passed_through: float
+    without_levels: int
     group: Group
     folds: int
     seeds: int
@@ -92,6 +94,7 @@ class Comparison:
             "coverage_by_label": {label: row for label, row in table(self.coverage).items() if label},
             "rejection": [{"rejected": share, "mae": mae} for share, mae in self.rejection],
             "passed_through": self.passed_through,
+            "without_levels": self.without_levels,
             "universal_coverage": None
             if universal is None
             else {label or "all": row for label, row in table(universal).items()},
@@ -125,6 +128,7 @@ def run(
         DatasetError, ParameterError: see `splits.by_group` and `fit`. MissingDependencyError: no scikit-learn.
     """
     known = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
+    without_levels = int((~known).sum()) if known.any() else 0
     dataset = dataset.rows(known) if known.any() else dataset
     held_out_by_seed = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
     names = NAMES if dataset.has_cirs else NAMES_WITHOUT_CIRS
@@ -152,6 +156,7 @@ def run(
             (share, mae_after_rejection(final.ravel(), variance.ravel(), share)) for share in REJECTED
         ),
         passed_through=float(np.mean([seed_result.passed_through for seed_result in held_out_by_seed])),
+        without_levels=without_levels,
         group=group,
         folds=len(splits.by_group(dataset, group, folds, 0)),
         seeds=seeds,
