@@ -293,6 +293,23 @@ def test_a_bag_is_read_by_topic_and_field_path(tmp_path: Path):
         found = [(one.measurement.anchor_id, round(one.measurement.range_m, 2)) for one in source]
         assert found == [(1, 2.5), (2, 3.5)] * 3
     assert next(iter(source)).measurement.cir.rx_power_dbm == pytest.approx(-80.5)
+    mapping = load_mapping("nlink_nodeframe2")
+    # Other files are searched in the folder of the bag's file, which is a bag itself.
+    write(tmp_path / "two/anchors.csv", "a,x\n1,0\n2,5\n")
+    anchors = {"files": "anchors.csv", "id": "a", "position": ["x", 0, 0]}
+    document = mapping.model_dump(exclude={"anchors"}) | {"anchors": anchors}
+    assert len(read(document, tmp_path / "two/two.db3").anchors.index) == 2
+    with pytest.raises(RecordingError, match=r"the mapping has no topics \(the bag has: /nlink_link"):
+        MappedRecording(mapping.model_copy(update={"topics": []}), tmp_path / "two")
+
+
+def test_dates_of_parquet_are_stamps(tmp_path: Path):
+    import pandas as pd
+
+    times = pd.to_datetime(["2023-11-14T22:13:20.123456789", None])
+    pd.DataFrame({"t": times, "a": 1, "r": 2.0}).to_parquet(tmp_path / "x.parquet")
+    (record,) = read(PLAIN, tmp_path / "x.parquet")
+    assert record.measurement.stamp_ns == 1_700_000_000_123_456_789
 
 
 NODE2 = "uint8 role\nuint8 id\nfloat32 dis\nfloat32 fp_rssi\nfloat32 rx_rssi\n"
@@ -571,6 +588,7 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
             "stamp = 'yesterday' is not a date",
         ),
         ("t,a,r\n1700000000000,1,2\n", {}, "stamp = 1700000000000 is outside .*unit: ms"),
+        ("t,a,r\n2024-06-09T19:39:13,1,2\n", {}, "is not a number .*dates: set unit: iso8601"),
         ("t,a,r\n0,9007199254740993,2\n1,,2\n", {}, "is not an id"),
         ("", {}, "the file is empty"),
     ],
@@ -591,6 +609,30 @@ def test_millimetres_of_the_truth_are_an_error(tmp_path: Path):
     write(tmp_path / "x.csv", "t,a,r,true\n0,1,2,1900\n1,1,3,2900\n")
     with pytest.raises(RecordingError, match=r"median true range is 2,400 m .*unit: mm"):
         read(PLAIN | {"truth": {"range": "true"}}, tmp_path / "x.csv")
+
+
+def test_errors_in_another_unit_than_the_ranges_are_reported(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r,e\n0,1,2,150\n1,1,3,170\n")
+    source = read(PLAIN | {"truth": {"error": "e"}}, tmp_path / "x.csv")
+    assert source.warnings == ["the median error is 160 m: do range and truth have the same unit?"]
+
+
+def test_tables_that_do_not_match_any_range_are_reported(tmp_path: Path):
+    write(tmp_path / "x.csv", "t,a,r\n0,11,2\n1,12,3\n")
+    write(tmp_path / "poses.csv", "t,x\n500,0\n600,0\n")
+    write(tmp_path / "anchors.csv", "name,x\nA11,0\nA12,5\n")
+    write(tmp_path / "cirs.csv", "t,a,c\n0,1,2 2\n")
+    join = {"stamp": "t", "anchor": "a"}
+    document = PLAIN | {
+        "truth": {"poses": {"files": "poses.csv", "stamp": "t", "position": ["x", 0, 0]}},
+        "anchors": {"files": "anchors.csv", "id": {"column": "name", "names": True}, "position": ["x", 0, 0]},
+        "cir": {"files": "cirs.csv", "column": "c", "join": join},
+    }
+    assert read(document, tmp_path / "x.csv").warnings == [
+        "no CIR belongs to a range: compare stamps and ids of cir.join",
+        "no range is within the times of the true poses: compare the stamps",
+        "no anchor of a range has a position: compare the ids",
+    ]
 
 
 def test_an_error_column_of_the_opposite_sign_is_reported(tmp_path: Path):
@@ -760,6 +802,7 @@ def test_a_truncated_compressed_file_gives_what_is_before_the_damage(
         ),
         ("name: x\nfields: {anchor: {column: a, pattern: '(('}, range: r}\n", "not a regular expression"),
         ("name: x\nfields: {anchor: {column: a, pattern: 'a'}, range: r}\n", "has no group"),
+        ("name: x\nfields: {anchor: a, range: r}\ndrop: [{column: a}]\n", "drop.0: a rule needs equals"),
         ("!!python/object/apply:os.system ['true']\n", "not YAML"),
         ("[" * 5000, "not YAML"),
         ("7\n", "valid dictionary|should be"),

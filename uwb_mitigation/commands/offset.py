@@ -113,7 +113,7 @@ def _show(estimate: OffsetEstimate) -> None:
                 placement.placement,
                 placement.ranges,
                 *values,
-                f"{placement.power_gap_db:.1f}",
+                f"{placement.power_gap_db:.1f}".replace("nan", "-"),
                 placement.predicted_m,
             )
         )

@@ -182,11 +182,12 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
     texts = pd.Series([str(item).strip() for item in raw.tolist()], dtype=object)
     found = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
     for row in np.flatnonzero(np.isnan(found) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
-        comma = re.fullmatch(r"[-+]?\d+,\d+", texts[row])
+        comma, date = (re.match(form, texts[row]) for form in (r"[-+]?\d+,\d+$", r"\d{4}-\d\d-\d\d"))
+        number = "dates: set unit: iso8601" if date else f"a number in column {column}"
         raise RecordingError(
             f"{name} = {texts[row]!r:.40} is not a number",
             where=chunk.where(row),
-            valid="decimal commas: set decimal: ','" if comma else f"a number in column {column}",
+            valid="decimal commas: set decimal: ','" if comma else number,
         )
     return found
 
@@ -228,6 +229,8 @@ def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int6
         if LOG_TIME in chunk.columns:
             return np.asarray(chunk.columns[LOG_TIME], np.int64)
         raise RecordingError("no stamp", where=str(chunk.path), valid="fields.stamp: a column, or rate_hz")
+    if raw.dtype.kind == "M":
+        raw, value = raw.astype("datetime64[ns]").astype(np.int64), value.model_copy(update={"unit": "ns"})
     if value.unit == "iso8601":
         import pandas as pd
 

@@ -43,6 +43,9 @@ MAX_POSSIBLE = 10_000.0
 MAX_DIFFERENCE_M = 0.3
 """Largest plausible median difference of true ranges and the distances of true positions."""
 
+MAX_ERROR_M = 20.0
+"""Largest plausible median error of ranges."""
+
 MAX_INDEX = 1016
 _LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 _TAG, _ANCHOR, _POSE = (tuple(axes(name, None)) for name in ("tag", "anchor", "pose"))
@@ -203,6 +206,8 @@ class MappedRecording(Source):
                 found = self._read(source, paths, keys, "CIR ", source)
                 if join:
                     join_by_time(self.values, rows, found, join.tolerance_s)
+                    if (self.values["cir"][rows] < 0).all():
+                        self.warnings.append("no CIR belongs to a range: compare stamps and ids of cir.join")
                 else:
                     join_by_row(self.values, rows, found, str(file))
 
@@ -301,8 +306,8 @@ class MappedRecording(Source):
     def _check_units(self) -> None:
         """Raise RecordingError for wrong units."""
         for name, low, high, unit, other in (
-            ("range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm"),
-            ("true range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm"),
+            ("range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
+            ("true range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
             ("first_path_index", 0.0, MAX_INDEX, "samples", "'10.6'"),
         ):
             median = _median(np.abs(self.values[name]))
@@ -321,7 +326,13 @@ class MappedRecording(Source):
         keys = pd.DataFrame({name: values[name] for name in ("stamp", "tag", "anchor")})
         if repeated := int(keys.duplicated().sum()):
             self.warnings.append(f"{repeated} ranges repeat the stamp of another range of the same pair")
+        if truth.poses and not np.isfinite(values["tag x"]).any():
+            self.warnings.append("no range is within the times of the true poses: compare the stamps")
+        if hasattr(self, "anchors") and not np.isin(values["anchor"], list(self.anchors.index)).any():
+            self.warnings.append("no anchor of a range has a position: compare the ids")
         errors = self.errors_m
+        if (error := _median(np.abs(errors))) > MAX_ERROR_M:
+            self.warnings.append(f"the median error is {error:.0f} m: do range and truth have the same unit?")
         if truth.error and not truth.range and len(errors) >= 20:
             # Errors of UWB have a tail of late first paths, which are positive.
             low, middle, high = np.percentile(errors, (5, 50, 95))

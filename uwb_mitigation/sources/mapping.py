@@ -144,6 +144,12 @@ class Drop(_Strict):
     above: float | None = None
     from_median: float | None = None
 
+    @model_validator(mode="after")
+    def _check(self) -> Drop:
+        if not self.model_fields_set - {"column"}:
+            raise ValueError("a rule needs equals, differs, below, above or from_median")
+        return self
+
     def __str__(self) -> str:
         rules = self.model_dump(exclude_none=True, exclude={"column"})
         return f"{self.column} " + ", ".join(f"{name} {value}" for name, value in rules.items())

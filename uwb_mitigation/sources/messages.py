@@ -101,6 +101,7 @@ def _step(value: Any, name: str, column: str) -> Any:
         known = [
             str(each).lstrip("_")
             for each in getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
+            if each != "__msgtype__"
         ]
     raise RecordingError(
         f"no field {name} for column {column}",

@@ -103,7 +103,7 @@ def find_files(table: Table, root: Path, ranges: Path | None = None) -> list[Pat
     Raises:
         RecordingError: no file matches.
     """
-    if root.is_file() or (root / "metadata.yaml").is_file():
+    if root.is_file() or (ranges is None and (root / "metadata.yaml").is_file()):
         return [root]
     pattern = table.files
     try:
@@ -320,9 +320,11 @@ def _messages(table: Table, path: Path, columns: Mapping[str, bool]) -> _Rows:
         store.register(get_types_from_msg(text, name))
     with AnyReader([path], default_typestore=store) as bag:
         topics = {connection.topic: connection.msgtype for connection in bag.connections}
-        if missing := [topic for topic in table.topics if topic not in topics]:
+        # Without topics, the library would read all of them.
+        if missing := [topic for topic in table.topics or [""] if topic not in topics]:
             known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:40])
-            raise RecordingError(f"no topic {missing[0]}", where=str(path), valid=f"the bag has: {known}")
+            what = f"no topic {missing[0]}" if missing[0] else "the mapping has no topics"
+            raise RecordingError(what, where=str(path), valid=f"the bag has: {known}")
         messages = bag.messages([each for each in bag.connections if each.topic in table.topics])
         while batch := list(islice(messages, 1000)):
             rows: dict[str, list[Any]] = {}
