@@ -294,11 +294,12 @@ def test_new_rate_changes_the_later_intervals():
 
 
 def test_late_records_are_published_in_batches_and_in_order():
-    player = Player(
-        steps(500, 1000), lambda player, sequence: time.sleep(0.02) if sequence == 0 else None
-    ).play()
+    second_ns = 10**18 + 10**9
+    source = ListSource([10**18, *range(second_ns, second_ns + 499_000, 1000)])
+    player = Player(source, lambda player, sequence: time.sleep(1.1) if sequence == 0 else None).play()
     assert player.sequences == list(range(500))
     assert max(player.batches) > 1
+    # The second record is not due yet.
     assert player.batches[0] == 1
 
 
