@@ -130,6 +130,14 @@ def test_firmware_with_a_count_of_one_byte_gets_its_window():
     assert Bench(UciBoardModel(count_bytes=1), window=157).start().session.window == (157, 5)
 
 
+def test_firmware_that_refuses_the_number_of_taps_gets_the_lead():
+    class Refusing(UciBoardModel):
+        def _set_calibration(self, payload):
+            return b"\2\x9d\0" not in payload and super()._set_calibration(payload)
+
+    assert Bench(Refusing(), window=157).start().session.window == (16, 5)
+
+
 def test_taps_of_18_bits_are_scaled_to_16_bits():
     taps = np.array([[0, 0], [131071, -131072], [-2, 2]], np.int32)
     block = messages.CirBlock(0, 1, True, -1, taps)
@@ -281,6 +289,7 @@ def test_ranges_without_diagnostics_are_published_without_delay():
         run.step(run.board.range_packet(handle, sequence, 3.0), 18)
     assert len(run.found) == 100
     assert run.found[-1].stamp_ns == run.now_ns
+    assert run.found[-1].cir.source == "DW3000 without CIR"
 
 
 @given(st.binary(max_size=600), st.integers(1, 40))

@@ -336,13 +336,10 @@ def rejected_tags(payload: bytes) -> dict[int, int]:
     return dict(zip(pairs[::2], pairs[1::2], strict=False))
 
 
-def set_calibration(values: Mapping[str, int], count_bytes: int) -> bytes:
-    """Return the payload of SET_CALIBRATION for 16-bit values; firmware versions differ in the size of the count."""
-    packed = b"".join(
-        bytes([len(key)]) + key.encode() + b"\2" + value.to_bytes(2, "little")
-        for key, value in values.items()
-    )
-    return len(values).to_bytes(count_bytes, "little") + packed
+def set_calibration(key: str, value: int, count_bytes: int) -> bytes:
+    """Return the payload of SET_CALIBRATION for a 16-bit value; firmware versions differ in the size of the count."""
+    count = (1).to_bytes(count_bytes, "little")
+    return count + bytes([len(key)]) + key.encode() + b"\2" + value.to_bytes(2, "little")
 
 
 def get_calibration(keys: Sequence[str]) -> bytes:

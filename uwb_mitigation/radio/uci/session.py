@@ -286,9 +286,9 @@ class UciSession:
         self.window = None
         if not self.settings.window:
             return ""
-        for count_bytes, packets in ((2, [wanted]), (1, [{k: v} for k, v in wanted.items()])):
-            for values in packets:
-                payload = messages.set_calibration(values, count_bytes)
+        for count_bytes in (2, 1):
+            for key, value in wanted.items():
+                payload = messages.set_calibration(key, value, count_bytes)
                 yield _Command(messages.SET_CALIBRATION, payload, tries=1)
             values = {}
             answer = yield _Command(messages.GET_CALIBRATION, messages.get_calibration(list(wanted)), tries=2)
