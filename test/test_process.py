@@ -222,7 +222,7 @@ def test_ranges_of_a_radio_without_model_are_counted_with_their_reason(tmp_path:
     done = run(*words.split(), folder=tmp_path)
     assert done.returncode == 0, done.stderr
     text = " ".join(done.stderr.split())
-    assert "12 ranges are not corrected: their CIRs are of DW3000 STS" in text
+    assert "12 ranges are not corrected: they are of DW3000 STS" in text
     assert "trained for DW1000 IPATOV" in text
     (counts,) = [bag["mismatches"] for bag in json.loads((tmp_path / "out.json").read_text())["bags"]]
     assert list(counts.values()) == [12]

@@ -115,6 +115,11 @@ class Cir:
         return len(self.samples) // (2 if self.encoding == Encoding.COMPLEX_INT16 else 1)
 
     @property
+    def source(self) -> str:
+        """Radio and segment, human-readable."""
+        return f"{self.radio.name} {self.segment.name if len(self) else 'without CIR'}"
+
+    @property
     def power_gap_db(self) -> float:
         """Receive level minus first-path level; NaN = unknown."""
         return self.rx_power_dbm - self.first_path_power_dbm

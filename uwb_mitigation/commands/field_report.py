@@ -94,7 +94,7 @@ def _correct(observation: Observation) -> None:
 
     bundle = load_bundle(model_path(None))
     cirs = [measured.cir for measured in observation.ranges]
-    sources = {f"{cir.radio.name} {cir.segment.name}" for cir in cirs}
+    sources = {cir.source for cir in cirs}
     observation.model = (
         f"{bundle.name}: trained for {bundle.card.source}, ranges of {', '.join(sorted(sources))}"
     )

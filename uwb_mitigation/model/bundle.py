@@ -90,8 +90,8 @@ class Card:
         return " ".join("/".join(each.name for each in names) for names in (self.radios, self.segments))
 
     def mismatch(self, other: str) -> str:
-        """Return why ranges with CIRs of another radio and segment are not corrected."""
-        return f"their CIRs are of {other}, and model {self.name} was trained for {self.source}; only offsets are subtracted"
+        """Return why ranges of another radio or segment are not corrected."""
+        return f"they are of {other}, and model {self.name} was trained for {self.source}; only offsets are subtracted"
 
     @property
     def origin(self) -> str:

@@ -141,7 +141,7 @@ class Mitigator(ManagedNode):
             if corrected.status in _PASSED_THROUGH and not mitigation.bundle.card.fits(
                 cir.radio, cir.segment, len(cir) > 0
             ):
-                self.health.other_source = f"{cir.radio.name} {cir.segment.name}"
+                self.health.other_source = cir.source
             if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
                 (offset_m,) = offsets.of([measurement.tag_id], [measurement.anchor_id])
                 self.health.los_m.append(corrected.correction_m - float(offset_m))

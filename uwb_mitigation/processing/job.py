@@ -215,5 +215,5 @@ class _Corrector:
             self.statuses[result.status.name] += 1
             cir = measurement.cir
             if not card.fits(cir.radio, cir.segment, len(cir) > 0):
-                self.mismatches[card.mismatch(f"{cir.radio.name} {cir.segment.name}")] += 1
+                self.mismatches[card.mismatch(cir.source)] += 1
         return encoded
