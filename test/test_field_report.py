@@ -118,6 +118,7 @@ def test_missing_board_gives_a_report(report: Report, tmp_path: Path, monkeypatc
     assert "PATH" in checks["problem of the driver"]["value"]
     page = zipfile.Path(tmp_path / "out.zip", "report.html").read_text()
     assert "<h1>Field report: board with UCI firmware</h1>" in page
+    assert "issue of type <em>Field report</em>" in page
     assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC; 0 ranges at 3.00 m in 3 s", page)
     with zipfile.ZipFile(tmp_path / "out.zip") as archive:
         for name in archive.namelist():

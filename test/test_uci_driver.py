@@ -79,12 +79,15 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
 
 
 def test_rejected_parameters_and_a_missing_calibration_are_warnings():
-    counts = {"ranges": 30, "without_cir": 0, "inconsistent_cir": 0}
+    counts = {"ranges": 30, "without_cir": 0, "inconsistent_cir": 0, "joined": 30}
+    counts |= {"without_diagnostics": 0, "unknown_session": 0}
     report = UciReport("p", "", UciSettings(), (16, 5), {0xE9: 4, 0x35: 4}, b"", 0.0, counts)
     assert _warning(report).endswith("rejected: 0x35, 0xe9")
     assert not _warning(replace(report, rejected={}))
-    failed = replace(report, rejected={}, counts={"ranges": 0, "transmission_failed": 9})
-    assert "load its calibration" in _warning(failed)
+    none = counts | {"ranges": 0}
+    assert "load its calibration" in _warning(replace(report, counts=none | {"transmission_failed": 29}))
+    assert "no range yet" in _warning(replace(report, counts=none | {"transmission_failed": 9}))
+    assert "other addresses" in _warning(replace(report, counts=none | {"unknown_session": 9}))
 
 
 def value_of(**changes: object):

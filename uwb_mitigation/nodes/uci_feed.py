@@ -152,7 +152,10 @@ def _values(report: UciReport) -> dict[str, object]:
 def _warning(report: UciReport) -> str:
     """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
     counts = report.counts
-    if not counts["ranges"] and counts.get("transmission_failed"):
+    if not counts["ranges"] and counts["unknown_session"]:
+        return "the only ranges are of other addresses: are the ids swapped, or other boards in reach?"
+    exchanges = counts["joined"] + counts["without_diagnostics"]
+    if not counts["ranges"] and 2 * counts.get("transmission_failed", 0) > exchanges:
         return "the board cannot transmit: load its calibration again, as after a chip erase"
     if report.settings.role is Role.TAG and not counts["ranges"]:
         return "no range yet: are the anchors on, with the same channel, addresses and interval?"

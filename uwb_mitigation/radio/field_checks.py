@@ -167,7 +167,7 @@ def _ranges(o: Observation) -> Iterator[Check]:
 def _cirs(o: Observation) -> Iterator[Check]:
     cirs = [measured.cir for measured in o.ranges]
     filled = [cir for cir in cirs if np.any(cir.samples)]
-    remedy = "the firmware reports no CIR: use the image of the hardware page"
+    remedy = "the firmware reports no CIR, or only zeros: use the image of the hardware page"
     yield _judge("share of ranges with CIR", len(filled) / len(cirs), 0.95, 0.5, "%", remedy, low=True)
     if not filled:
         return
