@@ -180,6 +180,17 @@ def test_cirs_in_text_keep_their_values(form: str, tmp_path: Path):
     )
 
 
+def test_complex_cirs_are_read_from_pairs(tmp_path: Path):
+    import pandas as pd
+
+    rows = pd.DataFrame({"t": [0.0], "a": 1, "r": 2.0, "c": [[[1, 2], [3, -4]]]})
+    rows.to_parquet(tmp_path / "x.parquet")
+    rows.to_csv(tmp_path / "x.csv", index=False)
+    for name in ("x.parquet", "x.csv"):
+        (record,) = read(PLAIN | {"cir": {"column": "c", "samples": "complex"}}, tmp_path / name)
+        assert record.measurement.cir.samples.tolist() == [1, 2, 3, -4], name
+
+
 def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):
     write(tmp_path / "x.csv", "t,a,r,C0,C1\n0,1,2,65534,32767\n1,1,2,0.5,1.0\n")
     big, small = (
@@ -567,6 +578,11 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
         ("t,a,rng\n0,1,2\n", {}, r"no column r(; did you mean 'rng'\?)? \(columns: t, a, rng"),
         ("t,a,r\n0,1,2\n0.1,A7,2\n", {}, r"row 2: anchor = 'A7' is not an id"),
         ("t,a,r\n0,-1,2\n", {}, "anchor = -1 is not an id"),
+        (
+            "t,a,r\n0,A7,2\n",
+            {"anchor": {"column": "a", "pattern": r"B(\d)"}},
+            "row 1: anchor = 'A7' does not match 'B",
+        ),
         ("t,a,r\n0,1,4700\n1,1,4800\n", {}, "median range is 4,750 m .*set unit: mm"),
         (
             "t,a,r\n0,1,2\n",

@@ -172,13 +172,19 @@ def test_offset_without_cirs_prefers_labels_to_levels():
     assert found.offset_m == pytest.approx(-0.05, abs=0.05)
 
 
-def test_offset_from_true_ranges_needs_no_levels():
+def test_offset_from_true_ranges_needs_no_levels(tmp_path: Path):
     universal = Mitigation(load_bundle(default_model_path()))
     records = ranges(4, levels=False)
     found = estimate_offset(universal, records)
     assert found.offset_m == pytest.approx(-0.05, abs=0.05)
     refused = {one.refused for one in found.placements if one.refused}
     assert refused == {"not line of sight: labelled as NLOS"}
+    with BagWriter(tmp_path / "bare.mcap", {"source": "test", "simulated": "true"}) as bag:
+        for record in records:
+            bag.write(record)
+    done = run("offset", "bare.mcap", "--truth", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "nan" not in done.stdout
     blocked = [record for record in records if record.truth is not None and record.truth.label == "NLOS"]
     with pytest.raises(DatasetError, match="labelled as NLOS"):
         estimate_offset(universal, blocked)

@@ -301,7 +301,9 @@ def _read_ids(value: Value, chunk: Chunk, name: str, file: str, names: dict[str,
                 raise ValueError(text)
         except (ValueError, UwbMitigationError) as error:
             raise RecordingError(
-                f"{name} = {item!r:.40} is not an id",
+                error.what
+                if isinstance(error, UwbMitigationError)
+                else f"{name} = {item!r:.40} is not an id",
                 where=chunk.where(row),
                 valid="a whole number such as 3 or 0x1f; `pattern` takes a number from a text, `names: true` numbers texts",
             ) from error
@@ -322,10 +324,14 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
         ValueError: the values are not numbers.
     """
     if isinstance(values, str):
+        if form == "complex" and not re.search("[ij]", values):
+            form = "interleaved"  # pairs such as [[1, 2], [3, 4]]
         items = [item.strip("[]()") for item in re.split(r"[,;\s]+", values.strip())]
         parse: Any = complex if form == "complex" else float
         values = [parse(item.replace("i", "j")) for item in items if item]
     array = np.asarray(values)
+    if array.dtype == object and array.ndim:
+        array = np.stack(list(array))  # Parquet gives pairs as arrays in an array.
     encoding = Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
     if form == "complex":
         pairs = array if array.ndim == 2 else np.stack([array.real, array.imag], axis=1)
