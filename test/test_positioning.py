@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
-from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, shape
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, horizontal_ellipse, shape
 from uwb_mitigation.positioning.initialization import candidate_positions
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
@@ -338,3 +338,12 @@ def test_truth_is_not_interpolated_across_gaps():
 def test_model_out_of_range_is_refused():
     with pytest.raises(ParameterError, match="range_sd"):
         NoiseModel(range_sd=math.nan)
+
+
+def test_ellipse_contains_95_percent_of_the_errors():
+    covariance = np.array([[0.5, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 9.0]])
+    major, minor, angle = horizontal_ellipse(covariance)
+    x, y = np.random.default_rng(1).multivariate_normal(np.zeros(3), covariance, 100_000).T[:2]
+    along, across = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+    assert np.mean((along / major) ** 2 + (across / minor) ** 2 < 1.0) == pytest.approx(0.95, abs=0.003)
+    assert np.isnan(horizontal_ellipse(-covariance)).all()

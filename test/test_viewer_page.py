@@ -405,6 +405,8 @@ def test_content_fits_the_screen(browser: Browser, view: View, server: ViewerSer
         )
     open_page(browser, server, width, 2000)
     browser.wait("the table", lambda: len(browser.table("Pairs")) == 3)
+    if width == 1280:
+        assert "scroll the table sideways" not in browser.text()
     assert browser.run("return document.documentElement.scrollWidth") <= width
     assert browser.run("return document.querySelector('header').clientHeight") <= 60
     browser.screenshot(f"viewer_{width}")
@@ -466,6 +468,12 @@ def test_pairs_can_be_sorted_and_selected(browser: Browser, view: View, server: 
     pressed = browser.find("button", "Select anchor 2, tag 7").get_attribute("aria-pressed")
     assert pressed == "true"
     browser.wait("it in the URL", lambda: "#anchor=2&tag=7" in browser.driver.current_url)
+    with view.lock:
+        view.scene.add_sample((3, 7), Sample(1005.0, 5.3, 5.3, 0.1, Status.NO_CIR))
+    browser.wait("the other pair", lambda: anchors() == ["2, 7", "3, 7"])
+    browser.click("button", "Select anchor 3, tag 7")
+    title = "Channel impulse response (CIR): anchor 3, tag 7: no CIR"
+    browser.wait("the reason", lambda: browser.find("heading", title))
 
 
 def test_map_shows_and_exports_tracks_and_rays(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -478,7 +486,15 @@ def test_map_shows_and_exports_tracks_and_rays(browser: Browser, view: View, ser
     tracks = dict(view.scene.tracks)
     assert {kind for _, kind in tracks} == {TrackKind.CORRECTED, TrackKind.TRUE}
     svg = browser.export("Map as SVG")
-    for text in ("corrected", "true", "OUT_OF_DISTRIBUTION", "protection level", "anchor", "selected anchor"):
+    for text in (
+        "corrected",
+        "true",
+        "OUT_OF_DISTRIBUTION",
+        "protection level",
+        "heading",
+        "anchor",
+        "selected anchor",
+    ):
         assert f">{text}<" in svg
     assert f">{TrackKind.SMOOTHED.value}<" not in svg, "the legend lists what the map contains"
     assert "PNG" in browser.export("Map as PNG")[:8]

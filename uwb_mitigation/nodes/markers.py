@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
@@ -13,12 +14,12 @@ from visualization_msgs.msg import Marker, MarkerArray
 from uwb_mitigation.measurement import Status
 from uwb_mitigation.nodes import topics
 from uwb_mitigation.positioning.anchors import MAX_ANCHORS, Anchor, AnchorMap
+from uwb_mitigation.positioning.geometry import horizontal_ellipse
 from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.viewer import palette
 from uwb_mitigation.viewer.palette import STATUS_LOOKS
 
 TRAIL = 400
-_ELLIPSE95 = 2.448  # square root of the 95th percentile of chi-squared with two degrees of freedom
 
 SYMBOL_M = 0.12
 """Radius of the symbol of a status."""
@@ -123,13 +124,11 @@ def tag_markers(
     name = marker("tag_names", Marker.TEXT_VIEW_FACING, _colour(None))
     name.pose.position = _point((x, y, z + 0.3))
     name.scale, name.text = Vector3(z=0.25), picture.name
-    values, vectors = np.linalg.eigh(estimate.covariance[:2, :2])
-    small, large = 2.0 * _ELLIPSE95 * np.sqrt(np.maximum(values, 1e-6))
-    angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    major, minor, angle = horizontal_ellipse(estimate.covariance)
     ellipse = marker("ellipses", Marker.CYLINDER, _colour(palette.BLUE, 0.3))
-    turned = Quaternion(z=float(np.sin(angle / 2)), w=float(np.cos(angle / 2)))
+    turned = Quaternion(z=math.sin(angle / 2), w=math.cos(angle / 2))
     ellipse.pose = Pose(position=here, orientation=turned)
-    ellipse.scale = Vector3(x=float(large), y=float(small), z=0.02)
+    ellipse.scale = Vector3(x=2.0 * major, y=2.0 * minor, z=0.02)
     trail = marker("trails", Marker.LINE_STRIP, _colour(palette.BLUE))
     trail.scale.x = 0.03
     trail.points = [_point(position) for position in picture.trail]

@@ -142,6 +142,26 @@ def geometry(anchors: NDArray[np.float64], position: NDArray[np.float64], *, lev
     return Geometry(math.sqrt(spread[0] + spread[1]), 0.0 if level else math.sqrt(spread[2]))
 
 
+CHI2_95 = 5.991
+"""Squared radius of the 95 % ellipse in two dimensions, for a covariance of 1."""
+
+
+def horizontal_ellipse(covariance: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return half axes (m, the larger first) and angle of the larger one (rad) of the 95 % ellipse; NaN: invalid covariance.
+
+    Args:
+        covariance: covariance of a position, float64 (d, d) with d of at least 2, m^2.
+    """
+    horizontal = covariance[:2, :2]
+    if not (np.abs(horizontal) < 1e30).all():
+        return math.nan, math.nan, math.nan
+    values, vectors = np.linalg.eigh((horizontal + horizontal.T) / 2)
+    if values[0] < 0.0:
+        return math.nan, math.nan, math.nan
+    minor, major = np.sqrt(CHI2_95 * values).tolist()
+    return major, minor, math.atan2(vectors[1, 1], vectors[0, 1])
+
+
 PROTECTION = 3.29
 """Deviations that a normal error exceeds once in a thousand times (two-sided)."""
 

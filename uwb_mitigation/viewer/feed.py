@@ -18,12 +18,11 @@ from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_ra
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.geometry import PROTECTION
+from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_ellipse
 from uwb_mitigation.positioning.tracks import Estimate
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
-    MAX_COORDINATE_M,
     MAX_ID_DIGITS,
     MAX_TEXT,
     MAX_TRUTHS,
@@ -44,9 +43,6 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     topics.RANGE_TRUTH: decode_truth,
     topics.RANGE_CORRECTED: decode_corrected,
 }
-
-CHI2_95 = 5.991
-"""Squared radius of the 95 % ellipse in two dimensions."""
 
 MAX_HEADING_VARIANCE = 1.0
 """If the variance of the heading is larger, rad^2, the heading is unknown."""
@@ -137,7 +133,7 @@ class Feed:
         q, heading_rad = message.pose.pose.orientation, math.nan
         if 0.0 < covariance[5, 5] < MAX_HEADING_VARIANCE:
             heading_rad = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-        pose = Pose(position.x, position.y, position.z, *_bounds(covariance[:2, :2]), heading_rad)
+        pose = Pose(position.x, position.y, position.z, *_bounds(covariance), heading_rad)
         with self.lock:
             self.scene.add_pose(tag, pose)
 
@@ -145,7 +141,7 @@ class Feed:
         """Add a position that the viewer itself estimated."""
         x, y, z = estimate.position.tolist()
         with self.lock:
-            self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance[:2, :2])))
+            self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance)))
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position
@@ -187,11 +183,6 @@ class Feed:
 
 
 def _bounds(covariance: np.ndarray[Any, Any]) -> tuple[tuple[float, float, float], float]:
-    """Return half axes and angle of the 95 % ellipse of a 2 x 2 covariance, and the protection level; NaN if invalid."""
-    is_plausible = (np.abs(covariance) < MAX_COORDINATE_M**2).all()
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 if is_plausible else -np.eye(2))
-    if values[0] < 0:
-        return (math.nan, math.nan, math.nan), math.nan
-    minor, major = np.sqrt(CHI2_95 * values)
-    ellipse = float(major), float(minor), math.atan2(vectors[1, 1], vectors[0, 1])
-    return ellipse, float(PROTECTION * math.sqrt(values[1]))
+    """Return half axes and angle of the 95 % ellipse, and the protection level; NaN if the covariance is invalid."""
+    ellipse = horizontal_ellipse(covariance)
+    return ellipse, PROTECTION / math.sqrt(CHI2_95) * ellipse[0]

@@ -83,6 +83,10 @@ _STROKES = {
 _LIVE = TrackKind.RAW, TrackKind.CORRECTED, TrackKind.SECOND
 
 
+HEADING_M = 1.0
+"""Length of the line that shows the heading of a tag."""
+
+
 class Controls(DataModel):  # type: ignore[misc]
     """State that the page's script shows, and its commands.
 
@@ -125,7 +129,8 @@ class Models:
         self.pairs = _source("pairs", "anchor", "tag", "no_data", *COLUMNS)
         self.anchors = _source("anchors", "x", "y", "name", "id")
         self.selected = _source("", "x", "y")
-        self.tags = _source("tags", "x", "y", "name", "status", "heading", "heading_size")
+        self.tags = _source("tags", "x", "y", "name", "status")
+        self.headings = _source("headings", "x", "y", "heading")
         self.ellipses = _source("ellipses", "x", "y", "width", "height", "angle", "status")
         self.protection = _source("protection levels", "x", "y", "protection")
         self.tracks = {kind: _source(kind.value, "x", "y") for kind in _STROKES}
@@ -211,7 +216,7 @@ class Models:
             ("protection level", "circle", self.protection, {
                 "radius": "protection", "fill_color": None, "line_color": NIGHT, "line_dash": "dotted",
             }),
-            ("", "ray", self.tags, {"length": "heading_size", "angle": "heading", "line_color": NIGHT, "line_width": 3}),
+            ("heading", "ray", self.headings, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
             ("status", "scatter", self.statuses, self._symbols | {"size": 10, "line_width": 2}),
             ("tag", "scatter", self.tags, {
                 "marker": "star", "size": 13, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
@@ -220,7 +225,7 @@ class Models:
             ("selected anchor", "scatter", self.selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
             }),
-            ("", "text", self.anchors, label | {"y_offset": -6}),
+            ("", "text", self.anchors, label | {"x_offset": 0, "y_offset": -13, "text_align": "center"}),
             ("", "text", self.tags, label | {"y_offset": 18}),
         ]  # fmt: skip
         items = defaultdict[str, list[Any]](list)

@@ -51,9 +51,6 @@ LEVELS = ("\u25cf OK", "\u25b2 WARN", "\u2716 ERROR", "\u25a0 STALE")
 TABLE_S = 0.5
 """Minimum interval of updates of the table of pairs."""
 
-HEADING_M = 1.0
-"""Length of the heading arrow."""
-
 MARGIN_M = 5.0
 """Margin around a tag on a map without anchors."""
 
@@ -273,13 +270,13 @@ class Page:
                         "height": 2 * minor,
                         "angle": angle,
                         "protection": _drawable(pose.protection_m),
-                        "heading": finite_or_zero(pose.heading_rad),
-                        "heading_size": HEADING_M if math.isfinite(pose.heading_rad) else math.nan,
+                        "heading": pose.heading_rad,
                     }
                 )
         _set_rows(models.tags, tags)
         _set_rows(models.ellipses, [row for row in tags if row["width"] > 0.0 and row["height"] > 0.0])
         _set_rows(models.protection, [row for row in tags if row["protection"] > 0.0])
+        _set_rows(models.headings, [row for row in tags if math.isfinite(row["heading"])])
         self._draw_tracks(scene)
         fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
         # The view is set for the first content and for the first anchors, and then only by the user.

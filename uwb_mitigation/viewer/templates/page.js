@@ -92,12 +92,14 @@ function start(doc) {
   body.addEventListener("pointerdown", () => { pressed = true; });
   for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { pressed = false; setTimeout(drawPairs); });
   source.properties.data.change.connect(updatePairs);
-  on("selected", () => {
-    drawPairs();
-    const [anchor, tag] = controls.selected ?? [];
-    const title = anchor == null ? "" : `: anchor ${anchor}, tag ${tag}`;
-    for (const [name, head] of [["strip", "Range"], ["cir", "Channel impulse response (CIR)"]]) setText($(`${name}-title`), head + title);
-  });
+  const trace = model("cir").renderers.map((r) => r.data_source).find((s) => "magnitude" in s.data);
+  const titlePair = () => {
+    const [anchor, tag] = controls.selected ?? [], pair = anchor == null ? "" : `: anchor ${anchor}, tag ${tag}`;
+    setText($("strip-title"), "Range" + pair);
+    setText($("cir-title"), `Channel impulse response (CIR)${pair}${trace.data.sample.length ? "" : ": no CIR"}`);
+  };
+  trace.properties.data.change.connect(titlePair);
+  on("selected", () => { drawPairs(); titlePair(); });
   for (const name of ["search", "filter"]) $(name).addEventListener("input", drawPairs);
   for (const button of document.querySelectorAll("[data-sort]")) button.addEventListener("click", () => {
     descending = sort === button.dataset.sort && !descending;
@@ -119,7 +121,7 @@ function start(doc) {
     });
     view.update_range({xrs: new Map([moved[0]]), yrs: new Map([moved[1]])}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
-  const tags = map.renderers.map((r) => r.data_source).find((s) => "heading" in s.data);
+  const tags = map.renderers.map((r) => r.data_source).find((s) => s.name === "tags");
   tags.properties.data.change.connect(() => {
     if ($("follow").getAttribute("aria-pressed") !== "true") return;
     const i = Math.max(tags.data.name.findIndex((name) => name === `tag_${controls.selected?.[1]}`), 0);
