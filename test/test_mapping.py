@@ -90,6 +90,7 @@ def test_a_dry_run_shows_units_errors_and_what_is_missing(tmp_path: Path):
     assert "1.900" in done.stdout
     assert "Errors (measured - true) of 40 ranges" in done.stdout
     assert "40 of 40 ranges have no CIR" in done.stdout
+    assert "fewer than 3 placements" in done.stdout
     assert "no positions of the anchors" in done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log.csv", "map.yaml"]
 

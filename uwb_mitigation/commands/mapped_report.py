@@ -100,6 +100,10 @@ def missing(source: MappedRecording) -> list[str]:
         ),
         (not len(source.errors_m), "no true range: `evaluate`, `train` and `offset` cannot use it"),
         (
+            len(source.errors_m) and len(set(source.values["configuration"].tolist())) < 3,
+            "fewer than 3 placements (truth.configuration): `train` cannot hold any out",
+        ),
+        (
             not hasattr(source, "anchors"),
             "no positions of the anchors: `track` and `calibrate` need --anchors",
         ),
