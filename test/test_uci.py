@@ -138,6 +138,10 @@ def test_firmware_that_refuses_the_number_of_taps_gets_the_lead():
     assert Bench(Refusing(), window=157).start().session.window == (16, 5)
 
 
+def test_a_board_that_was_not_opened_has_all_counts():
+    assert UciSession(UciSettings()).totals().keys() == Bench().start().session.totals().keys()
+
+
 def test_taps_of_18_bits_are_scaled_to_16_bits():
     taps = np.array([[0, 0], [131071, -131072], [-2, 2]], np.int32)
     block = messages.CirBlock(0, 1, True, -1, taps)

@@ -183,7 +183,7 @@ class UciSession:
         )
         self.clock_offsets_ppm: deque[float] = deque(maxlen=200)
         self._decoder = PacketDecoder()
-        self._joined_before: Counter[str] = Counter()
+        self._joined_before: Counter[str] = Counter(Joiner(0).counts)
         self._outgoing = bytearray()
         self._steps: _Steps | None = None
         self._pending: _Command | None = None
