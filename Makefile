@@ -27,7 +27,7 @@ test-fast: setup-training  ## the tests that need neither ROS nor torch and are 
 
 # More at once than processors: nodes spend most of a test on waiting for each other.
 test: setup-training  ## run every test (COVERAGE=yes: and show what they reach)
-	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $$(($$(nproc) + 2)) --dist worksteal $(if $(COVERAGE),--cov --cov-report=term:skip-covered)
+	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $$(($$(nproc) + 3)) --dist worksteal $(if $(COVERAGE),--cov --cov-report=term:skip-covered)
 
 # What a machine with ROS 2 does by hand; without one, the environment stands in for /opt/ros/jazzy.
 COLCON = $(IN_ROS) PATH="$(CURDIR)/$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$${AMENT_PREFIX_PATH:-$(CURDIR)/$(VENV)}" \
