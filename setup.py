@@ -67,11 +67,11 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
-            "interfaces/*.msg",
-            "mappings/*.yaml",
-            "evaluation/templates/*.j2",
-            "paper/templates/*.j2",
-            "radio/templates/*.j2",
+            "types/ros/interfaces/*.msg",
+            "recordings/mappings/*.yaml",
+            "training/templates/*.j2",
+            "training/paper/templates/*.j2",
+            "commands/field/templates/*.j2",
             "viewer/templates/*",
         ]
     },
@@ -117,14 +117,14 @@ setup(
     python_requires=">=3.10",
     entry_points={
         "console_scripts": [
-            "driver = uwb_mitigation.entry:driver",
-            "mitigator = uwb_mitigation.entry:mitigator",
-            "locator = uwb_mitigation.entry:locator",
-            "pipeline = uwb_mitigation.entry:pipeline",
-            "monitor = uwb_mitigation.entry:monitor",
-            "px4 = uwb_mitigation.entry:px4",
-            "viewer = uwb_mitigation.entry:viewer",
-            "uwb-mitigation = uwb_mitigation.entry:command_line",
+            "driver = uwb_mitigation.commands.entry:driver",
+            "mitigator = uwb_mitigation.commands.entry:mitigator",
+            "locator = uwb_mitigation.commands.entry:locator",
+            "pipeline = uwb_mitigation.commands.entry:pipeline",
+            "monitor = uwb_mitigation.commands.entry:monitor",
+            "px4 = uwb_mitigation.commands.entry:px4",
+            "viewer = uwb_mitigation.commands.entry:viewer",
+            "uwb-mitigation = uwb_mitigation.commands.entry:command_line",
         ],
     },
 )

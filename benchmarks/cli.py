@@ -1,6 +1,7 @@
 """Measure nodes, positions, radios, firmware and links: `python -m benchmarks NAME [--json FILE]`, in a checkout.
 
-Three more commands: emulated EVB1000s (`emulate-evb1000`) and two demonstrations (`radio-demo`, `firmware-demo`).
+More commands: emulated boards (`emulate-board`, `emulate-evb1000`, `emulate-uci`) and two demonstrations (`radio-demo`,
+`firmware-demo`).
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from benchmarks.emulate_evb1000 import emulate_evb1000
-from benchmarks.emulate_uci import emulate_uci
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table
+from benchmarks.equipment.emulate_board import emulate_board
+from benchmarks.equipment.emulate_evb1000 import emulate_evb1000
+from benchmarks.equipment.emulate_uci import emulate_uci
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.console import JsonOption, Table
 from uwb_mitigation.errors import UwbMitigationError, missing_dependency
 
 if TYPE_CHECKING:
@@ -30,6 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.command("emulate-board")(emulate_board)
 app.command("emulate-evb1000")(emulate_evb1000)
 app.command("emulate-uci")(emulate_uci)
 
@@ -168,7 +171,7 @@ def link(
 ) -> None:
     """Decoder with a channel that corrupts bytes: lost frames, speed."""
     from benchmarks.decoder import loopback
-    from uwb_mitigation.link.faults import Faults
+    from benchmarks.equipment.faults import Faults
 
     faults = Faults(damage, damage, damage)
     with console.share_bar("sending") as advance:
@@ -197,7 +200,7 @@ def radio(
     busy computer slows them down. No result was measured on a real board.
     """
     from benchmarks import radio as bench
-    from uwb_mitigation.link.layout import Mode
+    from uwb_mitigation.radios.wire.layout import Mode
 
     with console.progress() as bar:
         task = bar.add_task("ranging", total=len(bench.PPM_PAIRS) * len(bench.DISTANCES_M))
@@ -269,8 +272,8 @@ def firmware(
     states and caches, and the power, can only be measured on a board.
     """
     from benchmarks import firmware as bench
-    from uwb_mitigation.firmware_export.toolchain import Kernels, require_tools
-    from uwb_mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.embedded.toolchain import Kernels, require_tools
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
 
     require_tools()
     networks = list(bench.random_shapes()) if model is None else [bench.trained(load_bundle(model))]

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.link.faults import DamagedData, Faults, damage
-from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
-from uwb_mitigation.link.layout import MessageType
+from benchmarks.equipment.faults import DamagedData, Faults, damage
+from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.radios.wire.layout import MessageType
 
 _FRAMES_PER_ROUND = 4096
 _LARGEST_READ = 4096

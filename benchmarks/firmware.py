@@ -14,22 +14,18 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from benchmarks import emulator
-from benchmarks.random_networks import mlp, remnet, rounding_windows
-from uwb_mitigation.firmware_export.export import (
-    Golden,
-    golden_windows,
-    write_header,
-)
-from uwb_mitigation.firmware_export.packing import PackedNetwork, pack
-from uwb_mitigation.firmware_export.toolchain import Kernels, Target, build_image
-from uwb_mitigation.model import graph
-from uwb_mitigation.model.architecture import Mlp
-from uwb_mitigation.model.bundle import Bundle, Card, session_options
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.weights import Int8Weights
-from uwb_mitigation.paper import published
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from benchmarks.equipment import emulator
+from benchmarks.equipment.random_networks import mlp, remnet, rounding_windows
+from uwb_mitigation.mitigation.embedded.export import Golden, golden_windows, write_header
+from uwb_mitigation.mitigation.embedded.packing import PackedNetwork, pack
+from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target, build_image
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.architecture import Mlp
+from uwb_mitigation.mitigation.model.bundle import Bundle, Card, session_options
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.weights import Int8Weights
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.training.paper import published
 
 CLOCK_HZ = 64e6
 """Clock of the board in the paper, an Arduino Nano 33 BLE Sense."""

@@ -18,17 +18,18 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rich.console import Console
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from benchmarks.emulated_firmware import EmulatedFirmware
+from benchmarks.equipment.emulated_firmware import EmulatedFirmware
+from benchmarks.equipment.probe import Probe
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.link import messages as wire
-from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.processes import NodeProcesses, Probe, run_demo, spinning_node
-from uwb_mitigation.sources.opening import open_recording
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
+from uwb_mitigation.radios.wire import messages as wire
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import CorrectedRange, Origin, RangeMeasurement
 
 TIMEOUT_S = 60.0
 """Timeout for mode DEVICE and for the next corrected range; after it, the remaining ranges count as lost."""

@@ -14,13 +14,14 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.bag.codec import encode_corrected
-from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
-from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.processes import Probe, spinning_node, wait
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
-from uwb_mitigation.positioning.filter import RangeFilter
+from benchmarks.equipment.probe import Probe
+from uwb_mitigation.nodes.support import processes, topics
+from uwb_mitigation.nodes.support.processes import spinning_node, wait
 from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.online.filter import RangeFilter
+from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
+from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.ros.codec import encode_corrected
 
 ANCHORS = AnchorMap(
     [

@@ -25,15 +25,16 @@ import numpy as np
 import psutil
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from benchmarks.relay import RELAYED
-from uwb_mitigation.bag.codec import first_field_offset
-from uwb_mitigation.bag.writer import BagWriter
+from benchmarks.equipment.probe import Probe
+from benchmarks.equipment.relay import RELAYED
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.measurement import Record
-from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.processes import Probe, spinning_node, wait
-from uwb_mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.nodes.support import processes, topics
+from uwb_mitigation.nodes.support.processes import spinning_node, wait
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.ros.codec import first_field_offset
 
 WINDOW = 157
 """Number of complex samples per range that the network reads."""
@@ -253,7 +254,7 @@ class Bench:
         if node in ("driver", "pipeline"):
             words = ["source:=mcap", f"path:={self._bag}", "loop:=true", "paused:=true"]
             words += ["wait_for_subscribers:=0", "start_delay:=0.0"]
-        module = "benchmarks.relay" if node == "relay" else processes.ENTRY
+        module = "benchmarks.equipment.relay" if node == "relay" else processes.ENTRY
         process = processes.start(node, *words, namespace=namespace, log_level="error", module=module)
         self.processes.append(process)
         return process

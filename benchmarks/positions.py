@@ -13,22 +13,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.evaluation.linear_fit import fit_linear_bias
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.initialization import candidate_positions, snapshot
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.smoother import smooth
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Ranges, Track, TrackErrors, TruePath, errors_of, track_errors
-from uwb_mitigation.sources.decaranging import DecaRangingFolder
-from uwb_mitigation.sources.opening import open_mapped
-from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey
-from uwb_mitigation.sources.source import Source
+from uwb_mitigation.positioning.online.initialization import candidate_positions, snapshot
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.track_errors import TrackErrors, errors_of, track_errors
+from uwb_mitigation.recordings.decaranging import DecaRangingFolder
+from uwb_mitigation.recordings.opening import open_mapped
+from uwb_mitigation.simulation.simulated import SimulatedSource, SimulatedSurvey
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.tracks import Ranges, Track, TruePath
 
 TIME_OFFSET_S = 0.2
 """Time offset of the ranges relative to the ground truth in every Hanyang run."""

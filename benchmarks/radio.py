@@ -16,15 +16,15 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from benchmarks.dw1000_model.boards import ModelledAir, SerialLink
-from benchmarks.dw1000_model.pairs import Pair
+from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
+from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.layout import Mode, Role
-from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.measurement import DEVICE_TIME_WRAP, RangeMeasurement
-from uwb_mitigation.radio.evb1000 import Evb1000Bus
-from uwb_mitigation.radio.radio_driver import RadioDriver
+from uwb_mitigation.radios.dw1000.driver import RadioDriver
+from uwb_mitigation.radios.evb1000 import Evb1000Bus
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.settings import RadioSettings, Role
+from uwb_mitigation.radios.wire.layout import Mode
+from uwb_mitigation.types.measurement import DEVICE_TIME_WRAP, RangeMeasurement
 
 PPM_PAIRS = ((-20.0, 20.0), (-10.0, 10.0), (0.0, 0.0), (10.0, -10.0), (20.0, -20.0))
 DISTANCES_M = (0.3, 1.0, 5.01, 20.0, 100.0)

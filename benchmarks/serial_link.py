@@ -17,14 +17,15 @@ from pathlib import Path
 
 from uwb_mitigation_msgs.msg import RangeCir
 
+from benchmarks.equipment.emulated_board import EmulatedBoard
+from benchmarks.equipment.probe import Probe
 from benchmarks.nodes import process_usage
-from uwb_mitigation.link.emulated_board import EmulatedBoard
-from uwb_mitigation.measurement import Record
-from uwb_mitigation.nodes import processes, topics
-from uwb_mitigation.nodes.processes import Probe, spinning_node, wait
-from uwb_mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.sources.simulated import SimulatedSource
-from uwb_mitigation.sources.source import Source
+from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.nodes.support import processes, topics
+from uwb_mitigation.nodes.support.processes import spinning_node, wait
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.source import Source
 
 WINDOW = 157
 """Number of complex samples per range that the network reads."""

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.uci_board import EmulatedUciBoards, UciBoardModel, taps_of
+from benchmarks.equipment.uci_board import EmulatedUciBoards, UciBoardModel, taps_of
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.layout import Role
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.radio.uci.driver import UciDriver, UciEvent
-from uwb_mitigation.radio.uci.session import UciSession, UciSettings
+from uwb_mitigation.radios.fira.session import UciSession, UciSettings
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.settings import Role
+from uwb_mitigation.radios.uci import UciDriver, UciEvent
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 _TIMEOUT_S = 10.0
 _DISTANCE_AT = 4 + 25 + 4

@@ -10,6 +10,7 @@ from statistics import median
 
 from uwb_mitigation_msgs.msg import RangeCorrected
 
+from benchmarks.equipment.page_clients import PageClients
 from benchmarks.nodes import (
     Bench,
     ProgressCallback,
@@ -21,9 +22,8 @@ from benchmarks.nodes import (
     run_steps,
     searches,
 )
-from benchmarks.page_clients import PageClients
-from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.processes import wait
+from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support.processes import wait
 
 RATE_HZ = 100.0
 SENT_HZ = 500

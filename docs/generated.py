@@ -21,9 +21,10 @@ import typer
 from typer.cli import get_docs_for_click
 
 from uwb_mitigation.commands import cli
-from uwb_mitigation.link import layout
-from uwb_mitigation.link.layout import Layout, MessageType
-from uwb_mitigation.nodes.parameter_tables import TABLES
+from uwb_mitigation.nodes.support.parameter_tables import TABLES
+from uwb_mitigation.radios.settings import MAX_ANCHORS, RadioState, Role
+from uwb_mitigation.radios.wire import layout
+from uwb_mitigation.radios.wire.layout import Layout, MessageType
 
 try:
     import tomllib
@@ -276,7 +277,7 @@ def c_header() -> str:
         f"#define UWB_MAX_PAYLOAD_BYTES {layout.MAX_PAYLOAD_BYTES}",
         f"#define UWB_MAX_FRAME_BYTES {layout.MAX_FRAME_BYTES}",
         f"#define UWB_MAX_ENCODED_BYTES {layout.MAX_ENCODED_BYTES}",
-        f"#define UWB_MAX_ANCHORS {layout.MAX_ANCHORS}",
+        f"#define UWB_MAX_ANCHORS {MAX_ANCHORS}",
         f"#define UWB_MAX_OFFSETS {layout.MAX_OFFSETS}",
         "",
     ]
@@ -284,8 +285,8 @@ def c_header() -> str:
         ("TYPE", MessageType),
         ("FLAG", layout.Flag),
         ("MODE", layout.Mode),
-        ("ROLE", layout.Role),
-        ("RADIO_STATE", layout.RadioState),
+        ("ROLE", Role),
+        ("RADIO_STATE", RadioState),
         ("OFFSET_SCOPE", layout.OffsetScope),
         ("LOG_LEVEL", layout.LogLevel),
     ):
@@ -323,8 +324,8 @@ PARTS = {
     "parts": parts,
     "wire_limits": wire_limits,
     "wire_modes": partial(wire_values, layout.Mode),
-    "wire_roles": partial(wire_values, layout.Role),
-    "wire_radio_states": partial(wire_values, layout.RadioState),
+    "wire_roles": partial(wire_values, Role),
+    "wire_radio_states": partial(wire_values, RadioState),
     "wire_offset_scope": partial(wire_values, layout.OffsetScope),
     "wire_log_levels": partial(wire_values, layout.LogLevel),
 } | {

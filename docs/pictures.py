@@ -26,15 +26,14 @@ sys.path.insert(0, str(REPOSITORY / "test"))
 
 from browser import Browser, chromium  # noqa: E402
 
-from uwb_mitigation.nodes import processes  # noqa: E402
-from uwb_mitigation.positioning.anchors import dump_anchors  # noqa: E402
+from uwb_mitigation.commands.offline.track import track_tag  # noqa: E402
+from uwb_mitigation.nodes.support import processes  # noqa: E402
 from uwb_mitigation.positioning.geometry import Height  # noqa: E402
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig  # noqa: E402
-from uwb_mitigation.processing.tracking import track_tag  # noqa: E402
-from uwb_mitigation.sources.anchors_file import load_anchors  # noqa: E402
-from uwb_mitigation.sources.recorded_ranges import read_ranges  # noqa: E402
-from uwb_mitigation.sources.simulated import SimulatedSource  # noqa: E402
-from uwb_mitigation.sources.simulation.scene import FLAT  # noqa: E402
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig  # noqa: E402
+from uwb_mitigation.recordings.recorded_ranges import read_ranges  # noqa: E402
+from uwb_mitigation.simulation.scene import FLAT  # noqa: E402
+from uwb_mitigation.simulation.simulated import SimulatedSource  # noqa: E402
+from uwb_mitigation.types.anchors import dump_anchors, load_anchors  # noqa: E402
 from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, VERMILLION  # noqa: E402
 
 PICTURES = REPOSITORY / "docs" / "pictures"

@@ -12,7 +12,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from uwb_mitigation.nodes import launching
+from uwb_mitigation.nodes.support import launching
 
 NODES = ("driver", "mitigator")
 PARAMETERS = {

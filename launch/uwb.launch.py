@@ -18,7 +18,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.nodes import launching
+from uwb_mitigation.nodes.support import launching
 
 NODES = ("driver", "mitigator", "locator", "viewer")
 PARAMETERS = launching.arguments(NODES)

@@ -10,11 +10,10 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from uwb_mitigation.bag import codec, schemas
-from uwb_mitigation.bag.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import (
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.types.measurement import (
     SAMPLE_PERIOD_S,
     Cir,
     CorrectedRange,
@@ -24,8 +23,9 @@ from uwb_mitigation.measurement import (
     Status,
     Truth,
 )
-from uwb_mitigation.sources.mcap import McapRecording
-from uwb_mitigation.sources.source import Source
+from uwb_mitigation.types.ros import codec, schemas
+from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
+from uwb_mitigation.types.source import Source
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000

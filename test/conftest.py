@@ -18,7 +18,7 @@ from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
 from real_logs import Reading, read_once
 
-from benchmarks.dw1000_model.air import Air
+from benchmarks.equipment.dw1000_model.air import Air
 
 if TYPE_CHECKING:
     from ros_harness import Ros

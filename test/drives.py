@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
-from uwb_mitigation.positioning.tracks import Odometry, Ranges, Track, TruePath
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.tracks import Odometry, Ranges, Track, TruePath
 
 HALL = AnchorMap(
     [

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip, Host
-from benchmarks.dw1000_model.pairs import Pair
+from benchmarks.equipment.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Chip, Host
+from benchmarks.equipment.dw1000_model.pairs import Pair
 
 SLOW_HZ, FAST_HZ = 2_000_000, 16_000_000
 WRAP = 1 << 40

@@ -14,9 +14,9 @@ TESTS = Path(__file__).resolve().parent
 SLOW_MODULES = {
     *("rclpy", "torch", "launch", "uwb_mitigation_msgs", "selenium"),
     # They compile the firmware, or start commands.
-    *("uwb_mitigation.firmware_export.compiling", "compilers", "command_line"),
+    *("uwb_mitigation.mitigation.embedded.compiling", "compilers", "command_line"),
     # They simulate and solve many drives.
-    *("uwb_mitigation.positioning.self_calibration", "uwb_mitigation.positioning.survey"),
+    *("uwb_mitigation.positioning.batch.self_calibration", "uwb_mitigation.positioning.batch.survey"),
 }
 SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading"}
 

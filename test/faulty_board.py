@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-from uwb_mitigation.link.board import Board
-from uwb_mitigation.link.emulated_board import EmulatedBoard
-from uwb_mitigation.link.layout import PROTOCOL_VERSION
+from benchmarks.equipment.board import Board
+from benchmarks.equipment.emulated_board import EmulatedBoard
+from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION
 
 _FLOOD_BYTES = 4096
 

@@ -12,20 +12,20 @@ import model_material
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import random_networks
+from benchmarks.equipment import random_networks
 from benchmarks.firmware import Network, network_of
-from uwb_mitigation.firmware_export.export import Golden, golden_windows, write_header
-from uwb_mitigation.firmware_export.packing import pack
-from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement
-from uwb_mitigation.model import graph
-from uwb_mitigation.model.bundle import Bundle, save_bundle
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.ood import Band, OodBands
-from uwb_mitigation.model.weights import Int8Weights
-from uwb_mitigation.paper import published
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.sources.decaranging import open_decaranging
+from uwb_mitigation.mitigation.embedded.export import Golden, golden_windows, write_header
+from uwb_mitigation.mitigation.embedded.packing import pack
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.bundle import Bundle, save_bundle
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.ood import Band, OodBands
+from uwb_mitigation.mitigation.model.weights import Int8Weights
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.recordings.decaranging import open_decaranging
+from uwb_mitigation.training.paper import published
+from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD
 

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks.dw1000_model.air import Host
-from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.radio import native_radio as firmware
-from uwb_mitigation.radio.native_radio import NativeRadio
+from benchmarks.equipment.dw1000_model.air import Host
+from uwb_mitigation.radios.dw1000 import native as firmware
+from uwb_mitigation.radios.dw1000.native import NativeRadio
+from uwb_mitigation.radios.settings import RadioSettings
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 REPLY_US = 3000
 

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.measurement import Cir, Encoding, RangeMeasurement, Record, Truth
-from uwb_mitigation.model import graph
-from uwb_mitigation.model.architecture import HEAD, Remnet
-from uwb_mitigation.model.bundle import Bundle, Card, save_bundle
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.weights import FloatWeights, Int8Weights
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.quantization import quantize
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.mitigation.model.bundle import Bundle, Card, save_bundle
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.fit.quantization import quantize
+from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement, Record, Truth
 
 LINE = LinearBiasModel(*(float(np.float32(value)) for value in (-5.0, -0.0691, -0.0126)))
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import pytest
 
-from uwb_mitigation.measurement import Record
-from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.types.measurement import Record
 
 
 class Reading(NamedTuple):

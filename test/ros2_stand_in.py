@@ -10,14 +10,14 @@ import sys
 import threading
 from pathlib import Path
 
-from uwb_mitigation.bag.topics import RANGE_CIR_TYPE
-from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE
 
 
 def run(words: list[str]) -> None:
     package, node, *rest = words
     assert package == "uwb_mitigation", package
-    os.execv(sys.executable, [sys.executable, "-m", "uwb_mitigation.entry", node, *rest])
+    os.execv(sys.executable, [sys.executable, "-m", "uwb_mitigation.commands.entry", node, *rest])
 
 
 def record(words: list[str]) -> None:

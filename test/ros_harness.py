@@ -105,7 +105,7 @@ class Ros:
     def start(self, node: str, *parameters: str, arguments: tuple[str, ...] = ()) -> Process:
         """Start a node of this package like its executable."""
         given = [word for parameter in parameters for word in ("-p", parameter)]
-        command = [sys.executable, "-m", "uwb_mitigation.entry", node]
+        command = [sys.executable, "-m", "uwb_mitigation.commands.entry", node]
         return self.run([*command, "--ros-args", *given, *arguments])
 
     def run(self, command: list[str]) -> Process:

@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 from firmware_on_model import CLOCK, begin, host
 
-from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Host
+from benchmarks.equipment.dw1000_model.air import ANTENNA_DELAY_TICKS, Host
 
 pytest.importorskip("spidev", reason="spidev is for Linux")
 

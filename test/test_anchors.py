@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors, parse_anchors
+from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors, parse_anchors
 
 GOOD = """
 anchors:

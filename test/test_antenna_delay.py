@@ -11,13 +11,12 @@ import pytest
 import yaml
 from compilers import NEEDS_CC
 
-from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.radio.antenna_delay import delay_from_ranges
-from uwb_mitigation.radio.bus import bus_opener
-from uwb_mitigation.radio.radio_driver import RadioDriver
+from uwb_mitigation.radios.dw1000.antenna_delay import delay_from_ranges
+from uwb_mitigation.radios.dw1000.bus import bus_opener
+from uwb_mitigation.radios.dw1000.driver import RadioDriver
+from uwb_mitigation.radios.settings import RadioSettings, Role
 
 NOMINAL = 2 * 16436
 

@@ -22,9 +22,12 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_mitigation.bag import codec, schemas
-from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import (
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.ros import codec, schemas
+from uwb_mitigation.types.ros.topics import (
     RANGE_CIR_TYPE,
     RANGE_CORRECTED,
     RANGE_CORRECTED_TYPE,
@@ -32,9 +35,6 @@ from uwb_mitigation.bag.topics import (
     RANGE_TRUTH,
     RANGE_TRUTH_TYPE,
 )
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import Record
 
 TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
 

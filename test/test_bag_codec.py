@@ -12,14 +12,8 @@ from bag_material import record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_mitigation.bag import codec, schemas
-from uwb_mitigation.bag.topics import (
-    RANGE_CIR_TYPE,
-    RANGE_CORRECTED_TYPE,
-    RANGE_TRUTH_TYPE,
-)
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import (
+from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedRange,
     Encoding,
@@ -30,6 +24,8 @@ from uwb_mitigation.measurement import (
     Status,
     Truth,
 )
+from uwb_mitigation.types.ros import codec, schemas
+from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED_TYPE, RANGE_TRUTH_TYPE
 
 TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
 

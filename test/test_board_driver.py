@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.equipment.emulated_board import EmulatedBoard
+from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.link.board_driver import BoardDriver
-from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.emulated_board import EmulatedBoard
-from uwb_mitigation.link.events import Connected, Disconnected, Event, Loss
-from uwb_mitigation.link.faults import Faults
-from uwb_mitigation.link.messages import Hello
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.radio.evb1000 import Evb1000Bus
+from uwb_mitigation.radios.evb1000 import Evb1000Bus
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.serial import BoardDriver
+from uwb_mitigation.radios.wire.events import Connected, Disconnected, Event, Loss
+from uwb_mitigation.radios.wire.messages import Hello
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 
 TIMEOUT_S = 240
 """Timeout for expected events."""

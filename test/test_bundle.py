@@ -16,14 +16,20 @@ import pytest
 from model_material import bundle, card, random_int8, random_weights, windows
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.measurement import RadioType, Segment
-from uwb_mitigation.model import bundle as bundles
-from uwb_mitigation.model import floating, graph
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import Session, load_bundle, parse_bundle, save_bundle, session_options
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.mitigation.model import bundle as bundles
+from uwb_mitigation.mitigation.model import floating, graph
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import (
+    Session,
+    load_bundle,
+    parse_bundle,
+    save_bundle,
+    session_options,
+)
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.types.measurement import RadioType, Segment
 
 SHAPE = Remnet(samples=16, filters=4)
 
@@ -219,7 +225,7 @@ def test_shipped_model_of_an_installation_is_found(tmp_path, monkeypatch):
     folder = tmp_path / "share" / "uwb_mitigation" / "models"
     folder.mkdir(parents=True)
     (folder / "universal.onnx").touch()
-    module = tmp_path / "lib/python3.12/site-packages/uwb_mitigation/model/shipped.py"
-    monkeypatch.setattr("uwb_mitigation.model.shipped.__file__", str(module))
+    module = tmp_path / "lib/python3.12/site-packages/uwb_mitigation/mitigation/model/shipped.py"
+    monkeypatch.setattr("uwb_mitigation.mitigation.model.shipped.__file__", str(module))
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     assert default_model_path() == folder / "universal.onnx"

@@ -12,17 +12,17 @@ from command_line import run
 from drives import drive
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_mitigation.bag.poses import encode_odometry
-from uwb_mitigation.bag.topics import TF_TYPE
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.offsets import read_offsets
-from uwb_mitigation.positioning.tracks import Estimate
-from uwb_mitigation.sources.anchors_file import save_anchors
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.anchors import save_anchors
+from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
+from uwb_mitigation.types.offsets import read_offsets
+from uwb_mitigation.types.ros.poses import encode_odometry
+from uwb_mitigation.types.ros.topics import TF_TYPE
+from uwb_mitigation.types.tracks import Estimate
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 OWN = np.array([0.3, 0.1, 0.25, 0.05, 0.2])
@@ -171,7 +171,7 @@ def test_delayed_localisation_provides_the_truth(site):
 
 @pytest.mark.parametrize("truth", [None, "/odom"])
 def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, monkeypatch):
-    from uwb_mitigation.training import selection
+    from uwb_mitigation.training.fit import selection
 
     seen = []
 
@@ -194,7 +194,7 @@ def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, m
 
 
 def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
-    from uwb_mitigation.training.site_solution import _whole_segments
+    from uwb_mitigation.training.site.solution import _whole_segments
 
     segment = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 2, 2])
     labelled = np.array([1, 2, 4, 7, 8])
@@ -303,7 +303,7 @@ def worse_position(fields):
     ("change", "options"), [(no_range_gain, ()), (worse_scatter, ()), (worse_position, WITH_TRUTH)]
 )
 def test_calibration_without_gain_is_written_only_with_force(site, monkeypatch, change, options):
-    from uwb_mitigation.training import site_calibration
+    from uwb_mitigation.training.site import calibration as site_calibration
 
     make = site_calibration.SiteCalibration
     monkeypatch.setattr(site_calibration, "SiteCalibration", lambda **fields: make(**fields | change(fields)))
@@ -355,7 +355,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     from drives import HALL
 
-    from uwb_mitigation.training.anchor_check import check_anchors
+    from uwb_mitigation.training.site.anchor_check import check_anchors
 
     ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
     rng = np.random.default_rng(4)
@@ -382,8 +382,8 @@ def test_tag_is_matched_with_its_own_frame_in_any_namespace():
 
 
 def test_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch):
-    from uwb_mitigation.bag import pose_paths
     from uwb_mitigation.commands.calibrate import _lever_arm_in
+    from uwb_mitigation.recordings.bag import pose_paths
 
     arms = {"a": None, "b": (0.4, 0.1, 0.0), "c": (0.4, 0.1, 0.2)}
     monkeypatch.setattr(pose_paths, "read_lever_arm", lambda bag, body, frame: arms[bag])
@@ -395,10 +395,10 @@ def test_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch
 
 def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
     """Without torch, the candidate that needs it is skipped with a message."""
-    from uwb_mitigation.model.floating import float_network
-    from uwb_mitigation.model.shipped import default_model_path
-    from uwb_mitigation.training import candidates
-    from uwb_mitigation.training.candidates import network_m
+    from uwb_mitigation.mitigation.model.floating import float_network
+    from uwb_mitigation.mitigation.model.shipped import default_model_path
+    from uwb_mitigation.training.fit import candidates
+    from uwb_mitigation.training.fit.candidates import network_m
 
     monkeypatch.setattr(candidates.importlib.util, "find_spec", lambda name: None)
     source = SimulatedSource.with_anchors(5, seed=4, count=1600, rate_hz=20.0)
@@ -436,7 +436,7 @@ def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps
     """NLOS makes simulated STS ranges longer by `slope` m per dB between receive and first-path level, or not at all."""
     from drives import HALL
 
-    from benchmarks.uci_board import taps_of
+    from benchmarks.equipment.uci_board import taps_of
 
     def measure(seed):
         ranges, _ = drive(seconds=80, rate_hz=20.0, offset_m=0.0)

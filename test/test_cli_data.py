@@ -11,10 +11,10 @@ from bag_material import chunk_offsets
 from command_line import run, start
 from real_logs import Reading
 
-from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import RANGE_RAW, RANGE_TRUTH
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Truth
+from uwb_mitigation.types.ros.topics import RANGE_RAW, RANGE_TRUTH
 
 
 def write_bag(path: Path, count: int = 6) -> Path:
@@ -93,7 +93,7 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
 ) -> None:
     from rosbags.rosbag2 import Reader
 
-    from uwb_mitigation.bag import schemas
+    from uwb_mitigation.types.ros import schemas
 
     options = "-o apartment.mcap --longest-pause inf --json import.json"
     done = run("data", "import", apartment, *options.split(), folder=tmp_path)

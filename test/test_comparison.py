@@ -10,15 +10,16 @@ from model_material import dataset
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
-from uwb_mitigation.evaluation.splits import Group
-from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.training.data.splits import Group
 
 pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
-from uwb_mitigation.evaluation import recordings
-from uwb_mitigation.training import candidates, comparison
-from uwb_mitigation.training.candidates import Recipe
-from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training import comparison
+from uwb_mitigation.training.data import recordings
+from uwb_mitigation.training.fit import candidates
+from uwb_mitigation.training.fit.candidates import Recipe
+from uwb_mitigation.training.fit.options import FitOptions
 
 RECIPE = Recipe(Remnet(samples=8), FitOptions(epochs=1))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from uwb_mitigation.commands import console
+from uwb_mitigation.commands.support import console
 from uwb_mitigation.errors import UwbMitigationError
 
 

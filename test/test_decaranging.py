@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Record, Truth
-from uwb_mitigation.sources.decaranging import (
+from uwb_mitigation.recordings.decaranging import (
     Anomaly,
     CirFrame,
     DecaRangingFolder,
     DecaRangingLog,
     open_decaranging,
 )
+from uwb_mitigation.types.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP, Record, Truth
 
 ANCHOR, TAG = 0x100632205E37FA35, 0x100637205E37FAC2
 START_NS = 1_515_417_223 * 10**9  # 2018-01-08 13:13:43 UTC

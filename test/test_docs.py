@@ -27,8 +27,8 @@ from test_launch import launch
 from benchmarks import cli as benchmarks
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.nodes.parameter_tables import TABLES
-from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.nodes.support.parameter_tables import TABLES
+from uwb_mitigation.recordings.opening import open_recording
 
 PAGES = sorted(
     path

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from uwb_mitigation.commands import doctor
 from uwb_mitigation.commands.cli import app
-from uwb_mitigation.model.bundle import Session
+from uwb_mitigation.mitigation.model.bundle import Session
 
 
 @pytest.fixture(autouse=True)

@@ -14,9 +14,9 @@ import pytest
 from compilers import NEEDS_CC
 from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
 
-from benchmarks.dw1000_model.air import Air, Chip
-from benchmarks.dw1000_model.library import MODEL_FOLDER, model_objects
-from uwb_mitigation.firmware_export.compiling import WARNINGS, c_compiler, run
+from benchmarks.equipment.dw1000_model.air import Air, Chip
+from benchmarks.equipment.dw1000_model.library import MODEL_FOLDER, model_objects
+from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, c_compiler, run
 
 pytestmark = NEEDS_CC
 

@@ -14,11 +14,10 @@ from dw1000_driver import TICK_M, TXDLYS, TXSTRT, WAIT4RESP, WRAP
 from firmware_on_model import REPLY_US, ranging, use_virtual_time
 from spidev_on_model import dw1000, program, replace_spidev
 
-from benchmarks.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
-from benchmarks.dw1000_model.pairs import Pair
-from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.measurement import RangeMeasurement
+from benchmarks.equipment.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
+from benchmarks.equipment.dw1000_model.pairs import Pair
+from uwb_mitigation.radios.settings import RadioSettings, Role
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
 OTHERS = 0x0123456789ABCDEF

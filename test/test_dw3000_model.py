@@ -10,18 +10,18 @@ import pytest
 from model_material import measurement
 from typer.testing import CliRunner
 
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.commands.bundles import bundle_for
 from uwb_mitigation.commands.cli import app
+from uwb_mitigation.commands.support.bundles import bundle_for
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.preprocessing import Scaling
-from uwb_mitigation.sources.simulation.buildings import block_of
-from uwb_mitigation.sources.simulation.channel import Multipath
-from uwb_mitigation.sources.simulation.radio import DW3000_STS, PULSE_SPACING_TAPS, TAPS
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.buildings import block_of
+from uwb_mitigation.simulation.channel import Multipath
+from uwb_mitigation.simulation.radio import DW3000_STS, PULSE_SPACING_TAPS, TAPS
+from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status
 
 UNUSED_SEED = 424_242
 MODEL = load_bundle(shipped_model_path("dw3000_sts"))

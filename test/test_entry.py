@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY
 
-from uwb_mitigation.nodes.parameter_tables import TABLES
+from uwb_mitigation.nodes.support.parameter_tables import TABLES
 
 
 def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Popen[str]:
     """Start an executable or a demo; modules in `path` replace installed ones."""
-    start = ["-c", f"from uwb_mitigation.entry import {executable}; {executable}()"]
+    start = ["-c", f"from uwb_mitigation.commands.entry import {executable}; {executable}()"]
     if executable == "benchmarks":
         start = ["-m", "benchmarks", "radio-demo"]
     elif "demo" in executable:
-        start = ["-m", "uwb_mitigation.entry", executable]
+        start = ["-m", "uwb_mitigation.commands.entry", executable]
     modules = os.pathsep.join(str(entry) for entry in (path, REPOSITORY) if entry is not None)
     return subprocess.Popen(
         [sys.executable, *start, *words],

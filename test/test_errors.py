@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from uwb_mitigation.bag.pose_paths import check_topic
-from uwb_mitigation.commands.checks import scaling_of
+from uwb_mitigation.commands.support.checks import scaling_of
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.model.shipped import model_path
-from uwb_mitigation.nodes import launching
-from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.offsets import parse_offsets
-from uwb_mitigation.paper.data import split_by_name
-from uwb_mitigation.paper.experiment import Task
-from uwb_mitigation.positioning.anchors import parse_anchors
+from uwb_mitigation.mitigation.model.shipped import model_path
+from uwb_mitigation.nodes.support import launching
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.recordings.bag.pose_paths import check_topic
+from uwb_mitigation.training.paper.data import split_by_name
+from uwb_mitigation.training.paper.experiment import Task
+from uwb_mitigation.types.anchors import parse_anchors
+from uwb_mitigation.types.offsets import parse_offsets
 
 
 @pytest.mark.parametrize(

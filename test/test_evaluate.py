@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
-from uwb_mitigation.evaluation.accuracy import evaluate
-from uwb_mitigation.evaluation.metrics import ErrorStatistics
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.sources import opening
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.recordings import opening
+from uwb_mitigation.training.evaluation.accuracy import evaluate
+from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
 
 
 def run(*arguments: object):

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from model_material import amplitudes_only
 
-from uwb_mitigation.evaluation import zero_shot
-from uwb_mitigation.evaluation.accuracy import Accuracy, evaluate
-from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.measurement import Cir, Record
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.paper.simulated import SimulatedDeepUwb
-from uwb_mitigation.preprocessing import Scaling
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.training.data.dataset import build_dataset
+from uwb_mitigation.training.evaluation import zero_shot
+from uwb_mitigation.training.evaluation.accuracy import Accuracy, evaluate
+from uwb_mitigation.training.paper.simulated import SimulatedDeepUwb
+from uwb_mitigation.types.measurement import Cir, Record
 
 EVERY = 15
 

@@ -9,10 +9,11 @@ import pytest
 from model_material import dataset
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.evaluation import baselines, splits
-from uwb_mitigation.evaluation.intervals import calibrate
-from uwb_mitigation.evaluation.metrics import bootstrap_interval, mae_after_rejection
-from uwb_mitigation.evaluation.splits import Group
+from uwb_mitigation.training.data import splits
+from uwb_mitigation.training.data.splits import Group
+from uwb_mitigation.training.evaluation import baselines
+from uwb_mitigation.training.evaluation.intervals import calibrate
+from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, mae_after_rejection
 
 NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
 

@@ -19,13 +19,13 @@ import pytest
 from compilers import NEEDS_CC
 from typer.testing import CliRunner
 
-from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
-from benchmarks.uci_board import EmulatedUciBoards, UciFaults
+from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.commands import cli, field_report
-from uwb_mitigation.measurement import Cir, RangeMeasurement
-from uwb_mitigation.radio.field_checks import Observation, Verdict, run_checks
-from uwb_mitigation.radio.uci.capture import UciCapture
-from uwb_mitigation.sources.mcap import McapRecording
+from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
+from uwb_mitigation.radios.fira.capture import UciCapture
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement
 
 Report = Callable[..., dict[str, dict]]
 
@@ -112,7 +112,7 @@ def test_good_evb1000s_pass_and_a_low_supply_fails(report: Report, tmp_path: Pat
 
 
 def test_missing_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("uwb_mitigation.radio.field_test.START_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("uwb_mitigation.commands.field.test.START_TIMEOUT_S", 0.5)
     checks = report("uci", 1)
     assert {"problem of the driver", "ranges per second", "ids"} <= failed(checks)
     assert "PATH" in checks["problem of the driver"]["value"]

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
-from uwb_mitigation.bag.codec import encode_range
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.firmware_export import compiling
-from uwb_mitigation.firmware_export.compiled import FirmwareMitigation
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import Bundle
-from uwb_mitigation.offsets import Offsets
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.embedded import compiling
+from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
+from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.offsets import Offsets
+from uwb_mitigation.types.ros.codec import encode_range
 
 if TYPE_CHECKING:
     from ros_harness import Ros

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from benchmarks import cli as benchmarks
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.firmware_export import toolchain
+from uwb_mitigation.mitigation.embedded import toolchain
 
 
 def test_export_c_writes_the_header_and_prints_its_path(tmp_path: Path):

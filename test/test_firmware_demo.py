@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from uwb_mitigation.firmware_export import toolchain
+from uwb_mitigation.mitigation.embedded import toolchain
 
 MISSING = toolchain.missing_tools()
 pytestmark = pytest.mark.ros

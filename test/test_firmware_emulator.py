@@ -19,22 +19,22 @@ import numpy as np
 import pytest
 from firmware_models import Exported
 
-from benchmarks import emulator, random_networks
-from benchmarks.emulated_firmware import EmulatedFirmware, cut_to_window
-from uwb_mitigation.firmware_export import toolchain
-from uwb_mitigation.firmware_export.compiling import WARNINGS, firmware_folder, run
-from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.firmware_export.toolchain import Kernels, Target
-from uwb_mitigation.link import messages
-from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
-from uwb_mitigation.link.layout import MessageType
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import Bundle, load_bundle
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.offsets import Offsets
-from uwb_mitigation.preprocessing import Scaling
+from benchmarks.equipment import emulator, random_networks
+from benchmarks.equipment.emulated_firmware import EmulatedFirmware, cut_to_window
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.embedded import toolchain
+from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, firmware_folder, run
+from uwb_mitigation.mitigation.embedded.export import export_bundle
+from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target
+from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder
+from uwb_mitigation.radios.wire.layout import MessageType
+from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.offsets import Offsets
 
 MISSING = toolchain.missing_tools()
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not found: {toolchain.APT}")

@@ -11,14 +11,14 @@ import model_material
 import numpy as np
 import pytest
 
-from benchmarks import random_networks
+from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.firmware_export.export import export_bundle, number
-from uwb_mitigation.firmware_export.packing import pack
-from uwb_mitigation.model import graph
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle, save_bundle
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.embedded.export import export_bundle, number
+from uwb_mitigation.mitigation.embedded.packing import pack
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 
 
 def test_floats_read_back_to_the_same_bits():

@@ -11,26 +11,19 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
-from uwb_mitigation.firmware_export.compiled import link
-from uwb_mitigation.firmware_export.compiling import firmware_folder
-from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board
-from uwb_mitigation.link.emulated_board import EMULATED
-from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
-from uwb_mitigation.link.layout import (
-    HEADER,
-    MAX_OFFSETS,
-    MAX_PAYLOAD_BYTES,
-    Flag,
-    MessageType,
-    Mode,
-)
-from uwb_mitigation.link.messages import GetInfo, SetMode, SetOffsets, TimeSync
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import Bundle
-from uwb_mitigation.offsets import Offsets
+from benchmarks.equipment.board import Board
+from benchmarks.equipment.emulated_board import EMULATED
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.embedded.compiled import link
+from uwb_mitigation.mitigation.embedded.compiling import firmware_folder
+from uwb_mitigation.mitigation.embedded.export import export_bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.radios.wire.layout import HEADER, MAX_OFFSETS, MAX_PAYLOAD_BYTES, Flag, MessageType, Mode
+from uwb_mitigation.radios.wire.messages import GetInfo, SetMode, SetOffsets, TimeSync
+from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.offsets import Offsets
 
 pytestmark = NEEDS_CC
 

@@ -15,20 +15,20 @@ import pytest
 from compilers import NEEDS_CC, NEEDS_CXX
 from firmware_models import Exported
 
-from benchmarks import random_networks
+from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.firmware_export.compiled import CompiledFirmware, link
-from uwb_mitigation.firmware_export.compiling import firmware_folder, run
-from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model import graph
-from uwb_mitigation.model.architecture import HEAD
-from uwb_mitigation.model.bundle import load_bundle, save_bundle
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.shipped import default_model_path, shipped_model_path
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.embedded.compiled import CompiledFirmware, link
+from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run
+from uwb_mitigation.mitigation.embedded.export import export_bundle
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.architecture import HEAD
+from uwb_mitigation.mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.types.measurement import Status
 
 pytestmark = NEEDS_CC
 

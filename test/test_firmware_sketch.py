@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 from compilers import NEEDS_CXX
 
-from benchmarks.dw1000_model.library import MODEL_FOLDER, model_objects
-from uwb_mitigation.firmware_export.compiled import library_objects
-from uwb_mitigation.firmware_export.compiling import firmware_folder, run
-from uwb_mitigation.firmware_export.export import export_bundle
-from uwb_mitigation.link import messages
-from uwb_mitigation.link.framing import FrameDecoder, FrameEncoder
-from uwb_mitigation.link.messages import Correction, Hello
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.sources.simulated import SimulatedSource
+from benchmarks.equipment.dw1000_model.library import MODEL_FOLDER, model_objects
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.embedded.compiled import library_objects
+from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run
+from uwb_mitigation.mitigation.embedded.export import export_bundle
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder
+from uwb_mitigation.radios.wire.messages import Correction, Hello
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 EXAMPLES = Path(__file__).parent.parent / "firmware" / "examples"
 SKETCH = EXAMPLES / "UwbMitigation"

@@ -14,7 +14,7 @@ import pytest
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
-from uwb_mitigation.firmware_export.compiling import compile_objects, run
+from uwb_mitigation.mitigation.embedded.compiling import compile_objects, run
 
 PACKAGE = REPOSITORY / "uwb_mitigation"
 
@@ -45,8 +45,8 @@ def test_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
 def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch():
     code = (
         "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'torch', 'uwb_mitigation_msgs']))\n"
-        "import uwb_mitigation.commands.cli, uwb_mitigation.mitigation, uwb_mitigation.sources.opening\n"
-        "import uwb_mitigation.sources.mcap, uwb_mitigation.sources.decaranging"
+        "import uwb_mitigation.commands.cli, uwb_mitigation.mitigation.correction, uwb_mitigation.recordings.opening\n"
+        "import uwb_mitigation.recordings.mcap, uwb_mitigation.recordings.decaranging"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
 
@@ -65,7 +65,6 @@ def run_without(package: str, *words: object) -> subprocess.CompletedProcess[str
     [
         ("numpy", ("process", "in.mcap", "-o", "out.mcap")),
         ("onnx", ("board", "export-c", "-o", "/nowhere")),
-        ("cobs", ("board", "emulate", "--duration", "1")),
     ],
 )
 def test_missing_package_is_reported_in_one_line(package: str, words: tuple[str, ...]):
@@ -81,7 +80,7 @@ def test_training_without_torch_names_the_install_command(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("module", ["measurement", "preprocessing", "errors"])
+@pytest.mark.parametrize("module", ["types/measurement", "mitigation/preprocessing", "errors"])
 def test_pure_modules_do_no_input_or_output(module: str):
     text = (PACKAGE / f"{module}.py").read_text(encoding="utf-8")
     assert not re.search(r"\b(open\(|Path\b|import (os|sys|io|socket|logging)\b|print\()", text)

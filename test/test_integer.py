@@ -9,13 +9,13 @@ import onnxruntime
 import pytest
 from model_material import integer_network, random_int8, windows
 
-from uwb_mitigation.model import graph
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import Session, load_bundle, session_options
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.requantisation import neon_sum_table, sum_table
-from uwb_mitigation.model.shipped import SHIPPED, default_model_path, shipped_model_path
-from uwb_mitigation.model.weights import layer_inputs, sum_operands
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, session_options
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.requantisation import neon_sum_table, sum_table
+from uwb_mitigation.mitigation.model.shipped import SHIPPED, default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.model.weights import layer_inputs, sum_operands
 
 
 def hostile_inputs(samples: int, seed: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
-from uwb_mitigation.nodes.parameter_tables import TABLES
+from uwb_mitigation.nodes.support.parameter_tables import TABLES
 
 LAUNCH = REPOSITORY / "launch"
 

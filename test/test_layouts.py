@@ -12,10 +12,10 @@ import yaml
 from browser import Browser
 from conftest import REPOSITORY
 
-from uwb_mitigation.bag import schemas, topics
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.ros import schemas, topics
+from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import palette
 
 TYPES = {

@@ -19,19 +19,22 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
-from uwb_mitigation.evaluation import baselines, linear_fit, splits
-from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.evaluation.splits import Group, Split
-from uwb_mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.training.data import splits
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.data.splits import Group, Split
+from uwb_mitigation.training.evaluation import baselines
+from uwb_mitigation.training.fit import linear_fit
 
 pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
-from uwb_mitigation.paper import data as recordings
-from uwb_mitigation.paper import experiment
-from uwb_mitigation.paper.data import Parts
-from uwb_mitigation.training import candidates, cards, comparison, fitting, selection, train
-from uwb_mitigation.training.candidates import Recipe
-from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.training import comparison, train
+from uwb_mitigation.training.fit import candidates, cards, fitting, selection
+from uwb_mitigation.training.fit.candidates import Recipe
+from uwb_mitigation.training.fit.options import FitOptions
+from uwb_mitigation.training.paper import data as recordings
+from uwb_mitigation.training.paper import experiment
+from uwb_mitigation.training.paper.data import Parts
 
 SAMPLES = 8
 QUICK = FitOptions(epochs=1)

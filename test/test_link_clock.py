@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_mitigation.link.clock import DeviceClock
-from uwb_mitigation.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP
+from uwb_mitigation.radios.wire.clock import DeviceClock
+from uwb_mitigation.types.measurement import DEVICE_TICK_HZ, DEVICE_TIME_WRAP
 
 SECOND = 10**9
 EPOCH = 1_760_000_000 * SECOND

@@ -1,4 +1,4 @@
-"""`uwb-mitigation board emulate`, and the benchmark of the link."""
+"""`python -m benchmarks emulate-board`, and the benchmark of the link."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from bag_material import Foreign
 from typer.testing import CliRunner
 
-from uwb_mitigation.commands.cli import app
+from benchmarks.cli import app
 from uwb_mitigation.errors import ParameterError, RecordingError
 
 
@@ -19,7 +19,7 @@ def run(*arguments: str) -> str:
 
 def test_emulated_board_runs_for_the_given_duration(tmp_path):
     result = tmp_path / "board.json"
-    output = run("board", "emulate", "--duration", "0.5", "--rate", "100", "--json", str(result))
+    output = run("emulate-board", "--duration", "0.5", "--rate", "100", "--json", str(result))
 
     assert "simulated" in output
     assert "/dev/" in output
@@ -29,12 +29,12 @@ def test_emulated_board_runs_for_the_given_duration(tmp_path):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("board", "emulate", "--mode", "neither"),
-        ("board", "emulate", "--rate", "0"),
-        ("board", "emulate", "--duration", "-1"),
-        ("board", "emulate", "--lose", "nan"),
-        ("board", "emulate", "--seed", "-1"),
-        ("board", "emulate", "--link", "/nonexistent/board"),
+        ("emulate-board", "--mode", "neither"),
+        ("emulate-board", "--rate", "0"),
+        ("emulate-board", "--duration", "-1"),
+        ("emulate-board", "--lose", "nan"),
+        ("emulate-board", "--seed", "-1"),
+        ("emulate-board", "--link", "/nonexistent/board"),
     ],
     ids=" ".join,
 )
@@ -45,7 +45,7 @@ def test_option_out_of_its_range_is_refused(arguments):
 
 def test_empty_recording_is_reported_before_a_port_is_opened(tmp_path: Path):
     bag = Foreign(tmp_path / "empty.mcap").ours().finish()
-    result = CliRunner().invoke(app, ["board", "emulate", str(bag), "--duration", "1"])
+    result = CliRunner().invoke(app, ["emulate-board", str(bag), "--duration", "1"])
 
     assert isinstance(result.exception, RecordingError)
     assert "no measurements" in str(result.exception)

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.decoder import loopback
+from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.link.faults import Faults
-from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
-from uwb_mitigation.link.layout import MAX_PAYLOAD_BYTES, MessageType
+from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
 
 A = Frame(MessageType.LOG, 0, 7, 123_456, b"first\0\0")
 B = Frame(MessageType.RANGE_CIR, 1, 8, 2**63, bytes(range(256)) * 3)

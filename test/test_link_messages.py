@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import LinkError, ParameterError
-from uwb_mitigation.link import layout, messages
-from uwb_mitigation.link.layout import MessageType, Mode
-from uwb_mitigation.link.messages import (
+from uwb_mitigation.radios.wire import layout, messages
+from uwb_mitigation.radios.wire.layout import MessageType, Mode
+from uwb_mitigation.radios.wire.messages import (
     BoardStatus,
     Correction,
     GetInfo,
@@ -23,7 +23,7 @@ from uwb_mitigation.link.messages import (
     TimeSync,
     TimeSyncReply,
 )
-from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
 
 HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.DEVICE, 99, 3, 4224, 1, 2, 3, "uwb-nano33")
 CORRECTION = Correction(

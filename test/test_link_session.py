@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board
-from uwb_mitigation.link.events import (
+from benchmarks.equipment.board import Board
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.events import (
     Connected,
     Disconnected,
     Event,
@@ -17,11 +17,11 @@ from uwb_mitigation.link.events import (
     ModeRefused,
     VersionMismatch,
 )
-from uwb_mitigation.link.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
-from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode
-from uwb_mitigation.link.messages import BoardStatus, Correction, Hello, Log
-from uwb_mitigation.link.session import BoardSession
-from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
+from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log
+from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
 
 MS = 10**6
 EPOCH = 1_760_000_000 * 10**9

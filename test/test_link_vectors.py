@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwb_mitigation.link import layout, messages, radio_settings
-from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
-from uwb_mitigation.link.layout import Flag, LogLevel, MessageType, Mode, RadioState, Role
-from uwb_mitigation.link.messages import OffsetsAnswer, SetOffsets
-from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
-from uwb_mitigation.offsets import Offsets
+from uwb_mitigation.radios import settings as radio_settings
+from uwb_mitigation.radios.settings import RadioSettings, RadioState, Role
+from uwb_mitigation.radios.wire import layout, messages
+from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
+from uwb_mitigation.radios.wire.messages import OffsetsAnswer, SetOffsets
+from uwb_mitigation.types.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.offsets import Offsets
 
 FILE = Path(__file__).parent / "data" / "link_vectors.txt"
 

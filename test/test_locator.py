@@ -24,7 +24,7 @@ from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from uwb_mitigation.positioning.anchors import dump_anchors
+from uwb_mitigation.types.anchors import dump_anchors
 
 pytestmark = pytest.mark.ros
 
@@ -250,7 +250,7 @@ def test_tag_frame_in_use_is_refused(ros: Ros, anchors: Path, frame: str):
 
 
 def test_pipeline_contains_a_locator_if_anchors_are_given(ros: Ros, tmp_path: Path):
-    from uwb_mitigation.sources.simulated import SimulatedSource
+    from uwb_mitigation.simulation.simulated import SimulatedSource
 
     path = tmp_path / "flat.yaml"
     path.write_text(dump_anchors(SimulatedSource().anchors))

@@ -12,13 +12,13 @@ import pytest
 import yaml
 from command_line import run
 
-from uwb_mitigation.bag.odometry import read_odometry
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
-from uwb_mitigation.measurement import Encoding
-from uwb_mitigation.sources.mapped import MappedRecording
-from uwb_mitigation.sources.mapping import Mapping, load_mapping, shipped_mappings
-from uwb_mitigation.sources.mcap import McapRecording
-from uwb_mitigation.sources.opening import open_mapped
+from uwb_mitigation.recordings.bag.odometry import read_odometry
+from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shipped_mappings
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.recordings.opening import open_mapped
+from uwb_mitigation.types.measurement import Encoding
 
 DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 TEN_LINES = """
@@ -739,7 +739,7 @@ def test_single_impossible_values_are_dropped_and_counted(tmp_path: Path):
 
 
 def test_the_median_of_a_rule_is_that_of_all_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("uwb_mitigation.sources.tables.CHUNK_ROWS", 2)
+    monkeypatch.setattr("uwb_mitigation.recordings.mapping.tables.CHUNK_ROWS", 2)
     write(tmp_path / "a.csv", "t,a,r,z\n0,1,2,5\n1,1,3,5\n")
     write(tmp_path / "b.csv", "t,a,r,z\n2,1,4,1\n3,1,5,1\n4,1,6,1.2\n5,1,7,0.9\n6,1,8,\n")
     source = read(PLAIN | {"drop": [{"column": "z", "from_median": 0.5}]}, tmp_path)
@@ -785,7 +785,7 @@ def test_a_truncated_compressed_file_gives_what_is_before_the_damage(
 ):
     import lzma
 
-    monkeypatch.setattr("uwb_mitigation.sources.tables.CHUNK_ROWS", 1000)
+    monkeypatch.setattr("uwb_mitigation.recordings.mapping.tables.CHUNK_ROWS", 1000)
     rows = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3:.15f}\n" for n in range(20_000))
     data = lzma.compress(rows.encode())
     (tmp_path / "x.csv.xz").write_bytes(data[: len(data) - 1000])

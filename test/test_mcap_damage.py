@@ -13,11 +13,11 @@ import zstandard
 from bag_material import START_NS, STEP_NS, Foreign, chunk_offsets, numbers, prefix, record, write_bag
 from mcap.writer import IndexType
 
-from uwb_mitigation.bag import codec
-from uwb_mitigation.bag.reader import MAX_RECORD, BagReader
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.sources.mcap import McapRecording
+from uwb_mitigation.recordings.bag.reader import MAX_RECORD, BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.types.ros import codec
 
 
 def test_truncated_bag_yields_its_complete_messages_and_the_position_of_the_damage(tmp_path: Path) -> None:

@@ -11,15 +11,21 @@ import pytest
 from bag_material import START_NS, STEP_NS, Foreign, numbers, record, write_bag
 from mcap.writer import CompressionType
 
-from uwb_mitigation.bag import codec
-from uwb_mitigation.bag.poses import encode_odometry
-from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE, RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.positioning.tracks import Estimate
-from uwb_mitigation.sources.mcap import McapRecording
-from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.types.ros import codec
+from uwb_mitigation.types.ros.poses import encode_odometry
+from uwb_mitigation.types.ros.topics import (
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    RANGE_CIR_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+)
+from uwb_mitigation.types.tracks import Estimate
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])

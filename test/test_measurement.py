@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from uwb_mitigation.bag.poses import tag_frame, tag_of_frame
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.measurement import Encoding, Origin, Status
+from uwb_mitigation.types.measurement import Encoding, Origin, Status
+from uwb_mitigation.types.ros.poses import tag_frame, tag_of_frame
 
 
 def test_constants_equal_those_of_the_messages():

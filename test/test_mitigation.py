@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from model_material import LINE, bundle, measurement, window_of
 
-from uwb_mitigation.measurement import Encoding, Origin, RadioType, Segment, Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.preprocessing import Preprocessing
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.types.measurement import Encoding, Origin, RadioType, Segment, Status
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 
 
 @pytest.fixture(scope="module")

@@ -12,22 +12,22 @@ from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
-from uwb_mitigation.evaluation import linear_fit
-from uwb_mitigation.measurement import Record, Truth
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.sources import opening
-from uwb_mitigation.sources.truth_table import load_truth, with_truth
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.recordings import opening
+from uwb_mitigation.recordings.truth_table import load_truth, with_truth
+from uwb_mitigation.training.fit import linear_fit
+from uwb_mitigation.types.measurement import Record, Truth
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-from uwb_mitigation.evaluation import recordings
-from uwb_mitigation.model.floating import float_network
-from uwb_mitigation.training import candidates, selection
-from uwb_mitigation.training.candidates import Candidate, FittedModel, Recipe, network_m
-from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.selection import NESTED
+from uwb_mitigation.mitigation.model.floating import float_network
+from uwb_mitigation.training.data import recordings
+from uwb_mitigation.training.fit import candidates, selection
+from uwb_mitigation.training.fit.candidates import Candidate, FittedModel, Recipe, network_m
+from uwb_mitigation.training.fit.options import FitOptions
+from uwb_mitigation.training.fit.selection import NESTED
 
 SHAPE = Remnet(samples=8)
 RECIPE = Recipe(SHAPE, FitOptions(epochs=1))

@@ -10,9 +10,9 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from rich.console import Console
 
-from uwb_mitigation.bag.codec import MeasurementKey
-from uwb_mitigation.measurement import CorrectedRange, Origin, Status, Truth
 from uwb_mitigation.nodes.monitor import RangeStatistics, summary
+from uwb_mitigation.types.measurement import CorrectedRange, Origin, Status, Truth
+from uwb_mitigation.types.ros.codec import MeasurementKey
 
 
 def corrected(

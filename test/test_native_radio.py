@@ -19,19 +19,18 @@ import serial
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
-from benchmarks.dw1000_model.air import Air, Chip
-from benchmarks.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
+from benchmarks.equipment.dw1000_model.air import Air, Chip
+from benchmarks.equipment.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
 from uwb_mitigation.errors import LinkError, MissingDependencyError, ParameterError
-from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.messages import Radio
-from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.radio import spidev_bus
-from uwb_mitigation.radio.evb1000 import Evb1000Bus
-from uwb_mitigation.radio.native_radio import NativeRadio
-from uwb_mitigation.radio.radio_driver import RadioDriver, RadioLost
-from uwb_mitigation.radio.spidev_bus import SpidevBus
+from uwb_mitigation.radios import spi as spidev_bus
+from uwb_mitigation.radios.dw1000.driver import RadioDriver, RadioLost
+from uwb_mitigation.radios.dw1000.native import NativeRadio
+from uwb_mitigation.radios.evb1000 import Evb1000Bus
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.settings import RadioSettings, RadioState, Role
+from uwb_mitigation.radios.spi import SpidevBus
+from uwb_mitigation.radios.wire.messages import Radio
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
 

@@ -8,21 +8,16 @@ import pytest
 from model_material import card, random_weights, windows
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.model import floating, graph
-from uwb_mitigation.model.architecture import HEAD, Mlp, Remnet
-from uwb_mitigation.model.bundle import Session, load_bundle, save_bundle, session_options
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.weights import FloatWeights
-from uwb_mitigation.training.quantization import quantize
+from uwb_mitigation.mitigation.model import floating, graph
+from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, save_bundle, session_options
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.weights import FloatWeights
+from uwb_mitigation.training.fit.quantization import quantize
 
 torch = pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
-from uwb_mitigation.training.networks import (  # noqa: E402
-    MlpModule,
-    RemnetModule,
-    build,
-    weights_of,
-)
+from uwb_mitigation.training.fit.networks import MlpModule, RemnetModule, build, weights_of  # noqa: E402
 
 
 def mlp_weights(shape: Mlp, seed: int = 0) -> FloatWeights:

@@ -24,14 +24,14 @@ from rclpy.serialization import deserialize_message
 from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.bag.codec import encode_range
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.sources.decaranging import open_decaranging
-from uwb_mitigation.sources.opening import open_recording
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.recordings.decaranging import open_decaranging
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.ros.codec import encode_range
 
 pytestmark = pytest.mark.ros
 
@@ -42,7 +42,7 @@ CORRECTED = "/uwb/range_corrected"
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of 300 simulated ranges at 40 Hz."""
-    from uwb_mitigation.bag.writer import BagWriter
+    from uwb_mitigation.recordings.bag.writer import BagWriter
 
     path = tmp_path_factory.mktemp("bag") / "simulated.mcap"
     source = SimulatedSource(seed=3, count=300, rate_hz=40.0)
@@ -190,7 +190,7 @@ def test_duplicate_node_names_are_reported_except_for_a_killed_node(ros: Ros):
 
 
 def run_demo(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "uwb_mitigation.entry", "demo", *arguments]
+    command = [sys.executable, "-m", "uwb_mitigation.commands.entry", "demo", *arguments]
     environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
     return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
 

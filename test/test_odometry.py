@@ -10,17 +10,22 @@ import pytest
 from command_line import run
 from rosbags.highlevel import AnyReader
 
-from uwb_mitigation.bag import odometry as codec
-from uwb_mitigation.bag.odometry import encode_imu_row, encode_odometry_row, read_imu, read_odometry
-from uwb_mitigation.bag.topics import IMU_TYPE, ODOMETRY_TYPE
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.positioning.tracks import Imu, Odometry
-from uwb_mitigation.sources.mcap import McapRecording
-from uwb_mitigation.sources.simulated import SPEED_M_PER_S, SimulatedSource
-from uwb_mitigation.sources.simulation import odometry as simulation
-from uwb_mitigation.sources.simulation.odometry import simulate_motion, yaw_along_route
-from uwb_mitigation.sources.simulation.scene import ROUTE
+from uwb_mitigation.recordings.bag import odometry as codec
+from uwb_mitigation.recordings.bag.odometry import (
+    encode_imu_row,
+    encode_odometry_row,
+    read_imu,
+    read_odometry,
+)
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.simulation import odometry as simulation
+from uwb_mitigation.simulation.odometry import simulate_motion, yaw_along_route
+from uwb_mitigation.simulation.scene import ROUTE
+from uwb_mitigation.simulation.simulated import SPEED_M_PER_S, SimulatedSource
+from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE
+from uwb_mitigation.types.tracks import Imu, Odometry
 
 SECONDS = 300.0
 

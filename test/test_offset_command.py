@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from model_material import amplitudes_only
 
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.evaluation.radio_offsets import OffsetEstimate, estimate_offset
-from uwb_mitigation.measurement import RadioType, Record, Segment
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.offsets import Offsets, parse_offsets
-from uwb_mitigation.preprocessing import Scaling
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.training.site.radio_offsets import OffsetEstimate, estimate_offset
+from uwb_mitigation.types.measurement import RadioType, Record, Segment
+from uwb_mitigation.types.offsets import Offsets, parse_offsets
 
 NO_SAMPLES = np.empty(0, np.int16)
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from model_material import bundle, measurement
 
+from benchmarks.equipment.board import Board
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board
-from uwb_mitigation.link.events import OffsetsRefused
-from uwb_mitigation.link.layout import MAX_OFFSETS, MessageType, Mode
-from uwb_mitigation.link.messages import Correction, Hello
-from uwb_mitigation.link.session import MAX_TRIES, REQUEST_INTERVAL_NS, BoardSession
-from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.offsets import NO_OFFSETS, Offsets, dump_offsets, parse_offsets, read_offsets
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.events import OffsetsRefused
+from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, MessageType, Mode
+from uwb_mitigation.radios.wire.messages import Correction, Hello
+from uwb_mitigation.radios.wire.session import MAX_TRIES, REQUEST_INTERVAL_NS, BoardSession
+from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, dump_offsets, parse_offsets, read_offsets
 
 TEXT = """\
 default: 0.5
@@ -186,7 +186,7 @@ class Pair:
 
 
 def messages_in(data: bytes) -> list[tuple[int, bytes]]:
-    from uwb_mitigation.link.framing import FrameDecoder, encode_frame
+    from uwb_mitigation.radios.wire.framing import FrameDecoder, encode_frame
 
     return [(frame.type, encode_frame(frame)) for frame in FrameDecoder().feed(data)]
 

@@ -20,16 +20,16 @@ from command_line import run, start
 from model_material import window_of
 
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
-from uwb_mitigation.measurement import Encoding, Record
-from uwb_mitigation.paper import data as experiment_data
-from uwb_mitigation.paper import rooms
-from uwb_mitigation.paper.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, DeepUwbRecording
-from uwb_mitigation.paper.download import fetch_deepuwb
-from uwb_mitigation.paper.simulated import SimulatedDeepUwb
-from uwb_mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
-from uwb_mitigation.sources.mcap import McapRecording
-from uwb_mitigation.sources.simulation.rooms import OBSTACLES as SIMULATED_OBSTACLES
-from uwb_mitigation.sources.simulation.rooms import ROOMS as SIMULATED_ROOMS
+from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.simulation.rooms import OBSTACLES as SIMULATED_OBSTACLES
+from uwb_mitigation.simulation.rooms import ROOMS as SIMULATED_ROOMS
+from uwb_mitigation.training.paper import data as experiment_data
+from uwb_mitigation.training.paper import rooms
+from uwb_mitigation.training.paper.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, DeepUwbRecording
+from uwb_mitigation.training.paper.download import fetch_deepuwb
+from uwb_mitigation.training.paper.simulated import SimulatedDeepUwb
+from uwb_mitigation.types.measurement import Encoding, Record
 
 OBSTACLES = ("0000000000", "1000000000", "0000001001", "0000000001")
 

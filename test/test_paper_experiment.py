@@ -16,13 +16,13 @@ pytest.importorskip("torch", reason="training is not set up: run make setup-trai
 
 
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
-from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.paper import experiment
-from uwb_mitigation.paper.data import Parts, shorten_windows
-from uwb_mitigation.paper.results import RESULTS, ExperimentResults, read
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.fit.options import FitOptions
+from uwb_mitigation.training.paper import experiment
+from uwb_mitigation.training.paper.data import Parts, shorten_windows
+from uwb_mitigation.training.paper.results import RESULTS, ExperimentResults, read
 
 QUICK = FitOptions(epochs=2, learning_rate=1e-3, weight_decay=0.0)
 

@@ -14,10 +14,10 @@ import pytest
 from command_line import run
 from model_material import dataset
 
-from uwb_mitigation.paper import report, tables
-from uwb_mitigation.paper.report import Report, Study, build
-from uwb_mitigation.paper.results import ExperimentResults, FirmwareRow
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.training.paper import report, tables
+from uwb_mitigation.training.paper.report import Report, Study, build
+from uwb_mitigation.training.paper.results import ExperimentResults, FirmwareRow
 
 PARTS = ["data", "table1", "table2", "table3", "fig3", "fig4a", "fig4b", "fig5"]
 HOSTILE = "<script>alert(1)</script>_$\\frac{$"

@@ -14,10 +14,10 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from ros_harness import PAUSED, Ros, domain
 from uwb_mitigation_msgs.msg import RangeCir
 
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.measurement import Record
-from uwb_mitigation.nodes.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.nodes.support.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Record
 
 pytestmark = pytest.mark.ros
 

@@ -10,10 +10,10 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.simulation.simulated import SimulatedSource
 
 pytestmark = pytest.mark.ros
 

@@ -11,8 +11,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_mitigation.bag.pose_paths import read_bodies, read_heights, read_lever_arm
 from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.recordings.bag.pose_paths import read_bodies, read_heights, read_lever_arm
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 SECONDS = 10

@@ -11,23 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.positioning.filter import FIRST_ERROR, OFFSET, RangeFilter
+from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, horizontal_ellipse, shape
-from uwb_mitigation.positioning.initialization import candidate_positions
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.smoother import smooth
-from uwb_mitigation.positioning.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import (
-    Estimate,
-    Heights,
-    Ranges,
-    Track,
-    TruePath,
-    errors_of,
-    track_errors,
-)
+from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
+from uwb_mitigation.positioning.online.initialization import candidate_positions
+from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.track_errors import errors_of, track_errors
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track, TruePath
 
 PLAIN = NoiseModel(long=100.0, short=100.0)
 """No range is down-weighted."""

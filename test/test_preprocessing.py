@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_material import cir, window_of
 
-from uwb_mitigation.measurement import Cir, Encoding
-from uwb_mitigation.preprocessing import CirFault, Preprocessing, Scaling
+from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing, Scaling
+from uwb_mitigation.types.measurement import Cir, Encoding
 
 
 def single(value: float) -> float:

@@ -21,18 +21,18 @@ from bag_material import Foreign, chunk_offsets
 from command_line import ENVIRONMENT, command, run, start
 from model_material import cir
 
-from uwb_mitigation.bag import codec
-from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import RANGE_CORRECTED, RANGE_RAW
-from uwb_mitigation.bag.writer import BagWriter
+from uwb_mitigation.commands.offline.parallel import plan, run_on_dask
+from uwb_mitigation.commands.offline.process import Job, process_bag
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import RadioType, RangeMeasurement, Record, Segment, Truth
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import shipped_model_path
-from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.processing.job import Job, process_bag
-from uwb_mitigation.processing.parallel import plan, run_on_dask
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import shipped_model_path
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Record, Segment, Truth
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.types.ros import codec
+from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, RANGE_RAW
 
 REPOSITORY = Path(__file__).parent.parent
 START_NS = 1_700_000_000_000_000_000
@@ -356,7 +356,7 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
         "job.BagReader = killed\n"
     )
     code = (
-        "import pickle, sys; from uwb_mitigation.processing.parallel import run_locally\n"
+        "import pickle, sys; from uwb_mitigation.commands.offline.parallel import run_locally\n"
         "jobs = pickle.load(sys.stdin.buffer)\n"
         "print({one.job.source.name: one.error is None for one in run_locally(jobs, 2)})"
     )

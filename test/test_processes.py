@@ -17,7 +17,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 TIMEOUT_S = 240.0
 RUNS = {
     "bench": ["-m", "benchmarks", "nodes"],
-    "demo": ["-m", "uwb_mitigation.entry", "demo"],
+    "demo": ["-m", "uwb_mitigation.commands.entry", "demo"],
 }
 
 
@@ -26,7 +26,7 @@ def nodes_of(pid: int) -> list[psutil.Process]:
     return [
         child
         for child in psutil.Process(pid).children(recursive=True)
-        if {"uwb_mitigation.entry", "-m"} <= set(child.cmdline())
+        if {"uwb_mitigation.commands.entry", "-m"} <= set(child.cmdline())
     ]
 
 

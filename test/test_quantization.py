@@ -7,13 +7,13 @@ import pytest
 from model_material import random_weights, windows
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.model import floating, graph
-from uwb_mitigation.model.architecture import HEAD, Remnet
-from uwb_mitigation.model.bundle import load_bundle, save_bundle
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.requantisation import nudge
-from uwb_mitigation.model.shipped import SHIPPED, shipped_model_path
-from uwb_mitigation.training.quantization import quantize
+from uwb_mitigation.mitigation.model import floating, graph
+from uwb_mitigation.mitigation.model.architecture import HEAD, Remnet
+from uwb_mitigation.mitigation.model.bundle import load_bundle, save_bundle
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.requantisation import nudge
+from uwb_mitigation.mitigation.model.shipped import SHIPPED, shipped_model_path
+from uwb_mitigation.training.fit.quantization import quantize
 
 SHAPE = Remnet(samples=32)
 

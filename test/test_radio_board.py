@@ -6,15 +6,14 @@ import itertools
 
 from compilers import NEEDS_CC
 
-from benchmarks.dw1000_model.boards import ModelledAir, SerialLink
-from benchmarks.dw1000_model.pairs import Pair
-from uwb_mitigation.link import messages
-from uwb_mitigation.link.events import Event, RadioRefused
-from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.messages import SetRadio
-from uwb_mitigation.link.radio_settings import RadioSettings, RadioStatus
-from uwb_mitigation.link.session import BoardSession
-from uwb_mitigation.measurement import RangeMeasurement
+from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
+from benchmarks.equipment.dw1000_model.pairs import Pair
+from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.events import Event, RadioRefused
+from uwb_mitigation.radios.wire.messages import SetRadio
+from uwb_mitigation.radios.wire.session import BoardSession
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
 

@@ -14,16 +14,15 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from benchmarks.dw1000_model.boards import ModelledAir, SerialLink
-from benchmarks.dw1000_model.evb1000 import EmulatedEvb1000s
-from benchmarks.dw1000_model.pairs import Pair
+from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
+from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.equipment.dw1000_model.pairs import Pair
+from benchmarks.equipment.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.errors import ParameterError, format_id
-from uwb_mitigation.link.emulated_board import EmulatedBoard, PseudoTerminal
-from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio_settings import NEVER_MS, AnchorStatus, RadioSettings, RadioStatus
-from uwb_mitigation.nodes.live_feeds import anchor_values, settings_of
-from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.nodes.feeds.radios import anchor_values, settings_of
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.radios.settings import NEVER_MS, AnchorStatus, RadioSettings, RadioStatus, Role
+from uwb_mitigation.simulation.simulated import SimulatedSource
 
 pytestmark = [
     pytest.mark.ros,

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
-from benchmarks.dw1000_model import boards as modelled
-from benchmarks.dw1000_model.boards import ModelledAir
-from benchmarks.dw1000_model.pairs import Pair
-from uwb_mitigation.link.layout import Role
-from uwb_mitigation.link.radio_settings import PREAMBLES, RadioSettings
-from uwb_mitigation.radio import structures
+from benchmarks.equipment.dw1000_model import boards as modelled
+from benchmarks.equipment.dw1000_model.boards import ModelledAir
+from benchmarks.equipment.dw1000_model.pairs import Pair
+from uwb_mitigation.radios.dw1000 import structures
+from uwb_mitigation.radios.settings import PREAMBLES, RadioSettings, Role
 
 pytestmark = NEEDS_CC
 

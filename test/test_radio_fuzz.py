@@ -10,7 +10,7 @@ import pytest
 from compilers import NEEDS_CC
 
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.firmware_export.compiling import c_compiler, compile_objects, firmware_folder, run
+from uwb_mitigation.mitigation.embedded.compiling import c_compiler, compile_objects, firmware_folder, run
 
 SANITIZED = ("-std=c99", "-g", "-O1", "-fno-sanitize-recover=all")
 

@@ -11,15 +11,14 @@ import pytest
 from compilers import NEEDS_CC
 from firmware_on_model import ModelBus, ranging, use_virtual_time
 
-from benchmarks.dw1000_model.air import Air, Chip, Host
-from benchmarks.dw1000_model.pairs import Pair
+from benchmarks.equipment.dw1000_model.air import Air, Chip, Host
+from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.link.layout import RadioState, Role
-from uwb_mitigation.link.radio_settings import RadioSettings, RadioStatus
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.nodes import live_feeds
-from uwb_mitigation.radio import structures
-from uwb_mitigation.radio.native_radio import NativeRadio, load
+from uwb_mitigation.nodes.feeds import radios as live_feeds
+from uwb_mitigation.radios.dw1000 import structures
+from uwb_mitigation.radios.dw1000.native import NativeRadio, load
+from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
 

@@ -16,8 +16,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ros_harness import Ros, domain
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes import topics
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes.support import topics
 
 pytestmark = pytest.mark.ros
 
@@ -50,9 +50,8 @@ def ros(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("reference")
     port = folder / "port"
     with domain(folder) as ros:
-        code = "from uwb_mitigation.commands.cli import main; main()"
         model = str(default_model_path())
-        ros.run([sys.executable, "-c", code, "board", "emulate", "--link", str(port), "--model", model])
+        ros.run([sys.executable, "-m", "benchmarks", "emulate-board", "--link", str(port), "--model", model])
         ros.start("mitigator")
         ros.start("driver", "publish_clock:=true", "start_delay:=0.0")
         serial = ("source:=serial", f"port:={port}", "mode:=device")

@@ -24,12 +24,10 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.bag.codec import encode_range
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.diagnostics import (
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes.support.diagnostics import (
     DROPPED,
     MIN_LOS,
     NO_PREAMBLE_COUNT,
@@ -43,8 +41,10 @@ from uwb_mitigation.nodes.diagnostics import (
     Meter,
     MitigatorHealth,
 )
-from uwb_mitigation.offsets import Offsets, read_offsets
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.offsets import Offsets, read_offsets
+from uwb_mitigation.types.ros.codec import encode_range
 
 RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"

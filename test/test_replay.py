@@ -21,13 +21,13 @@ from ros_harness import Ros
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir
 
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.replay import ReplayClock, ReplayFeed
-from uwb_mitigation.offsets import NO_OFFSETS
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.nodes.feeds.replay import ReplayClock, ReplayFeed
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.types.offsets import NO_OFFSETS
 
 MS = 1_000_000
 COUNT = 400

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import random_networks
-from uwb_mitigation.firmware_export.packing import pack
-from uwb_mitigation.model import requantisation
+from benchmarks.equipment import random_networks
+from uwb_mitigation.mitigation.embedded.packing import pack
+from uwb_mitigation.mitigation.model import requantisation
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -13,16 +13,16 @@ import pytest
 from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, Robot, drive, wrapped
 
-from uwb_mitigation.positioning.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
-from uwb_mitigation.positioning.filter import FIRST_ERROR, RangeFilter
+from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.odometry_filter import OdometryFilter
-from uwb_mitigation.positioning.robot_estimator import RobotEstimator
-from uwb_mitigation.positioning.smoother import smooth
-from uwb_mitigation.positioning.tag_estimator import RobotData, TagEstimator
-from uwb_mitigation.positioning.tracks import Imu, Odometry
+from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
+from uwb_mitigation.positioning.online.filter import FIRST_ERROR, RangeFilter
+from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
+from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
+from uwb_mitigation.positioning.online.tag_estimator import RobotData, TagEstimator
+from uwb_mitigation.types.tracks import Imu, Odometry
 
 
 def rms(values) -> float:

@@ -11,15 +11,15 @@ from conftest import REPOSITORY
 from ekf_model import VX, VY, VYAW, YAW, Ekf, X, Y
 from numpy.typing import NDArray
 
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.offsets import Offsets
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Ranges, Track
-from uwb_mitigation.sources.simulated import SimulatedSource
-from uwb_mitigation.sources.simulation.odometry import RobotMotion
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.simulation.odometry import RobotMotion
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.offsets import Offsets
+from uwb_mitigation.types.tracks import Ranges, Track
 
 SEEDS = (11, 12, 13)
 """The process noise in config/ekf.yaml was selected on the seeds 1 to 4."""

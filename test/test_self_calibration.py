@@ -9,14 +9,14 @@ import pytest
 from drives import HALL, circuit, drive
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.anchor_errors import position_scatter
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.batch.anchor_errors import position_scatter
+from uwb_mitigation.positioning.batch.motion_segments import find_segments
+from uwb_mitigation.positioning.batch.pose_alignment import align_poses
+from uwb_mitigation.positioning.batch.self_calibration import calibrate
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.motion_segments import find_segments
 from uwb_mitigation.positioning.noise_model import SLOPE_SD, NoiseModel, Regressors
-from uwb_mitigation.positioning.pose_alignment import PosePath, align_poses
-from uwb_mitigation.positioning.self_calibration import calibrate
-from uwb_mitigation.positioning.tracks import Ranges
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.tracks import PosePath, Ranges
 
 LEVEL = Height(1.0)
 OWN = np.array([0.2, -0.1, 0.05, -0.2, 0.05])

@@ -20,17 +20,17 @@ from faulty_board import FaultyBoard
 from ros_harness import Process, Ros, diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.link.board_driver import BoardDriver
-from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.emulated_board import EmulatedBoard
-from uwb_mitigation.link.faults import Faults
-from uwb_mitigation.link.messages import Hello
-from uwb_mitigation.measurement import Origin
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.offsets import Offsets
-from uwb_mitigation.sources.simulated import SimulatedSource
+from benchmarks.equipment.emulated_board import EmulatedBoard
+from benchmarks.equipment.faults import Faults
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.serial import BoardDriver
+from uwb_mitigation.radios.wire.messages import Hello
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Origin
+from uwb_mitigation.types.offsets import Offsets
 
 pytestmark = pytest.mark.ros
 

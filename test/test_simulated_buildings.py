@@ -5,17 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
-from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.simulated import SimulatedBuildings
-from uwb_mitigation.sources.simulation import buildings
-from uwb_mitigation.sources.simulation.buildings import (
-    PLACEMENTS,
-    WIDE_KINDS,
-    block_of,
-    draw_plan,
-)
-from uwb_mitigation.training.simulated import building_dataset
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.simulation import buildings
+from uwb_mitigation.simulation.buildings import PLACEMENTS, WIDE_KINDS, block_of, draw_plan
+from uwb_mitigation.simulation.simulated import SimulatedBuildings
+from uwb_mitigation.training.data.dataset import Dataset, build_dataset
+from uwb_mitigation.training.data.simulated import building_dataset
 
 BLOCKS = 8
 

@@ -15,17 +15,12 @@ from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import Record
-from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.mcap import McapRecording
-from uwb_mitigation.sources.simulated import (
-    FIRST_TAG_ID,
-    NOT_RECEIVED,
-    SimulatedSource,
-    SimulatedSurvey,
-)
-from uwb_mitigation.sources.simulation.radio import TAPS, Radio
-from uwb_mitigation.sources.simulation.scene import ROUTE, FloorPlan, along_route
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.simulation.radio import TAPS, Radio
+from uwb_mitigation.simulation.scene import ROUTE, FloorPlan, along_route
+from uwb_mitigation.simulation.simulated import FIRST_TAG_ID, NOT_RECEIVED, SimulatedSource, SimulatedSurvey
+from uwb_mitigation.types.measurement import Record
 
 
 def values(record: Record) -> tuple[object, ...]:

@@ -7,13 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from uwb_mitigation.sources.simulation.channel import (
-    FREE_SPACE_LOSS_1M_DB,
-    WAVELENGTH_M,
-    Multipath,
-    direct_power_db,
-)
-from uwb_mitigation.sources.simulation.radio import (
+from uwb_mitigation.simulation.channel import FREE_SPACE_LOSS_1M_DB, WAVELENGTH_M, Multipath, direct_power_db
+from uwb_mitigation.simulation.radio import (
     EDGE_LEAD_TAPS,
     NOISE_TAPS,
     POWER_CONSTANT_DB,
@@ -23,7 +18,7 @@ from uwb_mitigation.sources.simulation.radio import (
     Radio,
     pulse,
 )
-from uwb_mitigation.sources.simulation.scene import (
+from uwb_mitigation.simulation.scene import (
     BRICK,
     FLAT,
     ROUTE,

@@ -24,8 +24,8 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ros_harness import Ros
 
-from uwb_mitigation.sources.anchors_file import load_anchors
-from uwb_mitigation.sources.recorded_ranges import read_ranges
+from uwb_mitigation.recordings.recorded_ranges import read_ranges
+from uwb_mitigation.types.anchors import load_anchors
 
 pytestmark = [
     pytest.mark.ros,

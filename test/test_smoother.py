@@ -7,12 +7,13 @@ import pytest
 from drives import HALL, block, drive
 from scipy.optimize import least_squares
 
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
-from uwb_mitigation.positioning.least_squares import LeastSquares
+from uwb_mitigation.positioning.batch.least_squares import LeastSquares
+from uwb_mitigation.positioning.batch.smoother import Smoother, knots_of, smooth
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.smoother import Smoother, knots_of, smooth
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Track, TruePath, track_errors
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.track_errors import track_errors
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.tracks import Track, TruePath
 
 
 def test_least_squares_solves_as_a_dense_matrix_does():

@@ -9,10 +9,10 @@ import pytest
 from drives import HALL, NANOSECONDS, circuit, drive
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
+from uwb_mitigation.positioning.batch.survey import displacements, survey
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.survey import displacements, survey
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 
 LEVEL = Height(1.0)
 

@@ -26,10 +26,10 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.nodes.topic_feed import TopicFeed, message_type
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap, dump_anchors
-from uwb_mitigation.sources.mapping import Drop, Mapping, Value, load_mapping
+from uwb_mitigation.nodes.feeds.topic import TopicFeed, message_type
+from uwb_mitigation.recordings.mapping.mapping import Drop, Mapping, Value, load_mapping
+from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 CORNERS = {0: (0.0, 0.0, 2.0), 1: (8.0, 0.0, 2.0), 2: (8.0, 6.0, 2.0), 3: (0.0, 6.0, 2.0)}
 TAG = (3.0, 2.0, 0.4)

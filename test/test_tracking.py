@@ -15,22 +15,21 @@ from command_line import run
 from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, circuit, drive, wrapped
 
-from uwb_mitigation.bag.pose_paths import read_truth
-from uwb_mitigation.bag.poses import encode_pose
-from uwb_mitigation.bag.topics import ODOMETRY, ODOMETRY_TRUTH, POSE_TYPE
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
-from uwb_mitigation.positioning.anchors import dump_anchors, parse_anchors
+from uwb_mitigation.commands.offline import track as tracking
+from uwb_mitigation.commands.offline.track import held_out, track_tag
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Estimate, Ranges, TruePath
-from uwb_mitigation.processing import tracking
-from uwb_mitigation.processing.tracking import held_out, track_tag
-from uwb_mitigation.sources.anchors_file import anchors_path
-from uwb_mitigation.sources.mapped import MappedRecording
-from uwb_mitigation.sources.opening import open_recording
-from uwb_mitigation.sources.recorded_ranges import TagRecording
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.recordings.bag.pose_paths import read_truth
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.recorded_ranges import TagRecording
+from uwb_mitigation.types.anchors import anchors_path, dump_anchors, parse_anchors
+from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
+from uwb_mitigation.types.ros.poses import encode_pose
+from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, POSE_TYPE
+from uwb_mitigation.types.tracks import Estimate, Ranges, TruePath
 
 
 def write_drive(

@@ -9,10 +9,10 @@ import pytest
 from model_material import dataset, windows
 
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.evaluation.linear_fit import fit_linear_bias, least_absolute_deviations
-from uwb_mitigation.model import floating
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model import floating
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias, least_absolute_deviations
 
 SHAPE = Remnet(samples=32)
 
@@ -67,8 +67,8 @@ def test_linear_bias_model_without_data_is_refused():
 
 torch = pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import train  # noqa: E402
-from uwb_mitigation.training.candidates import Recipe, fit_new_model  # noqa: E402
-from uwb_mitigation.training.fitting import FitOptions, fit  # noqa: E402
+from uwb_mitigation.training.fit.candidates import Recipe, fit_new_model  # noqa: E402
+from uwb_mitigation.training.fit.fitting import FitOptions, fit  # noqa: E402
 
 
 def test_seed_gives_the_same_weights():

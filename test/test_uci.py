@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import uci
-from benchmarks.uci_board import FIRST_PATH, UciBoardModel, UciFaults, _Session, taps_of
+from benchmarks.equipment.uci_board import FIRST_PATH, UciBoardModel, UciFaults, _Session, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterError, RecordingError
-from uwb_mitigation.link.layout import Role
-from uwb_mitigation.measurement import RadioType, RangeMeasurement, Segment
-from uwb_mitigation.radio.uci import messages
-from uwb_mitigation.radio.uci.capture import FIRST_LINE, CaptureWriter, UciCapture
-from uwb_mitigation.radio.uci.cir import read_cir
-from uwb_mitigation.radio.uci.joining import Joiner
-from uwb_mitigation.radio.uci.messages import Diagnostics, Kind
-from uwb_mitigation.radio.uci.packets import MAX_GAP_NS, PacketDecoder, encode
-from uwb_mitigation.radio.uci.session import UciSession, UciSettings
+from uwb_mitigation.radios.fira import messages
+from uwb_mitigation.radios.fira.capture import FIRST_LINE, CaptureWriter, UciCapture
+from uwb_mitigation.radios.fira.cir import read_cir
+from uwb_mitigation.radios.fira.joining import Joiner
+from uwb_mitigation.radios.fira.messages import Diagnostics, Kind
+from uwb_mitigation.radios.fira.packets import MAX_GAP_NS, PacketDecoder, encode
+from uwb_mitigation.radios.fira.session import UciSession, UciSettings
+from uwb_mitigation.radios.settings import Role
+from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment
 
 MS = 10**6
 RANGE = bytes.fromhex(

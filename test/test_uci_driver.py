@@ -12,15 +12,15 @@ import ros_harness
 from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import Cir, RangeCir, RangeCorrected
 
-from benchmarks.uci_board import EmulatedUciBoards, UciFaults
+from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.link.layout import Role
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import shipped_model_path
-from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.uci_feed import _warning, uci_settings
-from uwb_mitigation.radio.uci.driver import UciReport
-from uwb_mitigation.radio.uci.session import UciSettings
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import shipped_model_path
+from uwb_mitigation.nodes.feeds.uci import _warning, uci_settings
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.radios.fira.session import UciSettings
+from uwb_mitigation.radios.settings import Role
+from uwb_mitigation.radios.uci import UciReport
 
 DEFAULTS = {row.name: row.default for row in DRIVER}
 

@@ -11,11 +11,11 @@ import pytest
 from model_material import bundle, measurement
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.ood import Band, OodBands, OodDetector, features
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.ood import Band, OodBands, OodDetector, features
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.types.measurement import Status
 
 WIDE = Band(-1000.0, 1000.0, 1.0)
 SHAPE = Remnet(samples=157)

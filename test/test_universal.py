@@ -10,13 +10,13 @@ from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.preprocessing import Scaling
 
 torch = pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
 from uwb_mitigation.training import universal  # noqa: E402
-from uwb_mitigation.training.options import FitOptions  # noqa: E402
+from uwb_mitigation.training.fit.options import FitOptions  # noqa: E402
 from uwb_mitigation.training.universal import TrainingPlan, UniversalModel  # noqa: E402
 
 SMALL = TrainingPlan(seed=3, samples=32, blocks=2, held_out_blocks=1, fit=FitOptions(epochs=2, batch=64))

@@ -16,8 +16,8 @@ from lifecycle_msgs.msg import Transition
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from benchmarks.page_clients import PageClients
-from uwb_mitigation.nodes import topics
+from benchmarks.equipment.page_clients import PageClients
+from uwb_mitigation.nodes.support import topics
 
 pytestmark = pytest.mark.ros
 

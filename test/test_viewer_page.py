@@ -21,9 +21,9 @@ from bokeh.document import Document
 from browser import Browser
 from PIL import Image
 
-from benchmarks.page_clients import PageClients
+from benchmarks.equipment.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.measurement import Cir, Encoding, Status
+from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.page import Page, View
 from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind

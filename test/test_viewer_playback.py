@@ -21,10 +21,18 @@ from browser import Browser
 from command_line import run
 from drives import HALL, drive
 
-from uwb_mitigation.bag.codec import encode_range
-from uwb_mitigation.bag.poses import encode_pose, encode_true_position, tag_topic
-from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.bag.topics import (
+from uwb_mitigation.commands.offline.process import Job, process_bag
+from uwb_mitigation.errors import RecordingError, UwbMitigationError
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.anchors import anchors_path, dump_anchors, load_anchors
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Status
+from uwb_mitigation.types.ros.codec import encode_range
+from uwb_mitigation.types.ros.poses import encode_pose, encode_true_position, tag_topic
+from uwb_mitigation.types.ros.topics import (
     ODOMETRY_TRUTH,
     ODOMETRY_TYPE,
     POSE,
@@ -32,16 +40,7 @@ from uwb_mitigation.bag.topics import (
     RANGE_CIR_TYPE,
     RANGE_RAW,
 )
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.errors import RecordingError, UwbMitigationError
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.positioning.anchors import dump_anchors
-from uwb_mitigation.positioning.tracks import Estimate
-from uwb_mitigation.processing.job import Job, process_bag
-from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
+from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import playback
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.palette import TrackKind
@@ -335,7 +334,12 @@ def test_speed_scales_playback_and_the_second_recording_follows(bag: Path, monke
 @contextmanager
 def serve_recording(bag: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Run `uwb-mitigation view` on a bag; return the URL."""
-    command = [sys.executable, "-c", "from uwb_mitigation.entry import command_line; command_line()", "view"]
+    command = [
+        sys.executable,
+        "-c",
+        "from uwb_mitigation.commands.entry import command_line; command_line()",
+        "view",
+    ]
     running = subprocess.Popen(
         [*command, str(bag), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from command_line import run
 
-from uwb_mitigation.bag.writer import BagWriter
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.evaluation import splits
-from uwb_mitigation.evaluation.dataset import Dataset, build_dataset
-from uwb_mitigation.evaluation.linear_fit import fit_linear_bias_to_rows
-from uwb_mitigation.evaluation.radio_offsets import estimate_offset
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record, Truth
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.candidates import fit_line
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.training.data import splits
+from uwb_mitigation.training.data.dataset import Dataset, build_dataset
+from uwb_mitigation.training.fit.candidates import fit_line
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias_to_rows
+from uwb_mitigation.training.site.radio_offsets import estimate_offset
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Truth
 
 EMPTY = np.zeros(0, np.int16)
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from model_material import bundle, dataset
 
-from uwb_mitigation.evaluation import zero_shot
-from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.evaluation.zero_shot import NAMES, ZeroShot
-from uwb_mitigation.model.bundle import Bundle
-from uwb_mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.evaluation import zero_shot
+from uwb_mitigation.training.evaluation.zero_shot import NAMES, ZeroShot
 
 
 @pytest.fixture(scope="module")

@@ -29,24 +29,26 @@ from pathlib import Path
 import numpy as np
 from sites import draw_site
 
-from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.evaluation.site_data import read_site
-from uwb_mitigation.measurement import Record
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import Bundle, load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.pose_alignment import PosePath
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
-from uwb_mitigation.sources.simulated import SimulatedSource
-from uwb_mitigation.sources.simulation.buildings import RADIO
-from uwb_mitigation.sources.simulation.odometry import RobotMotion
-from uwb_mitigation.sources.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
-from uwb_mitigation.training import site_calibration, site_solution, train
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.track_errors import track_errors
+from uwb_mitigation.simulation.buildings import RADIO
+from uwb_mitigation.simulation.odometry import RobotMotion
+from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.training import train
+from uwb_mitigation.training.data.dataset import build_dataset
+from uwb_mitigation.training.site import calibration as site_calibration
+from uwb_mitigation.training.site import solution as site_solution
+from uwb_mitigation.training.site.data import read_site
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.types.tracks import PosePath, Ranges, TruePath
 
 UNSEEN = 7_000_000
 """Added to the seed of a building: the seeds of the universal model begin at 0 and at 1 000 003."""
@@ -123,9 +125,9 @@ def position_rmse(
 def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
     """Run `train --data` on the true ranges of the drive; each metre of a pair is one configuration."""
     dataset = build_dataset(records, universal.preprocessing)
-    from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.training.candidates import Recipe
-    from uwb_mitigation.training.options import FitOptions
+    from uwb_mitigation.mitigation.model.architecture import Remnet
+    from uwb_mitigation.training.fit.candidates import Recipe
+    from uwb_mitigation.training.fit.options import FitOptions
 
     recipe = Recipe(Remnet(samples=universal.preprocessing.samples), FitOptions())
     return train.train_new_model(

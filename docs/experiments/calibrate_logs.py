@@ -22,23 +22,24 @@ import numpy as np
 
 from benchmarks.positions import TIME_OFFSET_S, at_truths, hanyang_run
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.evaluation.site_data import read_site
-from uwb_mitigation.measurement import Record
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import Bundle, load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.batch.smoother import Smoother
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.smoother import Smoother
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Ranges, track_errors
-from uwb_mitigation.sources.decaranging import DecaRangingFolder
-from uwb_mitigation.sources.mapped import MappedRecording
-from uwb_mitigation.sources.opening import open_mapped
-from uwb_mitigation.training.site_calibration import SiteCalibration, calibrate
-from uwb_mitigation.training.site_solution import solve_without_truth
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.track_errors import track_errors
+from uwb_mitigation.recordings.decaranging import DecaRangingFolder
+from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+from uwb_mitigation.recordings.opening import open_mapped
+from uwb_mitigation.training.site.calibration import SiteCalibration, calibrate
+from uwb_mitigation.training.site.data import read_site
+from uwb_mitigation.training.site.solution import solve_without_truth
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.types.tracks import Ranges
 
 HEIGHT = Height(1.0, 0.2)
 

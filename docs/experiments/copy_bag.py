@@ -11,9 +11,9 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from uwb_mitigation.bag.reader import BagReader
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.processing.job import Job, process_bag
+from uwb_mitigation.commands.offline.process import Job, process_bag
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.recordings.bag.reader import BagReader
 
 
 def copy(source: Path, path: Path) -> None:

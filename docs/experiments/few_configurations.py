@@ -11,16 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation import linear_fit
-from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import Session, load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.decaranging import DecaRangingFolder
-from uwb_mitigation.training import candidates, selection
-from uwb_mitigation.training.candidates import Recipe, linear_bias_m
-from uwb_mitigation.training.options import FitOptions
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.recordings.decaranging import DecaRangingFolder
+from uwb_mitigation.training.data.dataset import build_dataset
+from uwb_mitigation.training.fit import candidates, linear_fit, selection
+from uwb_mitigation.training.fit.candidates import Recipe, linear_bias_m
+from uwb_mitigation.training.fit.options import FitOptions
 
 data = build_dataset(DecaRangingFolder(Path(sys.argv[1])), Preprocessing())
 data = data.rows(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm))

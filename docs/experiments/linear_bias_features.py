@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation import baselines, splits
-from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.evaluation.linear_fit import least_absolute_deviations
-from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.decaranging import CirFrame, DecaRangingFolder
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.recordings.decaranging import CirFrame, DecaRangingFolder
+from uwb_mitigation.training.data import splits
+from uwb_mitigation.training.data.dataset import build_dataset
+from uwb_mitigation.training.evaluation import baselines
+from uwb_mitigation.training.fit.linear_fit import least_absolute_deviations
 
 
 def features(data):

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.positions import HEIGHT, at_truths, hanyang_run
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.positioning.batch.smoother import Smoother
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.smoother import Smoother
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Ranges, TruePath
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.tracks import Ranges, TruePath
 
 
 def erring(

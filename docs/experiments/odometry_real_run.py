@@ -16,12 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.anchors import Anchor, AnchorMap
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.robot_estimator import make_estimator
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
-from uwb_mitigation.positioning.tracks import Odometry, Ranges, Track, TrackErrors, TruePath, track_errors
+from uwb_mitigation.positioning.online.robot_estimator import make_estimator
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.track_errors import TrackErrors, track_errors
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.tracks import Odometry, Ranges, Track, TruePath
 
 HALF_TRACK_M = 0.0785
 """Half the distance of the wheels. The columns "right" and "left" are exchanged (README of the data)."""

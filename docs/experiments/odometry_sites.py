@@ -20,16 +20,18 @@ from pathlib import Path
 import numpy as np
 from calibrate_drives import Drive
 
-from uwb_mitigation.evaluation.site_data import read_site
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.robot_estimator import make_estimator
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
-from uwb_mitigation.positioning.tracks import Ranges, TruePath, track_errors
-from uwb_mitigation.training import site_calibration, site_solution
+from uwb_mitigation.positioning.online.robot_estimator import make_estimator
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.track_errors import track_errors
+from uwb_mitigation.training.site import calibration as site_calibration
+from uwb_mitigation.training.site import solution as site_solution
+from uwb_mitigation.training.site.data import read_site
+from uwb_mitigation.types.tracks import Ranges, TruePath
 
 HEIGHT = Height(0.0, 0.05)
 STARTS = 8

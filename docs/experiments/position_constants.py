@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.positions import HEIGHT, at_truths, hanyang_run
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import TrackErrors
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.track_errors import TrackErrors
 
 LEAST_COVERAGE = 0.85
 CHANGES = [

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.processing.job import Job, process_bag
+from uwb_mitigation.commands.offline.process import Job, process_bag
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 
 count = int(sys.argv[1])
 generator = np.random.default_rng(0)

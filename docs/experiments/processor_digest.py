@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import SHIPPED, shipped_model_path
-from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import SHIPPED, shipped_model_path
+from uwb_mitigation.recordings.opening import open_recording
 
 
 def main(recordings: list[Path]) -> None:

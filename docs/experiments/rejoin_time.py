@@ -19,8 +19,8 @@ import rclpy
 from rclpy.node import Node
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.bag.writer import BagWriter
-from uwb_mitigation.sources.simulated import SimulatedSource
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.simulated import SimulatedSource
 
 BARE = """
 import rclpy, time

@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.measurement import SAMPLE_PERIOD_S, Encoding, RangeColumns, Status
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, Encoding, RangeColumns, Status
 
 LIGHT_M_PER_TAP = 299_792_458.0 * SAMPLE_PERIOD_S
 WAVELENGTH_M = 299_792_458.0 / 6489.6e6

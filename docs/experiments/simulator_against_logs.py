@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation.linear_fit import fit_linear_bias
-from uwb_mitigation.sources.decaranging import DecaRangingFolder
-from uwb_mitigation.sources.simulated import SimulatedSource, SimulatedSurvey
+from uwb_mitigation.recordings.decaranging import DecaRangingFolder
+from uwb_mitigation.simulation.simulated import SimulatedSource, SimulatedSurvey
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
 
 count = int(sys.argv[2]) if len(sys.argv) > 2 else 6000
 line = None

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from uwb_mitigation.sources.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
-from uwb_mitigation.sources.simulation.radio import Boards
-from uwb_mitigation.sources.simulation.scene import FloorPlan, Point
+from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
+from uwb_mitigation.simulation.radio import Boards
+from uwb_mitigation.simulation.scene import FloorPlan, Point
 
 SITES = ("flat", "office")
 """Types of buildings, with equal probability."""

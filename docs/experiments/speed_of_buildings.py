@@ -6,9 +6,9 @@ Argument: the number of placements. 100,352 placements took 102 s on two busy co
 import sys
 import time
 
-from uwb_mitigation.preprocessing import Preprocessing
-from uwb_mitigation.sources.simulation.buildings import PLACEMENTS
-from uwb_mitigation.training.simulated import building_dataset
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.simulation.buildings import PLACEMENTS
+from uwb_mitigation.training.data.simulated import building_dataset
 
 if __name__ == "__main__":
     blocks = -(-int(sys.argv[1]) // PLACEMENTS)

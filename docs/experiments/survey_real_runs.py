@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.positions import HEIGHT, hanyang_run
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.survey import displacements, survey
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.batch.survey import displacements, survey
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 
 OFF_M = 1.5
 

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation import zero_shot
-from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.training.data.dataset import build_dataset
+from uwb_mitigation.training.evaluation import zero_shot
+from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, coverage
 
 with open_recording(Path(sys.argv[1])) as source:
     records = list(source)

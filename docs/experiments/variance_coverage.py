@@ -7,11 +7,11 @@ Arguments: the simulated recording, and the bundle. Within one standard deviatio
 import sys
 from pathlib import Path
 
-from uwb_mitigation.evaluation.dataset import build_dataset
-from uwb_mitigation.evaluation.metrics import coverage
-from uwb_mitigation.model.bundle import Session, load_bundle
-from uwb_mitigation.paper.data import split_by_name
-from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.training.data.dataset import build_dataset
+from uwb_mitigation.training.evaluation.metrics import coverage
+from uwb_mitigation.training.paper.data import split_by_name
 
 bundle = load_bundle(Path(sys.argv[2]))
 card = bundle.card

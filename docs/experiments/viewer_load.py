@@ -19,15 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test"))
 
 from browser import Browser, chromium
 
-from uwb_mitigation.bag.codec import MeasurementKey
-from uwb_mitigation.measurement import (
-    Cir,
-    CorrectedRange,
-    Encoding,
-    Origin,
-    RangeMeasurement,
-    Status,
-)
+from uwb_mitigation.types.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.ros.codec import MeasurementKey
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.scene import AnchorPosition, Pose, Scene

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from uwb_mitigation.evaluation.accuracy import evaluate
-from uwb_mitigation.mitigation import Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.shipped import model_path
-from uwb_mitigation.sources.opening import open_recording
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.shipped import model_path
+from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.training.evaluation.accuracy import evaluate
 
 with open_recording(Path(sys.argv[1])) as source:
     records = list(source)[:: int(sys.argv[2])]

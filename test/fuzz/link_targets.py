@@ -5,12 +5,12 @@
 
 from __future__ import annotations
 
-from uwb_mitigation.link import messages
-from uwb_mitigation.link.board import Board
-from uwb_mitigation.link.events import LinkState
-from uwb_mitigation.link.framing import Frame, FrameDecoder, encode_frame
-from uwb_mitigation.link.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, Mode
-from uwb_mitigation.link.session import BoardSession
+from benchmarks.equipment.board import Board
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.events import LinkState
+from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.radios.wire.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, Mode
+from uwb_mitigation.radios.wire.session import BoardSession
 
 EPOCH = 1_760_000_000 * 10**9
 

@@ -1,115 +1,28 @@
-"""`uwb-mitigation board`: an emulated board, the antenna delay of radios, and the firmware of boards."""
+"""`uwb-mitigation board`: the antenna delay of radios, and the firmware of boards."""
 
 from __future__ import annotations
 
-import math
-import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table, print_line
-from uwb_mitigation.errors import ModelError, ParameterError, check_name, parse_id
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.console import JsonOption, Table, print_line
+from uwb_mitigation.errors import ModelError, ParameterError, parse_id
 from uwb_mitigation.files import write_atomically
 
 if TYPE_CHECKING:
-    from uwb_mitigation.link.messages import Hello
-    from uwb_mitigation.link.radio_settings import RadioSettings
-    from uwb_mitigation.mitigation import Mitigation
-    from uwb_mitigation.radio.antenna_delay import AntennaDelay
-    from uwb_mitigation.sources.source import Source
+    from uwb_mitigation.radios.dw1000.antenna_delay import AntennaDelay
+    from uwb_mitigation.radios.settings import RadioSettings
 
 ModelOption = Annotated[
     Path | None, typer.Option(help="Int8 bundle. Default: the shipped one.", show_default=False)
 ]
 
-app = typer.Typer(help="Emulate a board, calibrate radios, build firmware.", no_args_is_help=True)
-
-
-@app.command()
-def emulate(
-    recording: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[RECORDING]", help="Recording that is played in a loop. Default: simulated ranges."
-        ),
-    ] = None,
-    link: Annotated[Path | None, typer.Option(help="Symbolic link to the port while the board runs.")] = None,
-    rate: Annotated[float, typer.Option(help="Rate of the measurements, Hz.")] = 50.0,
-    model: Annotated[Path | None, typer.Option(help="Bundle on the board.")] = None,
-    mode: Annotated[str, typer.Option(help="Initial mode: host or device.")] = "host",
-    duration: Annotated[float | None, typer.Option(help="Duration, s. Default: until Ctrl-C.")] = None,
-    damage: Annotated[
-        float, typer.Option(help="Share of bytes that are flipped, dropped and inserted, each.")
-    ] = 0.0,
-    lose: Annotated[float, typer.Option(help="Share of lost messages.")] = 0.0,
-    duplicate: Annotated[float, typer.Option(help="Share of duplicated messages.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of the faults and of simulated measurements.")] = 1,
-    json: JsonOption = None,
-) -> None:
-    """Emulate a board on a pseudo-terminal.
-
-    Open the printed port like /dev/ttyACM0.
-    """
-    from uwb_mitigation.link.emulated_board import EmulatedBoard
-    from uwb_mitigation.link.faults import Faults
-    from uwb_mitigation.link.layout import Mode
-
-    check_name("mode", mode, ("host", "device"))
-    if duration is not None and not duration > 0:
-        raise ParameterError(f"duration = {duration}", valid="above 0")
-    if seed < 0:
-        raise ParameterError(f"seed = {seed}", valid="0 or more")
-    faults = Faults(damage, damage, damage, lose, duplicate)
-    identity, mitigation = _firmware(model)
-    with open_source(recording, rate, seed) as source:
-        board = EmulatedBoard(
-            source,
-            rate_hz=rate,
-            identity=identity,
-            corrector=mitigation,
-            mode=Mode[mode.upper()],
-            faults=faults,
-            link=link,
-            seed=seed,
-        )
-        with board:
-            print_line(f"{source.name} at {board.port}")
-            end_s = time.monotonic() + (duration or math.inf)
-            while board.failure is None and time.monotonic() < end_s:
-                time.sleep(0.05)
-    console.write_json(json, {"sent": board.sent_measurements})
-    if board.failure is not None:
-        raise board.failure
-
-
-def open_source(recording: Path | None, rate: float, seed: int) -> Source:
-    """Return the source of measurements: a recording, or the simulator without one."""
-    if recording is None:
-        from uwb_mitigation.sources.simulated import SimulatedSource
-
-        return SimulatedSource(seed=seed, rate_hz=rate)
-    from uwb_mitigation.sources.opening import open_recording
-
-    return open_recording(recording)
-
-
-def _firmware(model: Path | None) -> tuple[Hello, Mitigation | None]:
-    from uwb_mitigation.link.emulated_board import EMULATED
-
-    if model is None:
-        return EMULATED, None
-    from uwb_mitigation.mitigation import Mitigation
-    from uwb_mitigation.model.bundle import load_bundle
-
-    bundle = load_bundle(model)
-    return replace(EMULATED, model_id=bundle.model_id, window=bundle.preprocessing.samples), Mitigation(
-        bundle
-    )
+app = typer.Typer(help="Calibrate radios, build firmware.", no_args_is_help=True)
 
 
 class RadioSource(str, Enum):
@@ -170,8 +83,8 @@ def antenna_delay(
 
         uwb-mitigation board antenna-delay --distance 5.01 --port /dev/ttyACM0,/dev/ttyACM1 -o antenna_delay.yaml
     """
-    from uwb_mitigation.radio.antenna_delay import measure
-    from uwb_mitigation.radio.bus import bus_opener
+    from uwb_mitigation.radios.dw1000.antenna_delay import measure
+    from uwb_mitigation.radios.dw1000.bus import bus_opener
 
     if not 0.3 <= distance <= 100.0:
         raise ParameterError(f"--distance {distance}", valid="0.3 to 100 m")
@@ -202,7 +115,7 @@ def antenna_delay(
 def _settings(
     anchor: str | None, channel: int, prf: int, preamble: int, data_rate: int, start: int
 ) -> RadioSettings:
-    from uwb_mitigation.link.radio_settings import RadioSettings
+    from uwb_mitigation.radios.settings import RadioSettings
 
     try:
         anchors = () if anchor is None else (parse_id(anchor),)
@@ -260,10 +173,10 @@ def export_c(
 
     It contains weights, constants and golden vectors.
     """
-    from uwb_mitigation.firmware_export.export import GOLDEN_VECTORS, export_bundle
-    from uwb_mitigation.measurement import RadioType
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.model.shipped import model_path
+    from uwb_mitigation.mitigation.embedded.export import GOLDEN_VECTORS, export_bundle
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import model_path
+    from uwb_mitigation.types.measurement import RadioType
 
     bundle = load_bundle(model_path(model))
     if RadioType.DW1000 not in bundle.card.radios:
@@ -300,10 +213,10 @@ def build_image(
     """
     import tempfile
 
-    from uwb_mitigation.firmware_export import toolchain
-    from uwb_mitigation.firmware_export.export import export_bundle
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.model.shipped import model_path
+    from uwb_mitigation.mitigation.embedded import toolchain
+    from uwb_mitigation.mitigation.embedded.export import export_bundle
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import model_path
 
     if not output.absolute().parent.is_dir():
         raise ParameterError(f"--output {output}", valid="a file in an existing folder")

@@ -9,9 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.checks import check_output
-from uwb_mitigation.commands.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.commands.positioning import (
     AnchorsOption,
     AreaOption,
@@ -20,17 +17,20 @@ from uwb_mitigation.commands.positioning import (
     HeightTopicOption,
     OffsetOption,
 )
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.checks import check_output
+from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from uwb_mitigation.evaluation.site_data import SiteData
-    from uwb_mitigation.model.bundle import Bundle
-    from uwb_mitigation.positioning.anchors import AnchorMap
-    from uwb_mitigation.positioning.pose_alignment import PosePath
-    from uwb_mitigation.training.site_calibration import SiteCalibration
+    from uwb_mitigation.mitigation.model.bundle import Bundle
+    from uwb_mitigation.training.site.calibration import SiteCalibration
+    from uwb_mitigation.training.site.data import SiteData
+    from uwb_mitigation.types.anchors import AnchorMap
+    from uwb_mitigation.types.tracks import PosePath
 
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
 BASE_FRAME = "base_link"
@@ -117,10 +117,11 @@ def calibrate(
 
         uwb-mitigation process other.mcap --model site.onnx --offsets site.offsets.yaml -o corrected.mcap
     """
-    from uwb_mitigation.commands.bundles import bundle_for
+    from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
-    from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
-    from uwb_mitigation.training import site_calibration, site_solution
+    from uwb_mitigation.training.site import calibration as site_calibration
+    from uwb_mitigation.training.site import solution as site_solution
+    from uwb_mitigation.types.anchors import anchors_path, load_anchors
 
     check_output(output)
     for file in (output, site_calibration.offsets_file(output), *([report] if report else [])):
@@ -190,7 +191,7 @@ def calibrate(
     print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     if report is not None:
         from uwb_mitigation.files import write_atomically
-        from uwb_mitigation.training.site_page import site_page
+        from uwb_mitigation.training.site.page import site_page
 
         write_atomically(report, site_page(calibration, name, bundle, (str(output), str(offsets_path))))
         print_line(f"Wrote {report}.")
@@ -209,9 +210,9 @@ def _gather(
 ) -> SiteData:
     from contextlib import ExitStack
 
-    from uwb_mitigation.bag.pose_paths import read_heights
-    from uwb_mitigation.evaluation.site_data import read_site
-    from uwb_mitigation.sources.opening import open_recording
+    from uwb_mitigation.recordings.bag.pose_paths import read_heights
+    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.training.site.data import read_site
 
     heights = None if height_topic is None else [read_heights(bag, height_topic, height_sd) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
@@ -235,8 +236,8 @@ def _poses(
     """Return, for each tag, the poses of its body in each bag; and the lever arms, (T, 3)."""
     import numpy as np
 
-    from uwb_mitigation.bag.pose_paths import read_bodies
-    from uwb_mitigation.bag.poses import UWB_TAG, tag_of_frame
+    from uwb_mitigation.recordings.bag.pose_paths import read_bodies
+    from uwb_mitigation.types.ros.poses import UWB_TAG, tag_of_frame
 
     if lever_arm_m is not None and len(site.tags) > 1:
         raise ParameterError(
@@ -266,7 +267,7 @@ def _poses(
 
 def _body_of_tag(tag_id: int, bodies: Iterable[str], where: str) -> str:
     """Return the body of a tag: its own frame in any namespace, otherwise the only body that is not a tag."""
-    from uwb_mitigation.bag.poses import tag_frame, tag_of_frame
+    from uwb_mitigation.types.ros.poses import tag_frame, tag_of_frame
 
     names = sorted(bodies)
     tag_frames = [name for name in names if tag_of_frame(name) == tag_id]
@@ -284,7 +285,7 @@ def _lever_arm_in(
     bags: list[Path], bodies: list[str], frames: Iterable[str]
 ) -> tuple[float, float, float] | None:
     """Return the transform from robot to antenna from the bags that contain it; None if no bag does."""
-    from uwb_mitigation.bag.pose_paths import read_lever_arm
+    from uwb_mitigation.recordings.bag.pose_paths import read_lever_arm
 
     arms = [
         (bag, read_lever_arm(bag, body or BASE_FRAME, frame))

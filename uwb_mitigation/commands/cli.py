@@ -15,7 +15,6 @@ import uwb_mitigation
 from uwb_mitigation.commands import (
     board,
     calibrate,
-    console,
     data,
     doctor,
     field_report,
@@ -27,6 +26,7 @@ from uwb_mitigation.commands import (
     universal,
     view,
 )
+from uwb_mitigation.commands.support import console
 from uwb_mitigation.errors import UwbMitigationError, missing_dependency
 
 PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {

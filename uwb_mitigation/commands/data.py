@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, Table, print_line
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.console import JsonOption, Table, print_line
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.positioning.tracks import Imu, Odometry
-    from uwb_mitigation.sources.source import Source
+    from uwb_mitigation.types.source import Source
+    from uwb_mitigation.types.tracks import Imu, Odometry
 
 app = typer.Typer(help="Import, simulate and show recordings.", no_args_is_help=True)
 
@@ -88,8 +88,8 @@ def import_recordings(
     json: JsonOption = None,
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
-    from uwb_mitigation.commands import mapped_report
-    from uwb_mitigation.sources.opening import open_mapped
+    from uwb_mitigation.commands.support import mapped_report
+    from uwb_mitigation.recordings.opening import open_mapped
 
     if dry_run and not mapping:
         raise ParameterError("--dry-run needs --map", valid="--map FILE")
@@ -164,9 +164,9 @@ def _write(
     Raises:
         RecordingError: there are no ranges; or a source is damaged, after the bag was written.
     """
-    from uwb_mitigation.bag.odometry import write_robot
-    from uwb_mitigation.bag.writer import BagWriter
-    from uwb_mitigation.sources.inventory import Inventory, PauseShortener
+    from uwb_mitigation.recordings.bag.odometry import write_robot
+    from uwb_mitigation.recordings.bag.writer import BagWriter
+    from uwb_mitigation.recordings.inventory import Inventory, PauseShortener
 
     inventory = Inventory()
     kinds = {source.simulated for source in sources}
@@ -222,9 +222,9 @@ def _write(
 
 def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu | None] | None:
     """Return odometry and IMU data of a simulated drive that starts at `start_ns`, or the odometry of a mapping."""
-    from uwb_mitigation.sources.inventory import FIRST_DATE_NS
-    from uwb_mitigation.sources.mapped import MappedRecording
-    from uwb_mitigation.sources.simulated import SimulatedSource
+    from uwb_mitigation.recordings.inventory import FIRST_DATE_NS
+    from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+    from uwb_mitigation.simulation.simulated import SimulatedSource
 
     if isinstance(source, MappedRecording) and (odometry := source.motion) is not None:
         # Without a date, the first range starts at `start_ns`.
@@ -244,8 +244,8 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
     Raises:
         ParameterError: a number is out of its range.
     """
-    from uwb_mitigation.sources import simulated
-    from uwb_mitigation.sources.simulated import SimulatedBuildings
+    from uwb_mitigation.simulation import simulated
+    from uwb_mitigation.simulation.simulated import SimulatedBuildings
 
     if like in (Like.SURVEY, Like.BUILDINGS):
         if exchanges < 1 or ranges % exchanges:
@@ -263,10 +263,10 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
 
 def _open(path: Path, cir: CirChoice) -> Source:
     """Open any recording, including DeepUWB's pickle; raises the errors of `open_recording`."""
-    from uwb_mitigation.sources.opening import open_recording
+    from uwb_mitigation.recordings.opening import open_recording
 
     if path.suffix == ".pkl":
-        from uwb_mitigation.paper.deepuwb import DeepUwbRecording
+        from uwb_mitigation.training.paper.deepuwb import DeepUwbRecording
 
         return DeepUwbRecording(path)
     return open_recording(path, cir=cir.value)
@@ -279,8 +279,8 @@ def info(
     json: JsonOption = None,
 ) -> None:
     """Show the contents of a recording: pairs, counts, warnings."""
-    from uwb_mitigation.sources.inventory import Inventory
-    from uwb_mitigation.sources.mcap import McapRecording
+    from uwb_mitigation.recordings.inventory import Inventory
+    from uwb_mitigation.recordings.mcap import McapRecording
 
     source = _open(path, cir)
     inventory = Inventory()
@@ -300,7 +300,7 @@ def info(
 
 
 def _save_anchors(source: Source, bag: Path) -> None:
-    from uwb_mitigation.sources.anchors_file import HasAnchors, anchors_path, save_anchors
+    from uwb_mitigation.types.anchors import HasAnchors, anchors_path, save_anchors
 
     if isinstance(source, HasAnchors):
         path = anchors_path(bag)

@@ -14,8 +14,8 @@ from typing import NamedTuple
 from rich.markup import escape
 from rich.table import Column, Table
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import UwbMitigationError
 
 LIBRARIES = {
@@ -99,9 +99,9 @@ def _load_ros() -> str:
 
 
 def _compare_model() -> str:
-    from uwb_mitigation.firmware_export.export import compare_with_reference
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.model.shipped import default_model_path
+    from uwb_mitigation.mitigation.embedded.export import compare_with_reference
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import default_model_path
 
     bundle = load_bundle(default_model_path())
     if wrong := compare_with_reference(bundle):

@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import uwb_mitigation
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, print_line
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.console import JsonOption, print_line
 from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.radio.field_checks import Check, Observation
+    from uwb_mitigation.commands.field.checks import Check, Observation
 
 
 def field_report(
@@ -54,8 +54,8 @@ def field_report(
 
         uwb-mitigation field-report --source uci --port /dev/ttyACM0,/dev/ttyACM1 --distance 3.00
     """
-    from uwb_mitigation.radio.field_checks import Observation, Verdict, run_checks
-    from uwb_mitigation.radio.field_test import observe
+    from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
+    from uwb_mitigation.commands.field.test import observe
 
     if not 0.1 <= distance <= 500.0:
         raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")
@@ -88,9 +88,9 @@ def _ask(port: str) -> None:
 
 def _correct(observation: Observation) -> None:
     """Correct the ranges with the shipped model if it was trained for the radio."""
-    from uwb_mitigation.mitigation import Mitigation
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.model.shipped import model_path
+    from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import model_path
 
     bundle = load_bundle(model_path(None))
     cirs = [measured.cir for measured in observation.ranges]
@@ -104,10 +104,10 @@ def _correct(observation: Observation) -> None:
 
 def _write(folder: Path, source: str, observation: Observation, checks: list[Check]) -> None:
     """Write the page, the values and the ranges."""
-    from uwb_mitigation.bag.writer import BagWriter
-    from uwb_mitigation.evaluation.page import render_page
-    from uwb_mitigation.measurement import Record, Truth
-    from uwb_mitigation.radio.field_test import SOURCES
+    from uwb_mitigation.commands.field.test import SOURCES
+    from uwb_mitigation.recordings.bag.writer import BagWriter
+    from uwb_mitigation.training.page import render_page
+    from uwb_mitigation.types.measurement import Record, Truth
 
     system = {
         "uwb_mitigation": uwb_mitigation.__version__,
@@ -124,7 +124,7 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
         "ranges": len(observation.ranges),
         "system": system,
     }
-    templates = Path(uwb_mitigation.__file__).parent / "radio" / "templates"
+    templates = Path(__file__).parent / "field" / "templates"
     shown = {name: counts[name] for name in ("pass", "warning", "fail")}
     severity = ("fail", "warning", "pass")
     first_failed = sorted(checks, key=lambda check: severity.index(check.verdict.value))

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from uwb_mitigation.commands import console, model_tables
-from uwb_mitigation.commands.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.checks import OffsetsOption, check_output, needs_torch, scaling_of
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.support import console, model_tables
+from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support.checks import OffsetsOption, check_output, needs_torch, scaling_of
+from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, check_name
 
 if TYPE_CHECKING:
-    from uwb_mitigation.evaluation.dataset import Dataset
-    from uwb_mitigation.preprocessing import Preprocessing, Scaling
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+    from uwb_mitigation.training.data.dataset import Dataset
 
 DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
@@ -91,9 +91,9 @@ def train(
     candidate. It is not used with --recipe or --model. A network trained on the data is selected only if it reduces
     the error on held-out data.
     """
-    from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.preprocessing import Preprocessing
-    from uwb_mitigation.training.options import FitOptions
+    from uwb_mitigation.mitigation.model.architecture import Remnet
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.training.fit.options import FitOptions
 
     if (data is None) == (from_bag is None):
         raise ParameterError("no training data, or two sources of it", valid="either --data or --from-bag")
@@ -113,8 +113,8 @@ def train(
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
     check_output(output)
     with needs_torch():
-        from uwb_mitigation.training import candidates, fitting  # noqa: F401
         from uwb_mitigation.training import train as training
+        from uwb_mitigation.training.fit import candidates
 
     if data is not None:
         check_name("recipe", recipe_name, (training.AUTO, *candidates.NEW_MODELS))
@@ -157,9 +157,9 @@ def quantize(
 
     Its training or calibration data determine the scales of the activations.
     """
-    from uwb_mitigation.evaluation import recordings
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.training import quantization
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.training.data import recordings
+    from uwb_mitigation.training.fit import quantization
 
     source = load_bundle(model)
     quantization.check(source, percentile)
@@ -220,10 +220,10 @@ def evaluate(
         return
     if unused := _options_given(context, _CROSS_VALIDATION_OPTIONS):
         raise ParameterError(f"{unused} without --cross-validate", valid="only with --cross-validate")
-    from uwb_mitigation.evaluation import accuracy
-    from uwb_mitigation.mitigation import Mitigation
-    from uwb_mitigation.offsets import read_offsets
-    from uwb_mitigation.sources.opening import open_recording
+    from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.training.evaluation import accuracy
+    from uwb_mitigation.types.offsets import read_offsets
 
     mitigation = Mitigation(bundle_for(model, data), read_offsets(offsets or ""))
     with open_recording(data) as source, console.reading() as on_record:
@@ -233,20 +233,20 @@ def evaluate(
 
 
 def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
-    from uwb_mitigation.evaluation import splits
-    from uwb_mitigation.model.architecture import Remnet
-    from uwb_mitigation.preprocessing import Preprocessing
-    from uwb_mitigation.training.options import FitOptions
+    from uwb_mitigation.mitigation.model.architecture import Remnet
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.training.data import splits
+    from uwb_mitigation.training.fit.options import FitOptions
 
     check_name("group of --cross-validate", group, [kind.value for kind in splits.Group])
     if not 1 <= seeds <= 100:
         raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
-    from uwb_mitigation.model.bundle import load_bundle
-    from uwb_mitigation.model.shipped import default_model_path
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import default_model_path
 
     with needs_torch():
         from uwb_mitigation.training import comparison
-        from uwb_mitigation.training.candidates import Recipe
+        from uwb_mitigation.training.fit.candidates import Recipe
 
     _, dataset = _dataset(data, Preprocessing(Remnet().samples, scaling))
     universal = load_bundle(default_model_path(scaling))
@@ -260,7 +260,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
 def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = ()) -> tuple[str, Dataset]:
     """Return name and measurements of a recording; print the number of skipped ranges by reason."""
-    from uwb_mitigation.evaluation import recordings
+    from uwb_mitigation.training.data import recordings
 
     with console.reading() as on_record:
         name, dataset = recordings.load(data, preprocessing, truth, on_record)

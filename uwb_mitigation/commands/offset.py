@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, format_id, parse_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.evaluation.radio_offsets import OffsetEstimate
+    from uwb_mitigation.training.site.radio_offsets import OffsetEstimate
 
 MAX_DISTANCE_M = 1000.0
 
@@ -61,11 +61,11 @@ def offset(
         uwb-mitigation offset los.mcap --distance 5.00 -o offsets.yaml
         ros2 param set /mitigator offsets offsets.yaml
     """
-    from uwb_mitigation.evaluation import radio_offsets
     from uwb_mitigation.files import write_atomically
-    from uwb_mitigation.mitigation import Mitigation
-    from uwb_mitigation.offsets import dump_offsets
-    from uwb_mitigation.sources.opening import open_recording
+    from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.training.site import radio_offsets
+    from uwb_mitigation.types.offsets import dump_offsets
 
     if (distance is None) == (not truth):
         raise ParameterError("no distance, or two sources of it", valid="either --distance or --truth")
@@ -101,7 +101,7 @@ def _id(name: str, text: str) -> int:
 
 
 def _show(estimate: OffsetEstimate) -> None:
-    from uwb_mitigation.commands.console import MAX_ROWS, print_line, show_table
+    from uwb_mitigation.commands.support.console import MAX_ROWS, print_line, show_table
 
     rows: list[tuple[object, ...]] = []
     for placement in estimate.placements:

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.checks import needs_torch, scaling_of
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.checks import needs_torch, scaling_of
+from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.paper.data import Parts
-    from uwb_mitigation.paper.results import ExperimentResults
+    from uwb_mitigation.training.paper.data import Parts
+    from uwb_mitigation.training.paper.results import ExperimentResults
 
 app = typer.Typer(
     help="The paper's experiment, tables and figures; DeepUWB, downloaded or simulated.", no_args_is_help=True
@@ -59,7 +59,7 @@ def fetch(
 
     `data import` and all commands of `paper` read the file.
     """
-    from uwb_mitigation.paper.download import fetch_deepuwb
+    from uwb_mitigation.training.paper.download import fetch_deepuwb
 
     with console.progress() as bar:
         bar.add_task("downloading", total=None)
@@ -88,7 +88,7 @@ def simulate(
     The bag is marked as simulated. In a checkout, `make paper` runs the complete experiment on it.
     """
     from uwb_mitigation.commands.data import write_simulated
-    from uwb_mitigation.paper.simulated import SimulatedDeepUwb
+    from uwb_mitigation.training.paper.simulated import SimulatedDeepUwb
 
     source = SimulatedDeepUwb(seed=seed, ranges=ranges, exchanges=exchanges)
     write_simulated(source, ranges, seed, output, 5.0, force, json)
@@ -120,7 +120,7 @@ def protocol(
     """
     lengths = _lengths(windows)
     with needs_torch():
-        from uwb_mitigation.paper import experiment
+        from uwb_mitigation.training.paper import experiment
 
     wanted = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)
     options = replace(experiment.PAPER, epochs=epochs, learning_rate=learning_rate)
@@ -154,10 +154,10 @@ def report(
     """Write an HTML page with the tables and figures of the paper and of your data."""
     # Read everything before the work begins, so that a missing library or a wrong file is an early error.
     from uwb_mitigation.files import write_atomically
-    from uwb_mitigation.paper import published, results
-    from uwb_mitigation.paper import report as reports
-    from uwb_mitigation.paper.data import load
-    from uwb_mitigation.preprocessing import Preprocessing, Scaling
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+    from uwb_mitigation.training.paper import published, results
+    from uwb_mitigation.training.paper import report as reports
+    from uwb_mitigation.training.paper.data import load
 
     trainings = None if models is None else results.read(results.ExperimentResults, models / results.RESULTS)
     bench = () if firmware is None else results.read(results.FirmwareResults, firmware).rows
@@ -184,8 +184,8 @@ def _command() -> str:
 
 
 def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
-    from uwb_mitigation.paper import data as parts
-    from uwb_mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.training.paper import data as parts
 
     preprocessing = Preprocessing(samples, scaling_of(scaling))
     with console.reading() as on_record:
@@ -195,7 +195,7 @@ def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
 
 
 def _lengths(text: str) -> list[int]:
-    from uwb_mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing
 
     try:
         lengths = [int(part) for part in text.split(",")]
@@ -222,8 +222,8 @@ def _make_folder(path: Path) -> None:
 
 
 def _show_experiment(result: ExperimentResults) -> None:
-    from uwb_mitigation.commands.console import print_line, show_table
-    from uwb_mitigation.paper import tables
+    from uwb_mitigation.commands.support.console import print_line, show_table
+    from uwb_mitigation.training.paper import tables
 
     provenance = tables.Provenance(result.data, result.split, "", "")
     table = tables.accuracy(result, provenance, "", "Measured")

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.console import JsonOption, print_line, show_table, warn
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.positioning.anchors import AnchorMap
-    from uwb_mitigation.positioning.survey import SurveyResult
-    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
-    from uwb_mitigation.processing.tracking import HeldOut, TagTracks
-    from uwb_mitigation.sources.recorded_ranges import RecordedRanges
+    from uwb_mitigation.commands.offline.track import HeldOut, TagTracks
+    from uwb_mitigation.positioning.batch.survey import SurveyResult
+    from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+    from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
+    from uwb_mitigation.types.anchors import AnchorMap
 
 _COLUMNS = {
     "rmse": ("RMSE", "{:.3f}"),
@@ -132,11 +132,11 @@ def track(
 
         uwb-mitigation track drive.mcap -o track.mcap --height 0.4 --odometry /odom --imu /imu
     """
-    from uwb_mitigation.bag.writer import BagWriter
+    from uwb_mitigation.commands.offline.track import held_out, track_tag, tum_file, write_tracks
+    from uwb_mitigation.commands.offline.track import tum as tum_text
     from uwb_mitigation.files import write_atomically
-    from uwb_mitigation.processing.tracking import held_out, track_tag, tum_file, write_tracks
-    from uwb_mitigation.processing.tracking import tum as tum_text
-    from uwb_mitigation.sources.anchors_file import anchors_path, save_anchors
+    from uwb_mitigation.recordings.bag.writer import BagWriter
+    from uwb_mitigation.types.anchors import anchors_path, save_anchors
 
     config, recorded = _read(bag, anchors, height, height_sd, height_topic, area, stamp_offset, acceleration)
     config = replace(config, robot=_robot_of(bag, odometry, imu, lever_arm, recorded))
@@ -202,8 +202,8 @@ def survey(
     not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
-    from uwb_mitigation.positioning.survey import survey as find
-    from uwb_mitigation.sources.anchors_file import save_anchors
+    from uwb_mitigation.positioning.batch.survey import survey as find
+    from uwb_mitigation.types.anchors import save_anchors
 
     if not 0.0 < off <= 100.0:
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
@@ -238,12 +238,12 @@ def _read(
     stamp_offset: float,
     acceleration: float,
 ) -> tuple[EstimatorConfig, RecordedRanges]:
-    from uwb_mitigation.bag.pose_paths import read_heights
     from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.noise_model import NoiseModel
-    from uwb_mitigation.positioning.tag_estimator import EstimatorConfig
-    from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
-    from uwb_mitigation.sources.recorded_ranges import read_ranges
+    from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+    from uwb_mitigation.recordings.bag.pose_paths import read_heights
+    from uwb_mitigation.recordings.recorded_ranges import read_ranges
+    from uwb_mitigation.types.anchors import anchors_path, load_anchors
 
     if not abs(stamp_offset) <= 3600.0:
         raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
@@ -286,9 +286,9 @@ def _robot_of(
             raise ParameterError("--imu or --lever-arm without --odometry", valid="with --odometry TOPIC")
         return None
     _check_one_tag("--odometry", recorded)
-    from uwb_mitigation.bag.odometry import BASE_LINK, read_imu, read_odometry
-    from uwb_mitigation.bag.pose_paths import read_lever_arm, read_range_frame
-    from uwb_mitigation.positioning.tag_estimator import RobotData
+    from uwb_mitigation.positioning.online.tag_estimator import RobotData
+    from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odometry
+    from uwb_mitigation.recordings.bag.pose_paths import read_lever_arm, read_range_frame
 
     if arm is None:
         arm = read_lever_arm(bag, BASE_LINK, read_range_frame(bag)) or (0.0, 0.0, 0.0)
@@ -385,7 +385,7 @@ def _show_survey(result: SurveyResult) -> None:
 
 
 def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMap) -> dict[str, Any]:
-    from uwb_mitigation.processing.tracking import KINDS, pooled
+    from uwb_mitigation.commands.offline.track import KINDS, pooled
 
     known = any(one.errors["live"].epochs for one in tracks)
     hdops = [one.hdop for one in tracks if math.isfinite(one.hdop)]

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.checks import OffsetsOption
-from uwb_mitigation.commands.console import JsonOption, Table
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support.checks import OffsetsOption
+from uwb_mitigation.commands.support.console import JsonOption, Table
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.processing.job import Job, Outcome
+    from uwb_mitigation.commands.offline.process import Job, Outcome
 
 
 def process(
@@ -53,9 +53,9 @@ def process(
 
     All other messages are unchanged.
     """
-    from uwb_mitigation.offsets import read_offsets
-    from uwb_mitigation.processing import parallel
-    from uwb_mitigation.processing.job import Job
+    from uwb_mitigation.commands.offline import parallel
+    from uwb_mitigation.commands.offline.process import Job
+    from uwb_mitigation.types.offsets import read_offsets
 
     if workers is not None and workers < 1:
         raise ParameterError(f"jobs = {workers}", valid="1 or more")
@@ -96,7 +96,7 @@ def _make_folder(path: Path) -> None:
 
 
 def _process_one(job: Job) -> Outcome:
-    from uwb_mitigation.processing.job import try_process
+    from uwb_mitigation.commands.offline.process import try_process
 
     with console.progress() as bar:
         task = bar.add_task(escape(job.source.name), total=None)

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from uwb_mitigation.commands import console, model_tables
-from uwb_mitigation.commands.checks import check_output, needs_torch, scaling_of
-from uwb_mitigation.commands.console import JsonOption
+from uwb_mitigation.commands.support import console, model_tables
+from uwb_mitigation.commands.support.checks import check_output, needs_torch, scaling_of
+from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, check_name
 
 MAX_BLOCKS = 10_000
@@ -48,11 +48,11 @@ def train_universal(
 
         uwb-mitigation train-universal --radio dw3000 --samples 13 --scaling max -o dw3000_sts.onnx
     """
-    from uwb_mitigation.model import graph
-    from uwb_mitigation.model.bundle import save_bundle
-    from uwb_mitigation.preprocessing import Preprocessing
-    from uwb_mitigation.sources.simulation.buildings import RADIO
-    from uwb_mitigation.sources.simulation.radio import DW3000_STS
+    from uwb_mitigation.mitigation.model import graph
+    from uwb_mitigation.mitigation.model.bundle import save_bundle
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.simulation.buildings import RADIO
+    from uwb_mitigation.simulation.radio import DW3000_STS
 
     preprocessing = Preprocessing(samples, scaling_of(scaling))
     radios = {"dw1000": RADIO, "dw3000": DW3000_STS}

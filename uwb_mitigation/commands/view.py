@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands import console
-from uwb_mitigation.commands.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
 
 if TYPE_CHECKING:
-    from uwb_mitigation.mitigation import Backend
+    from uwb_mitigation.mitigation.correction import Backend
 
 
 def view(
@@ -71,7 +71,7 @@ def view(
     from threading import Lock
 
     from uwb_mitigation.positioning.geometry import Height
-    from uwb_mitigation.sources.anchors_file import anchors_path, load_anchors
+    from uwb_mitigation.types.anchors import anchors_path, load_anchors
     from uwb_mitigation.viewer.feed import Feed
     from uwb_mitigation.viewer.floor_plan import load_floor_plan
     from uwb_mitigation.viewer.page import View
@@ -121,6 +121,6 @@ def view(
 
 
 def _backend(model: Path | None, bag: Path) -> Backend:
-    from uwb_mitigation.mitigation import Mitigation
+    from uwb_mitigation.mitigation.correction import Mitigation
 
     return Mitigation(bundle_for(model, bag))

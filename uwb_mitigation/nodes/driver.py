@@ -23,25 +23,25 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.bag.codec import encode_corrected, encode_range, encode_truth
-from uwb_mitigation.bag.poses import encode_true_position
-from uwb_mitigation.bag.topics import RANGE_RAW
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
-from uwb_mitigation.link.board_driver import BoardDriver
-from uwb_mitigation.link.connection import PortAddress
-from uwb_mitigation.link.layout import Mode
-from uwb_mitigation.link.messages import Correction
-from uwb_mitigation.link.radio_settings import RadioSettings
-from uwb_mitigation.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
-from uwb_mitigation.nodes import diagnostics, topics
-from uwb_mitigation.nodes.diagnostics import Description
-from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
-from uwb_mitigation.nodes.live_feeds import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
-from uwb_mitigation.nodes.parameter_tables import DRIVER
-from uwb_mitigation.nodes.replay import ReplayFeed
-from uwb_mitigation.nodes.uci_feed import UciFeed, uci_settings
-from uwb_mitigation.offsets import NO_OFFSETS, read_offsets
-from uwb_mitigation.sources.source import Source
+from uwb_mitigation.nodes.feeds.radios import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
+from uwb_mitigation.nodes.feeds.replay import ReplayFeed
+from uwb_mitigation.nodes.feeds.uci import UciFeed, uci_settings
+from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support.diagnostics import Description
+from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.serial import BoardDriver
+from uwb_mitigation.radios.settings import RadioSettings
+from uwb_mitigation.radios.wire.layout import Mode
+from uwb_mitigation.radios.wire.messages import Correction
+from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
+from uwb_mitigation.types.offsets import NO_OFFSETS, read_offsets
+from uwb_mitigation.types.ros.codec import encode_corrected, encode_range, encode_truth
+from uwb_mitigation.types.ros.poses import encode_true_position
+from uwb_mitigation.types.ros.topics import RANGE_RAW
+from uwb_mitigation.types.source import Source
 
 if TYPE_CHECKING:
     from uwb_mitigation.nodes.mitigator import Mitigator
@@ -58,21 +58,21 @@ def open_source(value: Callable[[str], Any]) -> Source:
     """
     # Import here, because each source needs other dependencies.
     if value("source") == "simulated":
-        from uwb_mitigation.sources.simulated import SimulatedSource
+        from uwb_mitigation.simulation.simulated import SimulatedSource
 
         return SimulatedSource(seed=value("seed"), count=value("count"), rate_hz=value("simulated_rate"))
     if not value("path"):
         raise ParameterError("parameter path is empty", valid="the recording to replay, as -p path:=FILE")
     path = Path(value("path")).expanduser()
     if value("source") == "uci":
-        from uwb_mitigation.radio.uci.capture import UciCapture
+        from uwb_mitigation.radios.fira.capture import UciCapture
 
         return UciCapture(path)
     if value("source") == "mcap":
-        from uwb_mitigation.sources.mcap import McapRecording
+        from uwb_mitigation.recordings.mcap import McapRecording
 
         return McapRecording(path, topic=value("topic") or RANGE_RAW)
-    from uwb_mitigation.sources.decaranging import CirFrame, open_decaranging
+    from uwb_mitigation.recordings.decaranging import CirFrame, open_decaranging
 
     return open_decaranging(path, cir=CirFrame(value("cir")))
 
@@ -197,8 +197,8 @@ class Driver(ManagedNode):
 
     def _prepare_topics(self) -> Callable[[], Feed]:
         # Mapping files need pandas and pydantic, which the other sources do not.
-        from uwb_mitigation.nodes.topic_feed import TopicFeed
-        from uwb_mitigation.sources.mapping import load_mapping
+        from uwb_mitigation.nodes.feeds.topic import TopicFeed
+        from uwb_mitigation.recordings.mapping.mapping import load_mapping
 
         if not (name := self.value("map")):
             raise ParameterError(

@@ -23,29 +23,29 @@ from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from uwb_mitigation.bag.codec import (
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
+from uwb_mitigation.nodes import markers
+from uwb_mitigation.nodes.robot_motion import RobotMotion, transform_type
+from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support.lifecycle import ManagedNode
+from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
+from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
+from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
+from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.types.anchors import AnchorMap, load_anchors
+from uwb_mitigation.types.measurement import CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.ros.codec import (
     MeasurementKey,
     decode_corrected,
     decode_frame_id,
     decode_range,
     measurement_key,
 )
-from uwb_mitigation.bag.poses import BodyTwist, encode_odometry, encode_pose, tag_frame, tag_of_frame
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
-from uwb_mitigation.measurement import CorrectedRange, Origin, RangeMeasurement, Status
-from uwb_mitigation.nodes import diagnostics, markers, topics
-from uwb_mitigation.nodes.lifecycle import ManagedNode
-from uwb_mitigation.nodes.parameter_tables import LOCATOR
-from uwb_mitigation.nodes.robot_motion import RobotMotion, transform_type
-from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
-from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
-from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
-from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.robot_estimator import RobotEstimator
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, RobotData
-from uwb_mitigation.positioning.tracks import Estimate, Heading
-from uwb_mitigation.sources.anchors_file import load_anchors
+from uwb_mitigation.types.ros.poses import BodyTwist, encode_odometry, encode_pose, tag_frame, tag_of_frame
+from uwb_mitigation.types.tracks import Estimate, Heading
 
 BATCH = 64
 """Maximum number of queued ranges that one callback processes."""
@@ -198,8 +198,8 @@ class Locator(ManagedNode):
     def _subscribe_to_mapping(self, name: str) -> bool:
         """Subscribe to the topics of a mapping; return False if `name` is that of a topic."""
         # Mapping files need pandas and pydantic, which other ranges do not.
-        from uwb_mitigation.nodes.topic_feed import TopicFeed
-        from uwb_mitigation.sources.mapping import load_mapping, shipped_mappings
+        from uwb_mitigation.nodes.feeds.topic import TopicFeed
+        from uwb_mitigation.recordings.mapping.mapping import load_mapping, shipped_mappings
 
         if name not in shipped_mappings() and not name.endswith((".yaml", ".yml")):
             return False

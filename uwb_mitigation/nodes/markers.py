@@ -11,11 +11,11 @@ from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.nodes import topics
-from uwb_mitigation.positioning.anchors import MAX_ANCHORS, Anchor, AnchorMap
+from uwb_mitigation.nodes.support import topics
 from uwb_mitigation.positioning.geometry import horizontal_ellipse
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
+from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import palette
 from uwb_mitigation.viewer.palette import STATUS_LOOKS
 

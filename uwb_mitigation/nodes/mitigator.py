@@ -17,9 +17,17 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.bag.codec import decode_range, encode_corrected
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import (
+from uwb_mitigation.mitigation.correction import Backend, Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.shipped import model_path
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
+from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
+from uwb_mitigation.nodes.support.parameter_tables import MITIGATOR
+from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     Encoding,
     RadioType,
@@ -27,16 +35,8 @@ from uwb_mitigation.measurement import (
     Segment,
     Status,
 )
-from uwb_mitigation.mitigation import Backend, Mitigation
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.shipped import model_path
-from uwb_mitigation.nodes import diagnostics, topics
-from uwb_mitigation.nodes.diagnostics import MitigatorHealth
-from uwb_mitigation.nodes.lifecycle import ManagedNode, refuse_errors
-from uwb_mitigation.nodes.parameter_tables import MITIGATOR
-from uwb_mitigation.offsets import NO_OFFSETS, Offsets, read_offsets
-from uwb_mitigation.preprocessing import Scaling
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
+from uwb_mitigation.types.ros.codec import decode_range, encode_corrected
 
 # ONNX Runtime is imported later: fail early if it is missing.
 if importlib.util.find_spec("onnxruntime") is None:
@@ -57,7 +57,7 @@ def load(model: str, backend: str = "onnxruntime") -> Backend:
     bundle = load_bundle(model_path(model))
     if backend == "firmware":
         # Import on demand: it compiles C code.
-        from uwb_mitigation.firmware_export.compiled import FirmwareMitigation
+        from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
 
         return FirmwareMitigation(bundle)
     return Mitigation(bundle)

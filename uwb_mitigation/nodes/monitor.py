@@ -17,12 +17,12 @@ from rich.table import Table
 from rich.text import Text
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
-from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_truth
 from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
-from uwb_mitigation.measurement import CorrectedRange, Status, Truth
-from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.processes import spinning_node
-from uwb_mitigation.nodes.spinning import stop_event
+from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support.processes import spinning_node
+from uwb_mitigation.nodes.support.spinning import stop_event
+from uwb_mitigation.types.measurement import CorrectedRange, Status, Truth
+from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_truth
 from uwb_mitigation.viewer.scene import MAX_TRUTHS, BoundedDict, History, Pair, Sample
 
 REFRESH_HZ = 5

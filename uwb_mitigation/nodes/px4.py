@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.nodes import topics
+from uwb_mitigation.nodes.support import topics
 
 CORRELATION_S = 1.0
 """Errors of positions within this time are correlated. EKF2 takes them as independent, so their variance is increased."""

@@ -11,13 +11,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
-from uwb_mitigation.bag.odometry import yaw_of
-from uwb_mitigation.bag.poses import BodyTwist
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.nodes import topics
-from uwb_mitigation.nodes.lifecycle import ManagedNode
-from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support.lifecycle import ManagedNode
+from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
+from uwb_mitigation.recordings.bag.odometry import yaw_of
+from uwb_mitigation.types.ros.poses import BodyTwist
+from uwb_mitigation.types.tracks import Estimate
 
 Vector = tuple[float, float, float]
 

@@ -21,13 +21,13 @@ from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from visualization_msgs.msg import MarkerArray
 
-from uwb_mitigation.bag import topics as bag_topics
-from uwb_mitigation.nodes import diagnostics, markers, topics
-from uwb_mitigation.nodes.lifecycle import ManagedNode
-from uwb_mitigation.nodes.parameter_tables import VIEWER
-from uwb_mitigation.nodes.replay import ReplayClock
-from uwb_mitigation.positioning.anchors import AnchorMap
-from uwb_mitigation.sources.anchors_file import load_anchors
+from uwb_mitigation.nodes import markers
+from uwb_mitigation.nodes.feeds.replay import ReplayClock
+from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support.lifecycle import ManagedNode
+from uwb_mitigation.nodes.support.parameter_tables import VIEWER
+from uwb_mitigation.types.anchors import AnchorMap, load_anchors
+from uwb_mitigation.types.ros import topics as bag_topics
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.page import View

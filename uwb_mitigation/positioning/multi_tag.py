@@ -9,19 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning.dead_reckoning import DeadReckoning
-from uwb_mitigation.positioning.filter import RangeFilter
+from uwb_mitigation.positioning.batch.smoother import Smoother, fused_with_batch
 from uwb_mitigation.positioning.geometry import Shape, protection_levels, shape
-from uwb_mitigation.positioning.robot_estimator import RobotEstimator
-from uwb_mitigation.positioning.smoother import Smoother, fused_with_batch
-from uwb_mitigation.positioning.tag_estimator import (
+from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
+from uwb_mitigation.positioning.online.filter import RangeFilter
+from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
+from uwb_mitigation.positioning.online.tag_estimator import (
     MAX_VALUE,
     RANGE_TIMEOUT_S,
     EstimatorConfig,
     TagEstimator,
     is_valid,
 )
-from uwb_mitigation.positioning.tracks import Estimate, Heights, Ranges, Track
+from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track
 
 MAX_TAGS = 256
 """More tags are probably damaged numbers."""

@@ -8,17 +8,19 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.evaluation import baselines, splits, zero_shot
-from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.evaluation.metrics import bootstrap_interval, coverage, mae_after_rejection
-from uwb_mitigation.evaluation.splits import Group
-from uwb_mitigation.model.architecture import Mlp, Remnet
-from uwb_mitigation.model.bundle import Bundle
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.training import candidates, train
-from uwb_mitigation.training.candidates import Recipe, linear_bias_m, network_m
-from uwb_mitigation.training.fitting import fit
-from uwb_mitigation.training.quantization import calibration_inputs, quantize
+from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
+from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.training import train
+from uwb_mitigation.training.data import splits
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.data.splits import Group
+from uwb_mitigation.training.evaluation import baselines, zero_shot
+from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, coverage, mae_after_rejection
+from uwb_mitigation.training.fit import candidates
+from uwb_mitigation.training.fit.candidates import Recipe, linear_bias_m, network_m
+from uwb_mitigation.training.fit.fitting import fit
+from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize
 
 INNER_FOLDS = 4
 """Folds of the training part, by configuration, for calibrating the intervals."""

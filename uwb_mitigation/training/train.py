@@ -10,24 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, check_name
-from uwb_mitigation.evaluation import splits
-from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.evaluation.metrics import ErrorStatistics, mae_by_group
-from uwb_mitigation.model import floating, graph
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import Bundle, Card, load_bundle, save_bundle
-from uwb_mitigation.model.floating import float_network, scaled
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.shipped import default_model_path
-from uwb_mitigation.model.weights import FloatWeights
-from uwb_mitigation.training import candidates as models
-from uwb_mitigation.training import selection as selections
-from uwb_mitigation.training.candidates import Candidate, Recipe, fit_new_model, linear_bias_m
-from uwb_mitigation.training.cards import card_of, ood_bands_of
-from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.quantization import calibration_inputs, quantize
-from uwb_mitigation.training.selection import NESTED, Selection
+from uwb_mitigation.mitigation.model import floating, graph
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import Bundle, Card, load_bundle, save_bundle
+from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.model.weights import FloatWeights
+from uwb_mitigation.training.data import splits
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.evaluation.metrics import ErrorStatistics, mae_by_group
+from uwb_mitigation.training.fit import candidates as models
+from uwb_mitigation.training.fit import selection as selections
+from uwb_mitigation.training.fit.candidates import Candidate, Recipe, fit_new_model, linear_bias_m
+from uwb_mitigation.training.fit.cards import card_of, ood_bands_of
+from uwb_mitigation.training.fit.options import FitOptions
+from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize
+from uwb_mitigation.training.fit.selection import NESTED, Selection
 
 AUTO = "auto"
 MAX_NAMED = 100

@@ -12,25 +12,30 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.evaluation.dataset import Dataset
-from uwb_mitigation.evaluation.linear_fit import fit_linear_bias_to_rows
-from uwb_mitigation.evaluation.metrics import ErrorStatistics
-from uwb_mitigation.model import floating
-from uwb_mitigation.model.architecture import Remnet
-from uwb_mitigation.model.bundle import Card
-from uwb_mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.model.weights import FloatWeights, Int8Weights
-from uwb_mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.sources.simulation.buildings import PLACEMENTS, RADIO
-from uwb_mitigation.sources.simulation.radio import Radio
-from uwb_mitigation.training.augmentation import calibration_inputs, normalised, vary_channel, vary_receiver
-from uwb_mitigation.training.cards import card_of, ood_bands_of
-from uwb_mitigation.training.fitting import fit
-from uwb_mitigation.training.options import FitOptions
-from uwb_mitigation.training.quantization import quantize
-from uwb_mitigation.training.selection import step_counter
-from uwb_mitigation.training.simulated import building_dataset
+from uwb_mitigation.mitigation.model import floating
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import Card
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.simulation.buildings import PLACEMENTS, RADIO
+from uwb_mitigation.simulation.radio import Radio
+from uwb_mitigation.training.data.augmentation import (
+    calibration_inputs,
+    normalised,
+    vary_channel,
+    vary_receiver,
+)
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.data.simulated import building_dataset
+from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
+from uwb_mitigation.training.fit.cards import card_of, ood_bands_of
+from uwb_mitigation.training.fit.fitting import fit
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias_to_rows
+from uwb_mitigation.training.fit.options import FitOptions
+from uwb_mitigation.training.fit.quantization import quantize
+from uwb_mitigation.training.fit.selection import step_counter
 
 CALIBRATION_INPUTS = 512
 HELD_OUT_SEED = 1_000_003

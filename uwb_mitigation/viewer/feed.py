@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from uwb_mitigation.bag import topics
-from uwb_mitigation.bag.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Truth
-from uwb_mitigation.positioning.anchors import AnchorMap
 from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_ellipse
-from uwb_mitigation.positioning.tracks import Estimate
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
+from uwb_mitigation.types.ros import topics
+from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
+from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,

@@ -17,8 +17,8 @@ from bokeh.events import Reset
 from bokeh.models import ColumnDataSource
 
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.measurement import Status
-from uwb_mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer.floor_plan import FloorPlan
 from uwb_mitigation.viewer.models import COLUMNS, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
 from uwb_mitigation.viewer.palette import STATUS_LOOKS, TrackKind

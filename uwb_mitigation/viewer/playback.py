@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from uwb_mitigation.bag.codec import measurement_key
-from uwb_mitigation.bag.topics import ANCHORS, RANGE_RAW
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.measurement import RangeMeasurement
-from uwb_mitigation.mitigation import Backend
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.mitigation.correction import Backend
 from uwb_mitigation.positioning.geometry import Height
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.ros.codec import measurement_key
+from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
 from uwb_mitigation.viewer.feed import Feed
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording

@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from uwb_mitigation.bag import schemas, topics
-from uwb_mitigation.bag.reader import BagReader, check_channel
 from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
+from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.viewer.feed import DECODERS, DIAGNOSTICS
 from uwb_mitigation.viewer.scene import DEFAULT_TAG
 

@@ -9,18 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.bag.codec import MeasurementKey, measurement_key
-from uwb_mitigation.bag.poses import tag_frame
-from uwb_mitigation.bag.topics import ODOMETRY_TRUTH, POSE_SMOOTHED, RANGE_CORRECTED, RANGE_RAW, RANGE_TRUTH
 from uwb_mitigation.errors import DatasetError, RecordingError
-from uwb_mitigation.measurement import CorrectedRange, RangeMeasurement, Status
-from uwb_mitigation.mitigation import Backend
-from uwb_mitigation.positioning.anchors import AnchorMap
+from uwb_mitigation.mitigation.correction import Backend
+from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.initialization import snapshot
-from uwb_mitigation.positioning.smoother import smooth
-from uwb_mitigation.positioning.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.tracks import Estimate, Ranges
+from uwb_mitigation.positioning.online.initialization import snapshot
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.ros.codec import MeasurementKey, measurement_key
+from uwb_mitigation.types.ros.poses import tag_frame
+from uwb_mitigation.types.ros.topics import (
+    ODOMETRY_TRUTH,
+    POSE_SMOOTHED,
+    RANGE_CORRECTED,
+    RANGE_RAW,
+    RANGE_TRUTH,
+)
+from uwb_mitigation.types.tracks import Estimate, Ranges
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
 from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_RANGE_M, MAX_TAGS, BoundedDict, Pair, add_heat

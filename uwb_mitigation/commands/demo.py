@@ -1,0 +1,193 @@
+"""`make demo`: replay a recording through `driver` and `mitigator`, two processes over DDS, and show it live.
+
+python -m uwb_mitigation.commands.entry demo [--recording PATH] [--rate FACTOR]
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rich.console import Console
+from rich.live import Live
+
+from uwb_mitigation.errors import DatasetError, UwbMitigationError
+from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
+from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.anchors import AnchorMap, dump_anchors
+from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.tracks import TruePath
+
+SIMULATED_EXCHANGES = 600
+SIMULATED_RATE_HZ = 40.0
+LONGEST_PAUSE_S = 5.0
+TARGET_S = 15.0
+SETTLE_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class DemoPlan:
+    """A demo: title, the driver's parameters, and if known the anchors and the offset of the boards."""
+
+    title: str
+    parameters: tuple[str, ...]
+    anchors: AnchorMap | None = None
+    offset_m: float | None = None
+
+
+def simulated(rate: float) -> DemoPlan:
+    """Return the demo of the simulator's default scene, in which weak signals give no range."""
+    source = SimulatedSource(count=SIMULATED_EXCHANGES, rate_hz=SIMULATED_RATE_HZ)
+    offset_m = offset_of(source)
+    return DemoPlan(
+        f"simulated recording, {len(list(source))} ranges",
+        (
+            "source:=simulated",
+            f"count:={SIMULATED_EXCHANGES}",
+            f"simulated_rate:={SIMULATED_RATE_HZ}",
+            f"rate:={rate or 1.0}",
+        ),
+        source.anchors,
+        offset_m,
+    )
+
+
+def offset_of(source: Source) -> float | None:
+    """Return the offset of the boards (m) from LOS ranges with truth; None if it is unknown."""
+    from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import default_model_path
+    from uwb_mitigation.training.site.radio_offsets import estimate_offset
+
+    try:
+        return estimate_offset(Mitigation(load_bundle(default_model_path())), source).offset_m
+    except DatasetError:
+        return None
+
+
+def recorded(path: Path, rate: float) -> DemoPlan:
+    """Return the demo of a recording; at the default rate it lasts about 15 s."""
+    from uwb_mitigation.recordings.mcap import McapRecording
+    from uwb_mitigation.recordings.opening import open_recording
+
+    count, length_s, last_ns = 0, 0.0, None
+    with open_recording(path) as source:
+        for record in source:
+            stamp_ns = record.measurement.stamp_ns
+            if last_ns is not None:
+                length_s += min((stamp_ns - last_ns) / 1e9, LONGEST_PAUSE_S)
+            count, last_ns = count + 1, stamp_ns
+        offset_m = offset_of(source) if count else None
+        name = source.name
+        kind = "mcap" if isinstance(source, McapRecording) else "decaranging"
+    if not count:
+        raise UwbMitigationError("the recording contains no ranges", where=str(path))
+    rate = rate or max(1.0, length_s / TARGET_S)
+    return DemoPlan(
+        f"{name}, {count} ranges, {rate:.1f} x recorded speed",
+        (f"source:={kind}", f"path:={path.resolve()}", f"rate:={rate}", f"longest_pause:={LONGEST_PAUSE_S}"),
+        offset_m=offset_m,
+    )
+
+
+def position_rmse(poses: list[Any], truth: list[Any]) -> float:
+    """Return the horizontal RMSE (m) of poses where the truth is known."""
+    (stamps, positions), (true_stamps, true_positions) = _stamped(poses), _stamped(truth)
+    offset = positions - TruePath(true_stamps, true_positions).at(stamps)
+    return float(np.sqrt(np.nanmean(np.sum(offset[:, :2] ** 2, axis=1))))
+
+
+def _stamped(messages: list[Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    rows = {}
+    for message in messages:
+        at = message.pose.pose.position
+        rows[message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec] = (at.x, at.y, at.z)
+    stamps = sorted(rows)
+    return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps], np.float64)
+
+
+def watch(plan: DemoPlan, console: Console) -> list[str]:
+    """Run the nodes and show their ranges; return the failures."""
+    with spinning_node(Monitor) as monitor, tempfile.TemporaryDirectory() as folder:
+        statistics = monitor.statistics
+        poses: list[Any] = []
+        truth: list[Any] = []
+        monitor.create_subscription(PoseWithCovarianceStamped, topics.POSE, poses.append, topics.RANGES)
+        monitor.create_subscription(Odometry, topics.ODOMETRY_TRUTH, truth.append, topics.RANGES)
+        raw, corrected, anchors = (
+            monitor.resolve_topic_name(name)
+            for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS)
+        )
+        title, offset_m = plan.title, plan.offset_m
+        with NodeProcesses() as nodes:
+            if offset_m is None:
+                nodes.start("mitigator")
+            else:
+                title += f", {offset_m:.2f} m of antenna delays subtracted"
+                nodes.start("mitigator", f"offsets:={offset_m:.4f}")
+            if plan.anchors is not None:
+                file = Path(folder) / "anchors.yaml"
+                file.write_text(dump_anchors(plan.anchors), encoding="utf-8")
+                nodes.start("locator", f"anchors:={file}", "level:=true", "rate:=0.0")
+                nodes.wait(
+                    lambda: monitor.count_publishers(anchors) > 0, "the locator did not start: see above"
+                )
+            nodes.wait(
+                lambda: monitor.count_publishers(corrected) > 0 and monitor.count_subscribers(raw) > 1,
+                "the mitigator did not start: see above",
+            )
+            # The mitigator and this process must receive the first range.
+            nodes.start("driver", *plan.parameters, "wait_for_subscribers:=2")
+            with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
+                while nodes.running:
+                    live.update(live_table(statistics, title))
+                    time.sleep(1 / REFRESH_HZ)
+                # The last corrected ranges may arrive after the end of the driver.
+                deadline = time.monotonic() + SETTLE_S
+                while statistics.missing and time.monotonic() < deadline:
+                    time.sleep(0.05)
+                live.update(live_table(statistics, title))
+        console.print(summary(statistics))
+        if len(poses) > 1 and len(truth) > 1:
+            console.print(
+                f"horizontal position error of the locator: {position_rmse(poses, truth):.3f} m RMSE"
+            )
+    if statistics.missing or not statistics.corrected:
+        nodes.failures.append(f"{statistics.corrected} of {statistics.raw} ranges were corrected")
+    return nodes.failures
+
+
+def demo(
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
+    ] = None,
+    rate: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=10_000.0,
+            help="Speed of the replay relative to the recording; 0: total duration of about 15 s.",
+        ),
+    ] = 0.0,
+) -> None:
+    """Replay a recording through driver and mitigator, show it live, and print a summary."""
+    code = run_demo(
+        "demo",
+        lambda console: watch(simulated(rate) if recording is None else recorded(recording, rate), console),
+    )
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    """Run the demo with the options of the command line."""
+    typer.run(demo)

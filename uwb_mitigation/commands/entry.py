@@ -1,0 +1,119 @@
+"""Entry points, with signal handling during imports. Standard library only: other imports take a second.
+
+python -m uwb_mitigation.commands.entry NODE --ros-args ..., or demo ...
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_NODES = ("driver", "mitigator", "locator", "pipeline", "monitor", "px4", "viewer")
+
+
+def driver() -> None:
+    """Run the node `driver`."""
+    _node("driver")
+
+
+def mitigator() -> None:
+    """Run the node `mitigator`."""
+    _node("mitigator")
+
+
+def locator() -> None:
+    """Run the node `locator`."""
+    _node("locator")
+
+
+def pipeline() -> None:
+    """Run `driver` and `mitigator` in one process."""
+    _node("pipeline")
+
+
+def monitor() -> None:
+    """Run the node `monitor`."""
+    _node("monitor")
+
+
+def px4() -> None:
+    """Run the node `px4`."""
+    _node("px4")
+
+
+def viewer() -> None:
+    """Run the node `viewer`."""
+    _node("viewer")
+
+
+def command_line() -> None:
+    """Run the command `uwb-mitigation`."""
+    run_program("uwb_mitigation.commands.cli")
+
+
+def run_program(module: str) -> None:
+    """Import a module and call its `main`, which receives Ctrl-C as KeyboardInterrupt.
+
+    A signal during the import ends the process without a traceback, with exit code 128 + its number.
+    """
+    run = _load(module)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    run()
+
+
+def _node(name: str) -> None:
+    if name not in _NODES:
+        from uwb_mitigation.errors import did_you_mean
+
+        sys.exit(f"error: unknown node {name!r}; {did_you_mean(name, _NODES)} (one of {', '.join(_NODES)})")
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        from uwb_mitigation.nodes.support.parameter_tables import help_text
+
+        # A reader such as `head` may close the pipe early.
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        print(help_text(name))
+    elif name == "monitor":
+        # The monitor draws in this thread and spins in another.
+        _load("uwb_mitigation.nodes.monitor")()
+    else:
+        if name == "viewer":
+            # On a loaded CPU, correcting ranges has priority. Set this before the middleware starts its threads.
+            os.nice(10)
+        # It installs signal handlers after the node is loaded.
+        _load("uwb_mitigation.nodes.support.spinning")(name)
+
+
+def _load(module: str) -> Callable[..., Any]:
+    """Return `main` of a module; a signal during the import exits immediately with 128 + its number.
+
+    If a dependency is missing, the process exits with a one-line error.
+    """
+    for number in _SIGNALS:
+        signal.signal(number, _end)
+    try:
+        main: Callable[..., Any] = importlib.import_module(module).main
+    except ImportError as error:
+        from uwb_mitigation.errors import missing_dependency
+
+        if (absent := missing_dependency(error)) is None:
+            raise
+        sys.exit(f"error: {absent}")
+    return main
+
+
+def _end(number: int, frame: Any) -> None:
+    os._exit(128 + number)
+
+
+if __name__ == "__main__":
+    name = sys.argv.pop(1)
+    if name == "demo":
+        run_program("uwb_mitigation.commands.demo")
+    else:
+        _node(name)

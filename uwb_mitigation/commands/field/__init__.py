@@ -1,0 +1,1 @@
+"""The field report: measurements and checks on a board."""

@@ -1,0 +1,1 @@
+"""Processing of recordings in bulk: correction, tracks, parallel work."""

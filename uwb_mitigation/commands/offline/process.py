@@ -1,0 +1,219 @@
+"""Process one bag into one corrected bag.
+
+Every message is copied unchanged. Each raw range is followed by its corrected range with the same log time. The output is
+byte-identical to that of correcting the ranges one by one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+from uwb_mitigation.errors import (
+    DamagedRecordingError,
+    RecordingError,
+    UwbMitigationError,
+    missing_dependency,
+)
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.recordings.bag.reader import BagReader, RawMessage, check_channel
+from uwb_mitigation.recordings.bag.writer import METADATA_RECORD, BagWriter
+from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.types.ros import schemas
+from uwb_mitigation.types.ros.codec import decode_range, encode_corrected
+from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
+
+BATCH = 256
+"""Messages per batch: large enough for vectorisation, small enough for the network's inputs to fit into the cache."""
+
+Report = Callable[[int, int], None]
+"""Progress callback: (processed messages, total messages according to the bag's index)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Input, output and settings of processing one bag.
+
+    Attributes:
+        source: an MCAP file or rosbag2 folder.
+        output: an MCAP file if it ends in `.mcap`, otherwise a rosbag2 folder.
+        model: the bundle.
+        force: replace an existing `output`.
+        offsets: offsets of the radios.
+    """
+
+    source: Path
+    output: Path
+    model: Path
+    force: bool = False
+    offsets: Offsets = NO_OFFSETS
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The result of a job.
+
+    Attributes:
+        job: the job.
+        messages: messages read.
+        ranges: the number of raw ranges, corrected or passed through.
+        statuses: corrected ranges by status, {name: count}.
+        replaced: corrected ranges of the input, which are not copied.
+        skipped: warnings, {kind: count}.
+        mismatches: why ranges were passed through for their radio or segment, {reason: count}.
+        seconds: wall time of reading, correcting and writing.
+        error: why the output is missing or (damaged input) incomplete; None = success.
+        written: whether there is an output.
+    """
+
+    job: Job
+    messages: int = 0
+    ranges: int = 0
+    statuses: Counter[str] = field(default_factory=Counter)
+    replaced: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    mismatches: Counter[str] = field(default_factory=Counter)
+    seconds: float = 0.0
+    error: UwbMitigationError | None = None
+    written: bool = False
+
+
+def try_process(job: Job, report: Report | None = None) -> Outcome:
+    """Run `process_bag` and return its errors in the outcome, so that one bag does not stop the others."""
+    try:
+        return process_bag(job, report)
+    except UwbMitigationError as error:
+        return Outcome(job, error=error)
+    except ImportError as error:
+        if (absent := missing_dependency(error)) is None:
+            raise
+        return Outcome(job, error=absent)
+    except MemoryError:
+        return Outcome(job, error=RecordingError("not enough memory", where=str(job.source)))
+    except OSError as error:
+        problem = RecordingError(f"cannot be processed: {error.strerror}", where=str(job.source))
+        return Outcome(job, error=problem)
+
+
+def process_bag(job: Job, report: Report | None = None) -> Outcome:
+    """Process one bag. If the input is damaged, the output ends there and the outcome contains the error.
+
+    Raises:
+        RecordingError: the input is not a bag of this package or has no raw ranges, or the output exists
+            or cannot be written. A partial output is removed.
+        ModelError: the model cannot be used.
+    """
+    mitigation = Mitigation(load_bundle(job.model), job.offsets)
+    # The model is loaded once per process and takes as long as thousands of ranges: do not count it in the bag's time.
+    schemas.typestore()
+    started = time.perf_counter()
+    bag = BagReader(job.source)
+    metadata = bag.metadata.get(METADATA_RECORD, {})
+    origin = {
+        "source": f"{job.source.name}, corrected by model {mitigation.bundle.model_id:08x}",
+        "simulated": metadata.get("simulated", "unknown"),
+    }
+    with BagWriter(job.output, origin, force=job.force) as out:
+        corrector = _Corrector(job.source, mitigation, out)
+        damage = None
+        total, done = bag.message_count, 0
+        messages = bag.messages()
+        while True:
+            batch: list[RawMessage] = []
+            try:
+                # Not list(islice()): messages before the damage must be kept.
+                for message in islice(messages, BATCH):
+                    batch.append(message)  # noqa: PERF402
+            except DamagedRecordingError as error:
+                damage = error
+            if not batch:
+                break
+            corrector.write(batch)
+            done += len(batch)
+            if report is not None:
+                report(done, total)
+            if damage is not None:
+                break
+        if damage is not None and done == 0:
+            raise damage
+        if RANGE_RAW not in bag.topics:
+            topics = ", ".join(sorted(bag.topics)) or "no topic"
+            raise RecordingError(
+                f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag contains: {topics}"
+            )
+    seconds = time.perf_counter() - started
+    return Outcome(
+        job,
+        messages=done,
+        ranges=corrector.statuses.total(),
+        statuses=corrector.statuses,
+        replaced=corrector.replaced,
+        skipped=corrector.skipped + bag.warnings,
+        mismatches=corrector.mismatches,
+        seconds=seconds,
+        error=damage,
+        written=True,
+    )
+
+
+class _Corrector:
+    """Writes batches of messages and inserts the corrected ranges."""
+
+    def __init__(self, source: Path, mitigation: Mitigation, out: BagWriter) -> None:
+        self._source = source
+        self._mitigation = mitigation
+        self._out = out
+        # The bag keeps references to its channels, so that an id() identifies one channel of one file.
+        self._channels: dict[int, int] = {}
+        self._corrected = out.corrected_channel()
+        self.statuses: Counter[str] = Counter()
+        self.skipped: Counter[str] = Counter()
+        self.mismatches: Counter[str] = Counter()
+        self.replaced = 0
+
+    def write(self, batch: list[RawMessage]) -> None:
+        raw = [message for message in batch if message.channel.topic == RANGE_RAW]
+        for message in raw:
+            if id(message.channel) not in self._channels:
+                check_channel(message.channel, RANGE_CIR_TYPE, self._source)
+                self._channels[id(message.channel)] = self._out.copy_channel(message.channel)
+        corrected = iter(self._correct([message.data for message in raw]))
+        out = self._out
+        for message in batch:
+            channel, sequence, log_ns, publish_ns, data = message
+            if channel.topic == RANGE_CORRECTED:
+                self.replaced += 1
+                continue
+            number = self._channels.get(id(channel))
+            if number is None:
+                number = self._channels[id(channel)] = out.copy_channel(channel)
+            out.write_serialized(number, data, log_ns, publish_ns, sequence)
+            if channel.topic == RANGE_RAW:
+                message_data = next(corrected)
+                if message_data is not None:
+                    out.write_serialized(self._corrected, message_data, log_ns, publish_ns, sequence)
+
+    def _correct(self, messages: list[bytes]) -> list[bytes | None]:
+        """Return `RangeCorrected` for each message; None if it does not decode."""
+        encoded: list[bytes | None] = [None] * len(messages)
+        decoded: dict[int, RangeMeasurement] = {}
+        for number, message in enumerate(messages):
+            try:
+                decoded[number] = decode_range(message)
+            except RecordingError as error:  # noqa: PERF203
+                self.skipped[error.what] += 1
+        card = self._mitigation.bundle.card
+        corrected = self._mitigation.correct([*decoded.values()])
+        for (number, measurement), result in zip(decoded.items(), corrected, strict=True):
+            encoded[number] = encode_corrected(measurement, result)
+            self.statuses[result.status.name] += 1
+            cir = measurement.cir
+            if not card.fits(cir.radio, cir.segment, len(cir) > 0):
+                self.mismatches[card.mismatch(cir.source)] += 1
+        return encoded

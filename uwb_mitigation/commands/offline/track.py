@@ -1,0 +1,301 @@
+"""Live, smoothed and snapshot tracks of a recording, with their errors if the ground truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError, format_id
+from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
+from uwb_mitigation.positioning.geometry import Shape, geometry, shape
+from uwb_mitigation.positioning.online.initialization import snapshot
+from uwb_mitigation.positioning.online.robot_estimator import make_estimator
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.recorded_ranges import TagRecording
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.ros.poses import (
+    BodyTwist,
+    encode_odometry,
+    encode_pose,
+    encode_true_position,
+    tag_frame,
+    tag_topic,
+)
+from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, ODOMETRY_TYPE, POSE_SMOOTHED, POSE_TYPE
+from uwb_mitigation.types.tracks import Estimate, Ranges, Track, TruePath
+
+KINDS = ("live", "smoothed", "snapshot")
+POOR_HDOP = 10.0
+MIN_OTHERS = 3
+"""Other anchors that a track without an anchor needs."""
+
+CONTRADICTION_M = 0.4
+"""NLOS errors of the other anchors move their track by up to about this much."""
+
+WORSE = 1.1
+MIN_COVERAGE = 0.85
+MIN_HEIGHT_RMSE_M = 0.1
+"""If the truth is known, smoothing has failed if its horizontal RMSE or that of the height exceeds `WORSE` times the live one
+(heights: and this minimum), or its 95 % ellipses contain a smaller share of the true positions than `MIN_COVERAGE`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagTracks:
+    """The tracks of one tag and their errors; `NO_ERRORS` if the truth is unknown.
+
+    Attributes:
+        recording: the input.
+        live: an estimate for each range, from this and earlier ranges. smoothed: ten per second, from all ranges.
+        snapshot: least squares on raw ranges.
+        errors: errors of each of the `KINDS`.
+        hdop: median horizontal dilution of precision along the track.
+        disagreeing: rows of anchors whose ranges contradict the track of the other anchors.
+        warnings: reasons why the tracks may be unreliable; empty = none.
+    """
+
+    recording: TagRecording
+    live: Track
+    smoothed: Track
+    snapshot: Track
+    errors: dict[str, TrackErrors]
+    hdop: float
+    disagreeing: list[int]
+    warnings: list[str]
+
+    def as_json(self, anchors: AnchorMap) -> dict[str, object]:
+        """Return the entry of a tag in `track --json`; it contains errors only if the truth is known."""
+        errors = {kind: self.errors[kind].as_json() for kind in KINDS}
+        return {
+            "tag_id": self.recording.tag_id,
+            "ranges": len(self.recording.ranges),
+            **errors["smoothed"],
+            "epochs": self.errors["smoothed"].epochs or len(self.smoothed),
+            "warnings": self.warnings,
+            "disagreeing": [anchors.anchors[row].id for row in self.disagreeing],
+            **(errors if self.errors["live"].epochs else {}),
+        }
+
+
+def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
+    """Return the tracks of one tag.
+
+    Raises:
+        DatasetError: no position of the tag can be determined; the message contains the reason, if the anchors show it.
+    """
+    ranges, anchors = recording.ranges, config.anchors
+    locator = make_estimator(config)
+    live = locator.run(ranges)
+    if len(live) < 2:
+        raise _no_position(recording, config, locator)
+    smoothed = smooth(config, ranges, live)
+    snapshots = snapshot(anchors, recording.raw, config.height)
+    truth = recording.truth
+    tracks = zip(KINDS, (live, smoothed, snapshots), strict=True)
+    errors = {kind: track_errors(track, truth) for kind, track in tracks}
+    of_live, of_smoothed = errors["live"], errors["smoothed"]
+    sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
+    used = anchors.position[np.unique(ranges.anchor)]
+    level = config.height is not None or config.heights is not None
+    hdop = float(np.median([geometry(used, position, level=level).hdop for position in sample]))
+    warnings = []
+    if not hdop <= POOR_HDOP:
+        warnings.append(
+            f"poor geometry: median HDOP {hdop:.0f}. The anchors are {shape(used).value}. "
+            "Place anchors on more sides of the tag"
+        )
+    share = len(live) / len(ranges)
+    if share < 0.9:
+        warnings.append(
+            f"no position for {1.0 - share:.0%} of the ranges, because several positions explain them or too few anchors "
+            "were received. Give a height or an area"
+        )
+    if (
+        of_smoothed.rmse > WORSE * of_live.rmse
+        or of_smoothed.height_rmse > WORSE * max(of_live.height_rmse, MIN_HEIGHT_RMSE_M)
+        or of_smoothed.coverage95 < MIN_COVERAGE
+    ):
+        warnings.append(
+            f"smoothing failed: RMSE {of_smoothed.rmse:.3f} m (live {of_live.rmse:.3f} m), height "
+            f"{of_smoothed.height_rmse:.3f} m (live {of_live.height_rmse:.3f} m), {of_smoothed.coverage95:.0%} of the true "
+            "positions in the 95 % ellipses. Use the live track"
+        )
+
+    # The locator judges by its last ranges only: use the whole recording.
+    contradicting = [
+        row
+        for row in locator.disagreeing()
+        if contradicts(anchors, ranges, row, TagEstimator(config).run(ranges.take(ranges.anchor != row)))
+    ]
+    return TagTracks(recording, live, smoothed, snapshots, errors, hdop, contradicting, warnings)
+
+
+def contradicts(anchors: AnchorMap, ranges: Ranges, row: int, others: Track) -> bool:
+    """Whether an anchor's ranges contradict the track that was estimated without them.
+
+    A blocked line of sight makes some ranges too long, which is a long tail: the shortest residuals still fit. A wrong
+    anchor position or offset shifts all residuals, or makes many ranges too short, which no obstacle does.
+    """
+    own = ranges.anchor == row
+    if len(others) < 2 or not own.any() or own.all():
+        return False
+    position = np.stack(
+        [np.interp(ranges.stamp_ns, others.stamp_ns, axis) for axis in others.position.T], axis=1
+    )
+    residual = ranges.range_m - np.linalg.norm(position - anchors.position[ranges.anchor], axis=1)
+    low = float(np.percentile(residual[own], 20.0) - np.median(residual[~own]))
+    return abs(low) > CONTRADICTION_M
+
+
+def _no_position(recording: TagRecording, config: EstimatorConfig, locator: TagEstimator) -> DatasetError:
+    used = config.anchors.position[np.unique(recording.ranges.anchor)]
+    what = f"tag {format_id(recording.tag_id)}: no position can be determined from {len(recording.ranges)} ranges"
+    if locator.candidates > 1:
+        what += f": {locator.candidates} positions explain them equally well"
+    level = config.height is not None or config.heights is not None
+    needed, kind = 3 if level else 4, shape(used)
+    if locator.undetermined:
+        what += ": the geometry is too weak"
+    if len(used) < needed:
+        what += f"; {len(used)} anchors were received, {needed} are needed"
+    if kind in (Shape.LINE, Shape.POINT) or (kind is Shape.PLANE and not level):
+        what += f"; the anchors are {kind.value}: give a height or an area that contains only one position"
+    return DatasetError(what)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """Medians of absolute held-out residuals, m; NaN: unknown.
+
+    Attributes:
+        anchor_id: None = all anchors.
+        ranges: the number of residuals.
+        raw_m, corrected_m: of measured and of corrected ranges; corrected NaN if the bag has none.
+    """
+
+    anchor_id: int | None
+    ranges: int
+    raw_m: float
+    corrected_m: float
+
+    def as_json(self) -> dict[str, float | int | None]:
+        """Return the values for JSON; values that are not finite become null."""
+        values = {"raw_m": self.raw_m, "corrected_m": self.corrected_m}
+        return {"anchor_id": self.anchor_id, "ranges": self.ranges} | {
+            name: value if np.isfinite(value) else None for name, value in values.items()
+        }
+
+
+def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[HeldOut]:
+    """Return the held-out residuals of each anchor, and of all anchors last.
+
+    The ranges of each anchor are compared with a track that was estimated without this anchor. This needs no ground truth,
+    and a wrong offset of an anchor cannot hide, because its own ranges do not move the track.
+    """
+    raw = [(one.live, one.recording.raw) for one in tracks]
+    corrected = [(one.live, one.recording.ranges) for one in tracks if one.recording.corrected]
+
+    def of(row: int, kind: list[tuple[Track, Ranges]]) -> NDArray[np.float64]:
+        parts = [_residuals(live, ranges, row, config) for live, ranges in kind]
+        return np.concatenate([np.zeros(0), *parts])
+
+    by_anchor = [(of(row, raw), of(row, corrected)) for row in range(len(config.anchors))]
+    every = [np.concatenate(kind) for kind in zip(*by_anchor, strict=True)]
+    identities = [*(anchor.id for anchor in config.anchors.anchors), None]
+    return [
+        HeldOut(identity, len(before), _median(before), _median(after))
+        for identity, (before, after) in zip(identities, [*by_anchor, every], strict=True)
+    ]
+
+
+def _residuals(initial: Track, ranges: Ranges, row: int, config: EstimatorConfig) -> NDArray[np.float64]:
+    """Return range minus distance of an anchor's ranges, where the track of the others is known."""
+    own = ranges.anchor == row
+    if len(np.unique(ranges.anchor[~own])) < MIN_OTHERS or not own.any():
+        return np.zeros(0)
+    track = Smoother(config, ranges.take(~own)).fit(initial).track
+    position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[own])
+    residual = ranges.range_m[own] - np.linalg.norm(position - config.anchors.position[row], axis=1)
+    known: NDArray[np.float64] = residual[np.isfinite(residual)]
+    return known
+
+
+def _median(residual: NDArray[np.float64]) -> float:
+    return float(np.median(np.abs(residual))) if len(residual) else float("nan")
+
+
+def pooled(errors: list[TrackErrors]) -> TrackErrors:
+    """Return the errors of all tags, weighted by epochs; medians and percentiles are means."""
+    known = [one for one in errors if one.epochs]
+    if not known:
+        return NO_ERRORS
+    epochs, *columns = np.array([astuple(one) for one in known]).T
+    columns[0] = columns[0] ** 2
+    rmse, *means = (float(epochs @ column / epochs.sum()) for column in columns)
+    return TrackErrors(int(epochs.sum()), float(np.sqrt(rmse)), *means)
+
+
+def write_tracks(bag: BagWriter, tracks: list[TagTracks]) -> None:
+    """Write live estimates to `/uwb/odometry`, smoothed ones to `/uwb/pose_smoothed`, the truth to `/uwb/odometry_truth`.
+
+    With several tags, each tag has separate topics, like those of the node.
+
+    Raises:
+        RecordingError: the bag cannot be written.
+    """
+    messages = sorted(
+        (message for one in tracks for message in _messages(one, several=len(tracks) > 1)),
+        key=lambda message: message[0],
+    )
+    for stamp, topic, kind, data in messages:
+        bag.write_message(topic, kind, data, stamp)
+
+
+def _messages(one: TagTracks, several: bool) -> Iterator[tuple[int, str, str, bytes]]:
+    tag = one.recording.tag_id
+    name, frame = (tag if several else None), tag_frame(tag)
+    for estimate in one.live:
+        data = encode_odometry(estimate, child_frame_id=frame, twist=_body_twist(estimate))
+        yield estimate.stamp_ns, tag_topic(ODOMETRY, name), ODOMETRY_TYPE, data
+    for estimate in one.smoothed:
+        yield estimate.stamp_ns, tag_topic(POSE_SMOOTHED, name), POSE_TYPE, encode_pose(estimate)
+    truth = one.recording.truth
+    yaws = truth.yaw_at(truth.stamp_ns).tolist()
+    for stamp, position, yaw in zip(truth.stamp_ns.tolist(), truth.position.tolist(), yaws, strict=True):
+        data = encode_true_position(position, tag, stamp, yaw if np.isfinite(yaw) else None)
+        yield stamp, ODOMETRY_TRUTH, ODOMETRY_TYPE, data
+
+
+def _body_twist(estimate: Estimate) -> BodyTwist | None:
+    """Return the velocity in the axes of the robot; None: its heading is unknown."""
+    if estimate.heading is None:
+        return None
+    cosine, sine = np.cos(estimate.heading.yaw), np.sin(estimate.heading.yaw)
+    vx, vy, _ = estimate.velocity.tolist()
+    variance = float(estimate.covariance[[3, 4], [3, 4]].max())
+    return BodyTwist(cosine * vx + sine * vy, cosine * vy - sine * vx, speed_variance=variance)
+
+
+def tum(track: Track) -> str:
+    """Return a track in TUM's format: stamp in s, position, and orientation, which is the identity if it is unknown."""
+    lines = (
+        f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d} {x:.6f} {y:.6f} {z:.6f} {_quaternion_text(yaw)}\n"
+        for stamp, (x, y, z), yaw in zip(
+            track.stamp_ns.tolist(), track.position.tolist(), track.yaw[:, 0].tolist(), strict=True
+        )
+    )
+    return "".join(lines)
+
+
+def _quaternion_text(yaw: float) -> str:
+    return f"0 0 {np.sin(yaw / 2.0):.6f} {np.cos(yaw / 2.0):.6f}" if np.isfinite(yaw) else "0 0 0 1"
+
+
+def tum_file(path: Path, tag_id: int, several: bool) -> Path:
+    """Return the path of a tag's TUM file: `path`, with the tag's number in the name if there are several tags."""
+    return path.with_name(f"{path.stem}.{tag_frame(tag_id)}{path.suffix}") if several else path

@@ -1,0 +1,1 @@
+"""What commands share: console output, checks of options, model bundles."""

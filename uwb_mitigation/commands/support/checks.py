@@ -1,0 +1,60 @@
+"""Checks of arguments before a command starts its work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, check_name
+
+if TYPE_CHECKING:
+    from uwb_mitigation.mitigation.preprocessing import Scaling
+
+
+OffsetsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--offsets",
+        metavar="M|FILE",
+        help="Range offsets of the radios due to antenna delays: metres, or a file written by `uwb-mitigation offset`.",
+    ),
+]
+
+
+@contextmanager
+def needs_torch() -> Iterator[None]:
+    """Wrap imports: if torch is missing, the error names the command that installs it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
+
+
+def check_output(output: Path) -> None:
+    """Check that a bundle can be written to a path.
+
+    Raises:
+        ParameterError: it cannot.
+    """
+    if output.suffix != ".onnx" or output.is_dir() or not output.resolve().parent.is_dir():
+        raise ParameterError(
+            "not a path for a bundle", where=str(output), valid="a file .onnx in an existing folder"
+        )
+
+
+def scaling_of(name: str) -> Scaling:
+    """Return the scaling of that name.
+
+    Raises:
+        ParameterError: the name is unknown.
+    """
+    from uwb_mitigation.mitigation.preprocessing import Scaling
+
+    check_name("scaling", name, [kind.value for kind in Scaling])
+    return Scaling(name)

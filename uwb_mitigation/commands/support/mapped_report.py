@@ -1,0 +1,123 @@
+"""Tables of `data import --map`: the first converted ranges, errors, and what is missing for a model."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.console import print_line, show_table
+from uwb_mitigation.errors import format_id
+
+if TYPE_CHECKING:
+    from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+
+_ROWS = 5
+_BAR = 40
+_FIELDS = (
+    ("range, m", "range", 3),
+    ("true range, m", "true range", 3),
+    ("receive level, dBm", "rx_power", 1),
+    ("first-path level, dBm", "first_path_power", 1),
+    ("first-path index", "first_path_index", 2),
+    ("preamble count", "preamble_count", 0),
+)
+
+
+def show(sources: Sequence[MappedRecording], *, preview: bool) -> dict[str, Any]:
+    """Print dropped rows, warnings and on request the first ranges; return the counts for JSON."""
+    dropped = sum((source.dropped for source in sources), Counter[str]())
+    warnings = [warning for source in sources for warning in source.warnings]
+    for rule, count in dropped.items():
+        print_line(f"Dropped {count} rows: {rule}")
+    for warning in warnings:
+        console.warn(f"warning: {warning}")
+    for source in sources if preview else ():
+        show_preview(source)
+
+    def distinct(name: str) -> int:
+        return len(np.unique(np.concatenate([source.values[name] for source in sources])))
+
+    return {
+        "ranges": sum(map(len, sources)),
+        "with_cir": sum(map(_with_cir, sources)),
+        "with_truth": sum(len(source.errors_m) for source in sources),
+        "anchors": distinct("anchor"),
+        "tags": distinct("tag"),
+        "dropped": dict(dropped),
+        "warnings": warnings,
+    }
+
+
+def _with_cir(source: MappedRecording) -> int:
+    return int(np.count_nonzero(source.values["cir"] >= 0))
+
+
+def show_preview(source: MappedRecording) -> None:
+    """Print the first ranges with units, a histogram of the errors, and what is missing."""
+    values = source.values
+    shown = range(min(_ROWS, len(source)))
+    first = int(values["stamp"][0])
+    rows = [
+        ["time s", *(f"{(int(values['stamp'][row]) - first) / 1e9:.3f}" for row in shown)],
+        *([name, *(format_id(int(values[name][row])) for row in shown)] for name in ("tag", "anchor")),
+        *(
+            [name, *(f"{values[key][row]:.{n}f}".replace("nan", "-") for row in shown)]
+            for name, key, n in _FIELDS
+        ),
+        ["CIR samples", *(str(len(source.cir(row)) or "-") for row in shown)],
+        ["label", *(values["label"][row] or "-" for row in shown)],
+        ["placement", *(values["configuration"][row] or "-" for row in shown)],
+    ]
+    title = f"The first of {len(source)} ranges, from {np.datetime64(first // 1_000_000, 'ms')} UTC"
+    show_table(title, ("", *(str(row + 1) for row in shown)), rows)
+    _show_errors(source.errors_m)
+    for line in missing(source):
+        print_line(line)
+
+
+def missing(source: MappedRecording) -> list[str]:
+    """Return what a model or command will be missing, and the reason."""
+    count, with_cir = len(source), _with_cir(source)
+
+    def unknown(name: str) -> bool:
+        return not np.isfinite(source.values[name]).any()
+
+    no_cir = f"{count - with_cir} of {count} ranges have no CIR"
+    cases = (
+        (
+            with_cir < count,
+            f"{no_cir}: only constants and linear models correct them (networks: status NO_CIR)",
+        ),
+        (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
+        (with_cir and unknown("preamble_count"), "no preamble count: use the model `universal_amplitude`"),
+        (
+            unknown("rx_power") or unknown("first_path_power"),
+            "no receive or first-path level: no linear model",
+        ),
+        (not len(source.errors_m), "no true range: `evaluate`, `train` and `offset` cannot use it"),
+        (
+            len(source.errors_m) and len(set(source.values["configuration"].tolist())) < 3,
+            "fewer than 3 placements (truth.configuration): `train` cannot hold any out",
+        ),
+        (
+            not hasattr(source, "anchors"),
+            "no positions of the anchors: `track` and `calibrate` need --anchors",
+        ),
+    )
+    return [text for applies, text in cases if applies]
+
+
+def _show_errors(errors: Any) -> None:
+    if not len(errors):
+        return
+    low, high = np.percentile(errors, (1, 99))
+    counts, edges = np.histogram(np.clip(errors, low, high), bins=10)
+    rows = [
+        [f"{start:+.2f} to {stop:+.2f}", str(count), "#" * round(_BAR * count / max(counts.max(), 1))]
+        for count, start, stop in zip(counts.tolist(), edges[:-1], edges[1:], strict=True)
+    ]
+    show_table(f"Errors (measured - true) of {len(errors)} ranges", ("error m", "ranges", ""), rows, left=1)

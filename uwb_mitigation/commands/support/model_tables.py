@@ -1,0 +1,139 @@
+"""Tables with the results of `train`, `train-universal` and `evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from uwb_mitigation.commands.support.console import print_line, show_table
+
+if TYPE_CHECKING:
+    from uwb_mitigation.mitigation.model.bundle import Bundle
+    from uwb_mitigation.training.comparison import Comparison, Coverage
+    from uwb_mitigation.training.evaluation.accuracy import Accuracy
+    from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
+    from uwb_mitigation.training.fit.selection import Selection
+    from uwb_mitigation.training.train import TrainedBundle
+
+_ROWS = {
+    "raw": "raw",
+    "overall_median": "overall median",
+    "l1_line": "line",
+    "float": "model, float",
+    "int8": "model, int8",
+}
+
+_CANDIDATES = {
+    "raw": "measured ranges",
+    "as shipped": "the source model, unchanged",
+    "new offset": "the source model with a new offset",
+    "cold start": "network trained in simulation, with an offset of this data",
+    "mean of line and cold start": "average of both predictions",
+    "fine-tuned": "the source network, trained further on this data",
+    "constant": "one constant offset",
+    "line": "linear bias model in the received powers",
+    "line+network": "linear bias model, and a network for its residuals",
+    "network": "a network only",
+    "selection (nested)": "error of the selection, on data that it did not use",
+}
+
+
+def show_trained(trained: TrainedBundle) -> None:
+    """Show the selection, the cross-validation and the verdict of `train`."""
+    from uwb_mitigation.training.fit import candidates, selection
+
+    if trained.selection is not None:
+        show_selection(trained.selection)
+    if trained.prefers_cold_start:
+        print_line(
+            f"With fewer than {candidates.MIN_CONFIGURATIONS_FOR_MEAN} configurations, cold start is selected unless another candidate is "
+            f"{selection.COLD_START_MIN_GAIN:.0%} better."
+        )
+    if "int8" in trained.validation.errors:
+        rows = trained.validation.statistics().items()
+        show_table(
+            f"{trained.validation.folds}-fold cross-validation by configuration, m",
+            ("", "MAE", "std", "p95"),
+            [(_ROWS[name], *values.values()) for name, values in rows],
+        )
+    for name, before in trained.baseline_mae_m.items():
+        change = trained.mae_m / before - 1 if before else 0.0
+        verdict = "lower" if trained.mae_m < before else "higher, no improvement"
+        print_line(
+            f"MAE on held-out configurations: {trained.mae_m:.3f} m, {name} {before:.3f} m: {abs(change):.0%} {verdict}"
+        )
+    show_bundle(trained.bundle)
+
+
+def show_selection(selection: Selection) -> None:
+    """Show the held-out errors of the candidates."""
+    show_table(
+        f"{selection.configurations} configurations, {selection.folds} folds by configuration",
+        ("candidate", "MAE, m", "", ""),
+        [
+            (row, mae, "<-" if row == selection.chosen else "", _CANDIDATES.get(row, ""))
+            for row, mae in selection.mae().items()
+        ],
+        selection.chosen,
+    )
+
+
+def show_comparison(result: Comparison) -> None:
+    """Show the table of `evaluate --cross-validate`."""
+    labels, names = list(result.rows[0].by_label), [row.name for row in result.rows]
+
+    def covered(coverage: Coverage) -> str:
+        return ", ".join(
+            f"{label or 'all'} {narrow:.1%} and {wide:.1%}" for label, (narrow, wide) in coverage.items()
+        )
+
+    show_table(
+        f"{result.configurations} configurations, {result.folds} splits by {result.group.value}, "
+        f"mean of {result.seeds} seeds, MAE in m",
+        ("", "MAE", "std", "95 % interval", *(label or "no label" for label in labels)),
+        [
+            (row.name, row.mae_mean, row.mae_std, "{:.3f}-{:.3f}".format(*row.ci95), *row.by_label.values())
+            for row in result.rows
+        ],
+    )
+    kept = ", ".join(f"{share:.0%}: {mae:.3f}" for share, mae in result.rejection)
+    print_line(
+        f"{'shipped_int8' if 'shipped_int8' in names else 'shipped_float'}: coverage of the 68 % and 95 % intervals: {covered(result.coverage)}\n"
+        f"MAE after rejecting the share of ranges with the largest variances: {kept}\n"
+        f"not corrected, because out of distribution: {result.passed_through:.1%}"
+    )
+    if result.without_levels:
+        print_line(f"{result.without_levels} ranges without receive or first-path level are left out")
+    if result.universal_coverage is not None:
+        print_line(
+            f"universal_los_offset: coverage of the 68 % and 95 % intervals: {covered(result.universal_coverage)}"
+        )
+
+
+def show_held_out(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None:
+    """Show the table of `train-universal`."""
+    rows = [(row, *(statistics.mae for statistics in by.values())) for row, by in held_out.items()]
+    show_table("MAE in held-out simulated buildings, m", ("", *held_out["raw"]), rows)
+
+
+def show_bundle(bundle: Bundle) -> None:
+    """Show file, size and id of a bundle."""
+    kind = "int8" if bundle.quantised else "float32"
+    print_line(f"{bundle.path}: {kind}, {len(bundle.model)} bytes, model id {bundle.model_id:08x}")
+
+
+def show_accuracy(result: Accuracy) -> None:
+    """Show the table of `evaluate`."""
+    after = result.corrected
+    rows: list[tuple[object, ...]] = [("all", result.n, result.raw.mae, after.mae, after.std, after.p95)]
+    rows += [(label or "no label", *values, "", "") for label, values in result.by_label.items()]
+    columns = ("", "n", "raw MAE", "corrected MAE", "std", "p95")
+    show_table(f"{result.n} ranges, model {result.model_id:08x}, m", columns, rows)
+    for status, count in result.statuses.items():
+        if status != "OK":
+            print_line(f"{status}: {count} ranges not corrected")
+    if result.trained_on:
+        print_line(
+            f"The result is optimistic: {len(result.trained_on)} of {len(result.by_configuration)} configurations are in the "
+            "training data of the model. --cross-validate shows the error on held-out configurations."
+        )

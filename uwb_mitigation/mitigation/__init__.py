@@ -1,0 +1,1 @@
+"""Correction of ranges: preprocessing, models, and the export for boards."""

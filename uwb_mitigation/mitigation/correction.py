@@ -1,0 +1,259 @@
+"""Correction of ranges: offset, preprocessing, linear bias model, network, and the handling of failures."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.mitigation.model.bundle import Bundle, Card, Session
+from uwb_mitigation.mitigation.model.ood import OodDetector, features
+from uwb_mitigation.types.measurement import (
+    CorrectedColumns,
+    CorrectedRange,
+    Origin,
+    RangeColumns,
+    RangeMeasurement,
+    Status,
+)
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+
+MAX_RANGE_M = 1e6
+"""Upper limit of valid ranges: the radio reaches a few hundred metres."""
+
+_STATUSES = {int(status): status for status in Status}
+# NumPy takes microseconds to convert a member of an enumeration.
+_INFINITE_VARIANCE = np.float32(np.inf)
+_ALL_ROWS = slice(None)
+_OK, _NO_CIR, _BAD_CIR, _OUT_OF_DISTRIBUTION, _MODEL_ERROR = _STATUSES
+
+
+class CorrectionRule:
+    """Computes corrections and variances from predicted errors, as the card of a bundle specifies."""
+
+    def __init__(self, card: Card) -> None:
+        self._low, self._high = (np.float32(limit) for limit in card.correction_limits_m)
+        self._variance = np.float32(card.variance_m2)
+        self._variance_per_m2 = np.float32(card.variance_per_m2)
+        self._variance_uncorrected = np.float32(card.variance_uncorrected_m2)
+        ood_bands = card.ood_bands
+        self._ood_detector = None if ood_bands is None else OodDetector(ood_bands.bands)
+        self._scaling = card.preprocessing.scaling
+        self._known_offset = np.float32(0.0 if ood_bands is None else ood_bands.known_offset_m)
+
+    def accepts(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return which predicted errors are within the limits and have an OOD score below 1, bool (n,)."""
+        accepted: NDArray[np.bool_] = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
+        return accepted
+
+    def score(
+        self,
+        windows: NDArray[np.float32],
+        range_m: NDArray[np.floating],
+        rx_power_dbm: NDArray[np.floating],
+        first_path_power_dbm: NDArray[np.floating],
+    ) -> NDArray[np.float32]:
+        """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
+        if self._ood_detector is None:
+            return np.zeros(len(windows), np.float32)
+        values = features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
+        return self._ood_detector.score(values)
+
+    def apply(
+        self, predicted: NDArray[np.float32], score: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return corrections (m) and variances (m^2) of predicted errors that `accepts` accepts, float32 (n,)."""
+        correction: NDArray[np.float32] = predicted
+        variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
+        if self._ood_detector is not None and np.count_nonzero(score > 0.0):
+            shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
+            correction = np.where(score > 0.0, shrunk, predicted)
+            variance = variance + np.maximum(score, np.float32(0.0)) * self._variance_uncorrected
+        return correction, variance
+
+
+class Backend(ABC):
+    """Corrects ranges with a bundle: `Mitigation` with ONNX Runtime, `FirmwareMitigation` with the firmware's C.
+
+    Attributes:
+        bundle: the model.
+        offsets: offsets of the radios; may be changed between two calls.
+    """
+
+    bundle: Bundle
+    offsets: Offsets
+
+    @abstractmethod
+    def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
+        """Return the corrected ranges; never raises because of the content of a measurement."""
+
+    def correct(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]:
+        """Return the corrected range of each measurement; never raises because of their content.
+
+        Measurements whose CIRs have the same encoding and length are corrected in one batch.
+        """
+        results: list[CorrectedRange | None] = [None] * len(measurements)
+        for indices, ranges in RangeColumns.grouped(measurements):
+            corrected = self.correct_columns(ranges)
+            columns = (corrected.range_m, corrected.correction_m, corrected.variance_m2, corrected.status)
+            for index, range_m, correction_m, variance_m2, status in zip(
+                indices, *(column.tolist() for column in columns), strict=True
+            ):
+                results[index] = CorrectedRange(
+                    range_m,
+                    measurements[index].range_m,
+                    correction_m,
+                    variance_m2,
+                    _STATUSES[status],
+                    corrected.origin,
+                    corrected.model_id,
+                )
+        return [result for result in results if result is not None]
+
+
+def pass_through(
+    bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32], status: NDArray[np.uint8]
+) -> CorrectedColumns:
+    """Return the raw ranges minus the offsets of their radios, with the variance of uncorrected ranges.
+
+    The offset does not depend on the CIR. A range without a CIR from which an offset was subtracted gets the
+    variance of corrected ranges: that of uncorrected ranges contains the offsets of the training boards.
+
+    Args:
+        bundle: the model.
+        ranges: n measured ranges.
+        offset_m: offset of the radios of each range, m, float32 (n,).
+        status: `Status` of each range, uint8 (n,).
+
+    Returns:
+        n ranges; `status` is not copied.
+    """
+    card = bundle.card
+    range_m = _subtract_offset(ranges.range_m, offset_m)
+    variance = np.where(
+        _is_valid_range(range_m), np.float32(card.variance_uncorrected_m2), _INFINITE_VARIANCE
+    )
+    if not ranges.samples.shape[1]:
+        variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
+    return CorrectedColumns(range_m, offset_m, variance, status, Origin.HOST, bundle.model_id)
+
+
+def pass_other_radio(
+    bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32]
+) -> CorrectedColumns | None:
+    """Return the raw ranges minus the offsets if the bundle was trained for another radio or segment, otherwise None.
+
+    Args:
+        bundle: the model.
+        ranges: n measured ranges.
+        offset_m: offset of the radios of each range, m, float32 (n,).
+    """
+    has_cir = ranges.samples.shape[1] > 0
+    if bundle.card.fits(ranges.radio, ranges.segment, has_cir):
+        return None
+    status = _OUT_OF_DISTRIBUTION if has_cir else _NO_CIR
+    return pass_through(bundle, ranges, offset_m, np.full(len(ranges), status, np.uint8))
+
+
+class Mitigation(Backend):
+    """Corrects ranges with one bundle, by ONNX Runtime. Not thread-safe.
+
+    Predicted error = linear bias + network, correction = offset of the radios + predicted error, and corrected = range -
+    correction, each one float32 operation, so that a microcontroller computes the same bits. The bundle uses the range
+    minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
+    through with a status that gives the reason and a larger variance:
+
+    NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: the bundle was
+    trained for another radio or segment, the range minus offset is negative or not finite, the predicted error is outside
+    the bundle's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
+
+    The further a measurement is outside the bundle's training data (`Card.ood_bands`), the more its correction shrinks
+    from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
+
+    Args:
+        bundle: the model.
+        offsets: offsets of the radios, in addition to the bundle's prediction.
+
+    Raises:
+        ModelError: ONNX Runtime rejects the bundle's network.
+    """
+
+    def __init__(self, bundle: Bundle, offsets: Offsets = NO_OFFSETS) -> None:
+        self.bundle = bundle
+        self.offsets = offsets
+        self._session = Session(bundle)
+        self._rule = CorrectionRule(bundle.card)
+
+    def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
+        """See `Backend`."""
+        linear_bias, n = self.bundle.linear_bias, len(ranges)
+        offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
+        if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
+            return passed
+        range_m = _subtract_offset(ranges.range_m, offset)
+        valid = _is_valid_range(range_m)
+        powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
+        predicted = linear_bias.predict_m(*powers)
+        faults, windows = self.bundle.preprocessing.apply(ranges)
+        has_window, has_bias = faults == 0, np.isfinite(predicted)
+        is_predictable = has_window & has_bias & valid
+        rows = _row_index(is_predictable)
+        status, score = np.zeros(n, np.uint8), np.zeros(n, np.float32)
+        if rows is not _ALL_ROWS:
+            # CirFault.NO_POWER, which the preprocessing does not check
+            status[~has_bias] = _BAD_CIR
+            status[~valid] = _OUT_OF_DISTRIBUTION
+            status[~has_window] = _BAD_CIR if ranges.samples.shape[1] else _NO_CIR
+            windows = windows[is_predictable[has_window]]
+            predicted[~is_predictable] = np.nan
+        if len(windows):
+            try:
+                predicted[rows] += self._session.predict_m(windows)
+            except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
+                predicted[rows] = np.nan
+            score[rows] = self._rule.score(windows, range_m[rows], *(power[rows] for power in powers))
+        if not self.bundle.card.needs_cir and len(windows) < n:
+            # The first-path power may be unknown if the linear bias model has no weight for it.
+            first_path = powers[1] if linear_bias.per_power_gap != 0.0 else powers[0]
+            bias_only = linear_bias.predict_m(powers[0], first_path)
+            uses_bias_only = valid & ~is_predictable & np.isfinite(bias_only)
+            predicted[uses_bias_only], status[uses_bias_only] = bias_only[uses_bias_only], _OK
+
+        accepted = self._rule.accepts(predicted, score)
+        rows = _row_index(accepted)
+        excess, variance = self._rule.apply(predicted[rows], score[rows])
+        correction = offset[rows] + excess
+        corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
+        if rows is _ALL_ROWS:
+            model_id = self.bundle.model_id
+            return CorrectedColumns(corrected_m, correction, variance, status, Origin.HOST, model_id)
+        rejected = (status == _OK) & ~accepted
+        status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
+        corrected = pass_through(self.bundle, ranges, offset, status)
+        corrected.range_m[rows], corrected.correction_m[rows], corrected.variance_m2[rows] = (
+            corrected_m,
+            correction,
+            variance,
+        )
+        return corrected
+
+
+def _row_index(mask: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
+    """Return an index of the selected rows: a slice, which is faster, if all are selected."""
+    return _ALL_ROWS if np.count_nonzero(mask) == len(mask) else mask
+
+
+def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:
+    """Return ranges minus offsets in float32, as on boards; without an offset the unchanged range."""
+    corrected: NDArray[np.floating] = range_m.copy()
+    if np.count_nonzero(offset_m):
+        with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.
+            corrected = np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
+    return corrected
+
+
+def _is_valid_range(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:
+    valid: NDArray[np.bool_] = (range_m >= 0.0) & (range_m <= MAX_RANGE_M)
+    return valid

@@ -1,0 +1,254 @@
+"""Conversion of an int8 network to the firmware's arrays: layouts, integer constants, range checks.
+
+The layouts are documented in `firmware/src/uwb_mitigation.h` and `uwb_kernels.h`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.mitigation.model.requantisation import (
+    Sum,
+    accumulator_range,
+    requantisation_scale,
+    solve_requantisation,
+    solve_sum,
+)
+from uwb_mitigation.mitigation.model.weights import Int8Weights, layer_inputs
+
+FILTERS = 16
+FIRST_KERNELS = (3, 5)
+SAMPLES = range(8, 158)
+MODULES = range(1, 4)
+
+_BLOCK = 8
+_UNIT = 256
+_Integer = TypeVar("_Integer", np.int8, np.int32)
+_REMEDY = "quantise with `requantisation.nudge`, which moves scales by a few ulps"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channels:
+    """int32 (n,) each: bias times 256 including the rounding offset, and multiplier."""
+
+    bias: NDArray[np.int32]
+    multiplier: NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedModule:
+    """Weights and requantisation of one residual reduction module."""
+
+    residual_weights: NDArray[np.int8]
+    residual: Channels
+    residual_sum: Sum
+    reduce_weights: NDArray[np.int8]
+    reduce: Channels
+    skip: Channels
+    output_sum: Sum
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedLayer:
+    """Weights and requantisation of one fully connected layer."""
+
+    weights: NDArray[np.int8]
+    channels: Channels
+    inputs: int
+    outputs: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedNetwork:
+    """Network part of `uwb_model`: a REMNet has `modules`, an MLP has `layers`."""
+
+    samples: int
+    input_scale: np.float32
+    head_weights: NDArray[np.int8]
+    head_bias: int
+    head_scale: np.float32
+    first_kernel: int = 0
+    first_weights: NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, 0), np.int16))
+    first: Channels | None = None
+    modules: tuple[PackedModule, ...] = ()
+    layers: tuple[PackedLayer, ...] = ()
+
+
+def pack(weights: Int8Weights) -> PackedNetwork:
+    """Return the packed network.
+
+    Raises:
+        ModelError: the firmware has no kernels for its shape, or a layer has no exact integer
+            constants; the message names the layer and channel.
+    """
+    if isinstance(weights.architecture, Mlp):
+        return _pack_mlp(weights, weights.architecture)
+    return _pack_remnet(weights, weights.architecture)
+
+
+def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
+    for name, value, valid in (
+        ("filters", shape.filters, (FILTERS,)),
+        ("kernel", shape.kernel, (3,)),
+        ("first_kernel", shape.first_kernel, FIRST_KERNELS),
+        ("samples", shape.samples, SAMPLES),
+        ("modules", shape.modules, MODULES),
+    ):
+        if value not in valid:
+            raise ModelError(
+                f"the firmware has no kernels for {name} = {value}",
+                valid=" or ".join(map(str, valid)) if len(valid) < 3 else f"{valid[0]} to {valid[-1]}",
+            )
+    scale = weights.activation_scale
+    reads = layer_inputs(shape)
+
+    def channels(layer: str) -> Channels:
+        return _channels(
+            layer,
+            weights.weight[layer],
+            weights.bias[layer],
+            requantisation_scale(scale[reads[layer]], weights.weight_scale[layer], scale[layer]),
+        )
+
+    def total(name: str, first: str, second: str) -> Sum:
+        found = solve_sum(np.float32(scale[first] / scale[name]), np.float32(scale[second] / scale[name]))
+        if found is None:
+            raise ModelError("the sum has no exact integer form", where=name, valid=_REMEDY)
+        return found
+
+    first = np.zeros((FILTERS, shape.first_kernel + 1), np.int16)
+    first[:, :-1] = weights.weight["first"][:, 0].astype(np.int16) * _UNIT
+    modules = []
+    tensor = "first"
+    for number in range(1, shape.modules + 1):
+        name = f"module{number}"
+        wide = weights.weight[f"{name}.reduce"]
+        taps = np.stack(
+            [wide[..., 0], wide[..., 2], wide[..., 1], weights.weight[f"{name}.skip"][..., 0]], -1
+        )
+        modules.append(
+            PackedModule(
+                _share_words(_channel_pairs(weights.weight[f"{name}.residual"])),
+                channels(f"{name}.residual"),
+                total(f"{name}.sum", f"{name}.residual", tensor),
+                _share_words(_channel_pairs(taps)),
+                channels(f"{name}.reduce"),
+                channels(f"{name}.skip"),
+                total(name, f"{name}.reduce", f"{name}.skip"),
+            )
+        )
+        tensor = name
+    return PackedNetwork(
+        samples=shape.samples,
+        input_scale=scale["input"],
+        head_weights=_share_words(_head_in_blocks(weights.weight[HEAD], shape)),
+        head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
+        head_scale=np.float32(scale[tensor] * weights.weight_scale[HEAD][0]),
+        first_kernel=shape.first_kernel,
+        first_weights=first,
+        first=channels("first"),
+        modules=tuple(modules),
+    )
+
+
+def _pack_mlp(weights: Int8Weights, shape: Mlp) -> PackedNetwork:
+    """Pack an MLP; pad inputs and outputs with zeros to multiples of 8."""
+    layers = []
+    scale = weights.activation_scale["input"]
+    for dense in shape.layers:
+        name = dense.name
+        output_scale = weights.activation_scale[name]
+        channels = _channels(
+            name,
+            weights.weight[name],
+            weights.bias[name],
+            requantisation_scale(scale, weights.weight_scale[name], output_scale),
+        )
+        outputs, inputs = (-(-size // 8) * 8 for size in (dense.outputs, dense.inputs))
+        padded = np.zeros((outputs, inputs), np.int8)
+        padded[: dense.outputs, : dense.inputs] = weights.weight[name]
+        quads = padded.reshape(outputs // 4, 4, inputs // 4, 4).transpose(0, 2, 1, 3)
+        layers.append(
+            PackedLayer(
+                _share_words(quads.reshape(-1, 2)),
+                Channels(_padded(channels.bias, outputs), _padded(channels.multiplier, outputs)),
+                inputs,
+                outputs,
+            )
+        )
+        scale = output_scale
+    head = _padded(weights.weight[HEAD][:, 0], -(-shape.features // 8) * 8)
+    return PackedNetwork(
+        samples=shape.samples,
+        input_scale=weights.activation_scale["input"],
+        head_weights=_share_words(head.reshape(-1, 2)),
+        head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
+        head_scale=np.float32(scale * weights.weight_scale[HEAD][0]),
+        layers=tuple(layers),
+    )
+
+
+def _channels(
+    name: str, weight: NDArray[np.int8], bias: NDArray[np.int32], scales: NDArray[np.float32]
+) -> Channels:
+    low, high = accumulator_range(weight, bias)
+    constants = np.empty((2, len(bias)), np.int32)
+    for channel, scale in enumerate(scales):
+        found = solve_requantisation(scale, int(low[channel]), int(high[channel]))
+        if found is None:
+            raise ModelError(
+                f"channel {channel} has no exact integer requantisation (scale {scale!r}, "
+                f"accumulators {low[channel]} to {high[channel]})",
+                where=name,
+                valid=_REMEDY,
+            )
+        constants[:, channel] = _UNIT * int(bias[channel]) + found.offset, found.multiplier
+    return Channels(*constants)
+
+
+def _channel_pairs(weight: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Convert (filters, inputs, taps) to pairs (filters * inputs / 2 * taps, 2)."""
+    filters, inputs, taps = weight.shape
+    pairs: NDArray[np.int8] = (
+        weight.reshape(filters, inputs // 2, 2, taps).transpose(0, 1, 3, 2).reshape(-1, 2)
+    )
+    return pairs
+
+
+def _share_words(pairs: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Interleave pairs (n, 2), n even: bytes p0 q0 p1 q1 of each two pairs, int8 (2 n,)."""
+    return np.ascontiguousarray(pairs.reshape(-1, 2, 2).transpose(0, 2, 1)).reshape(-1)
+
+
+def _head_in_blocks(weight: NDArray[np.int8], shape: Remnet) -> NDArray[np.int8]:
+    """Return the head's weights as pairs, in the order of the last module's blocks, padded with zeros."""
+    length = shape.lengths[-1]
+    blocks = -(-length // _BLOCK)
+    padded = np.zeros((FILTERS, blocks * _BLOCK), np.int8)
+    padded[:, :length] = weight[:, 0].reshape(FILTERS, length)
+    pairs: NDArray[np.int8] = (
+        padded.reshape(FILTERS // 2, 2, blocks, _BLOCK).transpose(2, 0, 3, 1).reshape(-1, 2)
+    )
+    return pairs
+
+
+def _head_bias(weight: NDArray[np.int8], bias: NDArray[np.int32]) -> int:
+    low, high = accumulator_range(weight, bias)
+    # Up to 2^23 the conversion to float is exact, and the 256-fold accumulator fits 32 bits.
+    if int(low[0]) < -(2**23) or int(high[0]) >= 2**23:
+        raise ModelError(
+            f"accumulators from {low[0]} to {high[0]}", where=HEAD, valid="magnitudes below 2^23"
+        )
+    return _UNIT * int(bias[0])
+
+
+def _padded(values: NDArray[_Integer], length: int) -> NDArray[_Integer]:
+    padded = np.zeros(length, values.dtype)
+    padded[: len(values)] = values
+    return padded

@@ -1,0 +1,95 @@
+"""The float network in NumPy: activations for calibration, and a reference for PyTorch and ONNX Runtime."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ModelError
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.architecture import HEAD, Convolution, Mlp, Remnet
+from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.mitigation.model.weights import (
+    FloatWeights,
+    activation_tensors,
+    layer_inputs,
+    sum_operands,
+)
+
+CHUNK = 256
+"""Batch size, which limits the memory."""
+
+
+def activations(weights: FloatWeights, inputs: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    """Return all activations of the float network for inputs of shape (n, K).
+
+    The result is {tensor: (n, channels, length)}; for an MLP, {tensor: (n, outputs)}.
+    """
+    architecture = weights.architecture
+    if isinstance(architecture, Mlp):
+        dense = {"input": inputs}
+        for layer, read in layer_inputs(architecture).items():
+            if layer != HEAD:
+                sums = dense[read] @ weights.weight[layer].T + weights.bias[layer]
+                dense[layer] = np.maximum(sums, np.float32(0))
+        return dense
+    layers = {layer.name: layer for layer in architecture.convolutions}
+    reads = layer_inputs(architecture)
+    values = {"input": inputs[:, None, :]}
+    for tensor in activation_tensors(architecture)[1:]:
+        if tensor in reads:
+            values[tensor] = _convolve(weights, layers[tensor], values[reads[tensor]])
+        else:
+            first, second = sum_operands(tensor)
+            values[tensor] = values[first] + values[second]
+    return values
+
+
+def _convolve(weights: FloatWeights, layer: Convolution, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    padded = np.pad(values, ((0, 0), (0, 0), layer.padding))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, layer.kernel, axis=2)
+    windows = windows[:, :, :: layer.stride]
+    sums = np.einsum("ncpk,fck->nfp", windows, weights.weight[layer.name], optimize=True)
+    activation: NDArray[np.float32] = np.maximum(sums + weights.bias[layer.name][:, None], np.float32(0))
+    return activation
+
+
+def predict_m(weights: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the outputs of the float network, (n,), m, for inputs of shape (n, K)."""
+    last = activation_tensors(weights.architecture)[-1]
+    outputs = []
+    for start in range(0, len(inputs), CHUNK):
+        flat = activations(weights, inputs[start : start + CHUNK])[last]
+        outputs.append(flat.reshape(len(flat), -1) @ weights.weight[HEAD][:, 0] + weights.bias[HEAD])
+    return np.concatenate(outputs) if outputs else np.zeros(0, np.float32)
+
+
+def float_network(source: Bundle) -> FloatWeights:
+    """Return the float network of a bundle; an int8 network is dequantised.
+
+    Raises:
+        ModelError: it is not a REMNet.
+    """
+    if not isinstance(source.architecture, Remnet):
+        raise ModelError("no REMNet to start from", where=str(source.path), valid="a bundle of `train`")
+    if not source.quantised:
+        return graph.float_weights(source.model, source.architecture)
+    integers = graph.int8_weights(source.model, source.architecture)
+    reads = layer_inputs(source.architecture)
+    weight, bias = {}, {}
+    for layer, values in integers.weight.items():
+        scale = integers.weight_scale[layer]
+        shaped = scale if layer == HEAD else scale[:, None, None]
+        weight[layer] = (values * shaped).astype(np.float32)
+        unit = integers.activation_scale[reads[layer]] * scale
+        bias[layer] = (integers.bias[layer] * unit).astype(np.float32)
+    return FloatWeights(source.architecture, weight, bias)
+
+
+def scaled(network: FloatWeights, factor: float) -> FloatWeights:
+    """Return a network whose predictions are multiplied by `factor`."""
+    weight = {**network.weight, HEAD: network.weight[HEAD] * np.float32(factor)}
+    bias = {**network.bias, HEAD: network.bias[HEAD] * np.float32(factor)}
+    return replace(network, weight=weight, bias=bias)

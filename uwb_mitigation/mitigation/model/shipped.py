@@ -1,0 +1,77 @@
+"""Find the models and other files of the installed package."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from uwb_mitigation.errors import ModelError, did_you_mean
+
+if TYPE_CHECKING:
+    # `doctor` must work without NumPy.
+    from uwb_mitigation.mitigation.preprocessing import Scaling
+
+DEFAULT, AMPLITUDE = "universal", "universal_amplitude"
+"""Models for unknown sites and boards, with and without preamble counts."""
+
+SHIPPED = (DEFAULT, AMPLITUDE, "evk1000_apartment", "dw3000_sts")
+"""All models; an example of a surveyed site and an experimental one for the DW3000 are used only if they are named."""
+
+_SHARE = Path("share", "uwb_mitigation")
+
+
+def default_model_path(scaling: Scaling | None = None) -> Path:
+    """Return the path of the default model for inputs with a scaling (default: preamble); see `shipped_model_path`."""
+    return shipped_model_path(AMPLITUDE if scaling is not None and scaling.value == "max" else DEFAULT)
+
+
+def model_path(named: str | Path | None) -> Path:
+    """Return the path of a bundle: a file, or one of `SHIPPED`; the default for None.
+
+    Raises:
+        ModelError: there is no such shipped model or file; the message lists the shipped ones.
+    """
+    if not named or str(named) == ".":
+        return default_model_path()
+    if str(named) in SHIPPED:
+        return shipped_model_path(str(named))
+    path = Path(named).expanduser()
+    if not path.exists():
+        raise ModelError(
+            "neither a file nor a shipped model",
+            where=str(named),
+            valid=f"shipped models: {', '.join(SHIPPED)}",
+            suggestion=did_you_mean(path.stem, SHIPPED),
+        )
+    return path
+
+
+def shipped_model_path(name: str) -> Path:
+    """Return the path of one of `SHIPPED` in a source checkout, this installation, or a sourced ROS workspace.
+
+    Raises:
+        ModelError: the model is in none of these folders; the message lists them.
+    """
+    candidates = [folder / f"{name}.onnx" for folder in shared_folders("models")]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise ModelError(
+        f"the shipped model {name} is not installed",
+        where=", ".join(str(candidate.parent) for candidate in candidates),
+        valid="install the package again, or give the path of a model",
+    )
+
+
+def shared_folders(name: str) -> list[Path]:
+    """Return possible paths of the shared folder `name`: in a checkout, this installation and sourced workspaces."""
+    package = Path(__file__).resolve().parents[2]
+    folders = [package.parent / name]
+    # lib/python3.x/site-packages/uwb_mitigation, or Debian's local/lib/python3.x/dist-packages.
+    folders += [prefix / _SHARE / name for prefix in list(package.parents)[3:5]]
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    folders += [Path(prefix) / _SHARE / name for prefix in prefixes if prefix]
+    folders.append(Path(sys.prefix) / _SHARE / name)
+    return list(dict.fromkeys(folders))

@@ -1,0 +1,173 @@
+"""Conversion of channel impulse responses to the network's inputs, as in training and firmware.
+
+Every step is a single correctly rounded IEEE-754 binary32 operation, so that a microcontroller with
+a single-precision unit computes the same bits: exact integer power re^2 + im^2, converted to float32,
+square root, times `scale`, then the scaling. No I/O here.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.types.measurement import Encoding, RangeColumns, RangeMeasurement
+
+WINDOW_LEAD = 5
+"""Samples of the window before floor(first path): enough to include the noise before the path."""
+
+
+PREAMBLE_DIVISOR = 60
+"""Scales `magnitude / preamble_count` of the DW1000 to the order of one before the square root."""
+
+MIN_SCALE, MAX_SCALE = 1e-30, 1e30
+"""Accumulator units per count: any int16 magnitude times these is a normal float32."""
+
+SATURATED = np.iinfo(np.int16).max
+
+
+class Scaling(str, enum.Enum):
+    """Scaling of a window of magnitudes to the network's input.
+
+    MAX divides by the window's maximum, the only option for normalised amplitudes.
+    PREAMBLE is sqrt(magnitude / (60 preamble_count)), which preserves the received level.
+    """
+
+    MAX = "max"
+    PREAMBLE = "preamble"
+
+
+class CirFault(enum.IntEnum):
+    """Reason why a channel impulse response is unusable; the values of `uwb_status` in the firmware."""
+
+    EMPTY = 3
+    ODD_LENGTH = 4
+    BAD_SCALE = 5
+    NO_FIRST_PATH = 6
+    OUTSIDE = 7
+    ALL_ZERO = 8
+    NEGATIVE = 9
+    SATURATED = 10
+    NO_PREAMBLE_COUNT = 11
+    NO_POWER = 12
+
+    @property
+    def text(self) -> str:
+        """The reason as text."""
+        return _FAULT_TEXTS[self]
+
+
+_FAULT_TEXTS = {
+    CirFault.EMPTY: "the CIR has no samples",
+    CirFault.ODD_LENGTH: "a complex CIR has an odd number of values",
+    CirFault.BAD_SCALE: "the scale of the CIR is not a positive number within the range of float32",
+    CirFault.NO_FIRST_PATH: "the first-path index is not finite",
+    CirFault.OUTSIDE: "the window around the first path is partly outside the CIR",
+    CirFault.ALL_ZERO: "the window contains only zeros",
+    CirFault.NEGATIVE: "a magnitude is negative",
+    CirFault.SATURATED: "the window contains a saturated sample",
+    CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
+    CirFault.NO_POWER: "the receive or first-path power is unknown, and the linear bias model needs it",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Preprocessing:
+    """Window and scaling of a model.
+
+    Attributes:
+        samples: window length K, from 1 to 1016.
+        scaling: scaling of the magnitudes.
+
+    Raises:
+        ParameterError: the window length is out of its range.
+    """
+
+    samples: int = 157
+    scaling: Scaling = Scaling.PREAMBLE
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.samples <= 1016:
+            raise ParameterError(f"window of {self.samples} samples", valid="1 to 1016")
+
+    def apply(self, ranges: RangeColumns) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Return the network's inputs.
+
+        Returns:
+            `CirFault` of each row, uint8 (n,), 0 = usable; and the inputs of the u usable rows, float32 (u, samples).
+        """
+        is_complex = ranges.encoding == Encoding.COMPLEX_INT16
+        width = 2 if is_complex else 1
+        size, total = width * self.samples, ranges.samples.shape[1]
+        faults, windows, scales, symbols = [], [], [], []
+        numbers = (ranges.first_path_index, ranges.start_index, ranges.scale, ranges.preamble_count)
+        # A loop over Python numbers: for a live range, a batch of one, it is faster than operations on arrays.
+        for samples, first_path, start_index, scale, count in zip(
+            ranges.samples, *(column.tolist() for column in numbers), strict=True
+        ):
+            fault = 0
+            if total == 0:
+                fault = CirFault.EMPTY
+            elif not MIN_SCALE <= scale <= MAX_SCALE:
+                fault = CirFault.BAD_SCALE
+            elif not math.isfinite(first_path):
+                fault = CirFault.NO_FIRST_PATH
+            elif self.scaling is Scaling.PREAMBLE and count <= 0:
+                fault = CirFault.NO_PREAMBLE_COUNT
+            else:
+                start = width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
+                window = samples[start : start + size] if start >= 0 else samples[:0]
+                fault = CirFault.OUTSIDE if len(window) < size else _content_fault(window, total, is_complex)
+            faults.append(fault)
+            if not fault:
+                windows.append(window)
+                scales.append(scale)
+                symbols.append(PREAMBLE_DIVISOR * count)
+        if not windows:
+            return np.array(faults, np.uint8), np.empty((0, self.samples), np.float32)
+
+        if is_complex:
+            power = np.array(windows, np.int32)
+            np.multiply(power, power, out=power)
+            inputs = (power[:, 0::2] + power[:, 1::2]).astype(np.float32)
+            np.sqrt(inputs, out=inputs)
+        else:
+            inputs = np.array(windows, np.float32)
+        if any(scale != 1.0 for scale in scales):
+            np.multiply(inputs, np.array(scales, np.float32)[:, None], out=inputs)
+        if self.scaling is Scaling.MAX:
+            np.divide(inputs, inputs.max(axis=1, keepdims=True), out=inputs)
+        else:
+            np.divide(inputs, np.array(symbols, np.float32)[:, None], out=inputs)
+            np.sqrt(inputs, out=inputs)
+        return np.array(faults, np.uint8), inputs
+
+    def windows_of(self, measurements: Sequence[RangeMeasurement]) -> tuple[list[int], NDArray[np.float32]]:
+        """Return `CirFault` of each measurement (0 = usable), and the inputs, float32 (n, samples), zeros if unusable."""
+        faults = np.zeros(len(measurements), np.uint8)
+        inputs = np.zeros((len(measurements), self.samples), np.float32)
+        for indices, ranges in RangeColumns.grouped(measurements):
+            found, windows = self.apply(ranges)
+            faults[indices] = found
+            inputs[np.array(indices)[found == 0]] = windows
+        return faults.tolist(), inputs
+
+
+def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:
+    """Return the `CirFault` of the samples in a window of a CIR with `total` values; 0 = usable."""
+    # int16 has no +32768: compare the extremes instead of magnitudes.
+    highest, lowest = int(np.maximum.reduce(window)), int(np.minimum.reduce(window))
+    if is_complex and total % 2:
+        return CirFault.ODD_LENGTH
+    if not is_complex and lowest < 0:
+        return CirFault.NEGATIVE
+    if highest == 0 and lowest == 0:
+        return CirFault.ALL_ZERO
+    if highest >= SATURATED or lowest <= -SATURATED:
+        return CirFault.SATURATED
+    return 0

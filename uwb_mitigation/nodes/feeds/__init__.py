@@ -1,0 +1,1 @@
+"""Sources of the driver: radios, UCI boards, topics, and replayed recordings."""

@@ -1,0 +1,282 @@
+"""Replay a recording or the simulator for the driver: timing, pause, seek, loop, and waiting for subscribers."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes.support import diagnostics
+from uwb_mitigation.nodes.support.diagnostics import Description
+from uwb_mitigation.nodes.support.lifecycle import clock_reader
+from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.offsets import Offsets
+from uwb_mitigation.types.source import Source
+
+TICK_S = 0.02
+"""Interval at which commands and a simulated clock are checked, and /clock is published."""
+
+LATE_NS, BATCH = 1_000_000, 16
+"""A record that is later than this is published in a batch with the next ones, of at most BATCH records."""
+
+CLOCK_STEP_NS = 1_000_000
+"""If the node's clock shifts by more than this relative to the steady clock, it was set, and stamps follow it."""
+
+ANNOUNCEMENT_S = 3.0
+"""The middleware repeats its announcements after this time, if the first ones were lost."""
+
+LATE_WARNING_S = 0.5
+"""A delay of the replay above this is reported."""
+
+
+class ReplayClock:
+    """The clock that paces a replay, and its stamps on a node's clock.
+
+    This is simulated time if it is active, else a steady clock: setting the system clock does not affect the replay.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._stamp_now_ns = clock_reader(clock)
+        self._offset_ns: int | None = None
+
+    def now_ns(self) -> int:
+        """Return the time of the replay clock."""
+        return self._stamp_now_ns() if self._simulated else time.monotonic_ns()
+
+    def stamp_ns(self, replay_ns: int) -> int:
+        """Convert a time of the replay clock to the node's clock; intervals are the same on both."""
+        if self._simulated:
+            return replay_ns
+        offset_ns, uncertainty_ns = self._read_both()
+        while self._offset_ns is None and uncertainty_ns > CLOCK_STEP_NS:
+            offset_ns, uncertainty_ns = self._read_both()
+        if self._offset_ns is None or abs(offset_ns - self._offset_ns) > CLOCK_STEP_NS + uncertainty_ns:
+            self._offset_ns = offset_ns
+        return replay_ns + self._offset_ns
+
+    def _read_both(self) -> tuple[int, int]:
+        """Return the offset of the node's clock to the steady clock, and its uncertainty, ns.
+
+        The uncertainty distinguishes an interruption of the process between the two readings from a clock that was set.
+        """
+        before_ns = time.monotonic_ns()
+        offset_ns = self._stamp_now_ns() - before_ns
+        return offset_ns, time.monotonic_ns() - before_ns
+
+    @property
+    def _simulated(self) -> bool:
+        return self._clock.clock_type == ClockType.ROS_TIME and bool(self._clock.ros_time_is_active)
+
+
+class ReplayFeed:
+    """Publishes the records of a source when they are due, from its own thread; implements `Feed`.
+
+    A record is due at its offset from the first record, divided by the rate. Late records may be published in
+    batches. Rate, pause and position may change at any time; they take effect within `TICK_S`.
+
+    Args:
+        source: closed by the caller.
+        clock: the node's clock; simulated time paces the replay, otherwise a steady clock does.
+        value: returns the value of a parameter of the driver. With `publish_clock`, stamps are the recorded ones.
+        logger: with `info` and `warning`, as rclpy's.
+        subscribers: returns the number of subscribers.
+        publish: publishes [(record, stamp_ns), ...].
+        on_time: with `publish_clock`, called with the recorded time (ns) at every tick, to drive `/clock`.
+        on_end: called once from the playing thread with the error or None, unless `stop` came first.
+
+    Attributes:
+        played: number of records published.
+        late_ns: delay of the latest record.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        clock: Clock,
+        value: Callable[[str], Any],
+        logger: Any,
+        *,
+        subscribers: Callable[[], int],
+        publish: Callable[[Sequence[tuple[Record, int]]], None],
+        on_time: Callable[[int], None],
+        on_end: Callable[[UwbMitigationError | None], None],
+    ) -> None:
+        self.played = 0
+        self.late_ns = 0
+        self._source = source
+        self._clock = ReplayClock(clock)
+        self._value = value
+        self._logger = logger
+        self._subscribers = subscribers
+        self._publish = publish
+        self._on_time = on_time
+        self._on_end = on_end
+        self._uses_recorded_stamps = value("publish_clock")
+        self._requested_rate = self._rate = float(value("rate"))
+        self._pause_requested, self._paused = value("paused"), False
+        self._seeks = deque([int(value("seek_to") * 1e9)])
+        self._late: list[tuple[Record, int]] = []
+        # The played time `_reference_ns` is due at `_reference_clock_ns`.
+        self._reference_ns = self._reference_clock_ns = 0
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
+
+    def start(self) -> None:
+        if self._source.simulated:
+            self._logger.warning(f"replaying simulated ranges: {self._source.name}")
+        else:
+            self._logger.info(f"replaying {self._source.name}")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop before the next record, and join the thread; may be called twice."""
+        self._stopping.set()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def apply(self, changed: Collection[str], value: Callable[[str], Any], offsets: Offsets) -> None:
+        """Change rate, pause and position."""
+        if "rate" in changed:
+            self._requested_rate = float(value("rate"))
+        if "paused" in changed:
+            self._pause_requested = value("paused")
+        if "seek_to" in changed:
+            self._seeks.append(int(value("seek_to") * 1e9))
+
+    def describe(self) -> Description:
+        simulated = self._source.simulated
+        entries: dict[str, object] = {
+            "source": self._source.name,
+            "simulated": "unknown" if simulated is None else simulated,
+            "ranges published": self.played,
+        }
+        entries |= {f"warning: {kind}": count for kind, count in self._source.skipped.copy().items()}
+        level, text = diagnostics.OK, "paused" if self._pause_requested else "replaying"
+        if simulated:
+            level, text = diagnostics.WARN, f"{text} simulated ranges"
+        late_s = max(self.late_ns / 1e9, 0.0)
+        if late_s > LATE_WARNING_S:
+            level = diagnostics.WARN
+            text = f"{text}; {late_s:.1f} s behind: the rate is too high for this machine"
+            self._logger.warning(text, throttle_duration_sec=10.0)
+        entries["behind s"] = f"{late_s:.3f}"
+        return "simulated" if simulated else "recording", level, text, entries
+
+    def _run(self) -> None:
+        error: UwbMitigationError | None = None
+        try:
+            self._wait_for_subscribers()
+            self._play()
+        except UwbMitigationError as problem:
+            error = problem
+        except Exception as bug:
+            # Otherwise the thread would end without a message, and the node would stop publishing.
+            traceback.print_exc()
+            error = UwbMitigationError(f"the source failed: {bug!r}", where=self._source.name)
+        if not self._stopping.is_set():
+            skipped = ", ".join(f"{count} x {kind}" for kind, count in sorted(self._source.skipped.items()))
+            self._logger.info(f"played {self.played} ranges" + (f"; warnings: {skipped}" if skipped else ""))
+            self._on_end(error)
+
+    def _wait_for_subscribers(self) -> None:
+        """Wait until there are enough subscribers and the graph had time to connect, or until the timeout."""
+        wanted, started_s = self._value("wait_for_subscribers"), time.monotonic()
+        while (count := self._subscribers()) < wanted:
+            if time.monotonic() - started_s >= self._value("longest_wait"):
+                self._logger.warning(f"{count} of {wanted} subscribers connected; the replay starts")
+                return
+            if self._stopping.wait(TICK_S):
+                return
+        delay_s = self._value("start_delay")
+        if delay_s < 0.0:
+            delay_s = 0.0 if wanted > 1 else ANNOUNCEMENT_S
+        self._stopping.wait(delay_s)
+
+    def _play(self) -> None:
+        self._reference_clock_ns = self._clock.now_ns()
+        due_ns = 0
+        while not self._stopping.is_set():
+            from_ns = self._seeks.popleft() if self._seeks else 0
+            found, due_ns = self._play_from(from_ns, due_ns)
+            if not self._seeks and not (self._value("loop") and found):
+                return
+
+    def _play_from(self, from_ns: int, due_ns: int) -> tuple[bool, int]:
+        """Play until the source ends or a seek is requested.
+
+        Returns:
+            Whether the source has any record, and the played time at which the next one is due.
+        """
+        first_ns: int | None = None
+        last_ns: int | None = None
+        pause_ns, longest_ns = 1, int(self._value("longest_pause") * 1e9)
+        try:
+            for record in self._source:
+                recorded_ns = record.measurement.stamp_ns
+                if first_ns is None:
+                    first_ns = recorded_ns
+                if recorded_ns - first_ns < from_ns:
+                    if self._stopping.is_set() or self._seeks:
+                        break
+                    continue
+                if last_ns is not None:
+                    pause_ns = min(recorded_ns - last_ns, longest_ns)
+                    due_ns += pause_ns
+                last_ns = recorded_ns
+                late_ns = self._wait_until(due_ns, recorded_ns)
+                if late_ns is None:
+                    return True, min(due_ns, self._position_ns(self._clock.now_ns()))
+                self.late_ns = late_ns
+                stamp_ns = recorded_ns
+                if not self._uses_recorded_stamps:
+                    stamp_ns = self._clock.stamp_ns(self._clock_ns(due_ns))
+                self._late.append((record, stamp_ns))
+                if late_ns < LATE_NS or len(self._late) == BATCH:
+                    self._flush()
+        finally:
+            # Publish what was read before an error of the source or a seek.
+            self._flush()
+        # The next round begins when the next record would be due.
+        return first_ns is not None, due_ns + max(pause_ns, 1)
+
+    def _flush(self) -> None:
+        if self._late:
+            self._publish(self._late)
+            self.played += len(self._late)
+            self._late = []
+
+    def _wait_until(self, due_ns: int, recorded_ns: int) -> int | None:
+        """Wait until a record is due; return the delay, ns, or None if playing must stop."""
+        while True:
+            if self._stopping.is_set() or self._seeks:
+                return None
+            now_ns = self._clock.now_ns()
+            if self._paused or self._pause_requested or self._requested_rate != self._rate:
+                # Continue at the new rate, but never past the next record, so that stamps stay in order.
+                self._reference_ns, self._reference_clock_ns = min(self._position_ns(now_ns), due_ns), now_ns
+                self._paused, self._rate = self._pause_requested, self._requested_rate
+            ahead_ns = self._clock_ns(due_ns) - now_ns
+            if self._uses_recorded_stamps:
+                # Simulated recordings start at 0, and ROS time cannot be negative.
+                self._on_time(max(recorded_ns - int(max(ahead_ns, 0) * self._rate), 0))
+            if ahead_ns <= 0 and not self._paused:
+                return -ahead_ns
+            self._flush()
+            self._stopping.wait(TICK_S if self._paused else min(ahead_ns / 1e9, TICK_S))
+
+    def _clock_ns(self, due_ns: int) -> int:
+        """Return the time of the replay clock at which a played time is due."""
+        return self._reference_clock_ns + int((due_ns - self._reference_ns) / self._rate)
+
+    def _position_ns(self, now_ns: int) -> int:
+        """Return the played time at a time of the replay clock."""
+        if self._paused:
+            return self._reference_ns
+        return self._reference_ns + int((now_ns - self._reference_clock_ns) * self._rate)

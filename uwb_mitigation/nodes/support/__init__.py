@@ -1,0 +1,1 @@
+"""What all nodes share: lifecycle, parameters, topics, diagnostics, and starting processes."""

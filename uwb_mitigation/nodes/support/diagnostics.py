@@ -1,0 +1,267 @@
+"""Diagnostics of the nodes: the message, rate and latency, and the mitigator's health with its warnings."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from uwb_mitigation.types.measurement import Status
+
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+
+Description = tuple[str, bytes, str, dict[str, object]]
+"""Hardware id, level, message and values of a diagnostic status."""
+
+MAX_LATENCIES = 20_000
+"""Number of latencies that are kept."""
+
+
+def report(
+    node: Node, hardware_id: str, level: bytes, message: str, entries: Mapping[str, object]
+) -> DiagnosticArray:
+    """Return a message with one status, stamped on the node's clock and named after the node."""
+    status = DiagnosticStatus(
+        level=level,
+        name=f"{node.get_fully_qualified_name().lstrip('/')}: ranges",
+        message=message,
+        hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=str(value)) for key, value in entries.items()],
+    )
+    array = DiagnosticArray(status=[status])
+    array.header.stamp = node.get_clock().now().to_msg()
+    return array
+
+
+def percentiles(name: str, values_ns: list[int]) -> dict[str, object]:
+    """Return the values `NAME p50 ms` and `NAME p99 ms`; empty without data."""
+    if not values_ns:
+        return {}
+    p50, p99 = np.percentile(values_ns, (50, 99)) / 1e6
+    return {f"{name} p50 ms": f"{p50:.3f}", f"{name} p99 ms": f"{p99:.3f}"}
+
+
+def model_id(identity: int) -> str:
+    """Return a model id in hexadecimal, as the tools print it, and in decimal, as `ros2 topic echo` does."""
+    return f"{identity:08x} ({identity})"
+
+
+class Meter:
+    """Rate and latency since the previous call of `entries`.
+
+    Args:
+        now_ns: the node's clock, ns. If it is simulated, the rate is that of the recording.
+    """
+
+    def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        # deque.append and popleft are atomic: one thread adds, another reads.
+        self._latencies_ns: deque[int] = deque(maxlen=MAX_LATENCIES)
+        self._now_ns = now_ns
+        self._since_ns = now_ns()
+        self._passed = self._reported = 0
+
+    def add(self, latency_ns: int) -> None:
+        self._latencies_ns.append(latency_ns)
+        self._passed += 1
+
+    def entries(self) -> dict[str, object]:
+        """Return rate and percentiles of the latency, and begin a new period."""
+        now_ns = self._now_ns()
+        period_s, self._since_ns = (now_ns - self._since_ns) / 1e9, now_ns
+        passed, self._reported = self._passed - self._reported, self._passed
+        # A simulated clock may pause, or jump back when a recording restarts.
+        rate = f"{passed / period_s:.1f}" if period_s > 0 else "unknown"
+        return {"rate Hz": rate} | percentiles("latency", _drain(self._latencies_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """Threshold of a diagnostic warning.
+
+    Attributes:
+        quantity: the value that is compared, over the last period.
+        limit: the highest value that is OK.
+        text: the warning above it.
+    """
+
+    quantity: str
+    limit: float
+    text: str
+
+
+OUT_OF_DISTRIBUTION = Threshold(
+    "share of ranges OUT_OF_DISTRIBUTION",
+    0.2,
+    "many ranges are out of distribution: the model was trained on other data",
+)
+NO_USABLE_CIR = Threshold("share of ranges NO_CIR or BAD_CIR", 0.2, "many ranges have no usable CIR")
+NO_PREAMBLE_COUNT = Threshold(
+    "share of ranges without the preamble count that the model needs",
+    0.2,
+    "many CIRs have no preamble count, and this model needs it: set model to universal_amplitude",
+)
+DROPPED = Threshold("share of ranges dropped", 0.0, "ranges were dropped: the queue was too short")
+SLOW = Threshold("p99 of the processing time, ms", 20.0, "correction is slow: the processor is overloaded")
+NO_RANGES = Threshold("s without a range", 5.0, "no ranges received")
+OFFSET = Threshold(
+    "absolute median predicted error of LOS ranges, m",
+    0.15,
+    "the median correction of LOS ranges is large: the model probably includes the antenna delay of other "
+    "boards; calibrate offsets",
+)
+
+MAX_LOS, MIN_LOS = 1000, 200
+"""Maximum and minimum number of latest LOS ranges whose median is compared with OFFSET."""
+
+
+class MitigatorHealth:
+    """Counts ranges. One thread adds, another reads.
+
+    Args:
+        publishers: returns the number of publishers of ranges.
+        now_s: a steady clock.
+
+    Attributes:
+        statuses: number of ranges by status, since the start.
+        lost: ranges that the middleware reports as lost, because the publisher's queue was too short.
+        loss_counter: counts the lost ranges and those dropped by the subscription's queue.
+        malformed: messages that could not be decoded.
+        without_preamble_count: ranges whose CIR lacks the preamble count that the model needs, in this period.
+        other_source: radio and segment of a CIR that the model was not trained for, in this period.
+        los_m: predicted errors of the latest LOS ranges without the offsets of the radios.
+        excludes_offset: whether the predicted errors do not contain the radios' offset, so that the median of `los_m`
+            is near 0.
+    """
+
+    def __init__(
+        self, publishers: Callable[[], int] = lambda: 1, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.statuses: Counter[Status] = Counter()
+        self.lost = 0
+        self.loss_counter = LossCounter(publishers)
+        self.malformed = 0
+        self.without_preamble_count = 0
+        self.other_source = ""
+        self.los_m: deque[float] = deque(maxlen=MAX_LOS)
+        self.excludes_offset = False
+        self._processing_ns: deque[int] = deque(maxlen=MAX_LATENCIES)
+        self._now_s = now_s
+        self._last_s = now_s()
+        self._previous: tuple[Counter[Status], int] = (Counter(), 0)
+
+    @property
+    def dropped(self) -> int:
+        """Number of ranges that are known to have been dropped by a queue."""
+        return max(self.lost, self.loss_counter.missing)
+
+    def add_time(self, processing_ns: int) -> None:
+        """Add the processing time of a range or of a batch."""
+        self._processing_ns.append(processing_ns)
+        self._last_s = self._now_s()
+
+    def period(self) -> tuple[list[str], dict[str, object], bool]:
+        """Begin a new period.
+
+        Returns:
+            The warnings of the period that ends, its values for the diagnostics, and whether the model failed.
+        """
+        previous, previous_dropped = self._previous
+        self._previous = self.statuses.copy(), self.dropped
+        statuses = self._previous[0] - previous
+        dropped = self._previous[1] - previous_dropped
+        processing_ns = _drain(self._processing_ns)
+        los_m = self.los_m.copy()
+        median_m = statistics.median(los_m) if los_m else math.nan
+        total = max(statuses.total(), 1)
+        without_preamble_count, self.without_preamble_count = self.without_preamble_count / total, 0
+        out_of_distribution = statuses[Status.OUT_OF_DISTRIBUTION] / total
+        values = {
+            OUT_OF_DISTRIBUTION: out_of_distribution,
+            NO_USABLE_CIR: (statuses[Status.NO_CIR] + statuses[Status.BAD_CIR]) / total
+            - without_preamble_count,
+            NO_PREAMBLE_COUNT: without_preamble_count,
+            DROPPED: dropped / max(statuses.total() + dropped, 1),
+            SLOW: float(np.percentile(processing_ns, 99)) / 1e6 if processing_ns else 0.0,
+            NO_RANGES: self._now_s() - self._last_s,
+            OFFSET: abs(median_m) if self.excludes_offset and len(los_m) >= MIN_LOS else 0.0,
+        }
+        entries: dict[str, object] = {f"ranges {status.name}": self.statuses[status] for status in Status}
+        entries |= {
+            "out of distribution": f"{out_of_distribution:.3f}",
+            "dropped by a queue": f"{self.dropped}" + ("" if self.loss_counter.complete else " or more"),
+            "malformed": self.malformed,
+            "line of sight: ranges": len(los_m),
+        }
+        if los_m:
+            entries["line of sight: median predicted error m"] = f"{median_m:.3f}"
+        entries |= percentiles("processing", processing_ns)
+        warnings = [threshold.text for threshold, value in values.items() if value > threshold.limit]
+        return warnings, entries, statuses[Status.MODEL_ERROR] > 0
+
+
+NO_SEQUENCE_NUMBER = 2**64 - 1
+"""Sequence number of rmw if the middleware provides none (RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED)."""
+
+
+class LossCounter:
+    """Counts dropped messages by the sequence numbers of their publishers.
+
+    A queue with keep-last drops messages silently. A message does not identify its publisher: a number that
+    follows a known last number belongs to that publisher. Any other number is the first of a new publisher if
+    there are more publishers than known ones, and otherwise a gap after the nearest lower number. The gap may
+    be attributed to the wrong publisher, but the total is right.
+
+    Args:
+        publishers: returns the number of publishers; called only for a number that does not follow a known one.
+
+    Attributes:
+        missing: numbers that were never received.
+        complete: False once a message had no number.
+    """
+
+    def __init__(self, publishers: Callable[[], int]) -> None:
+        self.missing = 0
+        self.complete = True
+        self._publishers = publishers
+        # The last number of each publisher; the latest is at the end.
+        self._last: list[int] = []
+
+    def add(self, number: int) -> None:
+        """Add the number of a received message."""
+        last = self._last
+        if last and last[-1] == number - 1:
+            last[-1] = number
+        elif number == NO_SEQUENCE_NUMBER:
+            self.complete = False
+        elif number - 1 in last:
+            last.remove(number - 1)
+            last.append(number)
+        else:
+            self._add_gap_or_publisher(number)
+
+    def _add_gap_or_publisher(self, number: int) -> None:
+        publishers = self._publishers()
+        lower = [last for last in self._last if last < number]
+        if len(self._last) < publishers or not lower:
+            # A publisher has joined or restarted: it replaces the publisher with the oldest last message.
+            self._last.append(number)
+            del self._last[: max(len(self._last) - max(publishers, 1), 0)]
+            return
+        nearest = max(lower)
+        self.missing += number - nearest - 1
+        self._last.remove(nearest)
+        self._last.append(number)
+
+
+def _drain(values: deque[int]) -> list[int]:
+    """Remove and return all values; another thread may append meanwhile."""
+    return [values.popleft() for _ in range(len(values))]

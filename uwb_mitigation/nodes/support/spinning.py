@@ -1,0 +1,159 @@
+"""Start, spin and shut down the nodes of this package."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import NameValidationException
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
+from uwb_mitigation.nodes.support.parameter_tables import TABLES
+
+SPIN_S = 0.2
+
+_stop = threading.Event()
+
+
+def stop_event() -> threading.Event:
+    """Return the event that SIGINT and SIGTERM set from now on; a second signal terminates the process immediately."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not _on_signal:
+            signal.signal(number, _on_signal)
+    return _stop
+
+
+def _on_signal(number: int, frame: Any) -> None:
+    _stop.set()
+    signal.signal(number, signal.SIG_DFL)
+
+
+def spin(nodes: Node | Sequence[Node], stop: threading.Event) -> None:
+    """Run the callbacks of one or several nodes until `stop` is set."""
+    all_nodes = nodes if isinstance(nodes, Sequence) else [nodes]
+    executor = make_executor(all_nodes[0].context if all_nodes else None)
+    for node in all_nodes:
+        executor.add_node(node)
+    # A full collection walks all imported objects and would delay a range by tens of milliseconds.
+    gc.collect()
+    gc.freeze()
+    while not stop.is_set():
+        executor.spin_once(timeout_sec=SPIN_S)
+
+
+def make_executor(context: Context | None = None) -> Executor:
+    """Return the events executor (a quarter of the default's CPU time per message), or the default in older rclpy.
+
+    Its `spin()` does not return at shutdown: call `spin_once`.
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
+
+
+def load(name: str) -> Callable[[threading.Event], list[Node]]:
+    """Import an executable and return the function that makes its nodes.
+
+    The function gets the event that ends the process. `pipeline` is driver and mitigator in one process, and a locator
+    if `anchors` is given: measurements go to the mitigator in memory, and `/uwb/range_raw` is published only while it
+    has subscribers. Names, topics, parameters and diagnostics are the same as of separate nodes.
+    """
+    parts = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
+    modules = [importlib.import_module(f"uwb_mitigation.nodes.{part}") for part in parts]
+    if len(modules) == 1:
+        make_nodes: Callable[[threading.Event], list[Node]] = modules[0].make_nodes
+        return make_nodes
+    driver, mitigator, locator = modules
+    # Parameters on the command line reach all nodes.
+    other_parameters = {row.name for part in parts for row in TABLES[part]}
+
+    def make_pipeline(stop: threading.Event) -> list[Node]:
+        made: list[Node] = []
+        try:
+            consumer = mitigator.Mitigator(subscribe=False, other_parameters=other_parameters)
+            made.append(consumer)
+            made.insert(0, driver.Driver(stop, consumer, other_parameters=other_parameters))
+            # rclpy has no public access to the parameters given at start-up.
+            anchors = consumer._parameter_overrides.get("anchors")
+            if anchors is not None and anchors.value:
+                made.append(locator.Locator(other_parameters=other_parameters))
+        except BaseException:
+            for node in made:
+                node.destroy_node()
+            raise
+        return made
+
+    return make_pipeline
+
+
+def main(name: str) -> None:
+    """Run an executable until a signal or until one of its nodes ends it; exit with its code."""
+    sys.exit(_run(name))
+
+
+def _run(name: str) -> int:
+    """Initialise ROS, make the nodes, spin them, and destroy them in order; return the exit code.
+
+    SIGINT and SIGTERM set the event that the nodes get. ROS's own handlers would shut the context down while
+    callbacks still publish.
+    """
+    nodes: Sequence[Node] = ()
+    try:
+        _initialise()
+        try:
+            # Load before the handlers are installed: until then a signal terminates the process immediately.
+            make_nodes = load(name)
+            stop = stop_event()
+            nodes = make_nodes(stop)
+        except (rclpy_implementation.RCLError, NameValidationException) as error:
+            raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
+        spin(nodes, stop)
+    except ImportError as error:
+        if (absent := missing_dependency(error)) is None:
+            raise
+        print(f"error: {absent}", file=sys.stderr)
+        return 1
+    except UwbMitigationError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    finally:
+        for node in nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)
+
+
+def _initialise() -> None:
+    """Initialise ROS without its signal handlers.
+
+    Raises:
+        ParameterError: an argument is unknown, or ROS cannot parse it.
+    """
+    words = list(sys.argv)
+    try:
+        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise ParameterError(_first_line(error), valid="check what follows --ros-args") from error
+    if unknown := remove_ros_args(words)[1:]:
+        raise ParameterError(
+            f"arguments {' '.join(unknown)!r}", valid="parameters follow --ros-args, as in -p name:=value"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    """Return the first line of a ROS error without positions in ROS's source files."""
+    return str(error).strip().splitlines()[0].split(", at /")[0]

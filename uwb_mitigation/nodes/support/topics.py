@@ -1,0 +1,215 @@
+"""Topic names, quality of service (REP-2003), publishers, subscriptions, and ranges as sensor_msgs/Range.
+
+The names are relative: `/uwb/range_raw` without a namespace, `/board1/uwb/range_raw` in `board1`. History, depth and
+reliability can be overridden by the standard parameters `qos_overrides.TOPIC.publisher.POLICY` and
+`qos_overrides.TOPIC.subscription.POLICY`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.lifecycle import LifecycleNode
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from std_msgs.msg import Header
+
+from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.types.measurement import CorrectedRange
+
+RANGE_RAW = "uwb/range_raw"
+RANGE_CORRECTED = "uwb/range_corrected"
+RANGE_TRUTH = "uwb/range_truth"
+POSE = "uwb/pose"
+ODOMETRY = "uwb/odometry"
+POSE_SMOOTHED = "uwb/pose_smoothed"
+ANCHORS = "uwb/anchors"
+ODOMETRY_TRUTH = "uwb/odometry_truth"
+PX4_ODOMETRY = "/fmu/in/vehicle_visual_odometry"
+TF = "/tf"
+DIAGNOSTICS = "/diagnostics"
+CLOCK = "/clock"
+
+DEPTH = 1000
+"""Queue depth: a subscriber that stalls for 1 s at 1 kHz loses no range."""
+
+MAX_SENSOR_RANGE_M = 300.0
+"""Maximum range of a DW1000 in free space (data sheet, section 1)."""
+
+MAX_SENSOR_TOPICS = 256
+"""Maximum number of sensor_msgs/Range topics; bounded because ids are received over the air."""
+
+
+def _range_qos(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
+    return QoSProfile(
+        reliability=reliability,
+        durability=DurabilityPolicy.VOLATILE,
+        history=HistoryPolicy.KEEP_LAST,
+        depth=DEPTH,
+    )
+
+
+RANGES = _range_qos()
+
+LATCHED = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+)
+"""QoS of messages that late-joining subscribers need too."""
+
+
+def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
+    """Return a lifecycle publisher of ranges.
+
+    Raises:
+        ParameterError: an overridden quality of service is invalid.
+    """
+    with _translate_qos_errors(node, topic):
+        # rclpy writes overrides into the given profile, so each publisher needs a copy.
+        return node.create_lifecycle_publisher(
+            kind, topic, _range_qos(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
+        )
+
+
+def create_subscription(
+    node: LifecycleNode,
+    kind: type,
+    topic: str,
+    callback: Callable[[Any], None],
+    reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+    **options: Any,
+) -> Subscription:
+    """Return a subscription; a best-effort one also receives from best-effort publishers, such as odometry.
+
+    Raises:
+        ParameterError: an overridden quality of service is invalid.
+    """
+    overriding = QoSOverridingOptions.with_default_policies()
+    with _translate_qos_errors(node, topic):
+        return node.create_subscription(
+            kind, topic, callback, _range_qos(reliability), qos_overriding_options=overriding, **options
+        )
+
+
+def create_raw_subscription(
+    node: LifecycleNode,
+    kind: type,
+    topic: str,
+    callback: Callable[[bytes, int], None],
+    on_lost: Callable[[Any], None],
+) -> Subscription:
+    """Return a subscription of serialised ranges; `callback` gets the bytes and the publisher's sequence number.
+
+    Raises:
+        ParameterError: an overridden quality of service is invalid.
+    """
+
+    def take(data: Any, info: Any = None) -> None:
+        # rclpy's events executor passes (data, info) as one tuple.
+        if info is None:
+            data, info = data
+        callback(data, info["publication_sequence_number"])
+
+    events = SubscriptionEventCallbacks(message_lost=on_lost)
+    subscription = create_subscription(node, kind, topic, take, raw=True, event_callbacks=events)
+    # rclpy passes the info only to callbacks that require two arguments.
+    subscription._callback_type = Subscription.CallbackType.WithMessageInfo
+    return subscription
+
+
+def take_queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes, int]]:
+    """Yield messages that wait in the queue of a raw subscription, with the publisher's sequence number.
+
+    Args:
+        subscription: from `create_raw_subscription`.
+        limit: maximum number of messages, since more may arrive during processing.
+    """
+    take, kind = subscription.handle.take_message, subscription.msg_type
+    for _ in range(limit):
+        if (taken := take(kind, True)) is None:
+            return
+        data, info = taken
+        yield data, info["publication_sequence_number"]
+
+
+def incompatible_publishers(node: LifecycleNode) -> list[str]:
+    """Return a warning for each best-effort publisher from which a reliable subscription of the node receives nothing."""
+    return [
+        f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name} publishes with best-effort reliability "
+        f"and is not received: set "
+        f"qos_overrides.{subscription.topic_name}.subscription.reliability:=best_effort"
+        for subscription in node.subscriptions
+        if subscription.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        for endpoint in node.get_publishers_info_by_topic(subscription.topic_name)
+        if endpoint.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    ]
+
+
+def header(stamp_ns: int, frame_id: str) -> Header:
+    """Return a message header."""
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
+
+
+class SensorRanges:
+    """Publishes ranges as sensor_msgs/Range on `uwb/range_corrected/anchor_ID`; an invalid range is +Inf (REP-117).
+
+    sensor_msgs has no radiation type for radio, so it is 0; the field of view is the full circle.
+    """
+
+    def __init__(self, node: LifecycleNode) -> None:
+        # Import on demand: sensor_msgs takes a twelfth of the start-up time of a node.
+        from sensor_msgs.msg import Range
+
+        self._kind = Range
+        self._node = node
+        self._publishers: dict[int, Publisher] = {}
+
+    def publish(self, anchor_id: int, stamp_ns: int, frame_id: str, corrected: CorrectedRange) -> None:
+        publisher = self._publishers.get(anchor_id)
+        if publisher is None:
+            if len(self._publishers) == MAX_SENSOR_TOPICS:
+                text = f"more than {MAX_SENSOR_TOPICS} anchors: no topic for anchor {format_id(anchor_id)}"
+                self._node.get_logger().warning(text, throttle_duration_sec=60.0)
+                return
+            topic = f"{RANGE_CORRECTED}/anchor_{format_id(anchor_id)}"
+            publisher = self._publishers[anchor_id] = create_publisher(self._node, self._kind, topic)
+            publisher.on_activate(None)
+        valid = math.isfinite(corrected.range_m) and math.isfinite(corrected.variance_m2)
+        publisher.publish(
+            self._kind(
+                header=header(stamp_ns, frame_id),
+                field_of_view=2 * math.pi,
+                max_range=MAX_SENSOR_RANGE_M,
+                range=float(corrected.range_m) if valid else math.inf,
+                variance=float(corrected.variance_m2) if valid else math.inf,
+            )
+        )
+
+    def close(self) -> None:
+        """Destroy the publishers; may be called twice."""
+        for publisher in self._publishers.values():
+            self._node.destroy_lifecycle_publisher(publisher)
+        self._publishers.clear()
+
+
+@contextmanager
+def _translate_qos_errors(node: LifecycleNode, topic: str) -> Iterator[None]:
+    # rclpy raises various exception types for invalid overrides.
+    try:
+        yield
+    except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:
+        raise ParameterError(
+            f"qos_overrides of {node.resolve_topic_name(topic)}: {error}",
+            valid="history keep_last or keep_all, depth a whole number, reliability reliable or best_effort",
+        ) from error

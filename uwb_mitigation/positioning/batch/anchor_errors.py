@@ -1,0 +1,320 @@
+"""Checks of a calibration without ground truth: observability, errors in the anchors file, and agreement of the anchors.
+
+The ranges of an anchor that is not where the anchors file says look like ranges with an offset. The difference is that
+the error depends on the direction to the tag. So the hypothesis of another position competes with that of an offset, by
+their likelihoods.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.batch.joint_fit import (
+    FAR_S,
+    JointFit,
+    Observations,
+    fit_joint,
+    observations_of,
+)
+from uwb_mitigation.positioning.batch.motion_segments import Segments
+from uwb_mitigation.positioning.geometry import Area, Height, Shape, directions, shape
+from uwb_mitigation.positioning.noise_model import Regressors
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.types.anchors import AnchorMap
+
+MISPLACED_M = 0.4
+"""A smaller displacement looks like reflections."""
+
+MIN_LOSS_GAIN = 12.0
+"""The log likelihood by which another position must explain the ranges better than an offset."""
+
+LARGER = 0.35
+"""The share of the misfit that two swapped anchors must also explain."""
+
+SUSPECT_OFFSET_M, SUSPECT_MISFIT = 0.3, 2.5
+"""An anchor is examined if its offset is that far from the median offset (radios of one kind differ by 0.3 m at three
+sigma, Decawave APS014), or if its median residual is that many times the median of all."""
+
+MISFIT_M, MISFIT_SHARE = 0.5, 0.08
+"""Swaps are examined if this share of the ranges has larger residuals."""
+
+MOVES_M = 1.0
+MIN_INDEPENDENT = 20
+"""Independent ranges in addition to those that the positions at rest need."""
+
+MIRRORED = 4.5
+"""Mirror images cannot be distinguished if their likelihoods differ by a factor of less than e^4.5."""
+
+MAX_REFITS = 8
+MAX_GROUPS = 5
+
+_DISPLACEMENT_SD_M = 2.0
+_STEPS = 6
+_MAX_RANGES = 1000
+
+FirstPositions = Callable[
+    [EstimatorConfig, Segments, NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.bool_]]
+]
+
+
+def check_anchors(
+    anchors: AnchorMap, used: NDArray[np.intp], height: Height | None, area: Area | None = None
+) -> None:
+    """Refuse anchors that do not determine positions and offsets.
+
+    Args:
+        anchors: anchors of the file.
+        used: rows of the received anchors.
+        height: height of the tags, if constant.
+        area: of the tags; it can exclude the mirror image of a track at a plane of anchors.
+
+    Raises:
+        DatasetError: too few, or all on a line (without a height: in a plane).
+    """
+    needed = 4 if height is not None else 5
+    if len(used) < needed:
+        raise DatasetError(
+            f"{len(used)} anchors were received",
+            valid=f"{needed} or more" + (", or four and --height" if height is None else ""),
+        )
+    position = anchors.position[used]
+    if height is not None:
+        position = position * (1.0, 1.0, 0.0)
+    kind = shape(position)
+    if kind in (Shape.POINT, Shape.LINE):
+        raise DatasetError("the anchors are all on a line", valid="one or more that are not on this line")
+    if height is None and area is None and kind is Shape.PLANE:
+        raise DatasetError(
+            "the anchors are all in a plane: the mirror image of the track explains the ranges equally well",
+            valid="--height of the tag, --area on one side of the plane, or an anchor above or below that plane",
+        )
+
+
+def check_motion(fit: JointFit) -> None:
+    """Refuse recordings in which positions and offsets cannot be separated.
+
+    Raises:
+        DatasetError: the tags do not move enough, or there are too few independent ranges.
+    """
+    spread = float(np.linalg.norm(np.ptp(fit.position, axis=0)))
+    if spread < MOVES_M:
+        raise DatasetError(
+            f"the tag moves by {spread:.1f} m only: its position and the offset cannot be separated",
+            valid=f"a drive of {MOVES_M:g} m or more, or tags at several positions",
+        )
+    independent = float(fit.observations.share.sum())
+    needed = MIN_INDEPENDENT + 1.5 * fit.config.dims * int(fit.observations.is_stationary.sum())
+    if independent < needed:
+        raise DatasetError(
+            f"{len(fit.observations.of)} ranges, {independent:.0f} of them independent: too few",
+            valid=f"{needed:.0f} or more: a longer drive, or more anchors at each position",
+        )
+
+
+def mirrored(fit: JointFit) -> NDArray[np.bool_]:
+    """Return which segments have a mirror image beyond the anchors that explains the ranges equally well, bool (s,)."""
+    config, observations = fit.config, fit.observations
+    used = config.anchors.position[np.unique(observations.anchor)]
+    axes = slice(0, config.dims)
+    centre = used.mean(axis=0)
+    normal = np.zeros(3)
+    normal[axes] = np.linalg.svd(used[:, axes] - centre[axes])[2][-1]
+    image = fit.position - 2.0 * ((fit.position - centre) @ normal)[:, None] * normal
+    corrected = observations.range_m - observations.rows @ fit.parameters
+    fixed = replace(observations, range_m=corrected, rows=np.zeros((len(observations), 0)))
+    try:
+        other = fit_joint(config, fixed, Regressors.none(len(observations)), image, scale_m=fit.scale_m)
+    except DatasetError:
+        return np.zeros(len(fit.segment_loss), np.bool_)
+    apart = np.linalg.norm(other.position - fit.position, axis=1) > MOVES_M
+    if config.area is not None:
+        apart &= config.area.holds(other.position)
+    share = np.bincount(observations.knot_segment, apart) / np.bincount(observations.knot_segment)
+    return (other.segment_loss - fit.segment_loss < MIRRORED) & (share > 0.5)
+
+
+def check_anchor_positions(found: Segments, fit: JointFit, first_positions: FirstPositions) -> None:
+    """Refuse ranges that other anchor positions explain much better.
+
+    Args:
+        found: ranges of the solution.
+        fit: solution with the positions of the file.
+        first_positions: as in `self_calibration`.
+
+    Raises:
+        DatasetError: names the anchors.
+    """
+    anchors, observations = fit.config.anchors.anchors, fit.observations
+    fix = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
+    best: tuple[float, int, float] | None = None
+    for row in _suspects(fit):
+        moved_m, gain = _displaced(row, found, fit)
+        if moved_m > MISPLACED_M and gain > MIN_LOSS_GAIN and (best is None or gain > best[0]):
+            best = gain, row, moved_m
+    misfit = float(
+        (observations.share * (np.abs(fit.residual_m) > MISFIT_M)).sum() / observations.share.sum()
+    )
+    if misfit > MISFIT_SHARE and (pair := _swapped(found, fit, first_positions)) is not None:
+        a, b = (anchors[row] for row in pair)
+        raise DatasetError(
+            f"anchors {a} and {b} contradict the others: swapped, they explain the ranges", valid=fix
+        )
+    if best is not None:
+        _, row, moved_m = best
+        raise DatasetError(
+            f"anchor {anchors[row]} contradicts the others: {moved_m:.1f} m from its position in the anchors "
+            "file, it explains the ranges",
+            valid=fix,
+        )
+
+
+def _suspects(fit: JointFit) -> list[int]:
+    observations = fit.observations
+    used = np.unique(observations.anchor)
+    own = dict(zip(fit.prior.names, fit.parameters.tolist(), strict=True))
+    offset = np.array([own.get(f"anchor {row}", 0.0) for row in used])
+    size = np.abs(fit.residual_m)
+    misfit = np.array([np.median(size[observations.anchor == row]) for row in used])
+    suspect = (np.abs(offset - np.median(offset)) > SUSPECT_OFFSET_M) | (
+        misfit > SUSPECT_MISFIT * np.median(size)
+    )
+    return [int(row) for row in used[suspect]]
+
+
+def _displaced(row: int, found: Segments, fit: JointFit) -> tuple[float, float]:
+    """Return the displacement of the anchor that explains the ranges best, m, and the gain in log likelihood."""
+    config, keep = fit.config, np.array([name != f"anchor {row}" for name in fit.prior.names])
+    base, anchors = fit.prior.only(keep), config.anchors
+    observations = observations_of(found, base, config.model)
+    own = (observations.anchor == row)[:, None]
+    position, shared, moved = fit.position, fit.parameters[keep], anchors
+    gain, axes = 0.0, slice(0, 2)
+    try:
+        for _ in range(_STEPS):
+            tag = position[observations.knot] + observations.relative_height[:, None] * (0.0, 0.0, 1.0)
+            unit, _ = directions(tag, moved.position[observations.anchor])
+            rows = np.concatenate([observations.rows, -unit[:, axes] * own], axis=1)
+            shift = moved.position[row, axes] - anchors.position[row, axes]
+            prior = replace(
+                base,
+                mean=np.concatenate([base.mean, -shift]),
+                sd=np.concatenate([base.sd, np.full(2, _DISPLACEMENT_SD_M)]),
+            )
+            other = fit_joint(
+                replace(config, anchors=moved),
+                replace(observations, rows=rows),
+                prior,
+                position,
+                np.concatenate([shared, np.zeros(2)]),
+                scale_m=fit.scale_m,
+                around=position,
+                near=True,
+            )
+            position, shared, step = other.position, other.parameters[:-2], other.parameters[-2:]
+            where = moved.position.copy()
+            where[row, axes] += step
+            moved = moved.moved(where, moved.sd)
+            gain = fit.loss - other.loss
+            if float(np.abs(step).max()) < 0.02:
+                break
+    except DatasetError:
+        return 0.0, 0.0
+    return float(np.linalg.norm(moved.position[row] - anchors.position[row])), gain
+
+
+def _swapped(found: Segments, fit: JointFit, first_positions: FirstPositions) -> tuple[int, int] | None:
+    """Return the pair of anchors that explains the ranges best if swapped; None: no pair is much better."""
+    config, part = fit.config, np.arange(len(found.ranges)) < _MAX_RANGES
+    few, columns = found.only(part), fit.prior.take(part)
+    observations = observations_of(few, columns, config.model)
+    scale = np.maximum(fit.scale_m, 0.1)
+
+    def loss(order: NDArray[np.intp]) -> float:
+        anchors = config.anchors
+        tried = replace(config, anchors=anchors.moved(anchors.position[order], anchors.sd))
+        position, placed = first_positions(tried, few, columns.rows @ columns.mean)
+        if not placed.all():
+            return np.inf
+        try:
+            return fit_joint(tried, observations, columns, position, scale_m=scale).loss
+        except DatasetError:
+            return np.inf
+
+    order = np.arange(len(config.anchors))
+    limit = (1.0 - LARGER) * loss(order) - MIN_LOSS_GAIN
+    best: tuple[int, int] | None = None
+    for a, b in itertools.combinations(np.unique(found.ranges.anchor).tolist(), 2):
+        swapped = order.copy()
+        swapped[[a, b]] = b, a
+        if (value := loss(swapped)) < limit:
+            best, limit = (a, b), value
+    return best
+
+
+def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
+    """Return the error of the horizontal positions without ground truth, RMSE in m: the jackknife over the anchors.
+
+    Errors of ranges that contradict each other move the track when an anchor is left out. An error that all anchors have in
+    common is not detected.
+
+    Args:
+        fit: solution of n ranges.
+        correction_m: float64 (n,), subtracted from each range.
+
+    Returns:
+        NaN if too few anchors remain.
+    """
+    used = np.unique(fit.observations.anchor)
+    groups = min(MAX_GROUPS, len(used))
+    parts = [used[k::groups] for k in range(groups)]
+    if len(used) - max(map(len, parts)) < fit.config.dims + 1:
+        return float("nan")
+    tracks = np.array([fit.without_anchors(part, correction_m).position[:, :2] for part in parts])
+    squared = np.sum((tracks - tracks.mean(axis=0)) ** 2, axis=(0, 2))
+    return float(np.sqrt(squared.mean() * (groups - 1) / groups))
+
+
+def seen_by_others(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return for each range the distance of its anchor from the other anchors' track, and its standard deviation."""
+    observations, used = fit.observations, np.unique(fit.observations.anchor)
+    distance, sd = np.full(len(observations), np.nan), np.full(len(observations), np.nan)
+    # With many anchors, leave out several together: enough others remain.
+    for part in (used[k::MAX_REFITS] for k in range(min(MAX_REFITS, len(used)))):
+        try:
+            seen = fit.without_anchors(part, observations.rows @ fit.parameters)
+            covariance = seen.covariances()
+        except (DatasetError, np.linalg.LinAlgError):
+            continue
+        own = np.isin(observations.anchor, part)
+        received = np.zeros(len(observations.time_s), np.bool_)
+        received[observations.knot[~own]] = True
+        knot = observations.knot[own]
+        tag = seen.position[knot] + observations.ahead_s[own][:, None] * seen.velocity[knot]
+        tag[:, 2] += observations.relative_height[own]
+        unit, distance[own] = directions(tag, fit.config.anchors.position[observations.anchor[own]])
+        known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
+        known[~(_gap_s(observations, received)[knot] <= FAR_S)] = np.nan
+        sd[own] = known
+    return distance[observations.of], sd[observations.of]
+
+
+def _gap_s(observations: Observations, received: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the time from each knot to the nearest one of its segment that still has ranges; inf without one."""
+    # Segments are moved so far apart that none is near another.
+    time = observations.time_s + observations.knot_segment * (
+        float(observations.time_s.max(initial=0.0)) + 1e6
+    )
+    there = time[received]
+    if not len(there):
+        return np.full(len(time), np.inf)
+    after = np.searchsorted(there, time).clip(min(1, len(there) - 1), len(there) - 1)
+    nearest: NDArray[np.float64] = np.minimum(
+        np.abs(time - there[after]), np.abs(time - there[np.maximum(after - 1, 0)])
+    )
+    return nearest

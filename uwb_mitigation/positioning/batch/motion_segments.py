@@ -1,0 +1,143 @@
+"""Division of the ranges of tags into stationary positions and segments of motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.positioning.noise_model import MAD_TO_SD
+from uwb_mitigation.types.tracks import Ranges
+
+STILL_M = 0.06
+"""Ranges of one pair that scatter less (1.48 x median absolute deviation) are from a tag at rest: the noise of a DW1000 is
+2 to 5 cm."""
+
+FEW = 3
+"""If the median number of ranges per anchor is smaller, the tag is treated as stationary."""
+
+BIN_S = 1.0
+LEAST_S = 4.0
+"""Shorter stationary parts belong to the motion around them."""
+
+GAP_S = 10.0
+"""After a longer pause a tag may be anywhere."""
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segments:
+    """Ranges of all tags, ordered by segment.
+
+    Attributes:
+        ranges: in the order of the segments, each in the order of time; `tag_id` is meaningless.
+        tag: int (n,), index of the tag of each range.
+        row: int (n,), row in the ranges of that tag.
+        of: int (n,), segment of each range, from 0.
+        is_stationary: bool (s,), whether each segment is stationary.
+        relative_height: float64 (n,), the height of the tag above the common one at each range.
+    """
+
+    ranges: Ranges
+    tag: NDArray[np.intp]
+    row: NDArray[np.intp]
+    of: NDArray[np.intp]
+    is_stationary: NDArray[np.bool_]
+    relative_height: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """The number of segments."""
+        return len(self.is_stationary)
+
+    def keep(self, wanted: NDArray[np.bool_]) -> Segments:
+        """Return only these segments, bool (s,)."""
+        return self.only(wanted[self.of])
+
+    def only(self, kept: NDArray[np.bool_]) -> Segments:
+        """Return only these ranges, bool (n,), and the segments that contain them."""
+        numbers, of = np.unique(self.of[kept], return_inverse=True)
+        columns = (
+            self.tag[kept],
+            self.row[kept],
+            of,
+            self.is_stationary[numbers],
+            self.relative_height[kept],
+        )
+        return Segments(self.ranges.take(kept), *columns)
+
+
+def find_segments(tags: Sequence[Ranges]) -> Segments:
+    """Divide the ranges of tags into positions at rest and segments of motion.
+
+    A tag may be moved between positions at rest only without ranging, during a pause of more than `GAP_S`.
+    """
+    tag, row, of, stationary = [], [], [], list[bool]()
+    for number, ranges in enumerate(tags):
+        for piece, is_stationary in _segments(ranges):
+            tag.append(np.full(len(piece), number))
+            row.append(piece)
+            of.append(np.full(len(piece), len(stationary)))
+            stationary.append(is_stationary)
+    tag_of, row_of = np.concatenate(tag), np.concatenate(row)
+    kept_ranges = [one.take(row_of[tag_of == number]) for number, one in enumerate(tags)]
+    columns = Ranges.joined(kept_ranges)
+    return Segments(columns, tag_of, row_of, np.concatenate(of), np.array(stationary), np.zeros(len(columns)))
+
+
+def _segments(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
+    """Return the rows of each segment of one tag, and whether it is at rest."""
+    rows = np.arange(len(ranges))
+    # Ignore pauses: pairs may have been recorded one after the other.
+    if _is_sparse(ranges, rows) or _is_stationary(ranges, rows):
+        return [(rows, True)]
+    parts = np.split(rows, np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * _SECOND_NS) + 1)
+    return [segment for part in parts for segment in _parts(ranges, part)]
+
+
+def _parts(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], bool]]:
+    """Divide a segment without gaps at the start and end of stationary parts."""
+    if _is_sparse(ranges, rows) or _is_stationary(ranges, rows):
+        return [(rows, True)]
+    number = (ranges.stamp_ns[rows] - ranges.stamp_ns[rows[0]]) // round(BIN_S * _SECOND_NS)
+    # Whether the tag has one position in a bin and the next one: the ranges of each anchor are similar.
+    bins = int(number[-1]) + 1
+    starts = np.searchsorted(number, np.arange(bins + 1))
+    noise_group = np.zeros(bins, np.bool_)
+    for k in range(bins - 1):
+        noise_group[k] = _is_stationary(ranges, rows[starts[k] : starts[k + 2]], least=2)
+    still = noise_group | np.concatenate([[False], noise_group[:-1]])
+    edges = np.flatnonzero(np.diff(still)) + 1
+    found: list[tuple[NDArray[np.intp], bool]] = []
+    moving: list[NDArray[np.intp]] = []
+    for run in np.split(np.arange(bins), edges):
+        piece = rows[starts[run[0]] : starts[run[-1] + 1]]
+        if still[run[0]] and len(run) * BIN_S >= LEAST_S and _is_stationary(ranges, piece):
+            if moving:
+                found.append((np.concatenate(moving), False))
+                moving = []
+            found.append((piece, True))
+        elif len(piece):
+            moving.append(piece)
+    if moving:
+        found.append((np.concatenate(moving), False))
+    return found
+
+
+def _is_sparse(ranges: Ranges, rows: NDArray[np.intp]) -> bool:
+    """Return whether there are too few ranges per anchor to track motion."""
+    return float(np.median(np.unique(ranges.anchor[rows], return_counts=True)[1])) < FEW
+
+
+def _is_stationary(ranges: Ranges, rows: NDArray[np.intp], least: int = FEW) -> bool:
+    """Return whether the ranges of most anchors scatter only by noise."""
+    anchor, value = ranges.anchor[rows], ranges.range_m[rows]
+    spread = []
+    for one in np.unique(anchor):
+        own = value[anchor == one]
+        if len(own) >= least:
+            spread.append(MAD_TO_SD * float(np.median(np.abs(own - np.median(own)))))
+    # While a tag moves, its ranges to two anchors may be constant, but not to three.
+    return len(spread) >= 3 and float(np.quantile(spread, 0.8)) < STILL_M

@@ -1,0 +1,310 @@
+"""Survey of the anchors, from rough guesses and the ranges of a tag that moves among them.
+
+Track and anchors are estimated together. Ranges do not determine position and orientation of the whole: these come from
+the guesses, or from fixed anchors. Swapped anchors are tried first, because Gauss-Newton does not find them from the guesses.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.batch.smoother import Smoothed, Smoother
+from uwb_mitigation.positioning.geometry import Shape, directions, shape
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.tracks import Ranges, Track
+
+MISPLACED_M = 0.3
+"""An anchor is misplaced if it is further from its guess than this and than `_UNLIKELY` standard deviations."""
+
+_UNLIKELY = 2.2
+"""In a plane, an error exceeds this multiple of its RMS with a probability of 1/126: exp(-2.2^2)."""
+
+TAPE_M = 0.1
+"""Accuracy of a measured height."""
+
+_STEPS_M = (1.0, 0.5, 0.25, 0.0)
+"""Standard deviations of ranges decrease in steps, so that the first steps tolerate errors of a metre."""
+
+UNEXPLAINED = 0.6
+"""In real drives the loss was 0.7 or more if anchors were not found, or if a pair was wrongly reported as swapped."""
+
+_TRIAL_NS = 60_000_000_000
+_TRIAL_RANGES = 800
+_SWAP_GAIN = 0.15
+"""A correct swap reduces the mean loss by far more; a wrong one increases it."""
+
+_MOVES_M = 1.0
+
+_AS_WELL = 1.5
+_SAME_LOSS = 0.2
+"""Mean losses of two positions of an anchor that differ by less do not distinguish them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurveyResult:
+    """The result.
+
+    Attributes:
+        anchors: at the estimated positions, with standard deviations.
+        moved_m: float64 (m,), distances from the guesses after alignment.
+        misplaced: rows of anchors too far from their guesses.
+        swapped: pairs of rows that are swapped in the file.
+        track: of the tag.
+        loss: mean robust loss of a range.
+        alternatives: {row: float64 (3,)}, other positions of single anchors that explain the ranges equally well.
+        undetermined: rows of anchors whose standard deviation relative to the others exceeds `MISPLACED_M`.
+        mirrored: the mirror image of all anchors fits the guesses about as well; ranges never decide between the two.
+    """
+
+    anchors: AnchorMap
+    moved_m: NDArray[np.float64]
+    misplaced: list[int]
+    swapped: list[tuple[int, int]]
+    track: Track
+    loss: float
+    alternatives: dict[int, NDArray[np.float64]]
+    undetermined: list[int]
+    mirrored: bool
+
+    @property
+    def explained(self) -> bool:
+        """Whether the loss is below `UNEXPLAINED`: otherwise the anchors may be anywhere."""
+        return self.loss < UNEXPLAINED
+
+    def as_json(self) -> dict[str, object]:
+        """Return the keys of `survey --json`; anchors by their ids."""
+        ids = [anchor.id for anchor in self.anchors.anchors]
+        return {
+            "anchors": [
+                dict(zip("xyz", anchor.position, strict=True))
+                | {"id": anchor.id, "sd": anchor.sd, "moved_m": float(self.moved_m[row])}
+                for row, anchor in enumerate(self.anchors.anchors)
+            ],
+            "misplaced": [ids[row] for row in self.misplaced],
+            "swapped": [[ids[row] for row in pair] for pair in self.swapped],
+            "alternatives": {str(ids[row]): where.tolist() for row, where in self.alternatives.items()},
+            "undetermined": [ids[row] for row in self.undetermined],
+            "mirrored": self.mirrored,
+            "mean_loss": self.loss,
+            "explained": self.explained,
+        }
+
+
+def survey(
+    config: EstimatorConfig, ranges: Ranges, *, off_m: float = 1.0, fixed: frozenset[int] = frozenset()
+) -> SurveyResult:
+    """Estimate the positions of the anchors.
+
+    Args:
+        config: its anchors are at approximate positions.
+        ranges: of one tag that moves.
+        off_m: standard deviation of each coordinate of the guesses. With a `height`, that of the heights of anchors is at
+            most `TAPE_M`: a drive at constant height hardly determines them.
+        fixed: rows of anchors that have the standard deviations of the file.
+
+    Raises:
+        DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
+    """
+    guesses, model, used, needed = config.anchors, config.model, np.unique(ranges.anchor), config.dims + 1
+    if len(used) < needed:
+        raise DatasetError(f"{len(used)} anchors were received", valid=f"{needed} or more for a survey")
+    if shape(guesses.position[used]) is Shape.LINE:
+        raise DatasetError("the anchors are all on a line", valid="at least one next to the line")
+    deviations = np.array(
+        [sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())]
+    )
+    identity = np.arange(len(guesses))
+
+    def fit(order: NDArray[np.intp]) -> tuple[Smoothed, float]:
+        start = guesses.moved(guesses.position[order], deviations)
+        found = _fit(replace(config, anchors=start), ranges)
+        sd = np.sqrt(model.variances(ranges.variance_m2))
+        return found, float(model.loss(found.residual_m / sd).mean())
+
+    order = _unswap(config, ranges, off_m)
+    found, loss = fit(identity)
+    if (order != identity).any():
+        # In a square, swapped opposite anchors are the mirror image of the right ones: ranges cannot distinguish the two.
+        exchanged, lower = fit(order)
+        here, mirror = (
+            _misfit(fitted.anchors[used], guesses.position[used], mirrored=side)
+            for fitted, side in ((found, False), (exchanged, True))
+        )
+        there = _misfit(exchanged.anchors[used], guesses.position[order][used], mirrored=False)
+        limit = _AS_WELL * off_m
+        better = lower < loss - _SWAP_GAIN or here > max(limit, _AS_WELL * there)
+        if better and mirror > limit:
+            found, loss = exchanged, lower
+        else:
+            order = identity
+    swapped = np.flatnonzero(order != identity).tolist()
+    sd = np.sqrt(np.einsum("ijij->i", found.anchor_covariance) / 3.0)
+    moved = displacements(found.anchors[used], guesses.position[used])
+    distance = np.zeros(len(guesses))
+    # A drive at constant height hardly determines heights: they are those of the guesses.
+    axes = slice(0, config.dims)
+    distance[used] = np.linalg.norm(moved[:, axes], axis=1)
+    relative = np.linalg.norm(_relative_sd(found.anchors, found.anchor_covariance)[:, axes], axis=1)
+    misplaced = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
+    alternatives = {
+        row: other
+        for row in used.tolist()
+        if row not in fixed
+        for other in [_alternative(config, found, ranges, row)]
+        if other is not None
+    }
+    plain, mirror = (
+        _misfit(found.anchors[used], guesses.position[order][used], mirrored=side) for side in (False, True)
+    )
+    return SurveyResult(
+        guesses.moved(found.anchors, np.maximum(sd, 1e-3)),
+        distance,
+        misplaced,
+        [(swapped[0], swapped[1])] if swapped else [],
+        found.track,
+        loss,
+        alternatives,
+        [row for row in used.tolist() if row not in fixed and relative[row] > MISPLACED_M],
+        not fixed and mirror < _AS_WELL * max(plain, TAPE_M),
+    )
+
+
+def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
+    start = config.anchors
+    track = TagEstimator(config).run(ranges)
+    if len(track) < 2:
+        raise DatasetError(
+            "no position of the tag can be determined",
+            valid="better guesses, an area, or a height; four anchors or more",
+        )
+    spread = float(np.hypot(*np.ptp(track.position[:, :2], axis=0)))
+    if spread < _MOVES_M:
+        raise DatasetError(f"the tag moves by {spread:.1f} m only", valid=f"{_MOVES_M:g} m or more")
+    around = np.repeat(start.sd[:, None], 3, axis=1)
+    if config.height is not None:
+        around[:, 2] = np.minimum(around[:, 2], TAPE_M)
+    variance, known, fit = config.model.variances(ranges.variance_m2), start, None
+    for step in _STEPS_M:
+        fit = Smoother(
+            replace(config, anchors=known),
+            replace(ranges, variance_m2=np.maximum(variance, step**2)),
+            find_anchors=True,
+            around=(start.position, around),
+        ).fit(track)
+        track, known = fit.track, known.moved(fit.anchors, start.sd)
+    assert fit is not None
+    return fit
+
+
+def _misfit(found: NDArray[np.float64], guessed: NDArray[np.float64], *, mirrored: bool) -> float:
+    """Return the horizontal RMS distance between estimated anchors (m, 3), or their mirror image, and the guesses."""
+    side = -1.0 if mirrored else 1.0
+    return float(np.sqrt(np.mean(displacements(found * (side, 1.0, 1.0), guessed)[:, :2] ** 2)))
+
+
+def _alternative(
+    config: EstimatorConfig, fit: Smoothed, ranges: Ranges, row: int
+) -> NDArray[np.float64] | None:
+    """Return another position of an anchor that explains its ranges to the track equally well, or None.
+
+    Candidate: the mirror image beyond the track's plane (with a constant height: its line in plan), refined for this track.
+    """
+    own = ranges.anchor == row
+    track, axes, model = fit.track, config.dims, config.model
+    tag = np.stack(
+        [np.interp(ranges.stamp_ns[own], track.stamp_ns, axis) for axis in track.position.T], axis=1
+    )
+    centre = tag.mean(axis=0)
+    normal = np.zeros(3)
+    normal[:axes] = np.linalg.svd((tag - centre)[:, :axes], full_matrices=False)[2][-1]
+    anchor = fit.anchors[row]
+    other = anchor - 2.0 * float((anchor - centre) @ normal) * normal
+    found_m = np.linalg.norm(tag - anchor, axis=1)
+    sd = np.sqrt(model.variances(ranges.variance_m2[own]))
+    # Residuals of the fit, with what it attributes to offsets: the other position has to explain the same ranges.
+    range_m = found_m + fit.residual_m[own]
+    for _ in range(10):
+        unit, expected = directions(other, tag)
+        z = (range_m - expected) / sd
+        slope = (unit / sd[:, None])[:, :axes]
+        weighted = slope * model.weight(z)[:, None]
+        other[:axes] += np.linalg.solve(weighted.T @ slope + np.eye(axes), weighted.T @ z)
+    worse = float(model.loss((range_m - np.linalg.norm(other - tag, axis=1)) / sd).mean())
+    here = float(model.loss(fit.residual_m[own] / sd).mean())
+    return other if worse < here + _SAME_LOSS and np.linalg.norm(other - anchor) > MISPLACED_M else None
+
+
+def displacements(found: NDArray[np.float64], guessed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the displacement of each anchor (m, 3) from its guess, after alignment with the guesses.
+
+    The alignment, a translation and a rotation about the vertical, is a robust fit: one misplaced anchor does not displace the
+    others.
+    """
+    weight = np.ones(len(found))
+    off = found - guessed
+    for _ in range(30):
+        total = weight.sum()
+        a, b = (weight @ found) / total, (weight @ guessed) / total
+        p, q = found - a, guessed - b
+        cross = weight @ (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+        along = weight @ (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1])
+        angle = np.arctan2(cross, along)
+        c, s = np.cos(angle), np.sin(angle)
+        turned = p @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        off = turned - q
+        weight = 1.0 / np.maximum(np.linalg.norm(off, axis=1), 0.02)
+    return off
+
+
+def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return standard deviations (m, 3) of anchors (m, 3), except for translation and rotation of the whole.
+
+    Args:
+        position: positions of the anchors, float64 (m, 3), m.
+        covariance: float64 (m, 3, m, 3).
+    """
+    m = len(position)
+    whole = np.zeros((m, 3, 4))
+    whole[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    centred = position - position.mean(axis=0)
+    whole[:, 0, 3], whole[:, 1, 3] = -centred[:, 1], centred[:, 0]
+    basis, _ = np.linalg.qr(whole.reshape(3 * m, 4))
+    left = np.eye(3 * m) - basis @ basis.T
+    spread = np.diag(left @ covariance.reshape(3 * m, 3 * m) @ left).reshape(m, 3)
+    sd: NDArray[np.float64] = np.sqrt(spread)
+    return sd
+
+
+def _unswap(config: EstimatorConfig, ranges: Ranges, off_m: float) -> NDArray[np.intp]:
+    """Return the order of guesses that explains the first minute best, of all with at most one pair swapped, int (m,)."""
+    guesses, model = config.anchors, config.model
+    trial = ranges.take(ranges.stamp_ns < ranges.stamp_ns[0] + _TRIAL_NS)
+    if len(trial) > _TRIAL_RANGES:
+        # A random choice: with a constant stride, all might be from the same anchor.
+        chosen = np.random.default_rng(1).choice(len(trial), _TRIAL_RANGES, replace=False)
+        trial = trial.take(np.sort(chosen))
+    identity = np.arange(len(guesses))
+
+    def loss(order: NDArray[np.intp]) -> float:
+        tried = replace(config, anchors=guesses.moved(guesses.position[order], np.full(len(guesses), off_m)))
+        track = TagEstimator(tried).run(trial)
+        if len(track) < 2:
+            return np.inf
+        fit = Smoother(tried, trial).fit(track, iterations=4)
+        return float(model.loss(fit.residual_m / np.sqrt(off_m**2 / 4.0 + model.range_sd**2)).mean())
+
+    best, order = loss(identity), identity
+    if best < _SWAP_GAIN:
+        return order
+    for a, b in itertools.combinations(np.unique(trial.anchor).tolist(), 2):
+        swapped = identity.copy()
+        swapped[[a, b]] = b, a
+        if (found := loss(swapped)) < best - _SWAP_GAIN:
+            best, order = found, swapped
+    return order

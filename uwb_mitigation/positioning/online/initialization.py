@@ -1,0 +1,263 @@
+"""Candidate positions from a few ranges without an initial position, and least squares as a baseline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.tracks import Ranges, Track
+
+IMPLAUSIBLE = 9.0
+"""Positions that are less likely than the best one by a factor of e^9 (eight thousand) are not plausible."""
+
+_STEPS = 40
+_STUCK = 0.01
+_WALL_SD_M = 0.02
+"""Standard deviation of the pseudo-measurement that keeps a position at the boundary of the area."""
+
+_NEAR_WALL_M = 0.5
+_AROUND = 24
+_SPHERE = 96
+_LEAST_SQUARES = NoiseModel(long=100.0, short=100.0)
+_FRESH_S = 0.5
+_EVERY_S = 0.1
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CandidatePosition:
+    """A candidate position.
+
+    Attributes:
+        position: float64 (3,), m.
+        covariance: float64 (3, 3), m^2, of a tag whose ranges err independently.
+        gain: float64 (3, k), derivative of the position with respect to each range.
+        loss: minus the log likelihood, up to a constant.
+    """
+
+    position: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    loss: float
+
+
+def candidate_positions(
+    anchors: NDArray[np.float64],
+    range_m: NDArray[np.float64],
+    sd_m: NDArray[np.float64],
+    model: NoiseModel,
+    *,
+    height: Height | None = None,
+    area: Area | None = None,
+) -> list[CandidatePosition]:
+    """Return all plausible local optima, the best first.
+
+    Levenberg-Marquardt starts on the circles (spheres, if the height is unknown) of the two shortest ranges around their
+    anchors, and at the centre of the anchors.
+
+    Args:
+        anchors: float64 (k, 3), m, of each range.
+        range_m: measured ranges, float64 (k,), m.
+        sd_m: standard deviations of the ranges, float64 (k,), m.
+        model: how robust.
+        height: known height of the tag.
+        area: area of the tag.
+    """
+    dims = 2 if height is not None else 3
+    if len(range_m) < dims:
+        return []
+    x = _starts(anchors, range_m, height)
+    problem = _Problem.of(len(x), anchors, range_m, sd_m, model, height)
+    x, cost, gradient, hessian = problem.descend(x)
+    # Discard starts that have not converged, unless no start has converged.
+    step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
+    arrived = np.einsum("ni,ni->n", step, gradient) < _STUCK
+    if arrived.any():
+        cost = np.where(arrived, cost, np.inf)
+    keep = cost <= cost.min() + IMPLAUSIBLE
+    if area is not None:
+        keep = np.isfinite(cost)
+        excess = x - area.clip(x)
+        squared = np.einsum("ni,ni->n", excess, np.einsum("nij,nj->ni", hessian, excess))
+        near = (np.linalg.norm(excess, axis=1) < _NEAR_WALL_M) | (squared < IMPLAUSIBLE)
+        keep &= near
+        if not keep.any():
+            return []
+        outside = np.flatnonzero(keep & (excess != 0.0).any(axis=1))
+        if len(outside):
+            # Optima just outside, because of range errors: find the best positions on the boundary.
+            wall = area.clip(x[outside])
+            walls = problem.with_walls(outside, wall, excess[outside] != 0.0)
+            x[outside], cost[outside], *_ = walls.descend(wall)
+            x = area.clip(x)
+        keep &= cost <= cost[keep].min() + IMPLAUSIBLE
+    result: list[CandidatePosition] = []
+    for i in np.flatnonzero(keep)[np.argsort(cost[keep])]:
+        if any(_same(x[i], candidate) for candidate in result):
+            continue
+        _, _, h, rows = problem.at(np.array([i])).linearised(x[i : i + 1])
+        covariance = np.linalg.inv(h[0] + 1e-6 * np.eye(3))
+        # Of the damped normal equations, ranges only: their errors move the position by this much.
+        gain = covariance @ (rows[0] / sd_m[:, None]).T
+        result.append(CandidatePosition(x[i].copy(), covariance, gain, float(cost[i])))
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """k ranges, or n sets of k ranges (n, k), and independent priors of n positions.
+
+    Attributes:
+        anchors: float64 (k, 3). range_m, sd_m: float64 (k,) or (n, k).
+        mean, information: float64 (n, 3), priors and their inverse variances; 0: no prior.
+    """
+
+    anchors: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+    sd_m: NDArray[np.float64]
+    model: NoiseModel
+    mean: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        count: int,
+        anchors: NDArray[np.float64],
+        range_m: NDArray[np.float64],
+        sd_m: NDArray[np.float64],
+        model: NoiseModel,
+        height: Height | None,
+    ) -> _Problem:
+        """Return the problem for that number of positions."""
+        mean, information = np.zeros((2, count, 3))
+        if height is not None:
+            mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
+        return cls(anchors, range_m, sd_m, model, mean, information)
+
+    def at(self, rows: NDArray[np.intp]) -> _Problem:
+        """Return the same ranges with the priors of those positions."""
+        return replace(self, mean=self.mean[rows], information=self.information[rows])
+
+    def with_walls(
+        self, rows: NDArray[np.intp], wall: NDArray[np.float64], held: NDArray[np.bool_]
+    ) -> _Problem:
+        """Return `at`, with the coordinates `held` bool (n, 3) at the boundary."""
+        own = self.at(rows)
+        information = np.where(held, 1.0 / _WALL_SD_M**2, own.information)
+        return replace(own, mean=np.where(held, wall, own.mean), information=information)
+
+    def descend(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Run Levenberg-Marquardt from n starts; return positions, loss, gradient and Hessian."""
+        damping = np.full(len(x), 1e-2)
+        cost, gradient, hessian, _ = self.linearised(x)
+        for _ in range(_STEPS):
+            diagonal = np.einsum("nii->ni", hessian)
+            damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
+            trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
+            found = self.linearised(trial)
+            better = found[0] <= cost
+            x = np.where(better[:, None], trial, x)
+            cost = np.where(better, found[0], cost)
+            gradient = np.where(better[:, None], found[1], gradient)
+            hessian = np.where(better[:, None, None], found[2], hessian)
+            damping = np.clip(np.where(better, damping / 4.0, damping * 8.0), 1e-8, 1e8)
+        return x, cost, gradient, hessian
+
+    def linearised(
+        self, x: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return loss (n,), its gradient (n, 3), a Gauss-Newton Hessian (n, 3, 3), and weighted rows (n, k, 3) at x."""
+        away = x[:, None] - self.anchors
+        distance = np.sqrt(np.einsum("nki,nki->nk", away, away))
+        z = (self.range_m - distance) / self.sd_m
+        slope = away / np.maximum(distance, 1e-6)[..., None] / self.sd_m[..., None]
+        rows = slope * self.model.weight(z)[..., None]
+        apart = x - self.mean
+        pull = self.information * apart
+        cost = self.model.loss(z).sum(axis=1) + 0.5 * np.einsum("ni,ni->n", pull, apart)
+        gradient = pull - np.einsum("nki,nk->ni", rows, z)
+        hessian = np.einsum("nki,nkj->nij", rows, slope)
+        hessian[:, [0, 1, 2], [0, 1, 2]] += self.information
+        return cost, gradient, hessian, rows
+
+
+def _same(position: NDArray[np.float64], candidate: CandidatePosition) -> bool:
+    apart = position - candidate.position
+    return bool(apart @ apart < 0.25 or apart @ np.linalg.solve(candidate.covariance, apart) < 4.0)
+
+
+def _starts(
+    anchors: NDArray[np.float64], range_m: NDArray[np.float64], height: Height | None
+) -> NDArray[np.float64]:
+    order = np.argsort(range_m)[:2]
+    found = [anchors.mean(axis=0, keepdims=True) + 0.1]
+    for i in order:
+        if height is not None:
+            # Not along the axes: anchors are often aligned with one, where two mirror images meet in a saddle point.
+            angle = 0.1 + np.arange(_AROUND) * (2.0 * np.pi / _AROUND)
+            up = np.zeros_like(angle)
+        else:
+            # Points spread evenly over a sphere by the golden angle.
+            k = np.arange(_SPHERE) + 0.5
+            angle, up = np.pi * (1.0 + 5.0**0.5) * k, 1.0 - 2.0 * k / _SPHERE
+        level = np.sqrt(1.0 - up * up)
+        direction = np.stack([level * np.cos(angle), level * np.sin(angle), up], axis=1)
+        found.append(anchors[i] + max(float(range_m[i]), 0.1) * direction)
+    starts = np.concatenate(found)
+    if height is not None:
+        starts[:, 2] = height.value
+    return starts
+
+
+def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -> Track:
+    """Return the baseline: least squares on the latest range of each anchor, without motion model or robust loss.
+
+    A position ten times a second, if enough anchors (two, or three without a height) were received within half a second;
+    velocities and covariances are NaN. The solution with the smallest sum of squares is used; the descent starts at
+    the centre of the anchors, and on all sides of it.
+    """
+    stamps, latest = _latest(len(anchors), ranges)
+    enough = np.isfinite(latest).sum(axis=1) >= (2 if height is not None else 3)
+    stamps, latest = stamps[enough], latest[enough]
+    present = np.isfinite(latest)
+    range_m, sd_m = np.where(present, latest, 0.0), np.where(present, 1.0, np.inf)
+    reach = np.nanmedian(latest, axis=1, keepdims=True) if len(latest) else np.zeros((0, 1))
+    exact = None if height is None else Height(height.value, 1e-4)
+    problem = _Problem.of(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
+    best, least = np.zeros((len(latest), 3)), np.full(len(latest), np.inf)
+    sides = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -0.5]]) + 0.01
+    for side in sides:
+        x = anchors.position.mean(axis=0) + reach * side
+        if height is not None:
+            x[:, 2] = height.value
+        x, cost, *_ = problem.descend(x)
+        # Mirror images have equal costs: rounding must not choose between them.
+        better = cost < least - 1e-6
+        best, least = np.where(better[:, None], x, best), np.where(better, cost, least)
+    unknown = np.full((len(stamps), 6, 6), np.nan)
+    return Track(stamps, best, unknown[:, 0, :3], unknown)
+
+
+def _latest(count: int, ranges: Ranges) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return stamps int64 (t,) and the latest range of each anchor within `_FRESH_S`, float64 (t, count); NaN: none."""
+    every = round(_EVERY_S * _SECOND_NS)
+    number = (ranges.stamp_ns - ranges.stamp_ns[:1]) // every
+    # The last range of each interval.
+    ends = np.flatnonzero(np.diff(number, append=number[-1:] + 1)) if len(number) else np.zeros(0, np.intp)
+    found = np.full((len(ends), count), np.nan)
+    for row in range(count):
+        own = np.flatnonzero(ranges.anchor == row)
+        before = np.searchsorted(own, ends, side="right") - 1
+        some = before >= 0
+        last = own[before[some]]
+        age = ranges.stamp_ns[ends[some]] - ranges.stamp_ns[last]
+        found[some, row] = np.where(age <= _FRESH_S * _SECOND_NS, ranges.range_m[last], np.nan)
+    return ranges.stamp_ns[ends], found

@@ -1,0 +1,110 @@
+"""Errors of a track against true positions: RMSE, coverage, consistency and protection levels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.positioning.geometry import protection_levels
+from uwb_mitigation.types.tracks import Track, TruePath
+
+ELLIPSE95 = 5.991
+"""95th percentile of chi-squared with two degrees of freedom."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackErrors:
+    """Horizontal errors of a track, in m unless stated otherwise.
+
+    Attributes:
+        epochs: number of estimates with a known true position.
+        rmse, median, p95: of the horizontal distance to the truth.
+        coverage95: share of truths inside the 95 % ellipses; NaN without covariances.
+        nees_per_dof: mean normalised estimation error squared, over its two degrees of freedom: 1 is consistent,
+            more is overconfident (Bar-Shalom et al., section 5.4); NaN without covariances.
+        exceeded: share of epochs with an error in x or y above its protection level; NaN without covariances.
+        height_rmse: RMSE of z.
+        heading_rmse_deg: RMSE of the yaw where it is known, degrees; NaN: never, or without a true yaw.
+        heading_found_after_s: time from the first estimate to the first one with a yaw; NaN as above.
+    """
+
+    epochs: int
+    rmse: float
+    median: float
+    p95: float
+    coverage95: float
+    nees_per_dof: float
+    exceeded: float
+    height_rmse: float
+    heading_rmse_deg: float = math.nan
+    heading_found_after_s: float = math.nan
+
+    def as_json(self) -> dict[str, float | int | None]:
+        """Return the keys of `track --json`; unknown values are null."""
+        values = {_JSON_KEYS.get(key, key): value for key, value in asdict(self).items()}
+        return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+_JSON_KEYS = {
+    "rmse": "horizontal_rmse_m",
+    "median": "median_m",
+    "p95": "p95_m",
+    "exceeded": "protection_exceeded",
+    "height_rmse": "height_rmse_m",
+}
+
+
+NO_ERRORS = TrackErrors(0, *(math.nan,) * 7)
+
+
+def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErrors:
+    """Return the errors of a track at its own times.
+
+    Args:
+        track: estimates; NaN covariances are not evaluated.
+        truth: true positions.
+        offset_ns: added to the track's stamps to get times of the truth.
+    """
+    true = truth.at(track.stamp_ns + offset_ns)
+    known = np.isfinite(true).all(axis=1)
+    if not known.any():
+        return NO_ERRORS
+    errors = errors_of(track.position[known], track.covariance[known], true[known])
+    of_yaw = np.angle(np.exp(1j * (track.yaw[:, 0] - truth.yaw_at(track.stamp_ns + offset_ns))))
+    of_yaw = of_yaw[np.isfinite(of_yaw)]
+    if not len(of_yaw):
+        return errors
+    first = int(np.isfinite(track.yaw[:, 0]).argmax())
+    return replace(
+        errors,
+        heading_rmse_deg=math.degrees(np.sqrt(np.mean(of_yaw**2))),
+        heading_found_after_s=float(track.stamp_ns[first] - track.stamp_ns[0]) / 1e9,
+    )
+
+
+def errors_of(
+    position: NDArray[np.float64], covariance: NDArray[np.float64], true: NDArray[np.float64]
+) -> TrackErrors:
+    """Return the errors of n positions (n, 3) with covariances (n, d, d) from true positions (n, 3)."""
+    error = position[:, :2] - true[:, :2]
+    distance = np.hypot(*error.T)
+    plane = covariance[:, :2, :2]
+    coverage = nees = exceeded = math.nan
+    if len(error) and np.isfinite(plane).all():
+        squared = np.einsum("ni,ni->n", error, np.linalg.solve(plane, error[..., None])[..., 0])
+        coverage = float((squared <= ELLIPSE95).mean())
+        nees = float(squared.mean() / 2.0)
+        exceeded = float((np.abs(error) > protection_levels(plane)).any(axis=1).mean())
+    return TrackErrors(
+        len(error),
+        float(np.sqrt(np.mean(distance**2))),
+        float(np.median(distance)),
+        float(np.percentile(distance, 95)),
+        coverage,
+        nees,
+        exceeded,
+        float(np.sqrt(np.mean((position[:, 2] - true[:, 2]) ** 2))),
+    )

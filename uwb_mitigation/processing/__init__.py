@@ -1,1 +1,0 @@
-"""Correct recorded bags: selection of bags, processing of one bag, and parallel processing. Nothing here prints."""

@@ -1,0 +1,75 @@
+"""Interface between the driver and a chip at this computer, for USB and SPI."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Protocol
+
+from uwb_mitigation.radios.port import PortAddress
+
+
+class Bus(Protocol):
+    """SPI to one DW1000. If the chip is unreachable, methods raise LinkError within a second."""
+
+    @property
+    def name(self) -> str:
+        """Name for users."""
+        ...
+
+    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
+        """Transfer in one chip-select period: write `header`, then write `out` or read and return `count` octets."""
+        ...
+
+    def speed(self, fast: bool) -> None:
+        """Set the SPI clock: at most 3 MHz, or at most 20 MHz if `fast`."""
+        ...
+
+    @property
+    def reply_us(self) -> int:
+        """Time that a tag on this bus needs from ANSWER to FINAL."""
+        ...
+
+    @property
+    def timeout_us(self) -> int:
+        """Timeout of a tag for the frames of an anchor on such a bus."""
+        ...
+
+    @property
+    def has_reset(self) -> bool:
+        """Whether RSTn is wired."""
+        ...
+
+    def reset(self) -> None:
+        """Pull RSTn low for a short time, then let it float."""
+        ...
+
+    def pause(self) -> None:
+        """Wait between two polls of the chip's status."""
+        ...
+
+    def close(self) -> None:
+        """Close the bus; may be called twice."""
+        ...
+
+
+def bus_opener(source: str, address: str, reset: str = "") -> Callable[[], Bus]:
+    """Return a function that opens the bus of one radio.
+
+    Args:
+        source: `evb1000` or `spi`.
+        address: `/dev/ttyACM0`, `usb:0483:5740`; or `/dev/spidev0.0`.
+        reset: for spi, the reset line, such as `gpiochip0:25`; empty = not wired.
+
+    Raises:
+        ParameterError: `address` is not valid.
+        MissingDependencyError: a dependency of this type of bus is not installed.
+    """
+    # Import the dependencies of a type of bus only if it is used.
+    if source == "spi":
+        from uwb_mitigation.radios.spi import SpidevBus
+
+        return functools.partial(SpidevBus, address, reset)
+    from uwb_mitigation.radios.evb1000 import Evb1000Bus
+
+    return functools.partial(Evb1000Bus, PortAddress.parse(address))

@@ -1,0 +1,168 @@
+"""The settings and the status of a radio. No I/O."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+from uwb_mitigation.errors import ParameterError
+
+
+class Role(enum.IntEnum):
+    """Role of a board's radio."""
+
+    TAG = 0
+    """Starts exchanges with one anchor after the other."""
+    ANCHOR = 1
+    """Answers the exchanges of tags."""
+
+
+class RadioState(enum.IntEnum):
+    """Whether a board's radio works."""
+
+    RUNNING = 0
+    BUS = 1
+    """The bus between chip and processor has failed."""
+    ABSENT = 2
+    """No DW1000 answers."""
+    NO_CLOCK = 3
+    """The clock PLL does not lock: the chip ignores SPI at full speed."""
+    RESTARTED = 4
+    """The chip was reset and is being configured again."""
+    LOCK_UNCONFIRMED = 5
+    """The chip works, but did not report the lock of its clock PLL (errata: the report is not reliable)."""
+
+
+MAX_ANCHORS = 32
+"""Maximum number of anchors that a tag polls."""
+
+
+CHANNELS = (1, 2, 3, 4, 5, 7)
+PREAMBLES = (64, 128, 256, 512, 1024, 1536, 2048, 4096)
+RATES_KBPS = (110, 850, 6800)
+PRFS_MHZ = (16, 64)
+NEVER_MS = 0xFFFFFFFF
+"""`AnchorStatus.age_ms` of an anchor that was never received."""
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSettings:
+    """Settings of a radio. Both ends of a link must use the same channel, PRF, code, rate, delimiter and PAN.
+
+    Attributes:
+        role: tag or anchor.
+        address: 64 bits; 0 = the chip's own.
+        pan: PAN id; frames of other networks are ignored.
+        channel: 1 to 5, 7.
+        prf_mhz: 16, 64.
+        preamble: symbols; may differ between the ends.
+        preamble_code: 0 = the first code of the standard for channel and PRF.
+        rate_kbps: 110, 850, 6800.
+        decawave_sfd: Decawave's start-of-frame delimiter instead of the standard's.
+        tx_power: register TX_POWER in smart-power format, as in the OTP memory: octets, from the lowest, for frames of
+            any length, up to 500, 250 and 125 us. Below 6.8 Mbit/s the lowest octet is used for all frames. 0: the
+            calibrated value of the OTP memory, or the manual's if it is not programmed.
+        antenna_delay: total TX + RX antenna delay in ticks; 0: the value of the OTP memory (of a TREK1000 board the one
+            for this role, channel and rate), or 2 x 16436 if it is not programmed.
+        window: number of complex accumulator samples per range, from 5 before the first path; 0 = none,
+            1016 or more = all.
+        anchors: addresses that a tag polls in turn; empty = anchors found by broadcast.
+        reply_us: time from the reception of ANSWER to FINAL; 0 = default for the tag's bus and processor, plus the
+            duration of long frames.
+        timeout_us: timeout of a tag for an anchor's frames; 0 = default, also plus the duration of long frames.
+        interval_us: minimum time between the starts of two exchanges.
+        report: an anchor also sends its ranges to its host.
+        bias_correction: correct ranges for the received power (APS011); the models were trained without it.
+    """
+
+    role: Role = Role.TAG
+    address: int = 0
+    pan: int = 0x5542
+    channel: int = 5
+    prf_mhz: int = 64
+    preamble: int = 128
+    preamble_code: int = 0
+    rate_kbps: int = 6800
+    decawave_sfd: bool = False
+    tx_power: int = 0
+    antenna_delay: int = 0
+    window: int = 157
+    anchors: tuple[int, ...] = ()
+    reply_us: int = 0
+    timeout_us: int = 0
+    interval_us: int = 0
+    report: bool = False
+    bias_correction: bool = False
+
+    def check(self) -> None:
+        """Raise ParameterError, with the name of the setting, for an invalid value."""
+        _one_of("channel", self.channel, CHANNELS)
+        _one_of("prf_mhz", self.prf_mhz, PRFS_MHZ)
+        _one_of("preamble", self.preamble, PREAMBLES)
+        _one_of("rate_kbps", self.rate_kbps, RATES_KBPS)
+        if self.preamble_code:
+            _one_of("preamble_code", self.preamble_code, preamble_codes(self.channel, self.prf_mhz))
+        _within("address", self.address, 0, 2**64 - 2)
+        _within("pan", self.pan, 0, 0xFFFE)
+        _within("tx_power", self.tx_power, 0, 0xFFFFFFFF)
+        _within("antenna_delay", self.antenna_delay, 0, 0x1FFFE)
+        _within("window", self.window, 0, 0xFFFF)
+        if self.reply_us:
+            # Smart power allows one frame per millisecond; it exists at 6.8 Mbit/s only.
+            _within("reply_us", self.reply_us, 1000 if self.rate_kbps == 6800 else 200, 100_000)
+        if self.timeout_us:
+            _within("timeout_us", self.timeout_us, 400, 500_000)
+        _within("interval_us", self.interval_us, 0, 60_000_000)
+        _within("anchors", len(self.anchors), 0, MAX_ANCHORS)
+        for anchor in self.anchors:
+            _within("anchors", anchor, 1, 2**64 - 2)
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorStatus:
+    """Exchanges of a tag with one anchor; the fields of `layout.RADIO_ANCHOR`, in the same order."""
+
+    address: int
+    tried: int
+    ranged: int
+    rx_power_dbm: float
+    age_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class RadioStatus:
+    """State, and counts since the board's start; the fields of `layout.PAYLOADS[RADIO_STATUS]`."""
+
+    tried: int = 0
+    ranged: int = 0
+    no_answer: int = 0
+    late: int = 0
+    timeout: int = 0
+    damaged: int = 0
+    implausible: int = 0
+    broken: int = 0
+    refused: int = 0
+    restarts: int = 0
+    temperature_c: float = math.nan
+    voltage: float = math.nan
+    state: RadioState = RadioState.RUNNING
+    anchors: tuple[AnchorStatus, ...] = ()
+
+
+def preamble_codes(channel: int, prf_mhz: int) -> range:
+    """Return the preamble codes of IEEE 802.15.4 for a channel and a PRF of 16 or 64 MHz."""
+    if prf_mhz == 64:
+        return range(17, 21) if channel in (4, 7) else range(9, 13)
+    first = {1: 1, 2: 3, 3: 5, 4: 7, 5: 3, 7: 7}[channel]
+    return range(first, first + 2)
+
+
+def _one_of(name: str, value: int, allowed: tuple[int, ...] | range) -> None:
+    if value not in allowed:
+        raise ParameterError(f"radio setting {name} = {value}", valid=", ".join(map(str, allowed)))
+
+
+def _within(name: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise ParameterError(f"radio setting {name} = {value}", valid=f"{low} to {high}")

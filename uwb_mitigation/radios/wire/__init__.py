@@ -1,0 +1,1 @@
+"""The wire protocol of boards with our firmware: layout, messages, framing, clock and session."""

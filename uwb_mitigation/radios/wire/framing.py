@@ -1,0 +1,183 @@
+"""Frame encoder and decoder: COBS between zero delimiters, a fixed header, a CRC-32.
+
+The decoder accepts chunks of any size, buffers at most one frame, and resynchronises at the next
+delimiter after damage. `messages` decodes the payloads.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from cobs import cobs
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.radios.wire.layout import (
+    CRC_BYTES,
+    HEADER,
+    HEADER_BYTES,
+    MAX_ENCODED_BYTES,
+    MAX_FRAME_BYTES,
+    MAX_PAYLOAD_BYTES,
+    PROTOCOL_VERSION,
+)
+
+DELIMITER = b"\0"
+
+# The CRC-32 of any message followed by its own CRC, little-endian, is this constant.
+_CRC_RESIDUE = 0x2144DF1C
+
+# Limits the memory for splitting data that consists mainly of delimiters.
+_SLICE_BYTES = 1 << 16
+
+_MIN_FRAME_BYTES = HEADER_BYTES + CRC_BYTES
+_header = HEADER.as_struct()
+
+
+class Frame(NamedTuple):
+    """One intact frame of this protocol version; the fields of `layout.HEADER` and the payload."""
+
+    type: int
+    flags: int
+    sequence: int
+    time_us: int
+    payload: bytes
+
+
+@dataclass(slots=True)
+class DecoderCounts:
+    """Counts of the data that a decoder received.
+
+    Attributes:
+        frames: intact frames delivered.
+        bad_cobs: segments between delimiters that are not valid COBS.
+        bad_length: valid COBS, but shorter than header and CRC.
+        bad_crc: valid length, but wrong CRC.
+        oversize: segments longer than the longest frame.
+        foreign_versions: intact frames of other protocol versions, {version: count}.
+        last_foreign_version: version of the last of these frames; None = not yet received.
+        bytes_received: number of all bytes.
+    """
+
+    frames: int = 0
+    bad_cobs: int = 0
+    bad_length: int = 0
+    bad_crc: int = 0
+    oversize: int = 0
+    foreign_versions: Counter[int] = field(default_factory=Counter)
+    last_foreign_version: int | None = None
+    bytes_received: int = 0
+
+    @property
+    def corrupt(self) -> int:
+        """Number of segments that are not an intact frame of any version."""
+        return self.bad_cobs + self.bad_length + self.bad_crc + self.oversize
+
+
+def encode_frame(frame: Frame, version: int = PROTOCOL_VERSION) -> bytes:
+    """Return the encoded frame, with a delimiter before and after it.
+
+    The leading delimiter terminates preceding noise, boot text or partial frames, so that a frame is lost
+    only if one of its own bytes is damaged.
+
+    Raises:
+        ParameterError: the payload is longer than `MAX_PAYLOAD_BYTES`.
+    """
+    if len(frame.payload) > MAX_PAYLOAD_BYTES:
+        raise ParameterError(f"a payload of {len(frame.payload)} bytes", valid=f"at most {MAX_PAYLOAD_BYTES}")
+    body = _header.pack(version, frame.type, frame.flags, frame.sequence, frame.time_us) + frame.payload
+    return b"".join(
+        (DELIMITER, cobs.encode(body + zlib.crc32(body).to_bytes(CRC_BYTES, "little")), DELIMITER)
+    )
+
+
+class FrameEncoder:
+    """Numbers and encodes the frames of one sender.
+
+    Attributes:
+        sequence: sequence number of the next frame.
+    """
+
+    def __init__(self, version: int = PROTOCOL_VERSION) -> None:
+        self.sequence = 0
+        self._version = version
+
+    def encode(self, kind: int, payload: bytes, *, flags: int = 0, time_us: int = 0) -> bytes:
+        """Return the next frame, encoded; see `encode_frame`."""
+        wire = encode_frame(Frame(kind, flags, self.sequence, time_us, payload), self._version)
+        self.sequence = (self.sequence + 1) % (1 << 32)
+        return wire
+
+
+class FrameDecoder:
+    """Decodes the intact frames in a byte stream, which arrives in chunks of any size.
+
+    Never raises; `counts` contains the number of dropped frames. Between calls it buffers at most
+    `MAX_ENCODED_BYTES` bytes.
+    """
+
+    def __init__(self) -> None:
+        self.counts = DecoderCounts()
+        self._tail = b""
+        self._overrun = False
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Return the frames that `data` completes, in order."""
+        frames: list[Frame] = []
+        for start in range(0, len(data), _SLICE_BYTES):
+            self._feed_slice(data[start : start + _SLICE_BYTES], frames)
+        return frames
+
+    def reset(self) -> None:
+        """Discard a partly received frame, for example after the port was reopened; keep the counts."""
+        self._tail = b""
+        self._overrun = False
+
+    def _feed_slice(self, data: bytes, frames: list[Frame]) -> None:
+        counts = self.counts
+        counts.bytes_received += len(data)
+        segments = data.split(DELIMITER)
+        if self._overrun:
+            # The rest of a segment that is already counted as oversize.
+            if len(segments) == 1:
+                return
+            segments[0] = b""
+            self._overrun = False
+        elif self._tail:
+            segments[0] = self._tail + segments[0]
+        tail = segments.pop()
+        for segment in segments:
+            frame = self._decode(segment) if segment else None
+            if frame is not None:
+                frames.append(frame)
+        if len(tail) > MAX_ENCODED_BYTES:
+            counts.oversize += 1
+            self._overrun = True
+            tail = b""
+        self._tail = tail
+
+    def _decode(self, segment: bytes) -> Frame | None:
+        counts = self.counts
+        if len(segment) > MAX_ENCODED_BYTES:
+            counts.oversize += 1
+            return None
+        try:
+            body = cobs.decode(segment)
+        except cobs.DecodeError:
+            counts.bad_cobs += 1
+            return None
+        if not _MIN_FRAME_BYTES <= len(body) <= MAX_FRAME_BYTES:
+            counts.bad_length += 1
+            return None
+        if zlib.crc32(body) != _CRC_RESIDUE:
+            counts.bad_crc += 1
+            return None
+        version, kind, flags, sequence, time_us = _header.unpack_from(body)
+        if version != PROTOCOL_VERSION:
+            counts.foreign_versions[version] += 1
+            counts.last_foreign_version = version
+            return None
+        counts.frames += 1
+        return Frame(kind, flags, sequence, time_us, body[HEADER_BYTES:-CRC_BYTES])

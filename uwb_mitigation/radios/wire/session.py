@@ -1,0 +1,451 @@
+"""The host's state of the link to a board: handshake, mode, clock, losses. No I/O.
+
+A `BoardSession` takes received bytes and the time, and returns events and bytes to send. The owner of the
+port calls `receive` after each read, `tick` at least ten times a second, and sends `outgoing`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import fields
+from typing import TypeVar
+
+from uwb_mitigation.errors import LinkError
+from uwb_mitigation.radios.settings import RadioSettings, RadioStatus
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.clock import DeviceClock
+from uwb_mitigation.radios.wire.events import (
+    Connected,
+    Disconnected,
+    Event,
+    LinkState,
+    Loss,
+    ModeChanged,
+    ModeRefused,
+    OffsetsRefused,
+    RadioRefused,
+    SessionCounts,
+    VersionMismatch,
+)
+from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder
+from uwb_mitigation.radios.wire.layout import Flag, MessageType, Mode
+from uwb_mitigation.radios.wire.messages import (
+    BoardStatus,
+    Correction,
+    GetRadio,
+    Hello,
+    Log,
+    OffsetsAnswer,
+    Radio,
+    SetOffsets,
+    SetRadio,
+    TimeSyncReply,
+)
+from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+
+_MS = 10**6
+REQUEST_INTERVAL_NS = 500 * _MS
+"""Interval between retries of an unanswered request."""
+
+SYNC_INTERVAL_NS = 1000 * _MS
+"""Mean interval between time synchronisations. It is varied to avoid beats with the board's own period."""
+
+FIRST_SYNC_INTERVAL_NS = 47 * _MS
+FIRST_SYNCS = 8
+"""Number of round trips in quick succession after a HELLO, for a first clock estimate."""
+
+LINK_TIMEOUT_NS = 3000 * _MS
+"""Timeout of the link. A board sends at least one frame per second."""
+
+MAX_GAP = 1 << 20
+"""Largest plausible gap in sequence numbers. A larger gap means that the board was restarted."""
+
+MAX_TRIES = 6
+"""Number of requests for radio settings or offsets after which an unanswered request counts as unsupported."""
+
+_MAX_CONSECUTIVE_STALE = 3
+_MAX_PENDING = 1024
+_GOLDEN_RATIO = 0.618
+_MAX_OUTGOING_BYTES = 1 << 16
+_SEQUENCES = 1 << 32
+_STAMPED = (MessageType.RANGE_CIR, MessageType.RANGE_CORRECTED)
+
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
+
+
+class _Request:
+    """A request that is repeated until the board answers it.
+
+    Args:
+        unanswered: the problem if the board answers none of `MAX_TRIES` requests; empty = repeat forever.
+    """
+
+    def __init__(self, unanswered: str = "") -> None:
+        self.unanswered = unanswered
+        self.message: messages.Message | None = None
+        self.pending = False
+        self.tries = 0
+        self.sent: dict[int, None] = {}
+
+    def begin(self, message: messages.Message) -> None:
+        """Start a new request; answers to earlier requests are ignored."""
+        self.repeat(message)
+        self.sent.clear()
+
+    def repeat(self, message: messages.Message | None) -> None:
+        """Request `message` from now on; None = no request."""
+        self.message, self.pending, self.tries = message, message is not None, 0
+
+    def is_answered_by(self, sequence: int) -> bool:
+        """Whether the frame `sequence` was one of the requests; then the request is done."""
+        if sequence not in self.sent:
+            return False
+        self.sent.clear()
+        self.pending = False
+        return True
+
+
+class BoardSession:
+    """The host's side of the protocol with one board.
+
+    There are two clocks: `now_ns` is monotonic and measures intervals; `stamp_ns` is the node's clock, used
+    for the stamps of measurements. Read both clocks immediately after the bytes.
+
+    Args:
+        mode: mode to request; None = do not change the board's mode.
+        expected_model_id: identity of the expected model on the board; corrections by other models are
+            counted and not delivered. None accepts any.
+
+    Attributes:
+        state: state of the session.
+        hello: last HELLO of the board; None while not connected.
+        radio: last RADIO of the board; None while not connected or if the board has sent none.
+        foreign_version: with WRONG_VERSION, the protocol version of the board.
+        counts: numbers of frames; `totals` also contains those of damaged bytes.
+        clock: estimate of the board's clock relative to the node's.
+    """
+
+    def __init__(self, *, mode: Mode | None = None, expected_model_id: int | None = None) -> None:
+        self.state = LinkState.CONNECTING
+        self.hello: Hello | None = None
+        self.radio: Radio | None = None
+        self.foreign_version: int | None = None
+        self.counts = SessionCounts()
+        self.clock = DeviceClock()
+        self._decoder = FrameDecoder()
+        self._encoder = FrameEncoder()
+        self._expected_model_id = expected_model_id
+        self._outgoing = bytearray()
+        self._mode = mode
+        self._mode_request = _Request()
+        self._radio_request = _Request(
+            "its firmware does not support radio settings: flash a newer version, or do not set any"
+        )
+        self._offsets_request = _Request(
+            "its firmware does not support offsets: flash a newer version, or correct on the host"
+        )
+        self._offsets_confirmed = False
+        self._boot_key: tuple[int, int] | None = None
+        self._next_request_ns = 0
+        self._next_sync_ns = 0
+        self._num_syncs = 0
+        self._sync_send_times_ns: dict[int, int] = {}
+        self._next_sequence = 0
+        self._consecutive_stale = 0
+        self._foreign_frames = 0
+        self._last_received_ns = 0
+
+    def totals(self) -> dict[str, int]:
+        """Return the counts of frames for diagnostics, {name: count}."""
+        decoder, counts = self._decoder.counts, self.counts
+        totals = {"frames": decoder.frames, "corrupt": decoder.corrupt}
+        totals["foreign_version"] = decoder.foreign_versions.total()
+        for row in fields(counts):
+            value = getattr(counts, row.name)
+            totals[row.name] = value.total() if isinstance(value, Counter) else value
+        return totals
+
+    @property
+    def model_matches(self) -> bool:
+        """False if the connected board has another model than the expected one."""
+        return (
+            self.hello is None
+            or self._expected_model_id is None
+            or self.hello.model_id == self._expected_model_id
+        )
+
+    def opened(self, now_ns: int) -> list[Event]:
+        """Start the handshake after the port was opened."""
+        return self.closed(now_ns)
+
+    def closed(self, now_ns: int) -> list[Event]:
+        """Discard partly received and unsent bytes after the port was lost or closed."""
+        self._decoder.reset()
+        self._outgoing.clear()
+        self._last_received_ns = now_ns
+        return self._disconnect(Loss.CLOSED, now_ns)
+
+    def idle_ns(self, now_ns: int) -> int:
+        """Time since the last intact frame was received."""
+        return now_ns - self._last_received_ns
+
+    def set_mode(self, mode: Mode) -> None:
+        """Request `mode` until the board answers; a `ModeChanged` or `ModeRefused` follows."""
+        self._mode = mode
+        self._mode_request.begin(messages.SetMode(mode))
+        self._next_request_ns = 0
+
+    def set_radio(self, settings: RadioSettings) -> None:
+        """Request `settings` now and after each start of the board; a `Radio` or `RadioRefused` follows.
+
+        Raises:
+            ParameterError: no radio has such settings.
+        """
+        settings.check()
+        self._radio_request.begin(SetRadio(settings))
+        self._next_request_ns = 0
+
+    def set_offsets(self, offsets: Offsets) -> None:
+        """Request, now and after each start of the board, that it subtracts these offsets from its ranges.
+
+        Until the board confirms them, its corrections are counted and not delivered. `OffsetsRefused` follows if it
+        cannot use them, except for offsets of 0, which a board without offsets has anyway.
+        """
+        self._offsets_confirmed = False
+        self._offsets_request.begin(SetOffsets(offsets))
+        self._next_request_ns = 0
+
+    def outgoing(self) -> bytes:
+        """Return the bytes to send and clear the queue. Call it and send the bytes right after `receive` and `tick`."""
+        data = bytes(self._outgoing)
+        self._outgoing.clear()
+        return data
+
+    def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Event]:
+        """Return the events in the received bytes, in order. Never raises; invalid bytes are counted."""
+        events: list[Event] = []
+        frames = self._decoder.feed(data)
+        if frames:
+            self._last_received_ns = now_ns
+        for frame in frames:
+            events += self._handle(frame, now_ns, stamp_ns)
+        events += self._check_foreign_versions(now_ns)
+        return events + self.tick(now_ns, stamp_ns)
+
+    def tick(self, now_ns: int, stamp_ns: int) -> list[Event]:
+        """Repeat requests, synchronise the clock, and check for a timeout."""
+        events: list[Event] = []
+        if self.state is LinkState.READY and self.idle_ns(now_ns) > LINK_TIMEOUT_NS:
+            events += self._disconnect(Loss.TIMEOUT, now_ns)
+        if now_ns >= self._next_request_ns:
+            self._next_request_ns = now_ns + REQUEST_INTERVAL_NS
+            if self.state is not LinkState.READY:
+                self._send(*messages.encode(messages.GetInfo()))
+                return events
+            if self._send_request(self._offsets_request) and self._offsets:
+                events.append(OffsetsRefused(self._offsets_request.unanswered))
+            if self._mode_request.pending:
+                self._send_request(self._mode_request)
+            elif self._send_request(self._radio_request):
+                events.append(RadioRefused(self._radio_request.unanswered))
+        if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
+            self._send_sync(now_ns, stamp_ns)
+        return events
+
+    def _handle(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+        try:
+            return self._parse(frame, now_ns, stamp_ns)
+        except LinkError:
+            self.counts.malformed += 1
+            return []
+
+    def _parse(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+        if frame.type == MessageType.HELLO:
+            return self._handle_hello(frame, now_ns, stamp_ns)
+        if self.state is not LinkState.READY:
+            self.counts.withheld += 1
+            return []
+        if not self._in_sequence(frame):
+            return (
+                self._disconnect(Loss.OUT_OF_SEQUENCE, now_ns)
+                if self._consecutive_stale >= _MAX_CONSECUTIVE_STALE
+                else []
+            )
+        at_ns = 0
+        if frame.type in _STAMPED and not frame.flags & Flag.ANSWER:
+            at_ns = self.clock.stamp(frame.time_us, stamp_ns)
+        message = messages.decode(frame.type, frame.payload, stamp_ns=at_ns)
+        if isinstance(message, Correction):
+            return self._handle_correction(message, bool(frame.flags & Flag.ANSWER))
+        if isinstance(message, TimeSyncReply):
+            self._handle_sync(message, frame.time_us, stamp_ns)
+            return []
+        if isinstance(message, Radio):
+            return self._handle_radio(message, bool(frame.flags & Flag.ANSWER))
+        if isinstance(message, OffsetsAnswer):
+            return self._handle_offsets(message)
+        if isinstance(message, RadioStatus) and self.radio is None:
+            self._send(*messages.encode(GetRadio()))
+        if isinstance(message, RangeMeasurement | Log | BoardStatus | RadioStatus):
+            return [message]
+        # A board never sends the types of the host: count them as unknown.
+        self.counts.unknown_type[frame.type] += 1
+        return []
+
+    def _handle_hello(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+        hello = messages.decode(frame.type, frame.payload)
+        assert isinstance(hello, Hello)
+        boot = (hello.board_id, hello.boot_id)
+        events: list[Event] = []
+        if self.state is LinkState.READY:
+            if boot != self._boot_key:
+                events += self._disconnect(Loss.RESET, now_ns)
+            elif not self._in_sequence(frame):
+                return []
+        if boot != self._boot_key:
+            self.clock.reset()
+            self._boot_key = boot
+        self.clock.arrival(frame.time_us, stamp_ns)
+        self.hello = hello
+        if self.state is not LinkState.READY:
+            self.state = LinkState.READY
+            self.counts.connections += 1
+            self.foreign_version = None
+            self._next_sequence = (frame.sequence + 1) % _SEQUENCES
+            self._consecutive_stale = 0
+            self._num_syncs = 0
+            self._next_sync_ns = now_ns
+            self._mode_request.repeat(
+                None if self._mode in (None, hello.mode) else messages.SetMode(self._mode)
+            )
+            self._radio_request.repeat(self._radio_request.message)
+            self._offsets_request.repeat(self._offsets_request.message)
+            self._offsets_confirmed = False
+            self._next_request_ns = now_ns
+            events.append(Connected(hello))
+        elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
+            wanted = hello.mode if self._mode is None else self._mode
+            events.append(ModeChanged(wanted) if hello.mode == wanted else ModeRefused(wanted, hello.mode))
+        return events
+
+    @property
+    def _offsets(self) -> Offsets:
+        message = self._offsets_request.message
+        return message.offsets if isinstance(message, SetOffsets) else NO_OFFSETS
+
+    def _send_request(self, request: _Request) -> bool:
+        """Send a pending request; return True if it was given up after too many unanswered tries."""
+        if not request.pending or request.message is None:
+            return False
+        request.tries += 1
+        if request.unanswered and request.tries > MAX_TRIES:
+            request.pending = False
+            return True
+        sequence = self._send(*messages.encode(request.message))
+        if sequence is not None:
+            _add_bounded(request.sent, sequence, None)
+        return False
+
+    def _handle_offsets(self, answer: OffsetsAnswer) -> list[Event]:
+        if not self._offsets_request.is_answered_by(answer.request_sequence):
+            self.counts.unsolicited += 1
+            return []
+        self._offsets_confirmed = answer.accepted
+        text = f"it can store {answer.slots} offsets, but {len(self._offsets)} were requested"
+        return [] if answer.accepted else [OffsetsRefused(text)]
+
+    def _handle_radio(self, radio: Radio, answer: bool) -> list[Event]:
+        if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
+            return [RadioRefused(radio.text)]
+        self.radio = radio
+        return [radio]
+
+    def _handle_correction(self, correction: Correction, answer: bool) -> list[Event]:
+        if not self.model_matches:
+            self.counts.wrong_model += 1
+            return []
+        if self._offsets and not self._offsets_confirmed:
+            self.counts.wrong_offsets += 1
+            return []
+        if answer:
+            # This host never requests corrections from a board.
+            self.counts.unsolicited += 1
+            return []
+        return [correction]
+
+    def _handle_sync(self, reply: TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
+        sent_ns = self._sync_send_times_ns.pop(reply.request_sequence, None)
+        if sent_ns is None:
+            self.counts.unsolicited += 1
+        else:
+            self.clock.exchange(sent_ns, reply.received_us, replied_us, stamp_ns)
+
+    def _in_sequence(self, frame: Frame) -> bool:
+        gap = (frame.sequence - self._next_sequence) % _SEQUENCES
+        if gap > MAX_GAP:
+            self.counts.stale += 1
+            self._consecutive_stale += 1
+            return False
+        self.counts.lost += gap
+        self._next_sequence = (frame.sequence + 1) % _SEQUENCES
+        self._consecutive_stale = 0
+        return True
+
+    def _check_foreign_versions(self, now_ns: int) -> list[Event]:
+        counts = self._decoder.counts
+        seen = counts.foreign_versions.total()
+        if seen == self._foreign_frames:
+            return []
+        self._foreign_frames = seen
+        version = counts.last_foreign_version
+        # The buffers may still contain frames of firmware that ran before the connected board was restarted.
+        if self.state is LinkState.READY or version is None:
+            return []
+        self._last_received_ns = now_ns
+        if self.state is LinkState.WRONG_VERSION and version == self.foreign_version:
+            return []
+        self.state = LinkState.WRONG_VERSION
+        self.foreign_version = version
+        return [VersionMismatch(version)]
+
+    def _disconnect(self, loss: Loss, now_ns: int) -> list[Event]:
+        was_ready = self.state is LinkState.READY
+        self.state = LinkState.CONNECTING
+        self.hello = None
+        self.radio = None
+        self.foreign_version = None
+        for request in (self._mode_request, self._radio_request, self._offsets_request):
+            request.sent.clear()
+        self._sync_send_times_ns.clear()
+        self._next_request_ns = now_ns
+        return [Disconnected(loss)] if was_ready else []
+
+    def _send_sync(self, now_ns: int, stamp_ns: int) -> None:
+        request = self._send(*messages.encode(messages.TimeSync()))
+        if request is not None:
+            _add_bounded(self._sync_send_times_ns, request, stamp_ns)
+        self._num_syncs += 1
+        if self._num_syncs < FIRST_SYNCS:
+            self._next_sync_ns = now_ns + FIRST_SYNC_INTERVAL_NS
+        else:
+            self._next_sync_ns = now_ns + round(
+                SYNC_INTERVAL_NS * (0.7 + self._num_syncs * _GOLDEN_RATIO % 0.6)
+            )
+
+    def _send(self, kind: MessageType, payload: bytes) -> int | None:
+        """Queue a frame; return its sequence number, or None if the queue is full."""
+        if len(self._outgoing) + len(payload) > _MAX_OUTGOING_BYTES:
+            self.counts.unsent += 1
+            return None
+        sequence = self._encoder.sequence
+        self._outgoing += self._encoder.encode(kind, payload)
+        return sequence
+
+
+def _add_bounded(memory: dict[_Key, _Value], key: _Key, value: _Value) -> None:
+    """Add an entry to a dictionary of bounded size; the oldest entry is dropped."""
+    memory[key] = value
+    if len(memory) > _MAX_PENDING:
+        del memory[next(iter(memory))]

@@ -1,0 +1,1 @@
+"""Recordings: bags, DecaRanging logs, and files with a mapping; `opening` selects the reader by path."""

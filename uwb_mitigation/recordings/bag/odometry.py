@@ -1,0 +1,221 @@
+"""Odometry, IMU data and transforms of a robot as standard messages: encode to CDR, and read from bags."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.recordings.bag.pose_paths import check_topic, decode_messages
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.ros.schemas import typestore
+from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, ROBOT_IMU, ROBOT_ODOMETRY, TF, TF_TYPE
+from uwb_mitigation.types.tracks import Imu, Odometry
+
+ODOM, BASE_LINK = "odom", "base_link"
+"""The odometry frame and the robot's frame (REP-105)."""
+
+_PLANE = np.array([0, 1, 5])
+"""Rows of x, y and yaw in a 6x6 covariance."""
+
+_UNMEASURED = 1e6
+"""Variance of values that wheels do not measure: z, roll and pitch."""
+
+_NANOSECONDS = 1_000_000_000
+
+
+def encode_odometry_row(odometry: Odometry, row: int, frame_id: str = ODOM, child: str = BASE_LINK) -> bytes:
+    """Return one row as `nav_msgs/Odometry` in CDR."""
+    x, y, yaw = odometry.pose[row].tolist()
+    vx, vy, yaw_rate = odometry.twist[row].tolist()
+    message = _make(
+        ODOMETRY_TYPE,
+        header=_header(int(odometry.stamp_ns[row]), frame_id),
+        child_frame_id=child,
+        pose=_make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=_make(
+                "geometry_msgs/msg/Pose",
+                position=_make("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
+                orientation=_quaternion(yaw),
+            ),
+            covariance=_six(odometry.pose_covariance[row]),
+        ),
+        twist=_make(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=_make("geometry_msgs/msg/Twist", linear=_vector(vx, vy), angular=_vector(z=yaw_rate)),
+            covariance=_six(odometry.twist_covariance[row]),
+        ),
+    )
+    return _serialize(message, ODOMETRY_TYPE)
+
+
+def encode_imu_row(imu: Imu, row: int, frame_id: str = BASE_LINK) -> bytes:
+    """Return one row as `sensor_msgs/Imu` in CDR; the acceleration, and an unknown yaw, are marked as not measured."""
+    yaw = float(imu.yaw[row])
+    orientation, turning, acceleration = np.zeros(9), np.zeros(9), np.zeros(9)
+    orientation[0] = acceleration[0] = -1.0
+    if math.isfinite(yaw):
+        orientation[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_variance[row]
+    turning[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_rate_variance[row]
+    message = _make(
+        IMU_TYPE,
+        header=_header(int(imu.stamp_ns[row]), frame_id),
+        orientation=_quaternion(yaw if math.isfinite(yaw) else 0.0),
+        orientation_covariance=orientation,
+        angular_velocity=_vector(z=float(imu.yaw_rate[row])),
+        angular_velocity_covariance=turning,
+        linear_acceleration=_vector(),
+        linear_acceleration_covariance=acceleration,
+    )
+    return _serialize(message, IMU_TYPE)
+
+
+def encode_transform_row(odometry: Odometry, row: int, frame_id: str = ODOM, child: str = BASE_LINK) -> bytes:
+    """Return the pose of one row as `tf2_msgs/TFMessage` in CDR."""
+    x, y, yaw = odometry.pose[row].tolist()
+    transform = _make(
+        "geometry_msgs/msg/TransformStamped",
+        header=_header(int(odometry.stamp_ns[row]), frame_id),
+        child_frame_id=child,
+        transform=_make("geometry_msgs/msg/Transform", translation=_vector(x, y), rotation=_quaternion(yaw)),
+    )
+    return _serialize(_make(TF_TYPE, transforms=[transform]), TF_TYPE)
+
+
+def write_robot(bag: BagWriter, odometry: Odometry, imu: Imu | None, row: int, until_ns: int) -> int:
+    """Write odometry, IMU data (with the same stamps, if known) and the transform from odom to base_link, from a row up to a time.
+
+    Returns:
+        The first row that was not written.
+
+    Raises:
+        RecordingError: The bag cannot be written.
+    """
+    while row < len(odometry) and (stamp_ns := int(odometry.stamp_ns[row])) <= until_ns:
+        bag.write_message(ROBOT_ODOMETRY, ODOMETRY_TYPE, encode_odometry_row(odometry, row), stamp_ns)
+        if imu is not None:
+            bag.write_message(ROBOT_IMU, IMU_TYPE, encode_imu_row(imu, row), stamp_ns)
+        bag.write_message(TF, TF_TYPE, encode_transform_row(odometry, row), stamp_ns)
+        row += 1
+    return row
+
+
+def read_odometry(path: Path, topic: str) -> Odometry:
+    """Read a topic of `nav_msgs/Odometry`; messages with values that are not finite, except for the pose, are skipped.
+
+    Raises:
+        RecordingError: The bag cannot be read, has no such topic of this type, or it contains no valid message.
+    """
+    rows: dict[int, NDArray[np.float64]] = {}
+    for decoded in _messages(path, topic, ODOMETRY_TYPE):
+        pose, twist = decoded.pose.pose, decoded.twist.twist
+        values = [pose.position.x, pose.position.y, yaw_of(pose.orientation)]
+        values += [twist.linear.x, twist.linear.y, twist.angular.z]
+        covariances = [_three(one.covariance).ravel() for one in (decoded.pose, decoded.twist)]
+        rows[_stamp_ns(decoded)] = np.concatenate([values, *covariances])
+    # Some robots publish twists only: their orientation is zero, and the yaw NaN.
+    stamp_ns, columns = _columns(rows, path, topic, slice(3, None))
+    pose, twist, of_pose, of_twist = np.split(columns, [3, 6, 15], axis=1)
+    return Odometry(stamp_ns, pose, of_pose.reshape(-1, 3, 3), twist, of_twist.reshape(-1, 3, 3))
+
+
+def read_imu(path: Path, topic: str) -> Imu:
+    """Read a topic of `sensor_msgs/Imu`; messages without a finite yaw rate are skipped.
+
+    Raises:
+        RecordingError: The bag cannot be read, has no such topic of this type, or it contains no valid message.
+    """
+    rows: dict[int, NDArray[np.float64]] = {}
+    for decoded in _messages(path, topic, IMU_TYPE):
+        # The message marks values that are not measured with a -1 in front of their covariance.
+        turning, orientation = decoded.angular_velocity_covariance, decoded.orientation_covariance
+        if turning[0] == -1.0:
+            continue
+        yaw = math.nan if orientation[0] == -1.0 else yaw_of(decoded.orientation)
+        known = math.isfinite(yaw)
+        row = (decoded.angular_velocity.z, turning[8], yaw if known else 0.0, orientation[8], known)
+        rows[_stamp_ns(decoded)] = np.array(row, np.float64)
+    stamp_ns, values = _columns(rows, path, topic)
+    yaw_rate, yaw_rate_variance, yaw, yaw_variance, known_yaw = values.T
+    return Imu(stamp_ns, yaw_rate, yaw_rate_variance, np.where(known_yaw, yaw, np.nan), yaw_variance)
+
+
+def yaw_of(orientation: Any) -> float:
+    """Return the yaw (rad) of a quaternion with the fields x, y, z, w; NaN: it is not a rotation."""
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    norm = x * x + y * y + z * z + w * w
+    # An orientation that nobody set is zero.
+    if not 0.25 < norm < 4.0:
+        return math.nan
+    return math.atan2(2.0 * (w * z + x * y) / norm, 1.0 - 2.0 * (y * y + z * z) / norm)
+
+
+def _messages(path: Path, topic: str, kind: str) -> Any:
+    bag = BagReader(path)
+    check_topic(path, bag.topics, topic, (kind,))
+    return decode_messages(bag, [topic], f"{path}, topic {topic}")
+
+
+def _columns(
+    rows: dict[int, NDArray[np.float64]], path: Path, topic: str, checked: slice = slice(None)
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return stamps and values of the rows whose `checked` values are finite, in the order of time."""
+    finite = {stamp: row for stamp, row in rows.items() if np.isfinite(row[checked]).all()}
+    if not finite:
+        raise RecordingError(
+            "no valid message", where=f"{path}, topic {topic}", valid="finite values and covariances"
+        )
+    stamps = sorted(finite)
+    return np.array(stamps, np.int64), np.array([finite[stamp] for stamp in stamps])
+
+
+def _stamp_ns(decoded: Any) -> int:
+    stamp = decoded.header.stamp
+    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
+
+
+def _six(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a 6x6 covariance, flat, from that of x, y and yaw."""
+    covariance = np.diag(np.full(6, _UNMEASURED))
+    covariance[np.ix_(_PLANE, _PLANE)] = plane
+    return covariance.ravel()
+
+
+def _three(covariance: Any) -> NDArray[np.float64]:
+    six = np.asarray(covariance, np.float64).reshape(6, 6)
+    plane: NDArray[np.float64] = six[np.ix_(_PLANE, _PLANE)]
+    return plane
+
+
+@lru_cache(maxsize=64)
+def _type(name: str) -> Any:
+    return typestore().types[name]
+
+
+def _make(kind: str, **fields: Any) -> Any:
+    return _type(kind)(**fields)
+
+
+def _serialize(message: Any, kind: str) -> bytes:
+    return bytes(typestore().serialize_cdr(message, kind))
+
+
+def _header(stamp_ns: int, frame_id: str) -> Any:
+    seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
+    stamp = _make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return _make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def _vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
+    return _make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _quaternion(yaw: float) -> Any:
+    return _make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0))

@@ -1,0 +1,299 @@
+"""Poses of a robot's own localisation: positions and orientations from a topic of a bag.
+
+Messages are decoded with the types that the bag itself declares, so that no interface package is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwb_mitigation.errors import RecordingError, did_you_mean
+from uwb_mitigation.recordings.bag.reader import BagReader, Channel
+from uwb_mitigation.types.ros.codec import decode_frame_id
+from uwb_mitigation.types.ros.poses import POSITION_TYPES, UNOBSERVED, tag_of_frame
+from uwb_mitigation.types.ros.topics import (
+    IMU_TYPE,
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    POSE_TYPE,
+    RANGE_CORRECTED,
+    RANGE_RAW,
+    RANGE_SENSOR_TYPE,
+    TF,
+    TF_STATIC,
+    TF_TYPE,
+)
+from uwb_mitigation.types.tracks import Heights, PosePath, TruePath
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+
+MAX_POSES = 2_000_000
+MOVES_M = 0.05
+"""If an antenna's position in the robot's frame changes more, it has no constant lever arm."""
+
+HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
+_READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES, IMU_TYPE)))
+_MAX_FRAMES = 64
+_NANOSECONDS = 1_000_000_000
+_Row = tuple[int, float, float, float, float, float, float, float]
+
+
+def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, TruePath]:
+    """Return the positions of tags on a topic, {tag id: path}; None: another frame. Empty if the topic is missing.
+
+    Raises:
+        RecordingError: the bag cannot be read, or the topic has another type.
+    """
+    bag = BagReader(path)
+    if topic not in bag.topics:
+        return {}
+    check_topic(path, bag.topics, topic, POSITION_TYPES)
+    where = f"{path}, topic {topic}"
+    bodies = _bodies(bag, topic, where, oriented=False)
+    yaws: dict[str, dict[int, float]] = {}
+    for decoded in decode_messages(bag, [topic], where):
+        # An unknown heading has a very large variance, or a type without variances.
+        if getattr(decoded.pose, "covariance", (math.inf,) * 36)[35] < UNOBSERVED:
+            stamp, q = decoded.header.stamp, decoded.pose.pose.orientation
+            child = _frame(getattr(decoded, "child_frame_id", ""))
+            yaws.setdefault(child, {})[stamp.sec * _NANOSECONDS + stamp.nanosec] = 2.0 * math.atan2(q.z, q.w)
+    found = {}
+    for child, one in bodies.items():
+        own = yaws.get(child, {})
+        yaw = np.array([own.get(stamp, math.nan) for stamp in one.stamp_ns.tolist()]) if own else None
+        found[tag_of_frame(child)] = TruePath(one.stamp_ns, one.position, yaw)
+    return found
+
+
+def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
+    """Return the poses of each child frame on a topic, in the anchors' frame.
+
+    Args:
+        path: the bag.
+        topic: of `POSITION_TYPES`, or /tf.
+        frames: the anchors' frame and the robot's, such as map and base_link. Needed for /tf.
+
+    Returns:
+        {child frame: poses}; the key is empty for a type without a child frame.
+
+    Raises:
+        RecordingError: the bag cannot be read, has no such topic or frame, or its messages cannot be used.
+    """
+    bag = BagReader(path)
+    where = f"{path}, topic {topic}"
+    check_topic(path, bag.topics, topic, (*POSITION_TYPES, TF_TYPE))
+    if bag.topics[topic] == TF_TYPE:
+        if frames is None:
+            raise RecordingError(
+                "transforms between many frames", where=where, valid="--frames MAP BASE_LINK"
+            )
+        edges = _edges(bag, [topic, TF_STATIC], where)
+        return {_frame(frames[1]): _composed(edges, _frame(frames[0]), _frame(frames[1]), where)}
+    bodies = _bodies(bag, topic, where)
+    if frames is None or not set(bodies) - {""}:
+        return bodies
+    if (wanted := _frame(frames[1])) not in bodies:
+        raise RecordingError(
+            f"no poses of {wanted}",
+            where=where,
+            valid=f"--frames of: {', '.join(sorted(bodies))}",
+            suggestion=did_you_mean(wanted, bodies),
+        )
+    return {wanted: bodies[wanted]}
+
+
+def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) -> dict[str, PosePath]:
+    """Return {child frame: poses}; `oriented`: skip messages without an orientation."""
+    rows: dict[str, list[_Row]] = {}
+    for decoded in decode_messages(bag, [topic], where):
+        pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
+        row = _row(decoded.header.stamp, pose.position, pose.orientation if oriented else None)
+        child = _frame(getattr(decoded, "child_frame_id", ""))
+        if row is not None and (child in rows or len(rows) < _MAX_FRAMES):
+            rows.setdefault(child, []).append(row)
+    if oriented and not rows:
+        rows[""] = []
+    return {child: _path(own, where, 2 if oriented else 1) for child, own in rows.items()}
+
+
+def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, float] | None:
+    """Return the pose of a frame in the robot's frame, from /tf_static and /tf; None: no such transforms.
+
+    Raises:
+        RecordingError: the frame moves relative to the robot.
+    """
+    bag = BagReader(path)
+    topics = [name for name in (TF, TF_STATIC) if bag.topics.get(name) == TF_TYPE]
+    where = f"{path}, {' and '.join(topics)}"
+    if not topics or not frame or _frame(frame) == _frame(base):
+        return None
+    try:
+        position = _composed(_edges(bag, topics, where), _frame(base), _frame(frame), where).position
+    except RecordingError:
+        return None
+    if float(np.ptp(position, axis=0).max()) > MOVES_M:
+        raise RecordingError(f"{frame} moves relative to {base}", where=where, valid="--lever-arm X,Y,Z")
+    x, y, z = np.median(position, axis=0).tolist()
+    return x, y, z
+
+
+def read_range_frame(path: Path) -> str:
+    """Return the frame of the first range of a bag; empty: none.
+
+    Raises:
+        RecordingError: the bag or the message cannot be read.
+    """
+    for message in BagReader(path).messages((RANGE_RAW, RANGE_CORRECTED)):
+        return decode_frame_id(message.data)
+    return ""
+
+
+def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:
+    """Return {child frame: {parent frame: transforms}}."""
+    edges: dict[str, dict[str, list[_Row]]] = {}
+    for decoded in decode_messages(bag, topics, where):
+        for one in decoded.transforms:
+            row = _row(one.header.stamp, one.transform.translation, one.transform.rotation)
+            child = _frame(one.child_frame_id)
+            if row is not None and (child in edges or len(edges) < _MAX_FRAMES):
+                edges.setdefault(child, {}).setdefault(_frame(one.header.frame_id), []).append(row)
+    return edges
+
+
+def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
+    """Read a tag's height from a topic of one of the `HEIGHT_TYPES`.
+
+    A `sensor_msgs/Range` is the height above z = 0; of the other types the z coordinate counts.
+
+    Args:
+        path: The bag.
+        topic: The topic.
+        sd_m: Standard deviation where the message has no variance.
+
+    Raises:
+        RecordingError: The bag cannot be read, has no such topic, or the topic contains no valid height.
+    """
+    bag = BagReader(path)
+    where = f"{path}, topic {topic}"
+    check_topic(path, bag.topics, topic, HEIGHT_TYPES)
+    rows: dict[int, tuple[float, float]] = {}
+    for decoded in decode_messages(bag, [topic], where):
+        if bag.topics[topic] == RANGE_SENSOR_TYPE:
+            height, variance = float(decoded.range), float(getattr(decoded, "variance", 0.0))
+            valid = decoded.min_range <= height <= decoded.max_range
+        else:
+            height, variance = float(decoded.pose.pose.position.z), float(decoded.pose.covariance[14])
+            valid = True
+        if valid and math.isfinite(height):
+            stamp = decoded.header.stamp
+            known = math.isfinite(variance) and variance > 0.0
+            rows[stamp.sec * _NANOSECONDS + stamp.nanosec] = height, variance if known else sd_m**2
+    if not rows:
+        raise RecordingError("no valid height", where=where, valid="finite heights within the sensor's range")
+    stamps = sorted(rows)
+    values = np.array([rows[stamp] for stamp in stamps])
+    return Heights(np.array(stamps, np.int64), values[:, 0], values[:, 1])
+
+
+def check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
+    """Raise RecordingError unless the topic exists and has one of the types."""
+    if topics.get(topic) in types:
+        return
+    usable = [f"{name} ({kind})" for name, kind in sorted(topics.items()) if kind in types]
+    what = f"topic {topic} has the type {topics[topic]}" if topic in topics else f"no topic {topic}"
+    valid = ", ".join(usable) or f"a topic of type {', '.join(types)}; the bag has none"
+    suggestion = did_you_mean(topic, [name for name, kind in topics.items() if kind in types])
+    raise RecordingError(what, where=str(path), valid=valid, suggestion=suggestion)
+
+
+def decode_messages(bag: BagReader, topics: list[str], where: str) -> Iterator[Any]:
+    """Decode the messages of topics by the schemas of their channels."""
+    stores: dict[int, tuple[Typestore, str]] = {}
+    for count, message in enumerate(bag.messages(topics)):
+        if count >= MAX_POSES:
+            raise RecordingError(f"more than {MAX_POSES} messages", where=where, valid="a shorter recording")
+        key = id(message.channel)
+        if key not in stores:
+            stores[key] = _store(message.channel, where)
+        store, name = stores[key]
+        try:
+            decoded = store.deserialize_cdr(message.data, name)
+        except Exception as error:  # Of no common type.
+            raise RecordingError(f"a message is damaged: {error}", where=where) from error
+        yield decoded
+
+
+def _store(channel: Channel, where: str) -> tuple[Typestore, str]:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    name = channel.schema.name if channel.schema is not None else ""
+    if channel.schema is None or name not in _READABLE_TYPES:
+        raise RecordingError(f"messages of type {name!r}", where=where, valid=", ".join(_READABLE_TYPES))
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(channel.schema.data.decode(), name))
+    except Exception as error:  # Of no common type.
+        raise RecordingError(f"the type {name} cannot be read: {error}", where=where) from error
+    return store, name
+
+
+def _frame(name: str) -> str:
+    """Return the frame without the leading slash of ROS 1."""
+    return name.removeprefix("/")
+
+
+def _row(stamp: Any, position: Any, orientation: Any) -> _Row | None:
+    """Return a pose with a unit quaternion (without an orientation: the identity); None: the numbers are not valid."""
+    turn = (0.0, 0.0, 0.0, 1.0)
+    if orientation is not None:
+        turn = (orientation.x, orientation.y, orientation.z, orientation.w)
+    row = (stamp.sec * _NANOSECONDS + stamp.nanosec, position.x, position.y, position.z, *turn)
+    length = math.hypot(*turn)
+    if not all(map(math.isfinite, row)) or not 0.5 < length < 2.0:
+        return None
+    x, y, z, w = (value / length for value in turn)
+    return row[0], row[1], row[2], row[3], x, y, z, w
+
+
+def _path(rows: list[_Row], where: str, needed: int = 2) -> PosePath:
+    rows = sorted(set(rows))
+    stamps = np.array([row[0] for row in rows], np.int64)
+    _, first = np.unique(stamps, return_index=True)
+    if len(first) < needed:
+        raise RecordingError(
+            f"{len(first)} poses", where=where, valid="two or more with a position and orientation"
+        )
+    values = np.array([row[1:] for row in rows], np.float64)[first]
+    return PosePath(stamps[first], values[:, :3], values[:, 3:])
+
+
+def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, where: str) -> PosePath:
+    """Return the composed transforms from the root's frame to the leaf's, at the times of the most frequent one."""
+    chain: list[PosePath] = []
+    frame = leaf
+    while frame != root:
+        if frame not in edges or len(chain) > len(edges):
+            known = ", ".join(sorted({*edges, *(parent for own in edges.values() for parent in own)}))
+            raise RecordingError(
+                f"no transforms from {root} to {leaf}",
+                where=where,
+                valid=f"--frames of: {known or 'no frames found'}",
+            )
+        frame, rows = max(edges[frame].items(), key=lambda edge: len(edge[1]))
+        chain.append(_path(rows, where, 1))
+    if not chain:
+        raise RecordingError(f"--frames {root} {leaf}", where=where, valid="two different frames")
+    stamps = max(chain, key=len).stamp_ns
+    position, turn = np.zeros((len(stamps), 3)), Rotation.identity(len(stamps))
+    for step in reversed(chain):
+        moved, turned = step.interpolated(stamps)
+        position, turn = position + turn.apply(moved), turn * turned
+    return PosePath(stamps, position, turn.as_quat())

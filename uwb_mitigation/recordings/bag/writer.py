@@ -1,0 +1,259 @@
+"""Writes a bag that `ros2 bag`, Foxglove and the `rosbags` library open: MCAP, profile ros2, zstd chunks.
+
+The `mcap` library writes the records. The output is atomic: data goes to a `.part` file, which is renamed at the end
+and removed if an error or Ctrl-C ends the writer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import Writer
+
+import uwb_mitigation
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.files import partial_path, write_atomically
+from uwb_mitigation.recordings.bag.reader import Channel, Schema
+from uwb_mitigation.recordings.bag.rosbag2 import (
+    METADATA_NAME,
+    NO_QOS,
+    TopicCount,
+    describe,
+    dump,
+    recorded_qos,
+)
+from uwb_mitigation.types.measurement import RangeMeasurement, Record
+from uwb_mitigation.types.ros import schemas
+from uwb_mitigation.types.ros.codec import encode_range, encode_truth
+from uwb_mitigation.types.ros.poses import encode_true_position
+from uwb_mitigation.types.ros.topics import (
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    RANGE_CIR_TYPE,
+    RANGE_CORRECTED,
+    RANGE_CORRECTED_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
+
+METADATA_RECORD = "uwb_mitigation"
+"""Name of the MCAP metadata record that holds the bag's origin."""
+
+_QOS_KEY = "offered_qos_profiles"
+_HASH_KEY = "topic_type_hash"
+_NO_SCHEMA = 0
+
+
+def partial_file(path: Path) -> Path:
+    """Return the temporary path of a bag at `path` until the bag is complete."""
+    return partial_path(_bag_file(path))
+
+
+def _bag_file(path: Path) -> Path:
+    return path if path.suffix == ".mcap" else path / f"{path.name}_0.mcap"
+
+
+class BagWriter:
+    """Writes one bag; a context manager that completes the bag or, on any exception, removes it.
+
+    Args:
+        path: one file if it ends in `.mcap`, otherwise a rosbag2 folder.
+        metadata: origin of the bag; the version of the package is added. Readers of this package use `source` and
+            `simulated` (`true` or `false`).
+        force: replace an existing bag.
+
+    Attributes:
+        file: the MCAP file.
+        counts: messages written, {topic: count}.
+
+    Raises:
+        RecordingError: the bag exists and `force` is not given, or the path cannot be written.
+    """
+
+    def __init__(self, path: Path, metadata: Mapping[str, str], *, force: bool = False) -> None:
+        self._folder = None if path.suffix == ".mcap" else path
+        self.file = _bag_file(path)
+        self._partial = partial_file(path)
+        self._metadata = {"version": uwb_mitigation.__version__, **metadata}
+        self.counts: Counter[str] = Counter()
+        self._own_channels: dict[str, int] = {}
+        self._channel_ids: dict[tuple[object, ...], int] = {}
+        self._topic_of_channel: dict[int, str] = {}
+        self._topics: dict[str, TopicCount] = {}
+        self._schemas: dict[Schema, int] = {}
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._stream: BinaryIO | None = None
+
+        if self._folder is not None and path.exists() and not path.is_dir():
+            raise RecordingError("a file instead of a bag folder", where=str(path))
+        # Without `force`, a broken link is not replaced either.
+        occupied = os.path.lexists(self.file) or (
+            self._folder is not None and path.is_dir() and any(path.iterdir())
+        )
+        if occupied and not force:
+            raise RecordingError("exists already", where=str(path), valid="--force replaces it")
+        with self._translate_os_errors():
+            self._created_folder = self._folder is not None and not self._folder.exists()
+            if self._folder is not None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+            self._stream = self._partial.open("wb")
+            library = f"uwb_mitigation {uwb_mitigation.__version__}"
+            self._mcap = Writer(self._stream)
+            self._mcap.start(Profile.ROS2, library)
+            self._mcap.add_metadata(METADATA_RECORD, self._metadata)
+
+    def write(self, record: Record) -> None:
+        """Write a measurement to `/uwb/range_raw` and, if known, its truth to `/uwb/range_truth`.
+
+        The true position of the tag is written to `/uwb/odometry_truth`.
+
+        Raises:
+            RecordingError: a value does not fit its field, or the bag cannot be written.
+        """
+        measurement = record.measurement
+        self._write_own(RANGE_RAW, RANGE_CIR_TYPE, measurement, encode_range(measurement))
+        if record.truth is not None:
+            truth = encode_truth(measurement, record.truth)
+            self._write_own(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
+        if record.tag_position is not None:
+            odometry = encode_true_position(
+                record.tag_position, measurement.tag_id, measurement.stamp_ns, record.tag_yaw
+            )
+            self.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, odometry, measurement.stamp_ns)
+
+    def write_message(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:
+        """Write a serialised message of a standard type.
+
+        Raises:
+            RecordingError: the time is before the epoch, or the bag cannot be written.
+        """
+        self.write_serialized(self._own_channel(topic, type_name), data, stamp_ns, stamp_ns)
+
+    def copy_channel(self, channel: Channel) -> int:
+        """Register a channel of another bag; return its number.
+
+        Channels that differ only in their id get the same number, so that the files of one bag share it.
+        The recorded QoS is copied in the format of the current rosbag2.
+        """
+        metadata = channel.metadata | {_QOS_KEY: dump(recorded_qos(channel.metadata.get(_QOS_KEY, "")))}
+        return self._add_channel(replace(channel, metadata=metadata))
+
+    def corrected_channel(self) -> int:
+        """Register `/uwb/range_corrected`, for serialised messages; return its number."""
+        return self._own_channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
+
+    def write_serialized(
+        self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
+    ) -> None:
+        """Write the bytes of a message unchanged to a channel of `copy_channel` or `corrected_channel`.
+
+        Raises:
+            RecordingError: a time is negative, or the bag cannot be written.
+        """
+        if log_time_ns < 0 or publish_time_ns < 0:
+            raise RecordingError(f"time {min(log_time_ns, publish_time_ns)} ns is before the epoch")
+        try:
+            self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
+        except OSError as error:
+            raise self._write_error(error) from error
+        self.counts[self._topic_of_channel[channel]] += 1
+        self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
+        self._last_ns = max(self._last_ns, log_time_ns)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            self._discard()
+            return
+        try:
+            self._finish()
+        except BaseException:
+            self._discard()
+            raise
+
+    def _write_own(self, topic: str, type_name: str, measurement: RangeMeasurement, data: bytes) -> None:
+        stamp_ns = measurement.stamp_ns
+        self.write_serialized(
+            self._own_channel(topic, type_name), data, stamp_ns, stamp_ns, measurement.sequence
+        )
+
+    def _own_channel(self, topic: str, type_name: str) -> int:
+        number = self._own_channels.get(topic)
+        if number is None:
+            schema = Schema(type_name, SchemaEncoding.ROS2, schemas.definition(type_name).encode())
+            metadata = {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)}
+            number = self._add_channel(Channel(0, topic, MessageEncoding.CDR, metadata, schema))
+            self._own_channels[topic] = number
+        return number
+
+    def _add_channel(self, channel: Channel) -> int:
+        topic, schema, metadata = channel.topic, channel.schema, channel.metadata
+        key = (topic, channel.encoding, schema, *sorted(metadata.items()))
+        if key in self._channel_ids:
+            return self._channel_ids[key]
+        with self._translate_os_errors():
+            if schema is not None and schema not in self._schemas:
+                self._schemas[schema] = self._mcap.register_schema(schema.name, schema.encoding, schema.data)
+            schema_id = _NO_SCHEMA if schema is None else self._schemas[schema]
+            number = self._mcap.register_channel(topic, channel.encoding, schema_id, metadata)
+        self._channel_ids[key], self._topic_of_channel[number] = number, topic
+        # A topic may have several channels, of several publishers; rosbag2 lists it once.
+        kind, qos = schema.name if schema else "", recorded_qos(metadata[_QOS_KEY])
+        self._topics.setdefault(topic, TopicCount(topic, kind, metadata.get(_HASH_KEY, ""), 0, qos))
+        return number
+
+    def _finish(self) -> None:
+        topics = [replace(topic, messages=self.counts[topic.topic]) for topic in self._topics.values()]
+        first_ns = 0 if self._first_ns is None else self._first_ns
+        document = describe(self.file.name, topics, first_ns, self._last_ns, self._metadata)
+        with self._translate_os_errors():
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": dump(document)})
+            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._close()
+            self._partial.replace(self.file)
+            if self._folder is not None:
+                text = dump({"rosbag2_bagfile_information": document})
+                write_atomically(self.file.with_name(METADATA_NAME), text, RecordingError)
+
+    def _close(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+
+    def _discard(self) -> None:
+        with contextlib.suppress(OSError):
+            self._close()
+        # Do not replace the original error if the file cannot be removed.
+        with contextlib.suppress(OSError):
+            self._partial.unlink(missing_ok=True)
+        if self._created_folder and self._folder is not None:
+            with contextlib.suppress(OSError):
+                self._folder.rmdir()
+
+    @contextlib.contextmanager
+    def _translate_os_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise self._write_error(error) from error
+
+    def _write_error(self, error: OSError) -> RecordingError:
+        self._discard()
+        return RecordingError(f"cannot be written: {error.strerror}", where=str(self.file))

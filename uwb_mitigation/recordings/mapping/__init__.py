@@ -1,0 +1,1 @@
+"""Mapping files: tables and messages of other software as recordings of ranges."""

@@ -1,0 +1,404 @@
+"""Values of a mapping in SI units, from columns of a file or message."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import RecordingError, UwbMitigationError
+from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, Drop, Table, Value
+from uwb_mitigation.recordings.mapping.tables import CHUNK_ROWS, LOG_TIME, TOPIC, Chunk, read_chunks
+from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
+
+_MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
+"""Texts that mean an unknown value."""
+
+UNKNOWN_ID = (1 << 64) - 1
+UNKNOWN_STAMP = np.iinfo(np.int64).min
+"""Id and stamp of a row without one."""
+
+MAX_STAMP_S = 4.6e9
+"""Stamps are within the years 1824 to 2115, so that differences fit into 64 bits."""
+
+NO_CIR = Cir(np.zeros(0, np.int16))
+_LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
+"""Constant A of the DW1000's levels by PRF in MHz (user manual, section 4.7)."""
+
+Columns = dict[str, NDArray[Any]]
+"""{name: array (n,)} in SI units. `stamp`: ns, int64; `tag`, `anchor`: uint64; `label`, `configuration`: texts; others, such
+as `range`, `true range` and `tag x`: float64, NaN: unknown."""
+
+
+def joined(parts: list[Columns]) -> Columns:
+    """Concatenate parts with the same columns."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def take(columns: Columns, rows: NDArray[Any]) -> Columns:
+    """Return the chosen rows."""
+    everything = rows.dtype == bool and rows.all()
+    return columns if everything else {name: values[rows] for name, values in columns.items()}
+
+
+def measurement(columns: Columns, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
+    """Return one range with the samples of `cir` and its own levels; `sequence` is used if the columns have none."""
+
+    def number(name: str) -> float:
+        return float(columns[name][row])
+
+    given = number("sequence")
+    return RangeMeasurement(
+        int(columns["stamp"][row]),
+        int(columns["tag"][row]),
+        int(columns["anchor"][row]),
+        (int(given) if math.isfinite(given) else sequence) & 0xFFFFFFFF,
+        0,
+        number("range"),
+        Cir(
+            cir.samples,
+            cir.encoding,
+            cir.start_index,
+            number("first_path_index"),
+            scale=cir.scale,
+            preamble_count=_whole(number("preamble_count"), 65535),
+            rx_power_dbm=number("rx_power"),
+            first_path_power_dbm=number("first_path_power"),
+            channel=_whole(number("channel"), 255),
+        ),
+    )
+
+
+def _whole(value: float, most: int) -> int:
+    return int(value) if 0 <= value <= most else 0
+
+
+@dataclass(slots=True)
+class Converter:
+    """Converts the rows of a table.
+
+    Args:
+        values: the columns of the result; None: unknown.
+        names: numbers of named tags and anchors.
+    """
+
+    values: Mapping[str, Value | None]
+    names: Mapping[str, dict[str, int]] = field(default_factory=lambda: {"tag": {}, "anchor": {}})
+
+    @property
+    def columns(self) -> dict[str, bool]:
+        """Return the columns of the table that are needed, and whether they may be missing."""
+        found: dict[str, bool] = {}
+        for value in filter(None, self.values.values()):
+            found |= {name: value.optional and found.get(name, True) for name in value.columns}
+        return found
+
+    def convert(self, chunk: Chunk, file: str = "") -> Columns:
+        """Return the values of all rows of a chunk; `file`: its path for `file_name`.
+
+        Raises:
+            RecordingError: an id or a number cannot be read; `where` names the row.
+        """
+        found: Columns = {}
+        for name, value in self.values.items():
+            if name == "stamp":
+                found[name] = read_stamps(value, chunk, file)
+            elif name in self.names:
+                found[name] = _read_ids(value or Value(constant=1), chunk, name, file, self.names[name])
+            elif name in ("label", "configuration"):
+                found[name] = _read_texts(value, chunk, name, file)
+            else:
+                found[name] = read_numbers(value, chunk, name, file)
+        if "cir_power" in found:
+            _add_levels(found)
+        return found
+
+
+def _add_levels(columns: Columns) -> None:
+    """Compute both levels from the registers of a DW1000."""
+    count = columns["preamble_count"]
+    constant = np.where(columns["prf"] == 16, _LEVEL_OFFSETS[16], _LEVEL_OFFSETS[64])
+    first = sum(columns[f"amplitude {n}"] ** 2 for n in (1, 2, 3))
+    for name, power in (("rx_power", columns["cir_power"] * 2.0**17), ("first_path_power", first)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            level = 10 * np.log10(power / count**2) - constant
+        columns[name] = np.where(np.isfinite(level), level, np.nan)
+
+
+def _read_texts(value: Value | None, chunk: Chunk, name: str, file: str) -> NDArray[Any]:
+    """Return a value as texts (n,), after `pattern` and `values`; empty: unknown."""
+    raw = None if value is None else _raw(value, chunk, file)
+    if value is None or raw is None:
+        return np.full(chunk.count, "", object)
+    # None and NaN are missing values.
+    given = ["" if each is None or each != each else each for each in raw.tolist()]
+    texts = {each: _text(value, each, name) if each != "" else "" for each in dict.fromkeys(given)}
+    return np.array([texts[each] for each in given], object)
+
+
+def _text(value: Value, given: Any, name: str) -> str:
+    text = str(int(given)) if isinstance(given, float) and given.is_integer() else str(given).strip()
+    if value.pattern:
+        match = re.search(value.pattern, text)
+        if match is None:
+            raise RecordingError(f"{name} = {text!r:.60} does not match {value.pattern!r}")
+        text = match[1]
+    return value.values.get(text, text)
+
+
+def read_numbers(value: Value | None, chunk: Chunk, name: str, file: str = "") -> NDArray[np.float64]:
+    """Return a value in SI units, float64 (n,); NaN: unknown.
+
+    Raises:
+        RecordingError: a text is not a number; `where` names its row.
+    """
+    raw = None if value is None else _raw(value, chunk, file)
+    if value is None or raw is None:
+        return np.full(chunk.count, np.nan)
+    if value.pattern or value.values:
+        raw = _read_texts(value, chunk, name, file)
+    numbers = _floats(raw, chunk, name, value.column)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = numbers * SCALES.get(value.unit, 1.0) * value.scale + value.offset
+    return np.where(np.isfinite(found), found, np.nan)
+
+
+def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[np.float64]:
+    with np.errstate(all="ignore"):
+        try:
+            return raw.astype(np.float64)
+        except (ValueError, TypeError):
+            pass
+    import pandas as pd
+
+    texts = pd.Series([str(item).strip() for item in raw.tolist()], dtype=object)
+    found = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
+    for row in np.flatnonzero(np.isnan(found) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
+        comma, date = (re.match(form, texts[row]) for form in (r"[-+]?\d+,\d+$", r"\d{4}-\d\d-\d\d"))
+        number = "dates: set unit: iso8601" if date else f"a number in column {column}"
+        raise RecordingError(
+            f"{name} = {texts[row]!r:.40} is not a number",
+            where=chunk.where(row),
+            valid="decimal commas: set decimal: ','" if comma else number,
+        )
+    return found
+
+
+def _raw(value: Value, chunk: Chunk, file: str) -> NDArray[Any] | None:
+    """Return the unconverted values of the rows; None: the column is optional and missing."""
+    if rule := value.file_name or value.topic_name:
+        source = [file] * chunk.count if value.file_name else chunk.columns.get(TOPIC, [""] * chunk.count)
+        found = {text: re.search(rule, text) for text in set(source)}
+        if missing := [text for text, match in found.items() if match is None]:
+            raise RecordingError(f"{missing[0]!r} does not match {rule!r}", where=str(chunk.path))
+        return np.array([found[text][1] for text in source], object)  # type: ignore[index]
+    if value.rate_hz:
+        return np.asarray((chunk.before + chunk.rows) / value.rate_hz)
+    if value.constant is not None:
+        return np.full(chunk.count, value.constant)
+    needed = list(value.sum) or [value.column]
+    if missing := [name for name in needed if name not in chunk.columns]:
+        if value.optional:
+            return None
+        raise RecordingError(f"no column {missing[0]}", where=str(chunk.path))
+    arrays = {name: np.asarray(chunk.columns[name]) for name in needed}
+    if bad := [name for name, array in arrays.items() if array.ndim > 1]:
+        raise RecordingError(f"column {bad[0]} contains lists", where=str(chunk.path), valid="single values")
+    if value.sum:
+        parts = [factor * _floats(arrays[name], chunk, name, name) for name, factor in value.sum.items()]
+        return np.asarray(np.sum(parts, axis=0))
+    return arrays[value.column]
+
+
+def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int64]:
+    """Return stamps in ns, int64 (n,); `UNKNOWN_STAMP`: unknown.
+
+    Raises:
+        RecordingError: a text is not a date or number; or most stamps are impossible, so that the unit is wrong.
+    """
+    raw = None if value is None else _raw(value, chunk, file)
+    if value is None or raw is None:
+        if LOG_TIME in chunk.columns:
+            return np.asarray(chunk.columns[LOG_TIME], np.int64)
+        raise RecordingError("no stamp", where=str(chunk.path), valid="fields.stamp: a column, or rate_hz")
+    if raw.dtype.kind == "M":
+        raw, value = raw.astype("datetime64[ns]").astype(np.int64), value.model_copy(update={"unit": "ns"})
+    if value.unit == "iso8601":
+        import pandas as pd
+
+        times = pd.to_datetime(pd.Series(raw).astype(str), utc=True, errors="coerce", format="ISO8601")
+        given = times.notna().to_numpy()
+        for row in np.flatnonzero(~given).tolist():
+            if str(raw[row]).strip().lower() not in _MISSING:
+                raise RecordingError(
+                    f"stamp = {raw[row]!r:.40} is not a date",
+                    where=chunk.where(row),
+                    valid="2024-06-09T19:39:13.4387",
+                )
+        found = times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64)
+        possible = given & (np.abs(found / 1e9) < MAX_STAMP_S)
+    else:
+        # Without a unit: seconds; the stamp of a message is an integer in nanoseconds.
+        is_stamp = LOG_TIME in chunk.columns and raw.dtype.kind in "iu"
+        factor = TIME[value.unit or ("ns" if is_stamp else "s")]
+        scaled = _floats(raw, chunk, "stamp", value.column) * value.scale
+        given = np.isfinite(scaled)
+        possible = given & (np.abs(scaled) < MAX_STAMP_S * 1e9 / factor)
+        if raw.dtype.kind in "iu" and value.scale == 1.0:
+            # As integers, because a float64 resolves nanoseconds since 1970 to 256 ns only.
+            found = np.where(possible, raw, 0).astype(np.int64) * factor
+        else:
+            scaled = np.where(possible, scaled, 0.0)
+            whole = np.floor(scaled)
+            # A float64 resolves seconds since 1970 to 0.2 us only: round them to 1 us.
+            step = np.where((np.abs(whole) > 1e8) & (factor == TIME["s"]), 1000, 1)
+            rest = np.rint((scaled - whole) * factor / step).astype(np.int64) * step
+            found = whole.astype(np.int64) * factor + rest
+    if 2 * np.count_nonzero(possible) < np.count_nonzero(given):
+        first = raw[np.flatnonzero(given & ~possible)[0]]
+        raise RecordingError(
+            f"stamp = {first} is outside of the years 1824 to 2115",
+            where=str(chunk.path),
+            valid="unit: ms, us or ns",
+        )
+    possible &= np.abs(found / 1e9 + value.offset) < MAX_STAMP_S
+    offset = round(min(max(value.offset, -MAX_STAMP_S), MAX_STAMP_S) * 1e9)
+    return np.where(possible, found + offset, UNKNOWN_STAMP)
+
+
+def _read_ids(value: Value, chunk: Chunk, name: str, file: str, names: dict[str, int]) -> NDArray[np.uint64]:
+    """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`."""
+    raw = _raw(value, chunk, file)
+    if raw is None:
+        raise RecordingError(f"no column {value.column} for the {name}", where=str(chunk.path))
+    plain = not (value.pattern or value.values or value.names or value.offset)
+    if plain and (raw.dtype.kind == "u" or (raw.dtype.kind == "i" and (len(raw) == 0 or raw.min() >= 0))):
+        return np.asarray(raw, np.uint64)
+    found: dict[Any, int] = {}
+    items = raw.tolist()
+    for row, item in enumerate(items):
+        if item in found:
+            continue
+        try:
+            if str(item).strip().lower() in _MISSING:
+                found[item] = UNKNOWN_ID
+                continue
+            # Tables read whole numbers in a column with missing values as float64, which merges larger ids.
+            if isinstance(item, float) and abs(item) >= 2**53:
+                raise ValueError(item)
+            text = _text(value, item, name)
+            number = names.setdefault(text, len(names) + 1) if value.names else _id(text)
+            found[item] = number + round(value.offset)
+            if not 0 <= found[item] < UNKNOWN_ID:
+                raise ValueError(text)
+        except (ValueError, UwbMitigationError) as error:
+            raise RecordingError(
+                error.what
+                if isinstance(error, UwbMitigationError)
+                else f"{name} = {item!r:.40} is not an id",
+                where=chunk.where(row),
+                valid="a whole number such as 3 or 0x1f; `pattern` takes a number from a text, `names: true` numbers texts",
+            ) from error
+    return np.array([found[item] for item in items], np.uint64)
+
+
+def _id(text: str) -> int:
+    if re.fullmatch(r"[0-9a-fA-F]{2}([:-][0-9a-fA-F]{2}){1,7}", text):
+        return int(re.sub("[:-]", "", text), 16)
+    # A column with unknown values contains texts such as 10.0.
+    return int(text, 16) if text.lower().startswith("0x") else int(re.sub(r"\.0+$", "", text))
+
+
+def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, float]:
+    """Return int16 samples of one CIR, their encoding, and the scale that restores the values.
+
+    Raises:
+        ValueError: the values are not numbers.
+    """
+    if isinstance(values, str):
+        if form == "complex" and not re.search("[ij]", values):
+            form = "interleaved"  # pairs such as [[1, 2], [3, 4]]
+        items = [item.strip("[]()") for item in re.split(r"[,;\s]+", values.strip())]
+        parse: Any = complex if form == "complex" else float
+        values = [parse(item.replace("i", "j")) for item in items if item]
+    array = np.asarray(values)
+    if array.dtype == object and array.ndim:
+        array = np.stack(list(array))  # Parquet gives pairs as arrays in an array.
+    encoding = Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
+    if form == "complex":
+        pairs = array if array.ndim == 2 else np.stack([array.real, array.imag], axis=1)
+        array = pairs.reshape(-1)
+    elif np.iscomplexobj(array):
+        array = np.abs(array)
+    flat = array.reshape(-1).astype(np.float64)
+    if not np.isfinite(flat).all():
+        return NO_CIR.samples, encoding, 1.0
+    largest = float(np.abs(flat).max()) if len(flat) else 0.0
+    exact = largest <= 32767 and bool(np.all(flat == np.rint(flat)))
+    scale = 1.0 if exact or largest == 0.0 else largest / 32767
+    return np.rint(flat / scale).astype(np.int16), encoding, scale
+
+
+def kept_rows(rules: list[Drop], chunk: Chunk, dropped: Counter[str], prefix: str = "") -> NDArray[np.bool_]:
+    """Return which rows no rule drops, and count the others by rule; `from_median` needs all files and is ignored."""
+    kept = np.ones(chunk.count, bool)
+    for rule in rules:
+        raw = np.asarray(chunk.columns[rule.column])
+        bad = np.zeros(chunk.count, bool)
+        for wanted, is_bad in ((rule.equals, True), (rule.differs, False)):
+            if wanted is not None:
+                listed = wanted if isinstance(wanted, list) else [wanted]
+                texts = [f"{each:g}" if isinstance(each, float) else each for each in listed]
+                same = np.isin(raw.astype(str), texts)
+                if raw.dtype.kind in "iuf":
+                    same |= np.isin(raw, [each for each in listed if isinstance(each, float)])
+                bad |= same == is_bad
+        if rule.below is not None or rule.above is not None:
+            found = _floats(raw, chunk, rule.column, rule.column)
+            bad |= found < (-np.inf if rule.below is None else rule.below)
+            bad |= found > (np.inf if rule.above is None else rule.above)
+        kept &= ~count_bad(bad & kept, dropped, f"{prefix}{rule}")
+    return kept
+
+
+def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDArray[np.bool_]:
+    """Count the rows that are not used, by reason; return `bad`."""
+    if bad.any():
+        dropped[reason] += int(np.count_nonzero(bad))
+    return bad
+
+
+def read_csv(
+    path: Path, ids: Sequence[str], numbers: Mapping[str, tuple[float, float]], optional: Sequence[str] = ()
+) -> Columns:
+    """Read a CSV file of at most `CHUNK_ROWS` rows; `.xz` is decompressed.
+
+    Args:
+        path: the file.
+        ids: columns with ids.
+        numbers: columns with numbers, and their limits.
+        optional: names of numbers or texts that may be missing.
+
+    Raises:
+        RecordingError: a column or a value is missing or invalid; `where` gives the row.
+    """
+    values = {name: Value(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
+    converter = Converter(values, {name: {} for name in ids})
+    chunks = list(islice(read_chunks(Table(format="csv"), path, converter.columns), 2))
+    if len(chunks) != 1 or not chunks[0].count:
+        raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
+    found = converter.convert(chunks[0])
+    for name, (low, high) in [*((name, (0, UNKNOWN_ID - 1)) for name in ids), *numbers.items()]:
+        bad = ~((found[name] >= low) & (found[name] <= high))
+        for row in np.flatnonzero(bad & ~(np.isnan(found[name]) & (name in optional)))[:1].tolist():
+            what, where = f"{name} = {found[name][row]}", chunks[0].where(row)
+            raise RecordingError(what, where=where, valid=f"{low:g} to {high:g}")
+    return found

@@ -1,0 +1,110 @@
+"""Values of mapped columns in messages: ROS messages of any type, JSON, and lines such as `AT+RANGE=...`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from uwb_mitigation.errors import RecordingError, did_you_mean
+from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Table
+
+MAX_ROWS = 4096
+"""Largest number of ranges in one message."""
+
+MAX_TEXT = 1 << 20
+_COMMAND = re.compile(r"^\s*AT\+\w+[=:]")
+_PAIRS = re.compile(r"(\w+)\s*[:=]\s*(\([^()]*\)|\[[^\[\]]*\]|[^,\s()\[\]]+)")
+
+
+class MessageRows:
+    """Reads the columns of a table from messages; a path with `[]` gives one row per element of the list.
+
+    Args:
+        table: the mapping.
+        columns: {path of a field, such as `nodes[].dis`: whether it is left out if a message does not contain it}.
+    """
+
+    def __init__(self, table: Table, columns: Mapping[str, bool]) -> None:
+        self._table, self._columns = table, columns
+        self._paths = {
+            column: [part for part in re.split(r"\.|(\[\])", column) if part]
+            for column in columns
+            if column != LIST_INDEX
+        }
+
+    def rows(self, message: Any) -> dict[str, Any]:
+        """Return {column: array or list} of the rows of a message; all have the same length.
+
+        Raises:
+            RecordingError: a field is missing, or a text is not in the format of the mapping.
+        """
+        if self._table.text:
+            message = self._parsed(_step(message, self._table.text_field, self._table.text_field))
+        found = {}
+        for column, path in self._paths.items():
+            with contextlib.suppress(*([RecordingError] if self._columns[column] else [])):
+                found[column] = _walk(message, path, column)
+        many = [column for column in found if "[]" in self._paths[column]]
+        count = min((len(found[column]) for column in many), default=1)
+        if count > MAX_ROWS:
+            raise RecordingError(f"{count} ranges in one message", valid=f"at most {MAX_ROWS}")
+        rows: dict[str, Any] = {LIST_INDEX: np.arange(count)}
+        for column, value in found.items():
+            rows[column] = value[:count] if column in many else [value] * count
+        return rows
+
+    def _parsed(self, text: Any) -> Any:
+        if not isinstance(text, str) or len(text) > MAX_TEXT:
+            raise RecordingError(f"{self._table.text_field} is not a text", valid="a field of type string")
+        if self._table.text == "json":
+            try:
+                return json.loads(text)
+            except (ValueError, RecursionError) as error:
+                raise RecordingError(f"not JSON: {text!r:.60}") from error
+        return {name: _items(value) for name, value in _PAIRS.findall(_COMMAND.sub("", text))}
+
+
+def _items(text: str) -> Any:
+    """Return the list in brackets, or the text itself."""
+    return [item.strip() for item in text[1:-1].split(",")] if text[0] in "([" else text
+
+
+def _walk(value: Any, path: list[str], column: str) -> Any:
+    for number, part in enumerate(path):
+        if part == "[]":
+            if isinstance(value, str | dict) or not hasattr(value, "__len__"):
+                raise RecordingError(f"{column} is not a list")
+            return [_walk(item, path[number + 1 :], column) for item in value]
+        value = _step(value, part, column)
+    seconds = getattr(value, "sec", getattr(value, "secs", None))
+    if seconds is not None:
+        nanoseconds = getattr(value, "nanosec", getattr(value, "nsecs", 0))
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+    return value
+
+
+def _step(value: Any, name: str, column: str) -> Any:
+    if isinstance(value, dict):
+        if name in value:
+            return value[name]
+        known = [str(key) for key in value]
+    elif isinstance(value, list | tuple) and name.isdigit() and int(name) < len(value):
+        return value[int(name)]
+    else:
+        if not name.startswith("_") and hasattr(value, name):
+            return getattr(value, name)
+        known = [
+            str(each).lstrip("_")
+            for each in getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
+            if each != "__msgtype__"
+        ]
+    raise RecordingError(
+        f"no field {name} for column {column}",
+        valid=f"the message has {', '.join(known[:30]) or 'no fields'}",
+        suggestion=did_you_mean(name, known),
+    )

@@ -1,0 +1,185 @@
+"""Measurements from an MCAP bag: raw ranges with their CIRs, joined with the ground truth if the bag contains it.
+
+The truth consists of the true range and of the tag's position (`/uwb/odometry_truth`, at the stamp of the range).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from uwb_mitigation.errors import RecordingError, did_you_mean
+from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
+from uwb_mitigation.types.measurement import RangeMeasurement, Record, Truth
+from uwb_mitigation.types.ros.codec import MeasurementKey, decode_range, decode_truth, measurement_key
+from uwb_mitigation.types.ros.poses import decode_true_position
+from uwb_mitigation.types.ros.topics import (
+    ODOMETRY_TRUTH,
+    ODOMETRY_TYPE,
+    RANGE_CIR_TYPE,
+    RANGE_RAW,
+    RANGE_TRUTH,
+    RANGE_TRUTH_TYPE,
+)
+from uwb_mitigation.types.source import Source
+
+JOIN_WINDOW = 32
+"""Maximum number of exchanges between a range and its truth; it limits the memory for pending ranges."""
+
+
+class McapRecording(Source):
+    """The measurements in an MCAP file or a rosbag2 folder; implements `sources.source.Source`.
+
+    Args:
+        path: an MCAP file, or a folder with `metadata.yaml` or `*.mcap`.
+        topic: topic of the raw ranges, type `uwb_mitigation_msgs/msg/RangeCir`.
+
+    Attributes:
+        message_count: number of messages on all topics, from the bag's index.
+
+    Raises:
+        RecordingError: the path is missing or not an MCAP bag. Iterating raises it if the bag does not contain
+            the topic, or if its type, schema or field layout is not supported.
+    """
+
+    def __init__(self, path: Path, *, topic: str = RANGE_RAW) -> None:
+        self._path = path
+        self._topic = topic
+        self._closed = False
+        bag = BagReader(path)
+        self.message_count = bag.message_count
+        simulated_text = bag.metadata.get("uwb_mitigation", {}).get("simulated", "")
+        self.simulated = {"true": True, "false": False}.get(simulated_text)
+        self.name = f"MCAP bag {path}" + (" (simulated)" if self.simulated else "")
+        self.skipped: Counter[str] = Counter()
+
+    def __iter__(self) -> Iterator[Record]:
+        self.skipped = Counter()
+        self._closed = False
+        bag = BagReader(self._path)
+        try:
+            yield from self._join(bag)
+        finally:
+            self.skipped.update(bag.warnings)
+        if not self._closed and self._topic not in bag.topics:
+            known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.topics.items()))
+            raise RecordingError(
+                f"no topic {self._topic}",
+                where=str(self._path),
+                valid=f"the bag contains: {known or 'no topic'}",
+                suggestion=did_you_mean(self._topic, bag.topics),
+            )
+
+    def close(self) -> None:
+        """End an iteration at its next message; files are open only while iterating."""
+        self._closed = True
+
+    def _join(self, bag: BagReader) -> Iterator[Record]:
+        """Pair ranges with their truths, which may come before or after them; in the order of the ranges."""
+        pending: deque[_PendingRange] = deque()
+        by_key: dict[MeasurementKey, _PendingRange] = {}
+        early_truths: dict[MeasurementKey, Truth] = {}
+        poses: dict[StampedTag, TruePose] = {}
+        has_poses = bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE
+
+        def pop_oldest() -> Record:
+            entry = pending.popleft()
+            by_key.pop(measurement_key(entry.measurement), None)
+            return Record(entry.measurement, entry.truth, *(entry.pose or (None, None)))
+
+        try:
+            for item in self._decoded(bag):
+                if isinstance(item, RangeMeasurement):
+                    key = measurement_key(item)
+                    pose = poses.get(StampedTag(item.stamp_ns, item.tag_id))
+                    entry = _PendingRange(item, early_truths.pop(key, None), pose)
+                    pending.append(entry)
+                    by_key[key] = entry
+                elif isinstance(item[0], MeasurementKey):
+                    key, truth = item
+                    if key in by_key:
+                        by_key[key].truth = truth
+                    else:
+                        early_truths[key] = truth
+                        if len(early_truths) > JOIN_WINDOW:
+                            del early_truths[next(iter(early_truths))]
+                            self.skipped["truth without its range"] += 1
+                else:
+                    _assign_pose(*item, pending, poses)
+                while pending and (
+                    (pending[0].truth is not None and (pending[0].pose is not None or not has_poses))
+                    or len(pending) > JOIN_WINDOW
+                ):
+                    yield pop_oldest()
+        except RecordingError:
+            while pending:
+                yield pop_oldest()
+            raise
+        while pending and not self._closed:
+            yield pop_oldest()
+        if early_truths:
+            self.skipped["truth without its range"] += len(early_truths)
+
+    def _decoded(
+        self, bag: BagReader
+    ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | tuple[StampedTag, TruePose]]:
+        checked_channels: set[int] = set()
+        types = {self._topic: RANGE_CIR_TYPE, RANGE_TRUTH: RANGE_TRUTH_TYPE}
+        if bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE:
+            types[ODOMETRY_TRUTH] = ODOMETRY_TYPE
+        for message in bag.messages(types):
+            if self._closed:
+                return
+            topic = message.channel.topic
+            # The bag keeps references to its channels, so that an id() identifies one channel of one file.
+            if id(message.channel) not in checked_channels and topic != ODOMETRY_TRUTH:
+                check_channel(message.channel, types[topic], self._path)
+                checked_channels.add(id(message.channel))
+            try:
+                if topic == self._topic:
+                    yield decode_range(message.data)
+                elif topic == RANGE_TRUTH:
+                    yield decode_truth(message.data)
+                elif (decoded := decode_true_position(message.data)) is not None:
+                    stamp_ns, tag_id, position, yaw = decoded
+                    yield StampedTag(stamp_ns, tag_id), (position, yaw)
+            except RecordingError as error:
+                self.skipped[error.what] += 1
+
+
+TruePose = tuple[tuple[float, float, float], float | None]
+"""A true position and yaw."""
+
+
+class StampedTag(NamedTuple):
+    """Tag and stamp of a true position."""
+
+    stamp_ns: int
+    tag_id: int
+
+
+@dataclass(slots=True)
+class _PendingRange:
+    """A range that waits for its truth."""
+
+    measurement: RangeMeasurement
+    truth: Truth | None
+    pose: TruePose | None
+
+
+def _assign_pose(
+    stamped_tag: StampedTag,
+    pose: TruePose,
+    pending: deque[_PendingRange],
+    poses: dict[StampedTag, TruePose],
+) -> None:
+    """Assign a true pose to earlier and later ranges with the same tag and stamp."""
+    for entry in pending:
+        if (entry.measurement.stamp_ns, entry.measurement.tag_id) == stamped_tag:
+            entry.pose = pose
+    poses[stamped_tag] = pose
+    if len(poses) > JOIN_WINDOW:
+        del poses[next(iter(poses))]

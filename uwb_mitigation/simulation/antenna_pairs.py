@@ -1,0 +1,113 @@
+"""Antenna pairs at given positions: obstacles, and shared diffuse fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.simulation.channel import (
+    DiffuseField,
+    Environment,
+    Multipath,
+    draw_diffuse_field,
+    propagate,
+)
+from uwb_mitigation.simulation.scene import DirectPath, Point
+
+BORDER_M = 0.2
+MIN_DISTANCE_M = 0.5
+
+Environments = tuple[Environment, Environment]
+"""Diffuse fields for LOS and NLOS."""
+
+
+@dataclass(frozen=True, slots=True)
+class AntennaPairs:
+    """n antenna pairs before the radio model.
+
+    Attributes:
+        anchor, tag: float64 (n, 2), m.
+        path: the obstacles between them.
+        environments, fields: the diffuse fields for LOS and NLOS.
+        field_of: int (n,), row of the fields for each link.
+        stationary: fading is drawn once per field; in motion, once per link.
+    """
+
+    anchor: NDArray[np.float64]
+    tag: NDArray[np.float64]
+    path: DirectPath
+    environments: Environments
+    fields: tuple[DiffuseField, DiffuseField]
+    field_of: NDArray[np.intp]
+    stationary: bool
+
+    @property
+    def distance_m(self) -> NDArray[np.float64]:
+        """Straight-line distances, (n,)."""
+        distance: NDArray[np.float64] = np.hypot(*(self.tag - self.anchor).T)
+        return distance
+
+    def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> AntennaPairs:
+        """Return pairs over some of the fields, with new row numbers in `field_of`; field k is that of link k here."""
+        pairs, (los, nlos) = fields[field_of], self.fields
+        return AntennaPairs(
+            self.anchor[pairs],
+            self.tag[pairs],
+            self.path.take(pairs),
+            self.environments,
+            (los.take(fields), nlos.take(fields)),
+            field_of,
+            self.stationary,
+        )
+
+    def multipath(self, rng: np.random.Generator) -> Multipath:
+        """Return the received paths of each link; a link without obstacles uses the LOS environment."""
+        path, distance = self.path, self.distance_m
+        rays = self.fields[0].delay_ns.shape[1]
+        delay = np.empty((len(distance), 1 + rays))
+        gain = np.empty((len(distance), 1 + rays), np.complex128)
+        for environment, field, nlos in zip(self.environments, self.fields, (False, True), strict=True):
+            (rows,) = np.nonzero((path.crossings > 0) == nlos)
+            field_rows = self.field_of[rows]
+            fading = field.fade(rng)[field_rows] if self.stationary else field.take(field_rows).fade(rng)
+            received = propagate(
+                distance[rows],
+                path.loss_db[rows],
+                path.excess_m[rows],
+                environment,
+                field.take(field_rows),
+                fading,
+                rng,
+            )
+            delay[rows], gain[rows] = received.delay_ns, received.gain
+        return Multipath(delay, gain)
+
+
+def draw_fields(
+    environments: Environments,
+    n: int,
+    rng: np.random.Generator,
+    delay_factor: NDArray[np.float64] | float = 1.0,
+) -> tuple[DiffuseField, DiffuseField]:
+    """Draw the diffuse fields of n placements for LOS and NLOS; see `draw_diffuse_field` for `delay_factor`."""
+    los, nlos = environments
+    return draw_diffuse_field(los, n, rng, delay_factor), draw_diffuse_field(nlos, n, rng, delay_factor)
+
+
+def place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Draw n pairs of positions inside a rectangle, float64 (n, 2) each; pairs too close are drawn again."""
+    pair = np.empty((n, 2, 2))
+    again = np.ones(n, np.bool_)
+    while again.any():
+        pair[again] = rng.uniform((BORDER_M, BORDER_M), np.subtract(size, BORDER_M), (int(again.sum()), 2, 2))
+        again = np.hypot(*(pair[:, 0] - pair[:, 1]).T) < MIN_DISTANCE_M
+    return pair[:, 0], pair[:, 1]
+
+
+def label(nlos: bool, direct_above_threshold: bool) -> str:
+    """Return the propagation condition of a link."""
+    if not nlos:
+        return "LOS"
+    return "NLOS" if direct_above_threshold else "NDP NLOS"

@@ -1,0 +1,360 @@
+"""Simulated measurements of a drive through a flat, and of static placements.
+
+Static placements are in the same flat or in random buildings, with different boards for each placement. The same arguments give the same measurements, independent of how many are consumed: each segment of the scene
+has its own random generator. Stamps begin at 0 and follow the rate, not a clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import count as counting
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, label, place
+from uwb_mitigation.simulation.buildings import PLACEMENTS, block_of
+from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
+from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, DiffuseField, check_range
+from uwb_mitigation.simulation.odometry import RobotMotion, simulate_motion, yaw_along_route
+from uwb_mitigation.simulation.radio import Boards, Radio, Reception
+from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, FloorPlan, Point, along_route
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.measurement import (
+    DEVICE_TICK_HZ,
+    DEVICE_TIME_WRAP,
+    Cir,
+    RadioType,
+    RangeMeasurement,
+    Record,
+    Segment,
+    Truth,
+)
+from uwb_mitigation.types.source import Source
+
+BATCH = 256
+"""Exchanges per batch: large enough for vectorisation, small enough for the cache."""
+
+SEGMENT_S = 2.0
+SPEED_M_PER_S = 0.5
+"""A segment is a metre of the route: clusters stay the same within it, fading changes."""
+
+FIRST_TAG_ID = 101
+NOT_RECEIVED = "frame too weak to be received"
+
+RESIDENTIAL = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
+
+SURVEY_RATE_HZ = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Exchanges:
+    """n exchanges before the radio model: their numbers, ids, configurations and pairs, and headings of moving tags."""
+
+    sequence: NDArray[np.int64]
+    anchor_id: NDArray[np.int64]
+    tag_id: NDArray[np.int64]
+    configuration: list[str]
+    pairs: AntennaPairs
+    boards: Boards | None = None
+    tag_yaw: NDArray[np.float64] | None = None
+
+
+class Simulated(Source):
+    """Common base of these sources: a `sources.source.Source` over batches of exchanges."""
+
+    simulated = True
+
+    def __init__(self, name: str, rate_hz: float, radio: Radio, count: int) -> None:
+        check_range("simulated source", "rate_hz", rate_hz, 0.1, 100_000)
+        self.name = name
+        self.skipped: Counter[str] = Counter()
+        self._rate_hz = rate_hz
+        self._count = count
+        self._radio = radio
+
+    def _batches(self) -> Iterable[tuple[Exchanges, np.random.Generator]]:
+        """Yield batches in the order of time, each with the radio's random generator."""
+        raise NotImplementedError
+
+    def __iter__(self) -> Iterator[Record]:
+        self.skipped = Counter()
+        for exchanges, rng in self._batches():
+            yield from self._records(exchanges, rng)
+
+    def _records(self, exchanges: Exchanges, rng: np.random.Generator) -> Iterator[Record]:
+        pairs = exchanges.pairs
+        distance = pairs.distance_m
+        reception = self._radio.receive(pairs.multipath(rng), rng, exchanges.boards)
+        for i, sequence in enumerate(exchanges.sequence.tolist()):
+            # Always simulate a complete batch: its random numbers must not depend on `count`.
+            if self._count and sequence >= self._count:
+                return
+            if np.isnan(reception.first_path_index[i]):
+                self.skipped[NOT_RECEIVED] += 1
+                continue
+            stamp_ns = round(sequence * 1e9 / self._rate_hz)
+            anchor_id = int(exchanges.anchor_id[i])
+            measurement = RangeMeasurement(
+                stamp_ns=stamp_ns,
+                tag_id=int(exchanges.tag_id[i]),
+                anchor_id=anchor_id,
+                sequence=sequence & 0xFFFFFFFF,
+                device_time=round(stamp_ns * DEVICE_TICK_HZ / 1e9) % DEVICE_TIME_WRAP,
+                range_m=float(distance[i] + reception.error_m[i]),
+                cir=_cir(reception, i),
+                frame_id=f"simulated_anchor_{anchor_id}",
+            )
+            condition = label(bool(pairs.path.crossings[i]), bool(reception.direct_above_threshold[i]))
+            truth = Truth(float(distance[i]), condition, exchanges.configuration[i])
+            x, y = pairs.tag[i].tolist()
+            yaw = None if exchanges.tag_yaw is None else float(exchanges.tag_yaw[i])
+            yield Record(measurement, truth, None if pairs.stationary else (x, y, 0.0), yaw)
+
+
+class SimulatedSource(Simulated):
+    """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
+
+    Each metre of the route is a separate configuration for each pair, "simulated seed 1/tag 101/
+    anchor 3/segment 7": within it the clusters of the diffuse field stay the same and the fading changes.
+
+    Args:
+        seed: 0 to 2^32 - 1.
+        count: exchanges to simulate; 0 = endless. An exchange below the sensitivity is not yielded but
+            counted in `skipped`.
+        rate_hz: exchanges per second over all pairs, 0.1 to 100000.
+        tags: 1 to 64, spread evenly along the route.
+        anchors: positions in m; their identities are 1, 2, ... in this order.
+        plan, radio, route: the scene, the receiver, the closed route (m).
+
+    Attributes:
+        anchors: their positions; all antennas are at z = 0.
+
+    Raises:
+        ParameterError: an argument is out of its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        seed: int = 1,
+        count: int = 0,
+        rate_hz: float = 20.0,
+        tags: int = 1,
+        anchors: tuple[Point, ...] = ANCHORS,
+        plan: FloorPlan = FLAT,
+        radio: Radio | None = None,
+        route: tuple[Point, ...] = ROUTE,
+    ) -> None:
+        check_seed(seed)
+        check_range("simulated source", "count", count, 0, 2**40, whole=True)
+        check_range("simulated source", "tags", tags, 1, 64, whole=True)
+        _check_positions("anchors", anchors, 1, 64)
+        _check_positions("route", route, 3, 10_000)
+        super().__init__(f"simulated flat, seed {seed}", rate_hz, radio or Radio(), count)
+        self._plan = plan
+        self._seed = seed
+        self._tags = tags
+        self._anchors = np.asarray(anchors, np.float64)
+        self.anchors = AnchorMap([Anchor(n, (x, y, 0.0)) for n, (x, y) in enumerate(anchors, 1)])
+        self._route = route
+        closed = np.asarray([*route, route[0]])
+        self._spacing_m = float(np.hypot(*np.diff(closed, axis=0).T).sum()) / tags
+
+    @classmethod
+    def with_anchors(cls, number: int, *, seed: int, count: int, rate_hz: float = 20.0) -> SimulatedSource:
+        """Return a drive through the default flat past 4 to 8 anchors.
+
+        Raises:
+            ParameterError: an argument is out of its range.
+        """
+        check_range(
+            "simulated source", "anchors", number, len(ANCHORS), len(ANCHORS + MORE_ANCHORS), whole=True
+        )
+        anchors = (ANCHORS + MORE_ANCHORS)[:number]
+        return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors)
+
+    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
+        pairs = self._tags * len(self._anchors)
+        for segment in counting():
+            first, stop = (math.ceil(s * SEGMENT_S * self._rate_hz) for s in (segment, segment + 1))
+            if self._count and first >= self._count:
+                return
+            rng = np.random.default_rng([self._seed, segment, 0])
+            fields = draw_fields(RESIDENTIAL, pairs, rng)
+            for batch, start in enumerate(range(first, stop, BATCH)):
+                sequence = np.arange(start, min(start + BATCH, stop))
+                rng = np.random.default_rng([self._seed, segment, 1 + batch])
+                yield self._exchanges(sequence, segment, fields), rng
+
+    def _exchanges(
+        self, sequence: NDArray[np.int64], segment: int, fields: tuple[DiffuseField, DiffuseField]
+    ) -> Exchanges:
+        anchor = sequence % len(self._anchors)
+        tag = sequence // len(self._anchors) % self._tags
+        travelled = SPEED_M_PER_S * sequence / self._rate_hz + tag * self._spacing_m
+        tag_id, anchor_id = FIRST_TAG_ID + tag, 1 + anchor
+        names = [
+            f"simulated seed {self._seed}/tag {t}/anchor {a}/segment {segment}"
+            for t, a in zip(tag_id.tolist(), anchor_id.tolist(), strict=True)
+        ]
+        pair = tag * len(self._anchors) + anchor
+        anchors, positions = self._anchors[anchor], along_route(self._route, travelled)
+        path = self._plan.direct_path(anchors, positions)
+        return Exchanges(
+            sequence,
+            anchor_id,
+            tag_id,
+            names,
+            AntennaPairs(anchors, positions, path, RESIDENTIAL, fields, pair, stationary=False),
+            tag_yaw=yaw_along_route(self._route, travelled),
+        )
+
+    def motion(self) -> RobotMotion:
+        """Return odometry and IMU data of the robot with the first tag, for the duration of a source with a `count`."""
+        return simulate_motion(self._route, SPEED_M_PER_S, self._count / self._rate_hz, self._seed)
+
+
+class SimulatedSurvey(Simulated):
+    """Independent static placements with many exchanges each, like a surveyed data set; a `Source`.
+
+    Both antennas have random positions in the plan, 0.2 m from its border and at least `MIN_DISTANCE_M` apart. A
+    placement has one channel: its exchanges differ only in noise and sampling phase.
+
+    Args:
+        seed: 0 to 2^32 - 1.
+        configurations: 1 to 10^7 placements. exchanges: 1 to 1000 for each.
+        rate_hz: exchanges per second, 0.1 to 100000.
+        plan, radio: the scene, the receiver.
+
+    Raises:
+        ParameterError: an argument is out of its range, or the plan is too small.
+    """
+
+    def __init__(
+        self,
+        *,
+        seed: int = 1,
+        configurations: int = 100,
+        exchanges: int = 20,
+        rate_hz: float = 20.0,
+        plan: FloorPlan = FLAT,
+        radio: Radio | None = None,
+    ) -> None:
+        check_seed(seed)
+        check_range("simulated survey", "configurations", configurations, 1, 10**7, whole=True)
+        check_range("simulated survey", "exchanges", exchanges, 1, 1000, whole=True)
+        for axis, extent in zip("xy", plan.size, strict=True):
+            check_range("simulated survey", f"plan size in {axis}", extent, 2.0, 1000.0)
+        super().__init__(
+            f"simulated survey, seed {seed}", rate_hz, radio or Radio(), configurations * exchanges
+        )
+        self._plan = plan
+        self._seed = seed
+        self._exchanges = exchanges
+
+    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
+        placements = -(-BATCH // self._exchanges)
+        size = placements * self._exchanges
+        for batch in range(-(-self._count // size)):
+            rng = np.random.default_rng([self._seed, batch])
+            fields = draw_fields(RESIDENTIAL, placements, rng)
+            anchor, tag = place(self._plan.size, placements, rng)
+            of = np.repeat(np.arange(placements), self._exchanges)
+            names = [
+                f"simulated survey seed {self._seed}/placement {batch * placements + k}" for k in of.tolist()
+            ]
+            sequence = batch * size + np.arange(size)
+            ids = np.ones(size, np.int64)
+            path = self._plan.direct_path(anchor, tag).take(of)
+            yield (
+                Exchanges(
+                    sequence,
+                    ids,
+                    FIRST_TAG_ID * ids,
+                    names,
+                    AntennaPairs(anchor[of], tag[of], path, RESIDENTIAL, fields, of, stationary=True),
+                ),
+                rng,
+            )
+
+
+class SimulatedBuildings(Simulated):
+    """Static placements in random buildings, about as many LOS as NLOS; a `Source`.
+
+    A configuration is one placement: "simulated buildings seed 1/flat 12/placement 801". The range error comes
+    only from the channel: antenna delays are calibrated.
+
+    Args:
+        seed: 0 to 2^32 - 1.
+        placements: 1 to 10^7. exchanges: 1 to 1000 for each.
+
+    Raises:
+        ParameterError: an argument is out of its range.
+    """
+
+    def __init__(self, *, seed: int = 1, placements: int = 20_000, exchanges: int = 1) -> None:
+        check_seed(seed)
+        check_range("simulated buildings", "placements", placements, 1, 10**7, whole=True)
+        check_range("simulated buildings", "exchanges", exchanges, 1, 1000, whole=True)
+        super().__init__(
+            f"simulated buildings, seed {seed}", SURVEY_RATE_HZ, BUILDINGS_RADIO, placements * exchanges
+        )
+        self._seed = seed
+        self._exchanges = exchanges
+
+    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
+        each = self._exchanges
+        together = max(1, BATCH // each)
+        for number in range(-(-self._count // (PLACEMENTS * each))):
+            block, rng = block_of(self._seed, number)
+            for first in range(0, PLACEMENTS, together):
+                rows = np.arange(first, min(first + together, PLACEMENTS))
+                of = np.repeat(np.arange(len(rows)), each)
+                pairs = block.pairs.take(rows, of)
+                names = [block.configuration(self._seed, number, k) for k in rows.tolist()]
+                ids = np.ones(len(of), np.int64)
+                sequence = (number * PLACEMENTS + first) * each + np.arange(len(of))
+                exchanges = Exchanges(
+                    sequence,
+                    ids,
+                    FIRST_TAG_ID * ids,
+                    [names[k] for k in of.tolist()],
+                    pairs,
+                    block.boards.take(rows[of]),
+                )
+                yield exchanges, rng
+
+
+def _cir(reception: Reception, i: int) -> Cir:
+    return Cir(
+        samples=reception.samples[i].copy(),
+        first_path_index=float(reception.first_path_index[i]),
+        preamble_count=int(reception.preamble_count[i]),
+        noise_threshold=int(reception.noise_threshold[i]),
+        rx_power_dbm=float(reception.rx_power_dbm[i]),
+        first_path_power_dbm=float(reception.first_path_power_dbm[i]),
+        channel=2,
+        prf_mhz=64,
+        radio=RadioType.DW1000,
+        segment=Segment.IPATOV,
+    )
+
+
+def _check_positions(name: str, points: tuple[Point, ...], low: int, high: int) -> None:
+    try:
+        array = np.asarray(points, np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.ndim != 2 or array.shape[1] != 2 or not np.isfinite(array).all():
+        raise ParameterError(f"{name} = {points!r}", where="simulated source", valid="pairs of finite x, y")
+    check_range("simulated source", f"number of {name}", len(array), low, high)
+
+
+def check_seed(seed: int) -> None:
+    """Raise ParameterError if the seed is out of range."""
+    check_range("simulated source", "seed", seed, 0, 2**32 - 1, whole=True)

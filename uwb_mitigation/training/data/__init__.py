@@ -1,0 +1,1 @@
+"""Training data: recordings as arrays, splits by placement, augmentation."""

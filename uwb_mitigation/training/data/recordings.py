@@ -1,0 +1,72 @@
+"""Read a recording as a dataset for training, calibration or evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing, Scaling
+from uwb_mitigation.recordings import opening
+from uwb_mitigation.recordings.truth_table import load_truth, with_truth
+from uwb_mitigation.training.data import dataset as datasets
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.types.measurement import Record, Truth
+
+
+def load(
+    path: Path,
+    preprocessing: Preprocessing,
+    truth: Sequence[Path] = (),
+    on_record: Callable[[], None] = lambda: None,
+) -> tuple[str, Dataset]:
+    """Return the name of a recording (marked "simulated" if it is) and its labelled measurements.
+
+    Args:
+        path: a bag, or another recording.
+        preprocessing: preprocessing of the model.
+        truth: tables of true ranges that replace those of the recording.
+        on_record: called for each record that was read.
+
+    Raises:
+        RecordingError, DatasetError: it cannot be read, or no measurement is usable.
+    """
+    truth_segments = [row for table in truth for row in load_truth(table)]
+    with opening.open_recording(path) as source:
+        try:
+            records = with_truth(source, truth_segments) if truth_segments else source
+            dataset = datasets.build_dataset(records, preprocessing, on_record)
+        except DatasetError as error:
+            if preprocessing.scaling is Scaling.MAX or CirFault.NO_PREAMBLE_COUNT.text not in error.what:
+                raise
+            raise DatasetError(error.what, valid="--scaling max, which needs no preamble counts") from error
+        name = path.resolve().name
+        is_marked = "simulated" in name or not source.simulated
+    return (name if is_marked else f"{name} (simulated)"), dataset
+
+
+def load_inputs(
+    path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
+) -> Dataset:
+    """Return the measurements of a recording with or without true ranges; do not use their errors.
+
+    Without ground truth, each minute of a pair is one configuration.
+
+    Raises:
+        RecordingError, DatasetError: it cannot be read, or no CIR is usable.
+    """
+    with opening.open_recording(path) as source:
+        found = datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
+    if not found.has_cirs:
+        raise DatasetError("the recording has no CIRs", where=str(path))
+    return found
+
+
+def _with_configuration(record: Record) -> Record:
+    if record.truth is not None:
+        return record
+    measured = record.measurement
+    minute = measured.stamp_ns // 60_000_000_000
+    name = f"tag {measured.tag_id}/anchor {measured.anchor_id}/minute {minute}"
+    return replace(record, truth=Truth(measured.range_m, configuration=name))

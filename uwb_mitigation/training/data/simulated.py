@@ -1,0 +1,81 @@
+"""Generate simulated placements directly as arrays, without writing a recording."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.simulation.antenna_pairs import label
+from uwb_mitigation.simulation.buildings import RADIO, block_of
+from uwb_mitigation.simulation.radio import Radio, Reception
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.types.measurement import Encoding, RangeColumns
+
+
+def building_dataset(
+    seed: int,
+    blocks: int,
+    preprocessing: Preprocessing,
+    workers: int,
+    on_block: Callable[[], None] = lambda: None,
+    *,
+    wide: bool = False,
+    radio: Radio = RADIO,
+) -> Dataset:
+    """Return one range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
+
+    Ranges that are not received, or whose window is not usable, are omitted. The result does not depend on the number
+    of `workers` (processes); `on_block` is called after each block. `wide`, `radio`: see `block_of`.
+    """
+    simulate = partial(_block, seed, preprocessing, wide, radio)
+    parts = []
+    # Do not fork: the caller may run threads (torch, a progress bar).
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        for part in pool.imap(simulate, range(blocks)):
+            parts.append(part)
+            on_block()
+    return replace(Dataset.joined(parts), radios=(radio.kind,), segments=(radio.segment,))
+
+
+def _block(seed: int, preprocessing: Preprocessing, wide: bool, radio: Radio, number: int) -> Dataset:
+    block, rng = block_of(seed, number, wide=wide, radio=radio)
+    reception = radio.receive(block.pairs.multipath(rng), rng, block.boards)
+    distance = block.pairs.distance_m
+    received = np.flatnonzero(np.isfinite(reception.first_path_index))
+    faults, inputs = preprocessing.apply(_columns(reception, distance, received))
+    rows = received[faults == 0]
+    is_blocked, is_direct = block.pairs.path.crossings > 0, reception.direct_above_threshold
+    return Dataset(
+        preprocessing,
+        inputs,
+        reception.rx_power_dbm[rows].astype(np.float32),
+        reception.first_path_power_dbm[rows].astype(np.float32),
+        distance[rows] + reception.error_m[rows],
+        reception.error_m[rows],
+        np.array([block.configuration(seed, number, int(row)) for row in rows]),
+        np.array([label(bool(is_blocked[row]), bool(is_direct[row])) for row in rows]),
+    )
+
+
+def _columns(reception: Reception, distance: NDArray[np.float64], rows: NDArray[np.intp]) -> RangeColumns:
+    n = len(rows)
+    unknown = np.zeros(n, np.uint64)
+    return RangeColumns(
+        unknown,
+        unknown,
+        (distance + reception.error_m)[rows].astype(np.float32),
+        Encoding.COMPLEX_INT16,
+        reception.samples[rows],
+        np.zeros(n, np.int32),
+        reception.first_path_index[rows].astype(np.float32),
+        np.ones(n, np.float32),
+        reception.preamble_count[rows].astype(np.uint16),
+        reception.rx_power_dbm[rows].astype(np.float32),
+        reception.first_path_power_dbm[rows].astype(np.float32),
+    )

@@ -1,0 +1,108 @@
+"""Evaluate a bundle on a labelled recording with the same code as for live measurements."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from itertools import islice
+
+import numpy as np
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.training.evaluation.metrics import ErrorStatistics, GroupMae, coverage, mae_by_group
+from uwb_mitigation.types.measurement import Record
+
+_BATCH = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """Accuracy of one model on one recording.
+
+    Attributes:
+        n: number of measurements with a true range and a valid range.
+        raw, corrected: statistics of the errors before and after correction.
+        coverage68, coverage95: shares of corrected errors within the predicted intervals: 1 and
+            `interval95_sigmas` reported standard deviations.
+        by_label, by_configuration: {name: (n, MAE before, MAE after)}.
+        statuses: {status: number of measurements}; unless the status is OK, the corrected range is the raw range.
+        model_id: id of the model.
+        trained_on: configurations that are also in the training data according to the card. If not empty, the
+            result is optimistic.
+    """
+
+    n: int
+    raw: ErrorStatistics
+    corrected: ErrorStatistics
+    coverage68: float
+    coverage95: float
+    by_label: Mapping[str, GroupMae]
+    by_configuration: Mapping[str, GroupMae]
+    statuses: Mapping[str, int]
+    model_id: int
+    trained_on: tuple[str, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """Return the result of `uwb-mitigation evaluate`."""
+        groups = {"by_label": self.by_label, "by_configuration": self.by_configuration}
+        return asdict(self) | {
+            key: {name: group._asdict() for name, group in by_name.items()} for key, by_name in groups.items()
+        }
+
+
+def evaluate(
+    mitigation: Mitigation,
+    records: Iterable[Record],
+    on_record: Callable[[], None] = lambda: None,
+) -> Accuracy:
+    """Correct every measurement that has a true range and a valid range, and compare it with the truth.
+
+    `on_record` is called for each record that was read.
+
+    Raises:
+        DatasetError: no measurement can be compared.
+    """
+    raw, corrected, variance, labels, configurations = [], [], [], [], []
+    statuses: Counter[str] = Counter()
+    stream = iter(records)
+    read = 0
+    while batch := list(islice(stream, _BATCH)):
+        results = mitigation.correct([record.measurement for record in batch])
+        for record, result in zip(batch, results, strict=True):
+            # An infinite variance marks an invalid range.
+            if record.truth is None or not np.isfinite(record.truth.range_m + result.variance_m2):
+                continue
+            raw.append(result.range_raw_m - record.truth.range_m)
+            corrected.append(result.range_m - record.truth.range_m)
+            variance.append(result.variance_m2)
+            labels.append(record.truth.label)
+            configurations.append(record.truth.configuration)
+            statuses[result.status.name] += 1
+        read += len(batch)
+        for _ in batch:
+            on_record()
+    if not raw:
+        raise DatasetError(f"none of {read} measurements has a valid range and a true one")
+    raw_m, corrected_m, variances = np.array(raw), np.array(corrected), np.array(variance)
+    card = mitigation.bundle.card
+    # This part of the card is for people and may contain any JSON value.
+    training_configurations = card.training.get("configurations")
+    trained_on = {
+        name
+        for name in set(configurations)
+        if isinstance(training_configurations, list) and name in training_configurations
+    }
+    return Accuracy(
+        n=len(raw),
+        raw=ErrorStatistics.of(raw_m),
+        corrected=ErrorStatistics.of(corrected_m),
+        coverage68=coverage(corrected_m, variances, 1.0),
+        coverage95=coverage(corrected_m, variances, card.interval95_sigmas),
+        by_label=mae_by_group(np.array(labels), raw_m, corrected_m),
+        by_configuration=mae_by_group(np.array(configurations), raw_m, corrected_m),
+        statuses=dict(statuses.most_common()),
+        model_id=mitigation.bundle.model_id,
+        trained_on=tuple(sorted(trained_on)),
+    )

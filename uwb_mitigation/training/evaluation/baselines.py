@@ -1,0 +1,113 @@
+"""Baselines: constants, and regressions on features of the CIR and of the header. Needs scikit-learn.
+
+The nine features of the CIR are those used in the literature to classify NLOS propagation (Marano et al.,
+"NLOS identification and mitigation for localization based on UWB experimental data", JSAC 2010).
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import MissingDependencyError
+from uwb_mitigation.training.data.dataset import Dataset
+
+LOS = "LOS"
+RIDGE_PENALTY = 10.0
+TREES, LEAVES = 100, 8
+
+_FIRST_PATH = slice(5, 9)
+_LATE = 60
+_TINY = 1e-12
+
+Predict = Callable[[Dataset], NDArray[np.floating]]
+
+
+def los_median(train: Dataset) -> Predict:
+    """Predict the median error in LOS, or of all measurements if none has the label LOS."""
+    los_errors = train.error_m[train.labels == LOS]
+    return _constant(float(np.median(los_errors if len(los_errors) else train.error_m)))
+
+
+def overall_median(train: Dataset) -> Predict:
+    """Predict the median error."""
+    return _constant(float(np.median(train.error_m)))
+
+
+def ridge(train: Dataset, *, header: bool) -> Predict:
+    """Fit a ridge regression on standardised features of the CIR and, with `header`, of the header."""
+    pipeline, linear, preprocessing = (
+        scikit_learn("pipeline"),
+        scikit_learn("linear_model"),
+        scikit_learn("preprocessing"),
+    )
+    model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear.Ridge(RIDGE_PENALTY))
+    model.fit(features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
+    return lambda data: np.asarray(model.predict(features(data, header=header)), np.float64)
+
+
+def gradient_boosting(train: Dataset, seed: int) -> Predict:
+    """Fit gradient-boosted trees with absolute error on all features."""
+    model = scikit_learn("ensemble").HistGradientBoostingRegressor(
+        loss="absolute_error", max_iter=TREES, max_leaf_nodes=LEAVES, random_state=seed
+    )
+    # On data this small, threads only add overhead.
+    with importlib.import_module("threadpoolctl").threadpool_limits(1):
+        model.fit(features(train, header=True), train.error_m, sample_weight=_weights(train))
+    return lambda data: np.asarray(model.predict(features(data, header=True)), np.float64)
+
+
+def features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
+    """Return nine features of each CIR window and, with `header`, six of its header: float64 (n, 9 or 15).
+
+    Unknown values of the header are 0.
+    """
+    amplitude = dataset.inputs.astype(np.float64) ** 2
+    power = amplitude**2
+    energy = power.sum(axis=1) + _TINY
+    taps = np.arange(power.shape[1])
+    delay = power @ taps / energy
+    spread = np.sqrt((power * (taps - delay[:, None]) ** 2).sum(axis=1) / energy)
+    centred = amplitude - amplitude.mean(axis=1, keepdims=True)
+    kurtosis = (centred**4).mean(axis=1) / (centred**2).mean(axis=1).clip(_TINY) ** 2
+    peak = amplitude.max(axis=1)
+    first = amplitude[:, _FIRST_PATH].max(axis=1)
+    columns = [
+        10 * np.log10(energy),
+        20 * np.log10(peak + _TINY),
+        20 * np.log10(first + _TINY),
+        20 * np.log10((first + _TINY) / (peak + _TINY)),
+        amplitude.argmax(axis=1),
+        delay,
+        spread,
+        kurtosis,
+        power[:, _LATE:].sum(axis=1) / energy,
+    ]
+    if header:
+        rx_power = dataset.rx_power_dbm.astype(np.float64)
+        columns += [rx_power, rx_power - dataset.first_path_power_dbm]
+        headers = np.zeros((len(dataset), 2)) if dataset.headers is None else dataset.headers
+        columns += [*headers.T.astype(np.float64), *np.log1p(headers.T.astype(np.float64))]
+    result: NDArray[np.float64] = np.nan_to_num(np.column_stack(columns), nan=0.0, posinf=0.0, neginf=0.0)
+    return result
+
+
+def _constant(value: float) -> Predict:
+    return lambda data: np.full(len(data), value)
+
+
+def _weights(train: Dataset) -> NDArray[np.float64]:
+    """Return weights of the rows that give every configuration the same total weight."""
+    _, of, count = np.unique(train.configurations, return_inverse=True, return_counts=True)
+    return np.asarray(len(train) / (len(count) * count[of]), np.float64)
+
+
+def scikit_learn(module: str):  # type: ignore[no-untyped-def]
+    """Return a module of scikit-learn; raises `MissingDependencyError`."""
+    try:
+        return importlib.import_module(f"sklearn.{module}")
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError("this needs scikit-learn", valid="run `make setup-training`") from error

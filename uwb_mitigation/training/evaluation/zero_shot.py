@@ -1,0 +1,91 @@
+"""Evaluate a model at an unknown site without offset, with the LOS offset, and with that of all other placements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.mitigation.correction import CorrectionRule
+from uwb_mitigation.mitigation.model.bundle import Bundle, Card, Session
+from uwb_mitigation.training.data.dataset import Dataset
+
+LOS = "LOS"
+
+NAMES = ("universal", "universal_los_offset", "universal_offset")
+"""Rows: no offset; minus the median error of the LOS placements; minus the median error of all other placements."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ZeroShot:
+    """Residuals of a bundle on n measurements at an unknown site.
+
+    Attributes:
+        errors: {row of `NAMES`: float64 (n,), m}; without LOS placements, `universal_los_offset` equals
+            `universal`.
+        los_offset_m: subtracted offset; 0 without LOS placements.
+        variance_m2: predicted variances, float32 (n,).
+        sigmas95: number of standard deviations that should cover 95 %.
+        passed_through: bool (n,), not corrected.
+    """
+
+    errors: dict[str, NDArray[np.float64]]
+    los_offset_m: float
+    variance_m2: NDArray[np.float32]
+    sigmas95: float
+    passed_through: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CardCorrections:
+    """Corrections (0 if a range is passed through) and variances from the predictions of a model, each (n,)."""
+
+    correction_m: NDArray[np.float32]
+    variance_m2: NDArray[np.float32]
+    passed_through: NDArray[np.bool_]
+
+
+def apply_card(dataset: Dataset, card: Card, predicted_m: NDArray[np.float32]) -> CardCorrections:
+    """Apply the limits, the OOD score and the variances of a card to predictions, shape (n,)."""
+    rule = CorrectionRule(card)
+    score = rule.score(
+        dataset.inputs,
+        dataset.range_m.astype(np.float32),
+        dataset.rx_power_dbm,
+        dataset.first_path_power_dbm,
+    )
+    accepted = rule.accepts(predicted_m, score)
+    with np.errstate(invalid="ignore"):
+        correction, variance = rule.apply(predicted_m, score)
+    uncorrected = np.float32(card.variance_uncorrected_m2)
+    return CardCorrections(
+        np.where(accepted, correction, 0.0), np.where(accepted, variance, uncorrected), ~accepted
+    )
+
+
+def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
+    """Correct a dataset that is preprocessed as for `bundle`.
+
+    The offset of a pair of boards is a median over placements: errors of one placement are not independent.
+
+    Raises:
+        ModelError: ONNX Runtime rejects the bundle's network.
+    """
+    linear_bias = bundle.card.linear_bias.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
+    predicted = (linear_bias + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
+    corrections = apply_card(dataset, bundle.card, predicted)
+    residual = dataset.error_m - corrections.correction_m
+
+    names, configuration_index = np.unique(dataset.configurations, return_inverse=True)
+    means = np.bincount(configuration_index, residual) / np.bincount(configuration_index)
+    is_los = np.array(
+        [(dataset.labels[configuration_index == k] == LOS).mean() > 0.5 for k in range(len(names))]
+    )
+    los_offset = float(np.median(means[is_los])) if is_los.any() else 0.0
+    others = np.array([np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))])
+    errors = dict(
+        zip(NAMES, (residual, residual - los_offset, residual - others[configuration_index]), strict=True)
+    )
+    sigmas95 = bundle.card.interval95_sigmas
+    return ZeroShot(errors, los_offset, corrections.variance_m2, sigmas95, corrections.passed_through)

@@ -1,0 +1,401 @@
+"""Candidates for model selection: models that can be fitted to labelled ranges, in order of complexity.
+
+`train` chooses between new models (`new_models`) or models that start from a bundle (`from_bundle`), both with the
+universal network and an offset (`with_cold_start`); `calibrate` chooses between the models of a site (`site_models`).
+Only candidates that train a network need torch.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.mitigation.model import graph
+from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.bundle import Bundle, session_options
+from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.weights import FloatWeights
+from uwb_mitigation.training.data import splits
+from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.fit import linear_fit
+from uwb_mitigation.training.fit.options import FitOptions
+from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB
+
+NEW_MODELS = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+network", "network"
+"""Models that are fitted to the data only."""
+
+COLD_START, COLD_START_MEAN = "cold start", "mean of line and cold start"
+AS_SHIPPED, NEW_OFFSET, FINE_TUNED = "as shipped", "new offset", "fine-tuned"
+SITE_OFFSETS, SITE_LINE = "offsets", "offsets + line"
+SITE_UNIVERSAL, SITE_UNIVERSAL_LINE = "offsets + universal network", "offsets + universal network + line"
+SITE_FINE_TUNED = "fine-tuned network"
+
+NETWORK_ONLY = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
+"""Options of a network without a line: it needs more training than one that refines a line."""
+
+FINE_TUNING = FitOptions(epochs=2, learning_rate=3e-4, dropout=0.2)
+FINE_TUNING_PER_CONFIGURATION, MAX_FINE_TUNING_INPUTS = 6, 2500
+"""The fine-tuned network of a site is fitted to at most this number of inputs per configuration, and in total."""
+
+PER_CONFIGURATION = 20
+MIN_CONFIGURATIONS_FOR_MEAN = 20
+"""Number of configurations from which a line is averaged with the universal network."""
+
+FACTOR_BOUNDS, MIN_SPREAD_M = (0.0, 1.5), 0.05
+"""Bounds of the factor of the universal network's predictions, and the minimum spread that makes it observable."""
+
+_BATCH = 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedModel:
+    """A linear bias model, and a network or None. `factor`: the network is the universal one, multiplied by this factor."""
+
+    linear_bias: LinearBiasModel
+    network: FloatWeights | None = None
+    factor: float | None = None
+
+    def correction_m(self, data: Dataset) -> NDArray[np.float64]:
+        """Return linear bias + network, shape (n,), m; 0 where a power that the linear bias model needs is unknown."""
+        predicted = linear_bias_m(self.linear_bias, data).astype(np.float64)
+        if self.factor is not None and data.headers is not None:
+            predicted = predicted + self.factor * _universal_m(data)
+        elif self.network is not None:
+            predicted = predicted + network_m(self.network, data.inputs)
+        return np.where(np.isfinite(predicted), predicted, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One candidate model.
+
+    Attributes:
+        name: Name in tables.
+        fit: called with a dataset and a seed.
+        trains: whether it trains a network. Such a model is kept only if the nested error shows a gain.
+    """
+
+    name: str
+    fit: Callable[[Dataset, int], FittedModel]
+    trains: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Options for fitting a new model; they are recorded in the card.
+
+    Attributes:
+        architecture: Architecture of the network.
+        fit: options of a network that refines a line. network_only: options of a network without a line.
+        line: fit a line; otherwise the network predicts the whole error.
+        network: fit the network; otherwise it predicts 0. With neither, the linear bias model is a constant.
+        per_configuration: the network is fitted to at most this number of ranges of a configuration, so that a long
+            recording of one placement does not outweigh a short one.
+    """
+
+    architecture: Remnet
+    fit: FitOptions
+    network_only: FitOptions = NETWORK_ONLY
+    line: bool = True
+    network: bool = True
+    per_configuration: int = PER_CONFIGURATION
+
+    def for_candidate(self, name: str) -> Recipe:
+        """Return the recipe of one of `NEW_MODELS`."""
+        network = name in (LINE_NETWORK, NETWORK)
+        options = self.network_only if name == NETWORK else self.fit
+        return replace(self, line=name in (LINE, LINE_NETWORK), network=network, fit=options)
+
+
+def linear_bias_m(linear_bias: LinearBiasModel, data: Dataset) -> NDArray[np.float32]:
+    """Return the prediction of a linear bias model, shape (n,), m; NaN where it needs a power that is unknown."""
+    needs_gap = linear_bias.per_power_gap != 0.0
+    first_path = data.first_path_power_dbm if needs_gap else data.rx_power_dbm
+    return linear_bias.predict_m(data.rx_power_dbm, first_path)
+
+
+def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the prediction of a network, shape (n,), m. ONNX Runtime is much faster than NumPy."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(
+        graph.float_model(network), session_options(), providers=["CPUExecutionProvider"]
+    )
+    (source,), (result,) = session.get_inputs(), session.get_outputs()
+    parts = [
+        session.run([result.name], {source.name: inputs[start : start + _BATCH, None, :]})[0][:, 0]
+        for start in range(0, len(inputs), _BATCH)
+    ]
+    return np.concatenate(parts).astype(np.float64)
+
+
+def fit_new_model(
+    data: Dataset, recipe: Recipe, seed: int, on_epoch: Callable[[], None] = lambda: None
+) -> FittedModel:
+    """Fit a new model. Without a network, it contains the initial network, which predicts 0.
+
+    Raises:
+        DatasetError: see `fitting.fit`.
+    """
+    from uwb_mitigation.training.fit import fitting, networks
+
+    linear_bias = LinearBiasModel(0.0)
+    if recipe.line:
+        linear_bias = fit_line(data)
+    elif not recipe.network:
+        linear_bias = fit_constant(data)
+    if not recipe.network:
+        with fitting.single_thread(seed):
+            return FittedModel(linear_bias, networks.weights_of(networks.build(recipe.architecture, 0)))
+    options = replace(recipe.fit, seed=seed)
+    start = recipe.architecture, options, on_epoch
+    return FittedModel(linear_bias, _fit_residuals(data, linear_bias, recipe.per_configuration, *start))
+
+
+def _fit_residuals(
+    data: Dataset,
+    linear_bias: LinearBiasModel,
+    per_configuration: int,
+    architecture: Remnet,
+    options: FitOptions,
+    on_epoch: Callable[[], None] = lambda: None,
+    start: FloatWeights | None = None,
+) -> FloatWeights:
+    """Fit a network to the residuals of a linear bias model."""
+    from uwb_mitigation.training.fit import fitting
+
+    subset = data.rows(splits.subsample(data.configurations, per_configuration, options.seed))
+    residual = subset.error_m - linear_bias_m(linear_bias, subset)
+    # If the linear bias model needs a power that is unknown, the range is passed through.
+    known = np.isfinite(residual)
+    return fitting.fit(architecture, subset.inputs[known], residual[known], options, on_epoch, start=start)
+
+
+def fit_constant(data: Dataset) -> LinearBiasModel:
+    """Fit a constant: to configurations, or without CIRs to single ranges."""
+    # Each range counts as a configuration.
+    configurations = data.configurations if data.has_cirs else np.arange(len(data)).astype(str)
+    return linear_fit.fit_constant(configurations, data.error_m)
+
+
+def fit_line(data: Dataset) -> LinearBiasModel:
+    """Fit a line in both powers: to configurations (see `linear_fit`), or without CIRs to single ranges."""
+    if not data.has_cirs:
+        # Ranges of one pair at one distance are not independent.
+        true_m = np.round(data.range_m - data.error_m, 1)
+        assert data.tags is not None
+        assert data.anchors is not None
+        cells = np.array(
+            [
+                "/".join(map(str, each))
+                for each in zip(data.configurations, true_m, data.tags, data.anchors, strict=True)
+            ]
+        )
+        rows = data.rows(splits.subsample(cells, PER_CONFIGURATION, 0))
+        gap = rows.rx_power_dbm - rows.first_path_power_dbm
+        is_los = np.where(rows.labels == "", gap < LINE_OF_SIGHT_DB, rows.labels == "LOS")
+        return linear_fit.fit_linear_bias_to_rows(
+            rows.rx_power_dbm, rows.first_path_power_dbm, rows.error_m, is_los.astype(np.bool_)
+        )
+    return linear_fit.fit_linear_bias(
+        data.configurations, data.rx_power_dbm, data.first_path_power_dbm, data.error_m
+    )
+
+
+def new_models(recipe: Recipe) -> list[Candidate]:
+    """Return a constant, a line, a network on the residuals of the line, and a network without a line."""
+
+    def new_model(name: str) -> Callable[[Dataset, int], FittedModel]:
+        return lambda data, seed: fit_new_model(data, recipe.for_candidate(name), seed)
+
+    return [
+        _constant(),
+        _line(),
+        Candidate(LINE_NETWORK, new_model(LINE_NETWORK), trains=True),
+        Candidate(NETWORK, new_model(NETWORK), trains=True),
+    ]
+
+
+def _constant() -> Candidate:
+    return Candidate(CONSTANT, lambda data, seed: FittedModel(fit_constant(data)))
+
+
+def _line() -> Candidate:
+    return Candidate(LINE, lambda data, seed: FittedModel(fit_line(data)))
+
+
+def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
+    """Return the unchanged model of a bundle, the same with another offset, a constant, a line, and a fine-tuned network.
+
+    The fine-tuned network is trained on the residuals of a new linear bias model: a line if the bundle has one, otherwise an offset.
+
+    Raises:
+        ModelError: the network is not a REMNet.
+    """
+    network = float_network(source)
+
+    def with_new_offset(data: Dataset, seed: int) -> FittedModel:
+        residual = data.error_m - linear_bias_m(source.linear_bias, data) - network_m(network, data.inputs)
+        known = np.isfinite(residual)
+        shift = (
+            linear_fit.fit_constant(data.configurations[known], residual[known]).offset_m
+            if known.any()
+            else 0.0
+        )
+        linear_bias = replace(
+            source.linear_bias, offset_m=float(np.float32(source.linear_bias.offset_m + shift))
+        )
+        return FittedModel(linear_bias, network)
+
+    def fine_tuned(data: Dataset, seed: int) -> FittedModel:
+        linear_bias = fit_line(data) if source.linear_bias.needs_power else _offset(data, network)
+        assert isinstance(source.architecture, Remnet)
+        start = source.architecture, replace(options, seed=seed)
+        return FittedModel(
+            linear_bias, _fit_residuals(data, linear_bias, PER_CONFIGURATION, *start, start=network)
+        )
+
+    return [
+        Candidate(AS_SHIPPED, lambda data, seed: FittedModel(source.linear_bias, network)),
+        Candidate(NEW_OFFSET, with_new_offset),
+        _constant(),
+        _line(),
+        Candidate(FINE_TUNED, fine_tuned, trains=True),
+    ]
+
+
+def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: Bundle) -> list[Candidate]:
+    """Add the universal network with an offset of the data, if the data is preprocessed for it.
+
+    With few configurations it is the first candidate, so that it is preferred. With `MIN_CONFIGURATIONS_FOR_MEAN` or more it follows
+    the constant, and its mean with the line follows the line. The mean reduces both the scatter of the line and the
+    site-specific errors of the network.
+    """
+    if data.preprocessing != universal.preprocessing:
+        return list(candidates)
+    network = float_network(universal)
+    start = Candidate(COLD_START, lambda data, seed: FittedModel(_offset(data, network), network))
+    if has_few_configurations(data):
+        return [start, *candidates]
+    half = scaled(network, 0.5)
+    known = np.isfinite(data.rx_power_dbm - data.first_path_power_dbm)
+    has_line = len(data.rows(known).names) >= MIN_CONFIGURATIONS_FOR_MEAN
+
+    def mean(data: Dataset, seed: int) -> FittedModel:
+        line, offset = fit_line(data), _offset(data, network).offset_m
+        total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
+        return FittedModel(LinearBiasModel(*(float(np.float32(value / 2)) for value in total)), half)
+
+    inserted = {CONSTANT: [start], LINE: [Candidate(COLD_START_MEAN, mean)] if has_line else []}
+    return [item for one in candidates for item in (one, *inserted.get(one.name, ()))]
+
+
+def has_few_configurations(data: Dataset) -> bool:
+    """Whether the cold start is preferred because there are few configurations."""
+    return len(data.names) < MIN_CONFIGURATIONS_FOR_MEAN
+
+
+def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
+    return linear_fit.fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
+
+
+def site_models(
+    data: Dataset, has_cirs: bool, universal: Bundle
+) -> tuple[Dataset, list[Candidate], list[str]]:
+    """Return the models of a site, which are used together with the offsets of its radios.
+
+    Returns:
+        The data with the predictions of the universal network, so that they are computed only once; the candidates;
+        notes about missing candidates.
+    """
+    offsets = Candidate(
+        SITE_OFFSETS,
+        lambda data, seed: FittedModel(linear_fit.fit_constant(data.configurations, data.error_m)),
+    )
+    if not has_cirs:
+        line = Candidate(SITE_LINE, lambda data, seed: FittedModel(_site_line(data, data.error_m)))
+        return (
+            data,
+            [offsets, line],
+            ["no networks: the recording has no CIRs that the universal model was trained for"],
+        )
+    start = float_network(universal)
+    data = replace(data, headers=network_m(start, data.inputs)[:, None].astype(np.float32))
+
+    def with_network(line: bool) -> Callable[[Dataset, int], FittedModel]:
+        def fit(data: Dataset, seed: int) -> FittedModel:
+            factor = _factor(data)
+            residual = data.error_m - factor * _universal_m(data)
+            # A bundle with a network passes a range through if its first-path power is unknown.
+            has_line = line and _has_both_powers(data)
+            linear_bias = (
+                _site_line(data, residual)
+                if has_line
+                else linear_fit.fit_constant(data.configurations, residual)
+            )
+            return FittedModel(linear_bias, scaled(start, factor), factor)
+
+        return fit
+
+    candidates = [
+        offsets,
+        Candidate(SITE_UNIVERSAL, with_network(line=False)),
+        Candidate(SITE_UNIVERSAL_LINE, with_network(line=True)),
+    ]
+    if importlib.util.find_spec("torch") is None:
+        return data, candidates, ["no fine-tuned network: torch is not installed (`make setup-training`)"]
+
+    def fine_tuned(data: Dataset, seed: int) -> FittedModel:
+        from uwb_mitigation.training.fit import fitting
+
+        shift = linear_fit.fit_constant(data.configurations, data.error_m - _universal_m(data))
+        subset = data.rows(splits.subsample(data.configurations, FINE_TUNING_PER_CONFIGURATION, seed))
+        if len(subset) > MAX_FINE_TUNING_INPUTS:
+            chosen = np.random.default_rng(seed).choice(len(subset), MAX_FINE_TUNING_INPUTS, replace=False)
+            subset = subset.rows(np.sort(chosen))
+        options, targets = replace(FINE_TUNING, seed=seed), subset.error_m - shift.offset_m
+        return FittedModel(
+            shift, fitting.fit(universal.architecture, subset.inputs, targets, options, start=start)
+        )
+
+    return data, [*candidates, Candidate(SITE_FINE_TUNED, fine_tuned)], []
+
+
+def _universal_m(data: Dataset) -> NDArray[np.float64]:
+    """Return the predictions of the universal network, which `site_models` stores in the headers."""
+    assert data.headers is not None
+    return data.headers[:, 0].astype(np.float64)
+
+
+def _factor(data: Dataset) -> float:
+    """Fit the factor of the universal network's predictions to the errors.
+
+    Noise of the predictions would bias the factor towards 0, and with it the estimated offsets.
+    """
+    predicted, error = (
+        linear_fit.configuration_means(data.configurations, values)
+        for values in (_universal_m(data), data.error_m)
+    )
+    if len(predicted) < linear_fit.MIN_CONFIGURATIONS or float(np.ptp(predicted)) < MIN_SPREAD_M:
+        return 1.0
+    design = np.column_stack([np.ones(len(predicted)), predicted])
+    factor = float(linear_fit.least_absolute_deviations(design, error)[1])
+    return float(np.float32(np.clip(factor, *FACTOR_BOUNDS)))
+
+
+def _has_both_powers(data: Dataset) -> bool:
+    return bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
+
+
+def _site_line(data: Dataset, error_m: NDArray[np.float64]) -> LinearBiasModel:
+    """Fit a line in both powers if both are known, otherwise in the received power if known, otherwise a constant."""
+    if _has_both_powers(data):
+        return linear_fit.fit_linear_bias(
+            data.configurations, data.rx_power_dbm, data.first_path_power_dbm, error_m
+        )
+    return linear_fit.fit_linear_bias(data.configurations, data.rx_power_dbm, None, error_m)

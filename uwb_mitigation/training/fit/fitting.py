@@ -1,0 +1,111 @@
+"""Training loop with Adam in PyTorch, on data in memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.mitigation.model.architecture import Architecture
+from uwb_mitigation.mitigation.model.weights import FloatWeights
+from uwb_mitigation.training.fit import networks
+from uwb_mitigation.training.fit.options import FitOptions
+
+STAGES = ((0.6, 1.0), (0.9, 0.3), (1.0, 0.1))
+"""Schedule of `fit` with `vary`: (share of the steps until which it applies, factor of the learning rate)."""
+
+MEAN_DECAY = 0.999
+"""Decay of the running mean of the weights per step."""
+
+
+def fit(
+    architecture: Architecture,
+    inputs: NDArray[np.float32],
+    targets: NDArray[np.floating],
+    options: FitOptions,
+    on_epoch: Callable[[], None] = lambda: None,
+    *,
+    start: FloatWeights | None = None,
+    vary: Callable[[Tensor, torch.Generator], Tensor] | None = None,
+) -> FloatWeights:
+    """Fit a network to `targets` by mean absolute error.
+
+    The same seed gives the same weights on the same machine.
+
+    Args:
+        architecture: shape of the network.
+        inputs: float32 (n, K).
+        targets: (n,), m.
+        options: training options.
+        on_epoch: called after each pass over the data.
+        start: initial weights; by default random.
+        vary: augments each batch. The learning rate then decreases in `STAGES`, and the result is a running mean of the
+            weights, which removes the scatter of the last steps.
+
+    Raises:
+        DatasetError: there are no inputs, they are not finite, or the loss diverges.
+    """
+    if len(inputs) == 0 or not (np.isfinite(inputs).all() and np.isfinite(targets).all()):
+        raise DatasetError(f"cannot fit to {len(inputs)} inputs", valid="one or more, all finite")
+    source = torch.from_numpy(np.ascontiguousarray(inputs))
+    target_values = torch.from_numpy(targets.astype(np.float32))
+    with single_thread(options.seed):
+        # A separate generator, so that augmentation changes neither the order nor the dropout.
+        generator = torch.Generator().manual_seed(options.seed + 77)
+        network = networks.build(architecture, options.dropout, start)
+        # The paper's betas and epsilon (section III-B) are torch's defaults.
+        optimizer = torch.optim.AdamW(
+            network.parameters(), options.learning_rate, weight_decay=options.weight_decay, fused=True
+        )
+        mean_weights = [weight.detach().clone() for weight in network.parameters()]
+        network.train()
+        steps, step = options.epochs * -(-len(source) // options.batch), 0
+        for epoch in range(1, options.epochs + 1):
+            for rows in torch.randperm(len(source)).split(options.batch):
+                batch = source[rows]
+                if vary is not None:
+                    factor = next(factor for until, factor in STAGES if step < until * steps)
+                    optimizer.param_groups[0]["lr"] = options.learning_rate * factor
+                    batch = vary(batch, generator)
+                optimizer.zero_grad()
+                loss = nn.functional.l1_loss(network(batch), target_values[rows])
+                loss.backward()
+                optimizer.step()
+                if not math.isfinite(loss.item()):
+                    raise DatasetError(
+                        f"the loss is {loss.item()} in epoch {epoch}", valid="try a lower learning rate"
+                    )
+                step += 1
+                if vary is not None:
+                    # The mean adapts faster during the first steps, so that the initial weights have no effect.
+                    decay = min(MEAN_DECAY, (1 + step) / (10 + step))
+                    for mean, weight in zip(mean_weights, network.parameters(), strict=True):
+                        mean.lerp_(weight.detach(), 1.0 - decay)
+            on_epoch()
+        if vary is not None:
+            with torch.no_grad():
+                for mean, weight in zip(mean_weights, network.parameters(), strict=True):
+                    weight.copy_(mean)
+        return networks.weights_of(network)
+
+
+@contextmanager
+def single_thread(seed: int) -> Iterator[None]:
+    """Use one thread and seeded randomness in torch, and restore the caller's.
+
+    A network of this size is slower with more threads, and its sums depend on their number.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,211 @@
+"""Result files: `protocol.json` of the experiment and the JSON result of `benchmarks firmware`. One schema writes and reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from uwb_mitigation.errors import DatasetError, UwbMitigationError
+from uwb_mitigation.files import read_bounded
+from uwb_mitigation.training.fit.options import FitOptions
+
+RESULTS, MAX_BYTES = "protocol.json", 64 * 2**20
+FORMS = ("float", "optimised", "int8")
+"""Forms of a trained network, in the order of the paper's columns."""
+
+Count = Annotated[int, Field(ge=0)]
+Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Box = tuple[float, float, float, float, float]
+"""Quantiles of signed errors, m: 5 %, 25 %, 50 %, 75 %, 95 %."""
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class PartErrors(_Entry):
+    """Errors on a part of the test data, m: MAE, standard deviation and quantiles before (`raw`) and after correction.
+
+    If `n` is 0, all other fields have the value None.
+    """
+
+    n: Count
+    mae_raw: Number | None = None
+    sigma_raw: Number | None = None
+    mae: Number | None = None
+    sigma: Number | None = None
+    box_raw: Box | None = None
+    box: Box | None = None
+
+    @classmethod
+    def of(cls, raw_m: NDArray[np.floating], residual_m: NDArray[np.floating]) -> PartErrors:
+        """Return the statistics of errors, shape (n,), before and after correction."""
+        if len(raw_m) == 0:
+            return cls(n=0)
+        statistics: dict[str, Any] = {
+            f"{name}{suffix}": value
+            for suffix, error in (("_raw", raw_m), ("", residual_m))
+            for name, value in (
+                ("mae", np.abs(error).mean()),
+                ("sigma", np.std(error)),
+                ("box", tuple(np.percentile(error, (5, 25, 50, 75, 95)).tolist())),
+            )
+        }
+        return cls(n=len(raw_m), **statistics)
+
+
+class ErrorsByCondition(_Entry):
+    """Errors on the test part, on its LOS part and on its NLOS part; rows without a label count in `all` only."""
+
+    all: PartErrors
+    los: PartErrors
+    nlos: PartErrors
+
+    @classmethod
+    def of(
+        cls, error_m: NDArray[np.floating], residual_m: NDArray[np.floating], labels: NDArray[np.str_]
+    ) -> ErrorsByCondition:
+        """Return the statistics of errors, shape (n,), before and after correction."""
+        los = labels == "LOS"
+        parts = {"all": np.ones(len(labels), np.bool_), "los": los, "nlos": ~los & (labels != "")}
+        return cls(**{name: PartErrors.of(error_m[rows], residual_m[rows]) for name, rows in parts.items()})
+
+
+class TrainedModel(_Entry):
+    """One network, trained with one seed. Forms that a network does not have are omitted (None).
+
+    Attributes:
+        samples: window length K.
+        mae_raw, mae_float, mae_optimised, mae_int8: Mean absolute error on the test part, m (Table 1).
+        bytes_float, bytes_optimised, bytes_int8: File sizes (Table 2).
+        float_errors, int8_errors: Errors on the test part (Fig. 5).
+        calibration_mae: {calibration: MAE of int8 on the training part, m}; `calibration` is the chosen one.
+        seconds: training time; `samples_per_s` during it.
+    """
+
+    network: str
+    samples: Count
+    seed: Count
+    parameters: Count
+    multiply_accumulates: Count
+    mae_raw: Number
+    mae_float: Number
+    mae_optimised: Number | None = None
+    mae_int8: Number | None = None
+    bytes_float: Count | None = None
+    bytes_optimised: Count | None = None
+    bytes_int8: Count | None = None
+    float_errors: ErrorsByCondition
+    int8_errors: ErrorsByCondition | None = None
+    calibration: str | None = None
+    calibration_mae: Mapping[str, Number] | None = None
+    seconds: Number
+    samples_per_s: Number
+
+    def by_form(self, kind: str) -> list[float | None]:
+        """Return `mae` or `bytes` of each of `FORMS`."""
+        return [getattr(self, f"{kind}_{form}") for form in FORMS]
+
+    @property
+    def final_errors(self) -> ErrorsByCondition:
+        """Errors of int8 if the network has this form, otherwise of float."""
+        return self.int8_errors or self.float_errors
+
+
+class Baseline(_Entry):
+    """A correction without a network, on the same split; `errors` is None if the data does not allow it, for this `reason`."""
+
+    name: str
+    errors: ErrorsByCondition | None
+    reason: str = ""
+
+
+class ExperimentResults(_Entry):
+    """Results of the paper's experiment; `train` and `test` are the numbers of measurements, `options` those of every fit."""
+
+    data: str
+    split: str
+    command: str = ""
+    train: Count
+    test: Count
+    options: FitOptions
+    models: tuple[TrainedModel, ...]
+    baselines: tuple[Baseline, ...] = ()
+
+    def of(self, network: str, samples: int) -> tuple[TrainedModel, ...]:
+        """Return the trained models of a network in the order of seeds."""
+        statistics = [model for model in self.models if (model.network, model.samples) == (network, samples)]
+        return tuple(sorted(statistics, key=lambda model: model.seed))
+
+
+class FirmwareRow(_Entry):
+    """One network on an emulated Cortex-M4; rate (64 MHz, no wait states) and energy are estimates, the rest is measured.
+
+    Attributes:
+        first_kernel: 0 for an MLP.
+        energy_mj: at the paper's power; None if the paper has no such network.
+        mismatches: number of outputs that differ from ONNX Runtime's.
+    """
+
+    network: str = Field(validation_alias="model")
+    samples: Count = Field(validation_alias="k")
+    first_kernel: Count = Field(validation_alias="k0")
+    kernels: str
+    instructions: Number
+    ram_bytes: Number
+    flash_bytes: Number
+    rate_hz: Number = Field(validation_alias="hz")
+    energy_mj: Number | None
+    mismatches: Count
+    inputs: Count
+
+
+class FirmwareResults(_Entry):
+    """The JSON result of `benchmarks firmware`."""
+
+    rows: tuple[FirmwareRow, ...]
+
+
+Entry = TypeVar("Entry", bound=BaseModel)
+
+
+def read(kind: type[Entry], path: Path) -> Entry:
+    """Return the content of a result file.
+
+    Raises:
+        UwbMitigationError: it cannot be read, is empty or too large.
+        DatasetError: it is not a result file of this kind; `what` contains the invalid entry.
+    """
+    data = read_bounded(
+        path, MAX_BYTES, UwbMitigationError, "output of `paper protocol` or `benchmarks firmware`"
+    )
+    try:
+        return kind.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        entry = ".".join(map(str, first["loc"])) or "the file"
+        raise DatasetError(f"{entry}: {first['msg']}", where=str(path)) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Mean and standard deviation (n - 1) over seeds; the latter is omitted (None) for a single seed."""
+
+    mean: float
+    std: float | None
+    n: int
+
+    @classmethod
+    def of(cls, values: list[float | None]) -> Spread | None:
+        """Return the spread of the values that are not None; None if all are None."""
+        values_present = [value for value in values if value is not None]
+        if not values_present:
+            return None
+        std = float(np.std(values_present, ddof=1)) if len(values_present) > 1 else None
+        return cls(float(np.mean(values_present)), std, len(values_present))

@@ -1,0 +1,231 @@
+"""Recorded ranges of a site in columns, and their conversion to a `Dataset` when the true ranges are known."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import DatasetError, format_id
+from uwb_mitigation.mitigation.correction import MAX_RANGE_M
+from uwb_mitigation.mitigation.model.bundle import Card
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.training.data.dataset import CirSources, Dataset
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.tracks import Heights, Ranges
+
+MIN_CIR_SHARE = 0.5
+"""If the share of ranges with a usable CIR is smaller, no CIR is used."""
+
+CONFIGURATION_S = 2.0
+"""Duration of a configuration in motion: the errors of a pair are correlated for about this time."""
+
+FOLD_S = 10.0
+"""Duration of the segments of motion that are held out as a whole."""
+
+RECORDING_GAP_NS = 3_600_000_000_000
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteData:
+    """Ranges of all tags of all recordings, one tag after the other.
+
+    Attributes:
+        anchors: anchors of the site.
+        tags: data of each tag, in the order of time.
+        preprocessing: preprocessing of the inputs.
+        inputs: float32 (r, K), zeros if there is no CIR.
+        rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
+        has_cirs: whether CIRs are used.
+        has_usable_cir: bool (r,), ranges with a usable CIR.
+        height_m: float64 (r,), measured heights of the tags; None: not measured.
+        frame_ids: {tag id: the frame ids of its ranges}.
+        skipped: {reason: number of excluded ranges}.
+        shift_ns: time added to the stamps of each recording, so that recordings do not overlap.
+        sources: radios and segments of the CIRs.
+    """
+
+    anchors: AnchorMap
+    tags: tuple[Ranges, ...]
+    preprocessing: Preprocessing
+    inputs: NDArray[np.float32]
+    rx_power_dbm: NDArray[np.float32]
+    first_path_power_dbm: NDArray[np.float32]
+    has_cirs: bool
+    has_usable_cir: NDArray[np.bool_]
+    height_m: NDArray[np.float64] | None
+    frame_ids: dict[int, tuple[str, ...]]
+    skipped: Counter[str]
+    shift_ns: tuple[int, ...]
+    sources: CirSources
+
+    @property
+    def first_rows(self) -> NDArray[np.intp]:
+        """Index of the first range of each tag."""
+        return np.cumsum([0, *map(len, self.tags)])[:-1].astype(np.intp)
+
+    @property
+    def ranges(self) -> Ranges:
+        """Ranges of all tags."""
+        return Ranges.joined(self.tags)
+
+    @property
+    def tag(self) -> NDArray[np.intp]:
+        """Index of the tag of each range, shape (r,)."""
+        return np.repeat(np.arange(len(self.tags)), list(map(len, self.tags)))
+
+    def to_dataset(
+        self,
+        rows: NDArray[np.intp],
+        true_m: NDArray[np.float64],
+        segment: NDArray[np.intp],
+        is_stationary: NDArray[np.bool_],
+    ) -> Dataset:
+        """Return a dataset of selected ranges.
+
+        Args:
+            rows: indices, (k,), into the ranges of all tags.
+            true_m: (k,), their true ranges.
+            segment: int (k,), segment of the track.
+            is_stationary: bool (k,), whether the tag is stationary. A configuration is a
+                pair while the tag is stationary, or for `CONFIGURATION_S` of motion. Its name begins with the unit that is
+                held out as a whole: "segment 3.1/".
+        """
+        ranges = self.ranges.take(rows)
+        tag = np.array([one.tag_id for one in self.tags], np.uint64)[self.tag[rows]]
+        segment_start_ns = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
+        elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / _SECOND_NS
+        part = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
+        fold = np.where(is_stationary, 0, elapsed_s // FOLD_S).astype(int)
+        names = [
+            f"segment {s}.{f}/{c}/tag {t}/anchor {a}"
+            for s, f, c, t, a in zip(segment, fold, part, tag, ranges.anchor, strict=True)
+        ]
+        anchor_ids = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
+        return Dataset(
+            self.preprocessing,
+            self.inputs[rows],
+            self.rx_power_dbm[rows],
+            self.first_path_power_dbm[rows],
+            ranges.range_m,
+            ranges.range_m - true_m,
+            np.array(names),
+            np.full(len(rows), ""),
+            tags=tag,
+            anchors=anchor_ids[ranges.anchor],
+            radios=self.sources.radios,
+            segments=self.sources.segments,
+        )
+
+
+def read_site(
+    recordings: Iterable[Iterable[Record]],
+    anchors: AnchorMap,
+    card: Card,
+    on_record: Callable[[], None] = lambda: None,
+    *,
+    stamp_offset_s: float = 0.0,
+    heights: Sequence[Heights] | None = None,
+) -> SiteData:
+    """Read recordings, without their ground truth.
+
+    Args:
+        recordings: records of each recording, in the order of time.
+        anchors: anchors of the site; other anchors are skipped.
+        card: of the universal model. CIRs that it was not trained for are not used, but their levels are.
+        on_record: called for each record that was read.
+        stamp_offset_s: time offset added to the stamps of ranges: -0.2 if they are 0.2 s late.
+        heights: heights of the tags for each recording. Ranges without a height are excluded.
+
+    Raises:
+        DatasetError: no range belongs to an anchor in the map.
+    """
+    skipped: Counter[str] = Counter()
+    unknown: Counter[int] = Counter()
+    rows: list[tuple[int, int, int, float, float, float, float, bool]] = []
+    windows: list[NDArray[np.float32]] = []
+    sources = CirSources()
+    frame_ids: dict[int, dict[str, None]] = {}
+    shifts: list[int] = []
+    last_stamp_ns: int | None = None
+    for number, recording in enumerate(recordings):
+        shift: int | None = None
+        end_of_previous = last_stamp_ns
+        for record in recording:
+            on_record()
+            measured = record.measurement
+            stamp_ns = measured.stamp_ns + round(stamp_offset_s * _SECOND_NS)
+            if shift is None:
+                is_later = end_of_previous is None or stamp_ns > end_of_previous
+                shift = 0 if is_later else end_of_previous - stamp_ns + RECORDING_GAP_NS  # type: ignore[operator]
+            row = anchors.index.get(measured.anchor_id)
+            height = math.nan if heights is None else float(heights[number].at(np.array([stamp_ns]))[0][0])
+            if row is None:
+                unknown[measured.anchor_id] += 1
+            elif not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
+                skipped["no valid range"] += 1
+            elif heights is not None and math.isnan(height):
+                skipped["no height at that time"] += 1
+            else:
+                frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
+                (fault,), (window,) = card.preprocessing.windows_of([measured])
+                stamp_ns += shift
+                last_stamp_ns = stamp_ns if last_stamp_ns is None else max(last_stamp_ns, stamp_ns)
+                cir = measured.cir
+                powers = cir.rx_power_dbm, cir.first_path_power_dbm
+                usable = fault == 0 and card.fits(cir.radio, cir.segment, len(cir) > 0)
+                rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *powers, height, usable))
+                windows.append(window)
+                sources.add(cir)
+        shifts.append(shift or 0)
+    for anchor_id, count in unknown.items():
+        skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
+    if not rows:
+        received_ids = ", ".join(map(format_id, sorted(unknown))) or "none"
+        raise DatasetError(
+            f"no ranges of the anchors {', '.join(map(format_id, sorted(anchors.index)))}",
+            valid=f"anchors of the recording: {received_ids}",
+        )
+    types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
+    columns: list[NDArray[Any]] = [
+        np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), types, strict=True)
+    ]
+    order = np.lexsort((columns[1], columns[0]))
+    tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir = (
+        column[order] for column in columns
+    )
+    rx, first_path = (np.where(np.isfinite(powers), powers, np.nan) for powers in (rx, first_path))
+    tags = tuple(
+        Ranges(
+            stamp[tag_rows],
+            anchor[tag_rows],
+            range_m[tag_rows],
+            np.full(len(tag_rows), np.nan),
+            rx[tag_rows],
+            int(tag[tag_rows[0]]),
+        )
+        for tag_rows in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
+    )
+    return SiteData(
+        anchors=anchors,
+        tags=tags,
+        preprocessing=card.preprocessing,
+        inputs=np.stack([windows[index] for index in order]),
+        rx_power_dbm=rx.astype(np.float32),
+        first_path_power_dbm=first_path.astype(np.float32),
+        has_cirs=bool(has_usable_cir.mean() >= MIN_CIR_SHARE),
+        has_usable_cir=has_usable_cir,
+        height_m=None if heights is None else height_m,
+        frame_ids={tag_id: tuple(names) for tag_id, names in frame_ids.items()},
+        skipped=skipped,
+        shift_ns=tuple(shifts),
+        sources=sources,
+    )

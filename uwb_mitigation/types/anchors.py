@@ -1,0 +1,220 @@
+"""The anchors of a site: their file, and arrays for estimation.
+
+    anchors:
+      - {id: 1, x: 0.0, y: 0.0, z: 2.1}
+      - {id: 2, x: 7.6, y: 0.0, z: 2.1, sd: 0.05, name: door}
+
+Metres in the frame `map`; `sd`: standard deviation of each coordinate, 0.05 m by default; `id`: the 64-bit id of the
+ranges, decimal or 0x... . Other fields are errors.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import ParameterError, check_name, format_id
+from uwb_mitigation.files import read_bounded, write_atomically
+
+SD_M = 0.05
+"""Accuracy of a tape measure."""
+
+MAX_ANCHORS = 256
+MAX_TEXT = 1 << 20
+MAX_COORDINATE_M = 1e5
+MILLIMETRES = 200.0
+"""Anchors further apart do not receive each other: such coordinates are probably millimetres."""
+
+_MAX_ID = (1 << 64) - 1
+_NEEDED = ("id", "x", "y", "z")
+_FIELDS = (*_NEEDED, "sd", "name")
+SCHEMA = "anchors: a list of {id, x, y, z, and optionally sd, name}, in metres"
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """An anchor at a known position.
+
+    Attributes:
+        id: 64-bit identity.
+        position: x, y, z in m.
+        sd: standard deviation of each coordinate, m.
+        name: display name; may be empty.
+    """
+
+    id: int
+    position: tuple[float, float, float]
+    sd: float = SD_M
+    name: str = ""
+
+    def __str__(self) -> str:
+        identity = format_id(self.id)
+        return f"{identity} ({self.name})" if self.name else identity
+
+
+class AnchorMap:
+    """The anchors of a site; immutable.
+
+    Attributes:
+        anchors: one or more, with different ids.
+        position: float64 (m, 3), m.
+        sd: float64 (m,), m.
+        index: {id: row}.
+
+    Raises:
+        ParameterError: no anchor, too many, or an id twice.
+    """
+
+    def __init__(self, anchors: Sequence[Anchor], where: str = "anchors") -> None:
+        if not 1 <= len(anchors) <= MAX_ANCHORS:
+            raise ParameterError(f"{len(anchors)} anchors", where=where, valid=f"1 to {MAX_ANCHORS}")
+        self.anchors = tuple(anchors)
+        self.index = {anchor.id: row for row, anchor in enumerate(self.anchors)}
+        if len(self.index) < len(self.anchors):
+            twice = next(a.id for row, a in enumerate(self.anchors) if self.index[a.id] != row)
+            raise ParameterError(
+                f"anchor {format_id(twice)} is there twice", where=where, valid="one entry for each"
+            )
+        self.position: NDArray[np.float64] = np.array(
+            [anchor.position for anchor in self.anchors], np.float64
+        )
+        self.sd: NDArray[np.float64] = np.array([anchor.sd for anchor in self.anchors], np.float64)
+        self.position.setflags(write=False)
+        self.sd.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.anchors)
+
+    def moved(self, position: NDArray[np.float64], sd: NDArray[np.float64]) -> AnchorMap:
+        """Return the same anchors at other positions: float64 (m, 3) and (m,)."""
+        return AnchorMap(
+            [
+                Anchor(anchor.id, (float(p[0]), float(p[1]), float(p[2])), float(s), anchor.name)
+                for anchor, p, s in zip(self.anchors, position, sd, strict=True)
+            ]
+        )
+
+
+def parse_anchors(text: str, where: str) -> AnchorMap:
+    """Parse the text of an anchors file, YAML or JSON; `where`: its name in errors.
+
+    Raises:
+        ParameterError: it has another format; the message names entry and field.
+    """
+    if len(text) > MAX_TEXT:
+        raise ParameterError(f"{len(text)} characters", where=where, valid=f"{MAX_TEXT} at most")
+    try:
+        document = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ParameterError(f"not YAML: {first}", where=where, valid=SCHEMA) from error
+    entries = document.get("anchors") if isinstance(document, dict) else None
+    if not isinstance(entries, list) or not isinstance(document, dict) or len(document) != 1:
+        raise ParameterError("not a list of anchors", where=where, valid=SCHEMA)
+    found = AnchorMap([_anchor(entry, f"{where}: entry {n}") for n, entry in enumerate(entries, 1)], where)
+    spread = np.ptp(found.position, axis=0).max() if len(found) > 1 else 0.0
+    if spread > MILLIMETRES and np.all(found.position == np.rint(found.position)):
+        raise ParameterError(
+            f"anchors {spread:g} m apart, all at whole numbers: these look like millimetres",
+            where=where,
+            valid="metres",
+        )
+    return found
+
+
+def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:
+    """Return the text of an anchors file, after the lines of `comment`."""
+    out = io.StringIO()
+    for line in comment.splitlines():
+        out.write(f"# {line}\n")
+    out.write("anchors:\n")
+    for anchor in anchors.anchors:
+        x, y, z = (round(value, 6) for value in anchor.position)
+        entry: dict[str, object] = {"x": x, "y": y, "z": z, "sd": round(anchor.sd, 6)}
+        if anchor.name:
+            entry["name"] = anchor.name
+        fields = yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, width=1 << 16)
+        out.write(f"  - {{id: {format_id(anchor.id)}, {fields.removeprefix('{')}")
+    return out.getvalue()
+
+
+def _anchor(entry: Any, where: str) -> Anchor:
+    if not isinstance(entry, dict):
+        raise ParameterError(f"{entry!r:.60} is no anchor", where=where, valid=SCHEMA)
+    for name in entry:
+        check_name("field", name, _FIELDS, where)
+    absent = [name for name in _NEEDED if name not in entry]
+    if absent:
+        raise ParameterError(f"the field {absent[0]} is missing", where=where, valid=", ".join(_FIELDS))
+    x, y, z = (_number(entry, name, where, -MAX_COORDINATE_M, MAX_COORDINATE_M) for name in "xyz")
+    sd = _number(entry, "sd", where, 0.0, 100.0) if "sd" in entry else SD_M
+    name = entry.get("name", "")
+    if not isinstance(name, str) or len(name) > 100:
+        raise ParameterError(f"name = {name!r:.60}", where=where, valid="text of at most 100 characters")
+    identity = entry["id"]
+    if not isinstance(identity, int) or isinstance(identity, bool) or not 0 <= identity <= _MAX_ID:
+        raise ParameterError(
+            f"id = {identity!r:.60}", where=where, valid="a whole number of 64 bits, such as 3 or 0x1f"
+        )
+    return Anchor(identity, (x, y, z), sd, name)
+
+
+def _number(entry: dict[str, Any], name: str, where: str, low: float, high: float) -> float:
+    value = entry[name]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
+    if not (math.isfinite(value) and low <= value <= high):
+        hint = " (millimetres?)" if math.isfinite(value) and abs(value) > high else ""
+        raise ParameterError(f"{name} = {value!r:.60}{hint}", where=where, valid=f"{low:g} to {high:g} m")
+    return float(value)
+
+
+@runtime_checkable
+class HasAnchors(Protocol):
+    """A source with known anchor positions.
+
+    Attributes:
+        anchors: all anchors.
+    """
+
+    anchors: AnchorMap
+
+
+def anchors_path(bag: Path) -> Path:
+    """Return the path of a bag's anchors file: `X.anchors.yaml` in the folder of `X.mcap`."""
+    return bag.with_name(bag.name.removesuffix(".mcap") + ".anchors.yaml")
+
+
+def load_anchors(path: Path) -> AnchorMap:
+    """Read an anchors file.
+
+    Raises:
+        ParameterError: it cannot be read, or does not have the format of `positioning.anchors`.
+    """
+    data = read_bounded(
+        path, MAX_TEXT, ParameterError, "an anchors file (format: docs/background/positioning.md)"
+    )
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ParameterError("not a text file", where=str(path), valid="YAML in UTF-8") from error
+    return parse_anchors(text, str(path))
+
+
+def save_anchors(path: Path, anchors: AnchorMap, comment: str = "", *, force: bool = False) -> None:
+    """Write an anchors file atomically.
+
+    Raises:
+        ParameterError: it exists and `force` is not given, or it cannot be written.
+    """
+    if path.exists() and not force:
+        raise ParameterError("exists already", where=str(path), valid="--force replaces it")
+    write_atomically(path, dump_anchors(anchors, comment), ParameterError)

@@ -1,0 +1,321 @@
+"""Input and output of estimation, as arrays over time: ranges, estimates, tracks, true positions and poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+_Columns = TypeVar("_Columns", bound="Columns")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """Base of classes with n rows in the order of their times: arrays (n, ...).
+
+    Attributes:
+        stamp_ns: int64 (n,).
+    """
+
+    stamp_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self: _Columns, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> _Columns:
+        """Return the rows at `index`."""
+        columns = {one.name: getattr(self, one.name) for one in fields(self)}
+        taken = {name: column[index] for name, column in columns.items() if isinstance(column, np.ndarray)}
+        return replace(self, **taken)
+
+    def reversed(self: _Columns, end_ns: int) -> _Columns:
+        """Return the rows backwards in time, from `end_ns` on."""
+        back = self.take(slice(None, None, -1))
+        return replace(back, stamp_ns=end_ns - back.stamp_ns)
+
+
+def rows_of(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
+    """Return the rows of arrays (n, ...) as Python numbers and lists."""
+    return zip(*(column.tolist() for column in columns), strict=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges(Columns):
+    """n ranges of one tag.
+
+    Attributes:
+        anchor: int (n,), rows of an `AnchorMap`.
+        range_m: float64 (n,), finite.
+        variance_m2, rx_power_dbm: float64 (n,); NaN: unknown.
+        tag_id: of all of them.
+    """
+
+    anchor: NDArray[np.intp]
+    range_m: NDArray[np.float64]
+    variance_m2: NDArray[np.float64]
+    rx_power_dbm: NDArray[np.float64]
+    tag_id: int = 0
+
+    @classmethod
+    def joined(cls, parts: Sequence[Ranges]) -> Ranges:
+        """Concatenate ranges; the tag id is 0."""
+        names = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
+        columns: Any = (np.concatenate([getattr(one, name) for one in parts]) for name in names)
+        return cls(*columns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heading:
+    """Heading of the robot that carries a tag.
+
+    Attributes:
+        yaw: rad, in the anchors' frame.
+        covariance: float64 (4,), of the yaw with the x, y and z of the tag (m rad), and its variance (rad^2).
+    """
+
+    yaw: float
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Position and velocity of a tag at one time.
+
+    Attributes:
+        stamp_ns: its time.
+        position, velocity: float64 (3,), m and m/s, in the anchors' frame.
+        covariance: float64 (6, 6), of position and velocity.
+        heading: None: unknown.
+    """
+
+    stamp_ns: int
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    heading: Heading | None = None
+
+
+_UNKNOWN_HEADING = (math.nan,) * 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track(Columns):
+    """n estimates.
+
+    Attributes:
+        position, velocity: float64 (n, 3).
+        covariance: float64 (n, 6, 6), of position and velocity.
+        yaw: float64 (n, 5), heading of the robot (rad) and its covariance as in `Heading`; NaN: unknown.
+    """
+
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    yaw: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+
+    def __post_init__(self) -> None:
+        if len(self.yaw) != len(self.stamp_ns):
+            object.__setattr__(self, "yaw", np.full((len(self.stamp_ns), 5), np.nan))
+
+    @classmethod
+    def of(cls, estimates: list[Estimate]) -> Track:
+        """Return estimates as a track."""
+        return cls(
+            np.array([e.stamp_ns for e in estimates], np.int64),
+            np.array([e.position for e in estimates], np.float64).reshape(-1, 3),
+            np.array([e.velocity for e in estimates], np.float64).reshape(-1, 3),
+            np.array([e.covariance for e in estimates], np.float64).reshape(-1, 6, 6),
+            np.array(
+                [
+                    _UNKNOWN_HEADING if e.heading is None else (e.heading.yaw, *e.heading.covariance)
+                    for e in estimates
+                ],
+                np.float64,
+            ).reshape(-1, 5),
+        )
+
+    def __iter__(self) -> Iterator[Estimate]:
+        columns = (self.stamp_ns.tolist(), self.position, self.velocity, self.covariance, self.yaw)
+        for stamp_ns, position, velocity, covariance, yaw in zip(*columns, strict=True):
+            heading = Heading(float(yaw[0]), yaw[1:]) if np.isfinite(yaw[0]) else None
+            yield Estimate(stamp_ns, position, velocity, covariance, heading)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruePath(Columns):
+    """True positions of a tag: float64 (n, 3) positions in m, and yaws (n,) in rad if known."""
+
+    position: NDArray[np.float64]
+    yaw: NDArray[np.float64] | None = None
+
+    def at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return positions float64 (k, 3) at other times, by interpolation; NaN outside, and in gaps of over 1 s."""
+        if len(self) == 0:
+            return np.full((len(stamp_ns), 3), np.nan)
+        # Relative: a float64 resolves seconds since the epoch to a fraction of a microsecond only.
+        own, wanted = (stamps - self.stamp_ns[0] for stamps in (self.stamp_ns, stamp_ns))
+        found = np.stack([np.interp(wanted, own, axis, np.nan, np.nan) for axis in self.position.T], axis=1)
+        after = np.clip(np.searchsorted(own, wanted), 1, max(len(own) - 1, 1))
+        if len(own) > 1:
+            found[own[after] - own[after - 1] > 1_000_000_000] = np.nan
+        return found
+
+    def yaw_at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return yaws float64 (k,) at other times, by interpolation; NaN where unknown."""
+        if self.yaw is None:
+            return np.full(len(stamp_ns), np.nan)
+        circle = np.stack([np.cos(self.yaw), np.sin(self.yaw), np.zeros(len(self))], axis=1)
+        cosine, sine, _ = TruePath(self.stamp_ns, circle).at(stamp_ns).T
+        return np.asarray(np.arctan2(sine, cosine), np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heights(Columns):
+    """Measured heights of a tag in the anchors' frame.
+
+    Attributes:
+        height_m: float64 (n,), finite.
+        variance_m2: float64 (n,), positive.
+    """
+
+    height_m: NDArray[np.float64]
+    variance_m2: NDArray[np.float64]
+
+    def at(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return height and variance at each stamp, linearly interpolated; NaN outside and in gaps of over 1 s."""
+        columns = np.stack([self.height_m, self.variance_m2, np.zeros(len(self))], axis=1)
+        found = TruePath(self.stamp_ns, columns).at(stamp_ns)
+        return found[:, 0], found[:, 1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry(Columns):
+    """Motion of a robot's base in the plane, measured by its wheels or by another sensor.
+
+    Attributes:
+        pose: float64 (n, 3), x and y in m and yaw in rad, in the odometry frame, which drifts; NaN: unknown.
+        pose_covariance: float64 (n, 3, 3); zero: unknown.
+        twist: float64 (n, 3), velocities in m/s and yaw rate in rad/s, in the axes of the base.
+        twist_covariance: float64 (n, 3, 3); zero: unknown.
+    """
+
+    pose: NDArray[np.float64]
+    pose_covariance: NDArray[np.float64]
+    twist: NDArray[np.float64]
+    twist_covariance: NDArray[np.float64]
+
+    def reversed(self, end_ns: int) -> Odometry:
+        """Return the motion backwards in time, from `end_ns` on."""
+        return replace(Columns.reversed(self, end_ns), twist=-self.twist[::-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imu(Columns):
+    """Yaw rates, and if known yaws, of an IMU whose z axis points up.
+
+    Attributes:
+        yaw_rate: float64 (n,), rad/s. yaw_rate_variance: float64 (n,), rad^2/s^2; zero: unknown.
+        yaw: float64 (n,), rad; NaN: unknown. yaw_variance: float64 (n,), rad^2; zero: unknown.
+    """
+
+    yaw_rate: NDArray[np.float64]
+    yaw_rate_variance: NDArray[np.float64]
+    yaw: NDArray[np.float64]
+    yaw_variance: NDArray[np.float64]
+
+    def reversed(self, end_ns: int) -> Imu:
+        """Return the rotation backwards in time, from `end_ns` on."""
+        return replace(Columns.reversed(self, end_ns), yaw_rate=-self.yaw_rate[::-1])
+
+
+GAP_S = 0.5
+"""In longer gaps of the localisation the pose is unknown."""
+
+
+SMOOTHED_S = 0.2
+"""Poses jitter, but less halfway between two of them: without smoothing, such time offsets would look best."""
+
+
+_MAX_NEIGHBOURS = 20
+
+
+_WORST_CONDITION = 1e6
+
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePath(Columns):
+    """Poses of a robot's frame.
+
+    Contains float64 (n, 3) positions in m, and (n, 4) unit quaternions x, y, z, w that rotate the robot's axes to the map's.
+    """
+
+    position: NDArray[np.float64]
+    orientation: NDArray[np.float64]
+
+    def shifted(self, by_ns: int) -> PosePath:
+        """Return the poses at stamps later by the given time."""
+        return PosePath(self.stamp_ns + by_ns, self.position, self.orientation)
+
+    def smoothed(self) -> PosePath:
+        """Return poses with positions from parabolas through those of `SMOOTHED_S` before and after each (Savitzky and Golay, 1964)."""
+        time_s = (self.stamp_ns - self.stamp_ns[0]) / _SECOND_NS
+        # Sums over neighbours of 1, t, t^2, t^3, t^4, and of the positions times the first three.
+        moments, right = np.zeros((len(self), 5)), np.zeros((len(self), 3, 3))
+        reach = (
+            int(np.max(np.searchsorted(time_s, time_s + SMOOTHED_S, side="right") - np.arange(len(self)))) - 1
+        )
+        stride = max(1, reach // _MAX_NEIGHBOURS)
+        for step in range(-(reach // stride) * stride, reach + 1, stride):
+            here = np.arange(max(-step, 0), len(self) - max(step, 0))
+            since = (time_s[here + step] - time_s[here]) / SMOOTHED_S
+            powers = np.where(np.abs(since)[:, None] <= 1.0, since[:, None] ** np.arange(5), 0.0)
+            moments[here] += powers
+            right[here] += powers[:, :3, None] * self.position[here + step][:, None]
+        normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
+        # With duplicate poses there are too few different times for a parabola.
+        solvable = (moments[:, 0] >= 5.0) & (np.linalg.cond(normal) < _WORST_CONDITION)
+        position = self.position.copy()
+        position[solvable] = np.linalg.solve(normal[solvable], right[solvable])[:, 0]
+        return PosePath(self.stamp_ns, position, self.orientation)
+
+    @classmethod
+    def joined(cls, paths: Sequence[PosePath]) -> PosePath:
+        """Return all poses in the order of time."""
+        stamp_ns = np.concatenate([path.stamp_ns for path in paths])
+        columns = (np.concatenate([getattr(path, name) for path in paths]) for name in cls.__slots__)
+        return cls(stamp_ns, *columns).take(np.argsort(stamp_ns, kind="stable"))
+
+    def interpolated(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], Rotation]:
+        """Return positions (k, 3) and rotations (k,) at stamps; outside, those of the first or last pose.
+
+        Between two poses the quaternion is interpolated linearly and normalised: rotations are small there.
+        """
+        after = np.searchsorted(self.stamp_ns, stamp_ns).clip(0, len(self) - 1)
+        before = np.maximum(after - 1, 0)
+        span_ns = np.maximum(self.stamp_ns[after] - self.stamp_ns[before], 1)
+        part = ((stamp_ns - self.stamp_ns[before]) / span_ns).clip(0.0, 1.0)[:, None]
+        position = (1.0 - part) * self.position[before] + part * self.position[after]
+        first, second = self.orientation[before], self.orientation[after]
+        second = np.where(np.einsum("ni,ni->n", first, second)[:, None] < 0.0, -second, second)
+        return position, Rotation.from_quat((1.0 - part) * first + part * second)
+
+    def at(
+        self, stamp_ns: NDArray[np.int64], later_s: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside and in gaps > `GAP_S`."""
+        wanted = stamp_ns + round(later_s * _SECOND_NS)
+        after = np.searchsorted(self.stamp_ns, wanted).clip(1, len(self) - 1)
+        gap = self.stamp_ns[after] - self.stamp_ns[after - 1] > GAP_S * _SECOND_NS
+        unknown = (wanted < self.stamp_ns[0]) | (wanted > self.stamp_ns[-1]) | gap
+        position, rotation = self.interpolated(wanted)
+        matrices = rotation.as_matrix()
+        position[unknown], matrices[unknown] = np.nan, np.nan
+        return position, matrices
