@@ -19,7 +19,7 @@ from benchmarks.equipment.emulate_board import emulate_board
 from benchmarks.equipment.emulate_evb1000 import emulate_evb1000
 from benchmarks.equipment.emulate_uci import emulate_uci
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.console import JsonOption, Table
+from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption
 from uwb_mitigation.errors import UwbMitigationError, missing_dependency
 
 if TYPE_CHECKING:
@@ -339,14 +339,16 @@ _COLUMNS = 4
 
 def _report(result: Mapping[str, Any], json: Path | None) -> None:
     """Print a table for each list of rows, and one for all other values; write the JSON file."""
-    scalars = Table("figure", "value", title_justify="left")
+    scalars = ConsoleTable("figure", "value", title_justify="left")
     for key, value in result.items():
         if isinstance(value, list | tuple) and value:
             rows = [_flat(row) for row in value]
             for start in range(0, len(rows), _COLUMNS):
                 # One column for each row, since a terminal has no space for all figures next to each other.
                 shown = rows[start : start + _COLUMNS]
-                table = Table(key, *(str(number) for number in range(start + 1, start + 1 + len(shown))))
+                table = ConsoleTable(
+                    key, *(str(number) for number in range(start + 1, start + 1 + len(shown)))
+                )
                 for name in rows[0]:
                     table.add_row(name, *(_text(row.get(name, "")) for row in shown))
                 console.out.print(table)

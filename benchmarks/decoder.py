@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.equipment.faults import DamagedData, Faults, damage
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import MessageType
 
 _FRAMES_PER_ROUND = 4096
@@ -71,7 +71,7 @@ def loopback(
         begins = random.integers(0, len(pool) - payload_bytes, count)
         sizes = random.integers(0, payload_bytes + 1, count)
         sent = [
-            Frame(MessageType.RANGE_CIR, 0, first + i, first * 7, pool[begin : begin + size])
+            WireFrame(MessageType.RANGE_CIR, 0, first + i, first * 7, pool[begin : begin + size])
             for i, (begin, size) in enumerate(zip(begins.tolist(), sizes.tolist(), strict=True))
         ]
         wires = [encode_frame(frame) for frame in sent]
@@ -81,7 +81,7 @@ def loopback(
         is_intact = _is_unchanged(arrived, starts, ends)
         body_is_intact = _is_unchanged(arrived, starts + 1, ends - 1)
 
-        received: list[Frame] = []
+        received: list[WireFrame] = []
         at = 0
         while at < len(arrived.data):
             size = int(random.integers(1, _LARGEST_READ + 1))

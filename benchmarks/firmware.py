@@ -21,7 +21,7 @@ from uwb_mitigation.mitigation.embedded.packing import PackedNetwork, pack
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target, build_image
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import Mlp
-from uwb_mitigation.mitigation.model.bundle import Bundle, Card, session_options
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, session_options
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
@@ -48,7 +48,7 @@ class Network:
     network: str
     first_kernel: int
     packed: PackedNetwork
-    card: Card
+    card: ModelCard
     model_id: int
     onnx: bytes
 
@@ -117,11 +117,11 @@ def trained(bundle: Bundle) -> Network:
     )
 
 
-def network_of(weights: Int8Weights, card: Card | None, model_id: int, onnx: bytes) -> Network:
+def network_of(weights: Int8Weights, card: ModelCard | None, model_id: int, onnx: bytes) -> Network:
     """Return a network to measure; `card` None = a neutral one."""
     shape = weights.architecture
     network, first_kernel = ("mlp", 0) if isinstance(shape, Mlp) else ("remnet", shape.first_kernel)
-    card = card or Card(
+    card = card or ModelCard(
         "random weights",
         shape,
         Preprocessing(shape.samples, Scaling.PREAMBLE),

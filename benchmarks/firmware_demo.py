@@ -29,7 +29,7 @@ from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spin
 from uwb_mitigation.radios.wire import messages as wire
 from uwb_mitigation.recordings.opening import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.types.measurement import CorrectedRange, Origin, RangeMeasurement
+from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement
 
 TIMEOUT_S = 60.0
 """Timeout for mode DEVICE and for the next corrected range; after it, the remaining ranges count as lost."""
@@ -56,7 +56,7 @@ def is_identical(expected: CorrectedRange, message: RangeCorrected) -> bool:
     values = (expected.range_m, expected.correction_m, expected.variance_m2)
     computed = (message.range, message.correction, message.variance)
     first, second = (np.array(row, np.float32).tobytes() for row in (values, computed))
-    same_origin = message.source == Origin.DEVICE and message.model_id == expected.model_id
+    same_origin = message.source == CorrectedBy.DEVICE and message.model_id == expected.model_id
     return first == second and message.status == int(expected.status) and same_origin
 
 

@@ -20,7 +20,7 @@ from uwb_mitigation.nodes.support.processes import spinning_node, wait
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
-from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.ros.codec import encode_corrected
 
 ANCHORS = AnchorMap(
@@ -119,7 +119,9 @@ def _measure(
             time.sleep(min(remaining_s, 0.001))
         stamp_ns = time.time_ns()
         measured = RangeMeasurement(stamp_ns, 1, ANCHORS.anchors[row[i]].id, i, 0, float(range_m[i]), empty)
-        corrected = CorrectedRange(float(range_m[i]), float(range_m[i]), 0.0, 0.01, Status.OK, Origin.HOST, 1)
+        corrected = CorrectedRange(
+            float(range_m[i]), float(range_m[i]), 0.0, 0.01, Status.OK, CorrectedBy.HOST, 1
+        )
         publisher.publish(encode_corrected(measured, corrected))
         sent.append(stamp_ns)
     counted = sent[round(_WARM_S * rate_hz) :]

@@ -16,8 +16,8 @@ from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.measurement import (
     SAMPLE_PERIOD_S,
     Cir,
+    CorrectedBy,
     CorrectedRange,
-    Origin,
     RangeMeasurement,
     Record,
     Status,
@@ -52,7 +52,7 @@ def record(number: int, samples: int = 20) -> Record:
 
 
 def corrected(number: int) -> CorrectedRange:
-    return CorrectedRange(4.25 + number, 4.5 + number, 0.25, 0.0625, Status.OK, Origin.DEVICE, 77)
+    return CorrectedRange(4.25 + number, 4.5 + number, 0.25, 0.0625, Status.OK, CorrectedBy.DEVICE, 77)
 
 
 def write_corrected(bag: BagWriter, measurement: RangeMeasurement, corrected: CorrectedRange) -> None:

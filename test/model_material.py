@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import HEAD, Remnet
-from uwb_mitigation.mitigation.model.bundle import Bundle, Card, save_bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, save_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
@@ -54,7 +54,7 @@ def random_int8(architecture: Remnet, seed: int = 0, *, exact: bool = True) -> I
     return quantize(weights, windows(64, architecture.samples, seed), exact=exact)
 
 
-def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> Card:
+def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> ModelCard:
     options: dict[str, object] = {
         "name": "material",
         "architecture": architecture,
@@ -66,7 +66,7 @@ def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> 
         "correction_limits_m": (-4.0, 8.0),
         "training": {"data": "none"},
     }
-    return Card(**(options | changes))  # type: ignore[arg-type]
+    return ModelCard(**(options | changes))  # type: ignore[arg-type]
 
 
 def bundle(folder: Path, architecture: Remnet | None = None, *, seed: int = 0, **changes: object) -> Bundle:

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.types.measurement import (
     Cir,
+    CorrectedBy,
     CorrectedRange,
     Encoding,
-    Origin,
     RadioType,
     RangeMeasurement,
     Segment,
@@ -69,7 +69,7 @@ corrections = st.builds(
     correction_m=float32,
     variance_m2=float32,
     status=st.sampled_from(Status),
-    origin=st.sampled_from(Origin),
+    origin=st.sampled_from(CorrectedBy),
     model_id=st.integers(0, 2**32 - 1),
 )
 

@@ -355,7 +355,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     from drives import HALL
 
-    from uwb_mitigation.training.site.anchor_check import check_anchors
+    from uwb_mitigation.training.site.anchor_check import validate_anchor_map
 
     ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
     rng = np.random.default_rng(4)
@@ -368,7 +368,7 @@ def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     ):
         moved = replace(ranges, range_m=value)
         site = SimpleNamespace(anchors=anchors, ranges=moved, tag=np.zeros(len(moved), int))
-        check_anchors(site, path.position, known)
+        validate_anchor_map(site, path.position, known)
 
 
 def test_tag_is_matched_with_its_own_frame_in_any_namespace():

@@ -16,7 +16,7 @@ from dw1000_driver import Driver, Mode, exchange, flight_ticks, pair
 
 from benchmarks.equipment.dw1000_model.air import Air, Chip
 from benchmarks.equipment.dw1000_model.library import MODEL_FOLDER, model_objects
-from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, c_compiler, run
+from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, c_compiler, run_tool
 
 pytestmark = NEEDS_CC
 
@@ -87,7 +87,7 @@ class TestReceiver:
 
 def test_driver_may_define_any_name_without_the_prefix_of_the_model(tmp_path: Path):
     objects = model_objects()
-    defined = run(["nm", "-g", "--defined-only", "-P", *objects]).splitlines()
+    defined = run_tool(["nm", "-g", "--defined-only", "-P", *objects]).splitlines()
     names = [line.split()[0] for line in defined if not line.endswith(":")]
     assert len(names) > 50
     assert [name for name in names if not name.startswith("dw1000_")] == []
@@ -99,14 +99,14 @@ def test_driver_may_define_any_name_without_the_prefix_of_the_model(tmp_path: Pa
     )
     program = tmp_path / "driver"
     options = ("-fno-builtin", f"-I{MODEL_FOLDER}")
-    run([*c_compiler(), *options, str(driver), *objects, "-lm", "-lpthread", "-o", str(program)])
-    run([str(program)])
+    run_tool([*c_compiler(), *options, str(driver), *objects, "-lm", "-lpthread", "-o", str(program)])
+    run_tool([str(program)])
 
 
 def compiled(source: Path, program: Path) -> Path:
     sources = (*MODEL_FOLDER.glob("*.c"), source)
     options = ("-std=c11", "-O1", "-g", "-fsanitize=address,undefined", *WARNINGS, f"-I{MODEL_FOLDER}")
-    run([*c_compiler(), *options, *map(str, sources), "-lm", "-lpthread", "-o", str(program)])
+    run_tool([*c_compiler(), *options, *map(str, sources), "-lm", "-lpthread", "-o", str(program)])
     return program
 
 

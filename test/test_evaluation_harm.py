@@ -162,7 +162,9 @@ def test_universal_model_improves_unseen_sites(universal, calibrated):
 
 def test_universal_model_reaches_the_error_of_its_card_on_the_real_logs(apartment_reading):
     bundle = load_bundle(default_model_path())
-    found = zero_shot.run(build_dataset(apartment_reading.records, bundle.preprocessing), bundle)
+    found = zero_shot.evaluate_zero_shot(
+        build_dataset(apartment_reading.records, bundle.preprocessing), bundle
+    )
     left = [np.abs(found.errors[f"universal{offset}"]).mean() for offset in ("_los_offset", "_offset")]
     # The limits are 0.215 and 0.205.
     assert left == pytest.approx([0.212, 0.202], abs=0.001)

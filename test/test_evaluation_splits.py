@@ -10,9 +10,9 @@ from model_material import dataset
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.training.data import splits
-from uwb_mitigation.training.data.splits import Group
+from uwb_mitigation.training.data.splits import GroupKey
 from uwb_mitigation.training.evaluation import baselines
-from uwb_mitigation.training.evaluation.intervals import calibrate
+from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, mae_after_rejection
 
 NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
@@ -24,7 +24,7 @@ def placed(tags: list[int], anchors: list[int]):
     return replace(data, tags=np.repeat(np.uint64(tags), 4), anchors=np.repeat(np.uint64(anchors), 4))
 
 
-@pytest.mark.parametrize("group", list(Group))
+@pytest.mark.parametrize("group", list(GroupKey))
 def test_no_configuration_is_in_both_parts(group):
     data = placed([1, 1, 2, 2, 3, 4], [1, 2, 1, 2, 3, 4])
     for split in splits.by_group(data, group, 3, 0):
@@ -34,20 +34,20 @@ def test_no_configuration_is_in_both_parts(group):
 
 def test_each_tag_location_is_left_out_once():
     data = placed([1, 1, 2, 3], [1, 2, 1, 2])
-    held = [set(data.tags[split.test].tolist()) for split in splits.by_group(data, Group.TAG, 6, 0)]
+    held = [set(data.tags[split.test].tolist()) for split in splits.by_group(data, GroupKey.TAG, 6, 0)]
     assert held == [{1}, {2}, {3}]
 
 
 def test_configuration_with_two_tags_is_not_split():
     data = replace(placed([1, 2, 3, 4], [1, 1, 2, 2]))
     data.configurations[:8] = "c0"
-    for split in splits.by_group(data, Group.TAG, 6, 0):
+    for split in splits.by_group(data, GroupKey.TAG, 6, 0):
         assert not (
             {"c0"} <= set(data.configurations[split.train]) and "c0" in data.configurations[split.test]
         )
 
 
-@pytest.mark.parametrize("group", [Group.TAG, Group.HALF])
+@pytest.mark.parametrize("group", [GroupKey.TAG, GroupKey.HALF])
 def test_single_placement_cannot_be_split(group):
     with pytest.raises(DatasetError, match="2 or more"):
         splits.by_group(placed([1, 1], [1, 1]), group, 6, 0)
@@ -75,7 +75,7 @@ def test_intervals_cover_unseen_configurations():
     narrow, wide = [], []
     for _ in range(60):
         errors = np.repeat(generator.standard_t(3, 40), 5) * 0.2
-        found = calibrate(errors[:100], np.zeros(100), NAMES[:100])
+        found = fit_intervals(errors[:100], np.zeros(100), NAMES[:100])
         ratio = np.abs(errors[100:]) / np.sqrt(found.variance_m2)
         narrow.append(np.mean(ratio <= 1))
         wide.append(np.mean(ratio <= found.sigmas95))
@@ -85,16 +85,16 @@ def test_intervals_cover_unseen_configurations():
 
 def test_configurations_have_equal_weight():
     errors = np.where(NAMES == "c0", 3.0, 0.1)
-    once = calibrate(errors, np.zeros(200), NAMES)
+    once = fit_intervals(errors, np.zeros(200), NAMES)
     long = np.concatenate([errors, np.full(2000, 3.0)])
     names = np.concatenate([NAMES, np.full(2000, "c0")])
-    assert calibrate(long, np.zeros(2200), names).sigmas95 < 100
+    assert fit_intervals(long, np.zeros(2200), names).sigmas95 < 100
     assert once.variance_m2 == pytest.approx(0.01, rel=1e-3)
 
 
 def test_intervals_without_data_are_refused():
     with pytest.raises(DatasetError):
-        calibrate(np.array([np.nan]), np.array([0.0]), np.array(["a"]))
+        fit_intervals(np.array([np.nan]), np.array([0.0]), np.array(["a"]))
 
 
 def test_features_are_finite_if_header_fields_are_missing():

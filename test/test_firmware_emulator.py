@@ -23,7 +23,7 @@ from benchmarks.equipment import emulator, random_networks
 from benchmarks.equipment.emulated_firmware import EmulatedFirmware, cut_to_window
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded import toolchain
-from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, firmware_folder, run
+from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, firmware_folder, run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
@@ -188,7 +188,7 @@ def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):
     image = emulator.measure_size(tmp_path, tmp_path)
     assert image.flash_bytes < 24 << 10
     assert (image.available_flash_bytes, image.available_ram_bytes) == (512 << 10, 64 << 10)
-    text, data, bss = map(int, run(["arm-none-eabi-size", str(image.elf)]).splitlines()[1].split()[:3])
+    text, data, bss = map(int, run_tool(["arm-none-eabi-size", str(image.elf)]).splitlines()[1].split()[:3])
     assert (image.flash_bytes, image.static_bytes) == (text + data, data + bss)
 
 
@@ -212,5 +212,5 @@ def test_library_compiles_without_warnings_for_other_processors(cpu: str, tmp_pa
     sources = firmware_folder() / "src"
     command = ("arm-none-eabi-gcc", f"-mcpu={cpu}", "-mthumb", "-std=c99", *WARNINGS, f"-I{sources}")
     # Check only the syntax; the Cortex-M4 images are compiled with -Os.
-    run([*command, "-fsyntax-only", *map(str, sources.glob("*.c"))])
-    run([*command, "-c", *map(str, (sources / "cortex_m4").glob("*.S"))], folder=tmp_path)
+    run_tool([*command, "-fsyntax-only", *map(str, sources.glob("*.c"))])
+    run_tool([*command, "-c", *map(str, (sources / "cortex_m4").glob("*.S"))], folder=tmp_path)

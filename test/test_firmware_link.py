@@ -19,7 +19,7 @@ from uwb_mitigation.mitigation.embedded.compiling import firmware_folder
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import HEADER, MAX_OFFSETS, MAX_PAYLOAD_BYTES, Flag, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import GetInfo, SetMode, SetOffsets, TimeSync
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -90,7 +90,7 @@ def library(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> ctypes.
     return library
 
 
-def decode(library: ctypes.CDLL, wire: bytes) -> tuple[Frame | None, dict[str, int]]:
+def decode(library: ctypes.CDLL, wire: bytes) -> tuple[WireFrame | None, dict[str, int]]:
     header, payload = ctypes.create_string_buffer(16), ctypes.create_string_buffer(MAX_PAYLOAD_BYTES)
     counts = (ctypes.c_uint32 * len(KINDS))()
     length = library.native_decode(wire, len(wire), header, payload, counts)
@@ -98,10 +98,10 @@ def decode(library: ctypes.CDLL, wire: bytes) -> tuple[Frame | None, dict[str, i
     if length < 0:
         return None, counted
     _, *fields = HEADER.as_struct().unpack(header.raw)
-    return Frame(*fields, payload.raw[:length]), counted
+    return WireFrame(*fields, payload.raw[:length]), counted
 
 
-def encode(library: ctypes.CDLL, frame: Frame) -> bytes:
+def encode(library: ctypes.CDLL, frame: WireFrame) -> bytes:
     header = HEADER.as_struct().pack(1, *frame[:4])
     wire = ctypes.create_string_buffer(8192)
     count = library.native_encode(header, frame.payload, len(frame.payload), wire)
@@ -116,7 +116,7 @@ def words(kind: str) -> list[list[str]]:
 @pytest.mark.parametrize("vector", words("frame"), ids=lambda vector: vector[0])
 def test_golden_frames_are_decoded_and_encoded_to_the_byte(library: ctypes.CDLL, vector: list[str]):
     _, *numbers, payload, wire = vector
-    frame = Frame(*map(int, numbers), b"" if payload == "-" else bytes.fromhex(payload))
+    frame = WireFrame(*map(int, numbers), b"" if payload == "-" else bytes.fromhex(payload))
     assert decode(library, bytes.fromhex(wire)) == (frame, dict.fromkeys(KINDS, 0) | {"frames": 1})
     assert encode(library, frame) == bytes.fromhex(wire)
 
@@ -138,14 +138,14 @@ def test_frames_of_any_length_and_content_are_encoded_as_in_python(library: ctyp
         payload = random.integers(0, random.choice([2, 256]), length, np.uint8)
         if length % 2:
             payload[:] = np.maximum(payload, 1)
-        frame = Frame(2, 0, 0x01010101, 0x0101010101010101, payload.tobytes())
+        frame = WireFrame(2, 0, 0x01010101, 0x0101010101010101, payload.tobytes())
         assert encode(library, frame) == encode_frame(frame)
 
 
 def test_damaged_streams_give_the_frames_and_counts_that_python_gives(library: ctypes.CDLL):
     random = np.random.default_rng(2)
     for _ in range(300):
-        frames = [Frame(3, 0, i, i, random.bytes(random.integers(0, 600))) for i in range(3)]
+        frames = [WireFrame(3, 0, i, i, random.bytes(random.integers(0, 600))) for i in range(3)]
         stream = bytearray(b"".join(map(encode_frame, frames)))
         for at in random.integers(0, len(stream), random.integers(0, 4)):
             stream[at] = random.choice([0, 1, 255, random.integers(0, 256)])
@@ -167,7 +167,7 @@ def python_board(bundle: Bundle, mode: Mode) -> Board:
 def same(sent: bytes, expected: bytes) -> bool:
     """Compare frames byte by byte, except for the measured computing time."""
 
-    def frames(data: bytes) -> list[Frame]:
+    def frames(data: bytes) -> list[WireFrame]:
         decoded = FrameDecoder().feed(data)
         return [
             frame._replace(payload=frame.payload[:48] + bytes(4) + frame.payload[52:])

@@ -19,7 +19,7 @@ from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded.compiled import CompiledFirmware, link
-from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run
+from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import HEAD
@@ -126,7 +126,7 @@ ADDRESS_SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize
 def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
     firmware_models.write_model(tmp_path, random_networks.remnet(64, 5))
     program = build_program("golden", tmp_path, ADDRESS_SANITIZED)
-    assert "0 of 8 golden vectors wrong" in run([program])
+    assert "0 of 8 golden vectors wrong" in run_tool([program])
 
 
 def test_golden_vectors_detect_a_changed_weight(tmp_path: Path):
@@ -136,7 +136,7 @@ def test_golden_vectors_detect_a_changed_weight(tmp_path: Path):
     first = text[start : text.index(",", start)].strip()
     header.write_text(text[:start] + text[start:].replace(first, str(int(first) ^ 32), 1))
     with pytest.raises(UwbMitigationError, match="exit 1"):
-        run([build_program("golden", tmp_path)])
+        run_tool([build_program("golden", tmp_path)])
 
 
 @pytest.mark.parametrize("scaling", list(Scaling))
@@ -148,23 +148,23 @@ def test_arbitrary_cirs_pass_the_sanitizers(scaling: Scaling, tmp_path: Path):
         linear_bias=model_material.LINE,
         correction_limits_m=(-1e4, 1e4),
     )
-    seen = run([build_program("fuzz_correct", tmp_path, ADDRESS_SANITIZED), "4000", "1"])
+    seen = run_tool([build_program("fuzz_correct", tmp_path, ADDRESS_SANITIZED), "4000", "1"])
     statuses = {int(line.split()[1].rstrip(":")) for line in seen.splitlines()}
     assert {0, 4, 5, 6, 7, 9, 12, 14} <= statuses
 
 
 def test_arbitrary_bytes_to_a_board_pass_the_sanitizers(tmp_path: Path):
     firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
-    run([build_program("fuzz_link", tmp_path, ADDRESS_SANITIZED), "1000", "1"])
+    run_tool([build_program("fuzz_link", tmp_path, ADDRESS_SANITIZED), "1000", "1"])
 
 
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no CMake: apt install cmake")
 def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
     firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
     build = tmp_path / "build"
-    run(["cmake", "-S", str(firmware_folder()), "-B", str(build), f"-DUWB_MODEL_DIR={tmp_path}"])
-    run(["cmake", "--build", str(build)])
-    run(["ctest", "--test-dir", str(build)])
+    run_tool(["cmake", "-S", str(firmware_folder()), "-B", str(build), f"-DUWB_MODEL_DIR={tmp_path}"])
+    run_tool(["cmake", "--build", str(build)])
+    run_tool(["ctest", "--test-dir", str(build)])
 
 
 @pytest.mark.parametrize(
@@ -182,15 +182,15 @@ def test_plain_cmake_builds_the_library_and_passes_its_test(tmp_path: Path):
 )
 def test_flags_that_change_float_results_are_refused(flags: tuple[str, ...]):
     compile_ = ["cc", "-fsyntax-only", "-x", "c", str(firmware_folder() / "src" / "uwb_target.h")]
-    run(compile_)
+    run_tool(compile_)
     with pytest.raises(UwbMitigationError, match=r"wider type|-ffast-math"):
-        run([*compile_, *flags])
+        run_tool([*compile_, *flags])
 
 
 @pytest.mark.parametrize("name", ["preprocess", "correct", "network"])
 def test_every_source_with_float_arithmetic_refuses_fast_math(name: str):
     with pytest.raises(UwbMitigationError, match=r"wider type|-ffast-math"):
-        run(["cc", "-fsyntax-only", "-ffast-math", str(firmware_folder() / "src" / f"uwb_{name}.c")])
+        run_tool(["cc", "-fsyntax-only", "-ffast-math", str(firmware_folder() / "src" / f"uwb_{name}.c")])
 
 
 @NEEDS_CXX
@@ -199,4 +199,6 @@ def test_sketch_in_cpp_can_include_the_model(tmp_path: Path):
     sketch = tmp_path / "sketch.cpp"
     sketch.write_text('#include "uwb_model.h"\nuint32_t id() { return uwb_model_data.model_id; }\n')
     warnings = ("-std=gnu++14", "-Wall", "-Wextra", "-Werror")
-    run(["c++", *warnings, "-fsyntax-only", f"-I{firmware_folder() / 'src'}", f"-I{tmp_path}", str(sketch)])
+    run_tool(
+        ["c++", *warnings, "-fsyntax-only", f"-I{firmware_folder() / 'src'}", f"-I{tmp_path}", str(sketch)]
+    )

@@ -12,7 +12,7 @@ from compilers import NEEDS_CXX
 from benchmarks.equipment.dw1000_model.library import MODEL_FOLDER, model_objects
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded.compiled import library_objects
-from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run
+from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
@@ -34,7 +34,7 @@ def compile_sketch(name: str, folder: Path, compiler: tuple[str, ...], *files: s
     sketch.write_text((EXAMPLES / name / f"{name}.ino").read_text())
     warnings = ("-Wall", "-Wextra", "-Werror", "-include", str(STUB / "Arduino.h"))
     includes = (f"-I{STUB}", f"-I{firmware_folder() / 'src'}", f"-I{MODEL_FOLDER}", f"-I{folder}")
-    run([*compiler, *warnings, *includes, str(sketch), *files, "-o", str(program)])
+    run_tool([*compiler, *warnings, *includes, str(sketch), *files, "-o", str(program)])
     return program
 
 

@@ -14,7 +14,7 @@ import pytest
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
 
-from uwb_mitigation.mitigation.embedded.compiling import compile_objects, run
+from uwb_mitigation.mitigation.embedded.compiling import compile_objects, run_tool
 
 PACKAGE = REPOSITORY / "uwb_mitigation"
 
@@ -32,7 +32,9 @@ def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
 def test_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
     sources = REPOSITORY / folder
     objects = compile_objects(("cc",), (f"-I{sources}",), tuple(sorted(sources.glob("*.c"))))
-    symbols = {path: [line.split() for line in run(["nm", "-gP", path]).splitlines()] for path in objects}
+    symbols = {
+        path: [line.split() for line in run_tool(["nm", "-gP", path]).splitlines()] for path in objects
+    }
     owner = {name: path for path in objects for name, kind, *_ in symbols[path] if kind != "U"}
     TopologicalSorter(
         {

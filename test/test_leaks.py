@@ -22,7 +22,7 @@ from uwb_mitigation.commands.cli import app
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.data.splits import Group, Split
+from uwb_mitigation.training.data.splits import GroupKey, Split
 from uwb_mitigation.training.evaluation import baselines
 from uwb_mitigation.training.fit import linear_fit
 
@@ -154,7 +154,7 @@ def in_room_2(data: Dataset) -> NDArray[np.bool_]:
 
 
 def test_no_row_of_the_comparison_was_fitted_on_its_test_data(data, watch):
-    comparison.run(data, RECIPE, Group.CONFIGURATION, folds=2, seeds=1)
+    comparison.compare_models(data, RECIPE, GroupKey.CONFIGURATION, folds=2, seeds=1)
     watch.called("baselines.los_median", "baselines.overall_median", "baselines.ridge")
     watch.called(
         "baselines.gradient_boosting", "train.fit_with_card", "linear_fit.fit_linear_bias", "cards.calibrate"
@@ -196,14 +196,14 @@ def parts(data: Dataset) -> Parts:
 def test_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path):
     wanted = experiment.list_tasks(["remnet", "mlp"], [SAMPLES], seeds=1)
     with watch.without(parts(data).test.names):
-        experiment.run(parts(data), tmp_path, wanted, QUICK)
+        experiment.run_experiment(parts(data), tmp_path, wanted, QUICK)
     watch.called("experiment.calibrate", "fitting.fit")
     watch.called("baselines.los_median", "baselines.overall_median", "linear_fit.fit_linear_bias")
 
 
 @pytest.fixture
 def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
-    """Record the configurations of each call of `cards.calibrate`."""
+    """Record the configurations of each call of `cards.calibrate_quantization`."""
     calls: list[set[str]] = []
     calibrate = cards.calibrate
 

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from benchmarks.decoder import loopback
 from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
 
-A = Frame(MessageType.LOG, 0, 7, 123_456, b"first\0\0")
-B = Frame(MessageType.RANGE_CIR, 1, 8, 2**63, bytes(range(256)) * 3)
+A = WireFrame(MessageType.LOG, 0, 7, 123_456, b"first\0\0")
+B = WireFrame(MessageType.RANGE_CIR, 1, 8, 2**63, bytes(range(256)) * 3)
 
 frames = st.builds(
-    Frame,
+    WireFrame,
     st.integers(0, 255),
     st.integers(0, 2**16 - 1),
     st.integers(0, 2**32 - 1),
@@ -27,7 +27,7 @@ frames = st.builds(
 )
 
 
-def decode(data: bytes) -> list[Frame]:
+def decode(data: bytes) -> list[WireFrame]:
     return FrameDecoder().feed(data)
 
 

@@ -23,11 +23,11 @@ from uwb_mitigation.radios.wire.messages import (
     TimeSync,
     TimeSyncReply,
 )
-from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 
 HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.DEVICE, 99, 3, 4224, 1, 2, 3, "uwb-nano33")
 CORRECTION = Correction(
-    5, 1, 2, 3, 2**40 - 1, CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, Origin.DEVICE, 0xCAFE), 7100
+    5, 1, 2, 3, 2**40 - 1, CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, CorrectedBy.DEVICE, 0xCAFE), 7100
 )
 SMALL = [
     HELLO,

@@ -17,11 +17,11 @@ from uwb_mitigation.radios.wire.events import (
     ModeRefused,
     VersionMismatch,
 )
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder, encode_frame
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log
 from uwb_mitigation.radios.wire.session import BoardSession
-from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 
 MS = 10**6
 EPOCH = 1_760_000_000 * 10**9
@@ -33,7 +33,9 @@ class HalfMetre:
 
     def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
         return [
-            CorrectedRange(m.range_m - 0.5, m.range_m, 0.5, 0.01, Status.OK, Origin.HOST, IDENTITY.model_id)
+            CorrectedRange(
+                m.range_m - 0.5, m.range_m, 0.5, 0.01, Status.OK, CorrectedBy.HOST, IDENTITY.model_id
+            )
             for m in measurements
         ]
 
@@ -289,7 +291,7 @@ CORRECTION = Correction(0, 1, 2, 3, 4, HalfMetre().correct([measurement(1)])[0])
 def test_frames_that_are_not_delivered_are_counted(kind, flags, payload, counted):
     bench = connected()
     before = bench.session.totals()
-    frame = Frame(int(kind), flags, bench.session._next_sequence, 0, payload)
+    frame = WireFrame(int(kind), flags, bench.session._next_sequence, 0, payload)
 
     assert bench.host_hears(encode_frame(frame)) == []
     after = bench.session.totals()

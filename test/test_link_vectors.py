@@ -17,10 +17,17 @@ import pytest
 from uwb_mitigation.radios import settings as radio_settings
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, Role
 from uwb_mitigation.radios.wire import layout, messages
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import OffsetsAnswer, SetOffsets
-from uwb_mitigation.types.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import (
+    Cir,
+    CorrectedBy,
+    CorrectedRange,
+    Encoding,
+    RangeMeasurement,
+    Status,
+)
 from uwb_mitigation.types.offsets import Offsets
 
 FILE = Path(__file__).parent / "data" / "link_vectors.txt"
@@ -95,7 +102,7 @@ SENT = {
             2,
             3,
             4,
-            CorrectedRange(6.75, 7.3125, 0.5625, 0.0625, Status.OK, Origin.DEVICE, 0xDEADBEEF),
+            CorrectedRange(6.75, 7.3125, 0.5625, 0.0625, Status.OK, CorrectedBy.DEVICE, 0xDEADBEEF),
             7040,
         ),
         0,
@@ -109,7 +116,7 @@ SENT = {
             2,
             3,
             4,
-            CorrectedRange(math.nan, math.nan, 0.0, math.inf, Status.BAD_CIR, Origin.DEVICE, 0),
+            CorrectedRange(math.nan, math.nan, 0.0, math.inf, Status.BAD_CIR, CorrectedBy.DEVICE, 0),
         ),
         Flag.ANSWER,
         9,
@@ -148,9 +155,9 @@ SENT |= {
     "offsets": (OffsetsAnswer(4, 64, True), Flag.ANSWER, 13, 9_000_000),
     "get_radio": (messages.GetRadio(), 0, 2, 0),
     "set_radio": (messages.SetRadio(SETTINGS), 0, 3, 0),
-    "radio": (messages.Radio(SETTINGS, 3), Flag.ANSWER, 10, 8_000_000),
+    "radio": (messages.RadioConfigured(SETTINGS, 3), Flag.ANSWER, 10, 8_000_000),
     "radio_refused": (
-        messages.Radio(RadioSettings(), 3, False, "more anchors than 32"),
+        messages.RadioConfigured(RadioSettings(), 3, False, "more anchors than 32"),
         Flag.ANSWER,
         11,
         8_000_000,
@@ -172,7 +179,7 @@ SENT |= {
             RadioState.BUS,
             (
                 radio_settings.AnchorStatus(1, 20, 7, -80.5, 12),
-                radio_settings.AnchorStatus(2**64 - 2, 8, 0, math.nan, radio_settings.NEVER_MS),
+                radio_settings.AnchorStatus(2**64 - 2, 8, 0, math.nan, radio_settings.AGE_UNKNOWN_MS),
             ),
         ),
         0,
@@ -182,14 +189,14 @@ SENT |= {
 }
 
 
-def sent_frames() -> Iterator[tuple[str, Frame]]:
+def sent_frames() -> Iterator[tuple[str, WireFrame]]:
     for name, (message, flags, sequence, time_us) in SENT.items():
         kind, payload = messages.encode(message)
-        yield name, Frame(int(kind), int(flags), sequence, time_us, payload)
+        yield name, WireFrame(int(kind), int(flags), sequence, time_us, payload)
     # A receiver counts and skips unknown types; blocks of 254 bytes are a special case of COBS.
     for size in (253, 254, 255, 508):
-        yield f"unknown_{size}", Frame(200, 0x8000, size, 0, bytes(1 + i % 255 for i in range(size)))
-    yield "unknown_zeros", Frame(200, 0, 0, 0, bytes(300))
+        yield f"unknown_{size}", WireFrame(200, 0x8000, size, 0, bytes(1 + i % 255 for i in range(size)))
+    yield "unknown_zeros", WireFrame(200, 0, 0, 0, bytes(300))
 
 
 def rejected() -> Iterator[tuple[str, str, bytes]]:
@@ -202,7 +209,7 @@ def rejected() -> Iterator[tuple[str, str, bytes]]:
     yield "version_2", "foreign_version", b"\0" + stuffed(body + crc(body)) + b"\0"
 
 
-def value_lines(name: str, frame: Frame) -> Iterator[str]:
+def value_lines(name: str, frame: WireFrame) -> Iterator[str]:
     if frame.type not in layout.PAYLOADS:
         return
     table = layout.PAYLOADS[MessageType(frame.type)]
@@ -253,7 +260,7 @@ def test_file_equals_the_output_of_the_protocol():
 @pytest.mark.parametrize("line", lines_of("frame"), ids=lambda line: line[1])
 def test_vector_decodes_to_its_fields(line):
     _, _, *numbers, payload, wire = line
-    expected = Frame(*map(int, numbers), bytes.fromhex(payload) if payload != "-" else b"")
+    expected = WireFrame(*map(int, numbers), bytes.fromhex(payload) if payload != "-" else b"")
 
     assert FrameDecoder().feed(bytes.fromhex(wire)) == [expected]
 

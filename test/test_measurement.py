@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.types.measurement import Encoding, Origin, Status
+from uwb_mitigation.types.measurement import CorrectedBy, Encoding, Status
 from uwb_mitigation.types.ros.poses import tag_frame, tag_of_frame
 
 
 def test_constants_equal_those_of_the_messages():
     assert [status.value for status in Status] == [0, 1, 2, 3, 4]
-    assert (Origin.HOST, Origin.DEVICE) == (0, 1)
+    assert (CorrectedBy.HOST, CorrectedBy.DEVICE) == (0, 1)
     assert (Encoding.COMPLEX_INT16, Encoding.MAGNITUDE) == (0, 1)
 
 

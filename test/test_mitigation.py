@@ -14,7 +14,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
-from uwb_mitigation.types.measurement import Encoding, Origin, RadioType, Segment, Status
+from uwb_mitigation.types.measurement import CorrectedBy, Encoding, RadioType, Segment, Status
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 
 
@@ -83,7 +83,7 @@ def test_correction_is_linear_bias_plus_network_in_float32(mitigation):
     assert result.range_m == float(np.float32(3.1) - predicted)
     assert result.range_raw_m == 3.1
     assert result.variance_m2 == 0.0625
-    assert result.origin is Origin.HOST
+    assert result.origin is CorrectedBy.HOST
     assert result.model_id == mitigation.bundle.model_id
 
 

@@ -11,14 +11,14 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from rich.console import Console
 
 from uwb_mitigation.nodes.monitor import RangeStatistics, summary
-from uwb_mitigation.types.measurement import CorrectedRange, Origin, Status, Truth
+from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status, Truth
 from uwb_mitigation.types.ros.codec import MeasurementKey
 
 
 def corrected(
     statistics: RangeStatistics, sequence: int, raw: float, out: float, latency_s: float = 0.001
 ) -> None:
-    result = CorrectedRange(out, raw, raw - out, 0.04, Status.OK, Origin.HOST, 1)
+    result = CorrectedRange(out, raw, raw - out, 0.04, Status.OK, CorrectedBy.HOST, 1)
     key = MeasurementKey(sequence * 100_000_000, 1, 7, sequence)
     statistics.add_corrected(key, result, key.stamp_ns / 1e9 + latency_s)
 

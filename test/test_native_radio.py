@@ -29,7 +29,7 @@ from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, Role
 from uwb_mitigation.radios.spi import SpidevBus
-from uwb_mitigation.radios.wire.messages import Radio
+from uwb_mitigation.radios.wire.messages import RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
@@ -74,7 +74,7 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(
     anchor = RadioDriver(bus(f"{prefix}1"), RadioSettings(role=Role.ANCHOR))
     tag = RadioDriver(bus(f"{prefix}0"), RadioSettings())
     try:
-        (radio,) = wait_for(tag, Radio)
+        (radio,) = wait_for(tag, RadioConfigured)
         assert radio.settings.address
         assert radio.settings.antenna_delay == 2 * 16436
         for measured in wait_for(tag, RangeMeasurement, 10):
@@ -97,7 +97,7 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(
             wait_until(lambda: "is not there" in tag.report().problem)
             before = emulated.requests[0]
             emulated.plug(0)
-            wait_for(tag, Radio)
+            wait_for(tag, RadioConfigured)
             taken.append(emulated.requests[0] - before)
         assert 50 < min(taken) < 0.4 / ROUND_TRIP_S
         wait_for(tag, RangeMeasurement, 2)
@@ -113,7 +113,7 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(
         assert anchor.report().openings > openings
 
         tag.set_radio(RadioSettings(window=16))
-        wait_for(tag, Radio)
+        wait_for(tag, RadioConfigured)
         assert len(wait_for(tag, RangeMeasurement, 2)[-1].cir) == 16
     finally:
         tag.close()

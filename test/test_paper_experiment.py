@@ -35,7 +35,7 @@ def parts(seed: int = 0) -> Parts:
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("protocol")
     wanted = experiment.list_tasks(["remnet", "mlp"], [32], seeds=1)
-    return folder, experiment.run(parts(), folder, wanted, QUICK)
+    return folder, experiment.run_experiment(parts(), folder, wanted, QUICK)
 
 
 # --- the experiment ---
@@ -123,17 +123,17 @@ def test_finished_tasks_are_not_repeated_unless_damaged_or_of_other_data(finishe
         experiment, "train_task", lambda task, *rest: trained.append(task) or train(task, *rest)
     )
     wanted = [experiment.Task(model.network, model.samples, model.seed) for model in first.models]
-    assert experiment.run(parts(), folder, wanted, QUICK) == first
+    assert experiment.run_experiment(parts(), folder, wanted, QUICK) == first
     assert not trained
     copied = copytree(folder, tmp_path / "copy")
     journal = copied / experiment.JOURNAL
     lines = journal.read_text().splitlines()
     torn = next(line for line in lines if '"mlp_32_seed0"' in line)
     journal.write_text("\n".join(["[1]", "{}", *(line for line in lines if line != torn), torn[:90]]))
-    again = experiment.run(parts(), copied, wanted, QUICK)
+    again = experiment.run_experiment(parts(), copied, wanted, QUICK)
     assert trained == wanted[-1:]
     assert again.models[-1].mae_int8 == first.models[-1].mae_int8
-    other = experiment.run(parts(seed=5), copied, wanted[-1:], QUICK)
+    other = experiment.run_experiment(parts(seed=5), copied, wanted[-1:], QUICK)
     assert other.models[0].mae_raw != first.models[-1].mae_raw
 
 
@@ -141,7 +141,7 @@ def test_two_processes_give_the_same_models(tmp_path):
     wanted = experiment.list_tasks(["mlp"], [32], seeds=2)
     shares: list[float] = []
     one_worker, together = (
-        experiment.run(parts(), tmp_path / str(workers), wanted, QUICK, workers, shares.append)
+        experiment.run_experiment(parts(), tmp_path / str(workers), wanted, QUICK, workers, shares.append)
         for workers in (1, 2)
     )
     assert [m.mae_int8 for m in one_worker.models] == [m.mae_int8 for m in together.models]
@@ -153,7 +153,7 @@ def test_loss_that_diverges_ends_the_run(tmp_path, workers: int):
     bad = parts()
     bad = replace(bad, train=replace(bad.train, error_m=bad.train.error_m + 3e38))
     with pytest.raises(DatasetError):
-        experiment.run(bad, tmp_path, experiment.list_tasks(["mlp"], [32], 2), QUICK, workers)
+        experiment.run_experiment(bad, tmp_path, experiment.list_tasks(["mlp"], [32], 2), QUICK, workers)
 
 
 def test_shorter_windows_are_scaled_by_their_own_maximum():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.batch.smoother import smooth
-from uwb_mitigation.positioning.geometry import Area, Height, Shape, geometry, horizontal_ellipse, shape
+from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank, dop, horizontal_ellipse
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
@@ -304,11 +304,11 @@ def test_all_candidate_positions_are_found():
 
 def test_shapes_of_anchors_and_dilution():
     square = np.array([[0.0, 0, 2], [4, 0, 2], [4, 4, 2], [0, 4, 2]])
-    found = [shape(one) for one in (square[:1], square[:2], square, HALL.position)]
-    assert found == [Shape.POINT, Shape.LINE, Shape.PLANE, Shape.SPACE]
+    found = [anchor_rank(one) for one in (square[:1], square[:2], square, HALL.position)]
+    assert found == [AnchorRank.POINT, AnchorRank.LINE, AnchorRank.PLANE, AnchorRank.SPACE]
     middle = np.array([2.0, 2, 2])
-    assert geometry(square, middle, level=True).hdop == pytest.approx(1.0)
-    assert math.isinf(geometry(square[:2], np.array([2.0, 0, 2]), level=True).hdop)
+    assert dop(square, middle, level=True).hdop == pytest.approx(1.0)
+    assert math.isinf(dop(square[:2], np.array([2.0, 0, 2]), level=True).hdop)
 
 
 def test_errors_of_known_size():

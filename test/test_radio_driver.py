@@ -21,7 +21,7 @@ from benchmarks.equipment.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.nodes.feeds.radios import anchor_values, settings_of
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
-from uwb_mitigation.radios.settings import NEVER_MS, AnchorStatus, RadioSettings, RadioStatus, Role
+from uwb_mitigation.radios.settings import AGE_UNKNOWN_MS, AnchorStatus, RadioSettings, RadioStatus, Role
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
 pytestmark = [
@@ -103,7 +103,7 @@ def test_address_is_read_as_it_is_printed(address: int):
 
 def test_anchor_that_never_answered_has_no_last_seen_time():
     status = RadioStatus(
-        anchors=(AnchorStatus(7, 9, 0, np.nan, NEVER_MS), AnchorStatus(8, 9, 9, -80.0, 1500))
+        anchors=(AnchorStatus(7, 9, 0, np.nan, AGE_UNKNOWN_MS), AnchorStatus(8, 9, 9, -80.0, 1500))
     )
     never, recent = anchor_values(status).values()
     assert never == "0 of 9 ranged, nan dBm, last seen never"

@@ -10,7 +10,12 @@ import pytest
 from compilers import NEEDS_CC
 
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.mitigation.embedded.compiling import c_compiler, compile_objects, firmware_folder, run
+from uwb_mitigation.mitigation.embedded.compiling import (
+    c_compiler,
+    compile_objects,
+    firmware_folder,
+    run_tool,
+)
 
 SANITIZED = ("-std=c99", "-g", "-O1", "-fno-sanitize-recover=all")
 
@@ -33,12 +38,12 @@ def build(
     objects = compile_objects(compiler, options, tuple(sorted(others)))
     main = firmware / "test" / "fuzz_radio.c"
     program = folder / "fuzz_radio"
-    run([*compiler, *options, str(main), str(exchange), *objects, "-lm", "-o", str(program)])
+    run_tool([*compiler, *options, str(main), str(exchange), *objects, "-lm", "-o", str(program)])
     return program
 
 
 def test_arbitrary_frames_and_registers_yield_no_false_range(tmp_path: Path):
-    seen = run([str(build(tmp_path, c_compiler(), "-fsanitize=address,undefined")), "300", "1"])
+    seen = run_tool([str(build(tmp_path, c_compiler(), "-fsanitize=address,undefined")), "300", "1"])
     ranged, refused = (int(seen.split()[i]) for i in (0, 2))
     assert ranged > 1000
     assert refused > 5000
@@ -57,7 +62,7 @@ def test_arbitrary_frames_and_registers_yield_no_false_range(tmp_path: Path):
 def test_fuzzer_detects_an_exchange_without_one_of_its_checks(tmp_path: Path, check: tuple[str, str]):
     program = build(tmp_path, c_compiler(), broken=check)
     with pytest.raises(UwbMitigationError, match="exit -6"):
-        run([str(program), "300", "1"])
+        run_tool([str(program), "300", "1"])
 
 
 @pytest.mark.skipif(shutil.which("clang") is None, reason="no clang: apt install clang")

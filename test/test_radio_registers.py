@@ -16,7 +16,7 @@ from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.nodes.feeds import radios as live_feeds
 from uwb_mitigation.radios.dw1000 import structures
-from uwb_mitigation.radios.dw1000.native import NativeRadio, load
+from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -254,9 +254,9 @@ def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refuse
     """FINAL must not be sent within 1 ms after POLL with more power than the average limit."""
     config = structures.config(RadioSettings(rate_kbps=rate_kbps, preamble=64))
     config.reply_us = 999
-    radio = load().native_radio_new(ctypes.byref(structures.Io()), ctypes.byref(config), 1)
-    assert (load().native_radio_configure(radio, ctypes.byref(config)) is not None) == refused
-    load().native_radio_free(radio)
+    radio = load_native().native_radio_new(ctypes.byref(structures.Io()), ctypes.byref(config), 1)
+    assert (load_native().native_radio_configure(radio, ctypes.byref(config)) is not None) == refused
+    load_native().native_radio_free(radio)
 
 
 class StickyStatusBus(ModelBus):

@@ -38,8 +38,8 @@ from uwb_mitigation.nodes.support.diagnostics import (
     OUT_OF_DISTRIBUTION,
     SLOW,
     LossCounter,
-    Meter,
     MitigatorHealth,
+    RateMonitor,
 )
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Status
@@ -174,7 +174,7 @@ def test_diagnostics_continue_while_simulated_time_is_paused(ros: Ros):
 
 def test_rate_is_counted_on_the_nodes_clock():
     now_ns = [0]
-    meter = Meter(lambda: now_ns[0])
+    meter = RateMonitor(lambda: now_ns[0])
     for _ in range(50):
         meter.add(2_000_000)
     now_ns[0] = 5_000_000_000

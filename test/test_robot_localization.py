@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.simulation.odometry import RobotMotion
+from uwb_mitigation.simulation.odometry import SimulatedMotion
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.tracks import Ranges, Track
@@ -35,7 +35,7 @@ class Drive:
     """What the filter receives, the live track of the locator, and the truth at the stamps of the odometry."""
 
     track: Track
-    motion: RobotMotion
+    motion: SimulatedMotion
 
     def turned(self, angle: float) -> Drive:
         """Return the same drive in a site that is rotated by an angle."""
@@ -45,7 +45,7 @@ class Drive:
         covariance[:, :2, :2] = turn @ covariance[:, :2, :2] @ turn.T
         track = replace(self.track, position=position, covariance=covariance)
         motion = self.motion
-        rotated = RobotMotion(motion.position @ turn.T, motion.yaw + angle, motion.odometry, motion.imu)
+        rotated = SimulatedMotion(motion.position @ turn.T, motion.yaw + angle, motion.odometry, motion.imu)
         return Drive(track, rotated)
 
     def fuse(self, rate_hz: float, noise_factor: float = 1.0) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.anchor_errors import position_scatter
 from uwb_mitigation.positioning.batch.motion_segments import find_segments
 from uwb_mitigation.positioning.batch.pose_alignment import align_poses
-from uwb_mitigation.positioning.batch.self_calibration import calibrate
+from uwb_mitigation.positioning.batch.self_calibration import self_calibrate
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import SLOPE_SD, NoiseModel, Regressors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
@@ -33,7 +33,7 @@ def minute():
 
 @pytest.fixture(scope="module")
 def solved(minute):
-    return calibrate(HALL, [with_own(minute[0])], height=LEVEL)
+    return self_calibrate(HALL, [with_own(minute[0])], height=LEVEL)
 
 
 def places_at_rest(count=12, seed=3, slope=-0.02):
@@ -71,7 +71,7 @@ def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved
     assert 0.3 < np.sqrt(np.mean((error / solved.pseudo_sd_m) ** 2)) < 2.0
     # Ranges of the anchor itself are not used: wrong ones do not move the tag.
     changed = with_own(ranges, np.array([0.0, 0.0, 0.9, 0.0, 0.0]))
-    again = calibrate(HALL, [changed], height=LEVEL)
+    again = self_calibrate(HALL, [changed], height=LEVEL)
     own = ranges.anchor == 2
     assert np.abs(again.pseudo_m - truth)[own].mean() < 0.15
 
@@ -80,19 +80,19 @@ def test_held_out_ranges_do_not_affect_the_offsets(solved, minute):
     ranges = with_own(minute[0])
     late = ranges.stamp_ns > 30 * 10**9
     changed = replace(ranges, range_m=ranges.range_m + np.where(late & (ranges.anchor == 2), 0.5, 0.0))
-    found = calibrate(HALL, [changed], height=LEVEL)
-    again = found.without_ranges(found.segments.ranges.stamp_ns > 30 * 10**9)
+    found = self_calibrate(HALL, [changed], height=LEVEL)
+    again = found.raw_only(found.segments.ranges.stamp_ns > 30 * 10**9)
     before, after = (np.array([one.pair(0, row)[0] for row in range(5)]) for one in (found, again))
     assert after[2] < before[2] - 0.05
     assert np.abs(after - 0.25 - OWN).max() < 0.15
     assert (again.pseudo_m == found.pseudo_m).all()
     # Nothing is held out, as before.
-    same = solved.without_ranges(np.zeros(len(ranges), bool))
+    same = solved.raw_only(np.zeros(len(ranges), bool))
     assert np.abs(same.fit.parameters - solved.fit.parameters).max() < 2e-3
 
 
 def test_common_offset_is_selected_if_pairs_do_not_differ(minute):
-    found = calibrate(HALL, [minute[0]], height=LEVEL)
+    found = self_calibrate(HALL, [minute[0]], height=LEVEL)
     assert found.level == "one"
     assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.05)
     assert any("share one" in note for note in found.notes)
@@ -108,7 +108,7 @@ def test_ranges_with_larger_errors_have_lower_weights(minute):
     nothing = Regressors.none(len(ranges))
 
     def worst(noise_group):
-        found = calibrate(HALL, [changed], replace(nothing, noise_group=noise_group), height=LEVEL)
+        found = self_calibrate(HALL, [changed], replace(nothing, noise_group=noise_group), height=LEVEL)
         return np.abs([found.pair(0, row)[0] - 0.25 - OWN[row] for row in range(5)]).max()
 
     assert worst(blocked.astype(int)) < 0.07 < worst(nothing.noise_group)
@@ -118,7 +118,7 @@ def test_dozen_unknown_positions_determine_offset_and_line():
     anchors, tags, truth = places_at_rest()
     power = np.concatenate([one.rx_power_dbm for one in tags])
     level = Regressors.one("level", power + 88, 0.0, SLOPE_SD)
-    found = calibrate(anchors, tags, level, height=LEVEL)
+    found = self_calibrate(anchors, tags, level, height=LEVEL)
     assert found.segments.is_stationary.all()
     assert found.value("offset")[0] == pytest.approx(0.1, abs=0.06)
     assert found.value("level")[0] == pytest.approx(-0.02, abs=0.006)
@@ -167,7 +167,7 @@ def test_stationary_segment_of_a_drive_is_one_position():
 
 def refused(match, anchors, tags, **options):
     with pytest.raises(DatasetError, match=match):
-        calibrate(anchors, tags, **options)
+        self_calibrate(anchors, tags, **options)
 
 
 def test_unobservable_calibration_is_refused(minute):
@@ -208,7 +208,7 @@ def test_heavy_tail_accuses_no_anchor(minute):
     rng = np.random.default_rng(4)
     blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
     tail = np.where(blocked, rng.exponential(1.5, len(ranges)), 0.0)
-    calibrate(HALL, [replace(ranges, range_m=ranges.range_m + tail)], height=LEVEL)
+    self_calibrate(HALL, [replace(ranges, range_m=ranges.range_m + tail)], height=LEVEL)
 
 
 def test_offset_that_slow_errors_can_explain_is_not_subtracted():
@@ -223,7 +223,7 @@ def test_offset_that_slow_errors_can_explain_is_not_subtracted():
     )
     slow = np.random.default_rng(1).normal(0.0, 0.07, (5, 10))
     late = slow[ranges.anchor, ranges.stamp_ns // 20_000_000_000]
-    found = calibrate(near, [replace(ranges, range_m=ranges.range_m + late)], height=LEVEL)
+    found = self_calibrate(near, [replace(ranges, range_m=ranges.range_m + late)], height=LEVEL)
     assert [found.applied(0, row)[0] for row in range(5)] == [0.0] * 5
     assert found.applied(0, 0)[1] > 0.5
     assert any("not significant" in note for note in found.notes)
@@ -232,7 +232,7 @@ def test_offset_that_slow_errors_can_explain_is_not_subtracted():
 def test_anchor_with_few_ranges_gets_the_common_offset(minute):
     ranges = with_own(minute[0])
     few = np.isin(np.arange(len(ranges)), np.flatnonzero(ranges.anchor == 4)[:1])
-    found = calibrate(HALL, [ranges.take(few | (ranges.anchor != 4))], height=LEVEL)
+    found = self_calibrate(HALL, [ranges.take(few | (ranges.anchor != 4))], height=LEVEL)
     assert found.level == "pair"
     assert found.pair(0, 4)[0] == found.value("offset")[0]
     # The others have a standard deviation of 0.16 m, which also applies to this one.
@@ -244,7 +244,7 @@ def test_anchor_with_few_ranges_gets_the_common_offset(minute):
 def test_area_excludes_the_mirror_image_in_a_plane():
     flat = HALL.moved(HALL.position * (1, 1, 0) + (0, 0, 2.5), HALL.sd)
     ranges, _ = drive(flat, seconds=60, rate_hz=25.0, offset_m=0.25)
-    found = calibrate(flat, [ranges], area=Area((-1.0, -1.0, 0.0), (13.0, 10.0, 2.0)))
+    found = self_calibrate(flat, [ranges], area=Area((-1.0, -1.0, 0.0), (13.0, 10.0, 2.0)))
     assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.06)
     assert found.fit.position[:, 2].max() < 2.5
 
@@ -314,10 +314,10 @@ def test_measured_heights_replace_a_constant_one():
     ranges, path = drive(seconds=60, rate_hz=20.0, offset_m=0.25, path=up_and_down)
     truth = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
     measured, uncertain = (
-        calibrate(HALL, [ranges], heights_m=path.position[:, 2], height_sd_m=sd) for sd in (0.1, 0.5)
+        self_calibrate(HALL, [ranges], heights_m=path.position[:, 2], height_sd_m=sd) for sd in (0.1, 0.5)
     )
     assert np.median(uncertain.pseudo_sd_m) > 1.2 * np.median(measured.pseudo_sd_m)
-    constant = calibrate(HALL, [ranges], height=LEVEL)
+    constant = self_calibrate(HALL, [ranges], height=LEVEL)
     assert measured.pair(0, 0)[0] == pytest.approx(0.25, abs=0.06)
     wrong = [np.median(np.abs(one.pseudo_m - truth)) for one in (measured, constant)]
     assert wrong[0] < 0.06 < wrong[1]

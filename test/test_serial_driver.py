@@ -29,7 +29,7 @@ from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import BoardDriver
 from uwb_mitigation.radios.wire.messages import Hello
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.types.measurement import Origin
+from uwb_mitigation.types.measurement import CorrectedBy
 from uwb_mitigation.types.offsets import Offsets
 
 pytestmark = pytest.mark.ros
@@ -107,7 +107,7 @@ def test_correction_on_the_board_equals_that_on_the_host(ros: Ros, link: Path):
         drive(ros, link, "mode:=device")
         ros.spin_until(lambda: len(corrected) >= 60)
     for message in corrected:
-        assert message.source == Origin.DEVICE
+        assert message.source == CorrectedBy.DEVICE
         assert message.model_id == host.bundle.model_id
         assert message.range == np.float32(expected[message.sequence].range_m)
         assert message.variance == np.float32(expected[message.sequence].variance_m2)
@@ -120,7 +120,11 @@ def test_mode_changes_without_a_restart(ros: Ros, link: Path):
     ros.start("mitigator").wait_for_output("correcting with model")
     with board(link, model=True, rate_hz=200.0):
         driver = drive(ros, link)
-        for mode, origin in (("host", Origin.HOST), ("device", Origin.DEVICE), ("host", Origin.HOST)):
+        for mode, origin in (
+            ("host", CorrectedBy.HOST),
+            ("device", CorrectedBy.DEVICE),
+            ("host", CorrectedBy.HOST),
+        ):
             assert ros.set_parameter("driver", "mode", mode).successful
             ros.spin_until(lambda o=origin: [m.source for m in corrected[-20:]] == [o] * 20)
         assert not ros.set_parameter("driver", "mode", "sideways").successful

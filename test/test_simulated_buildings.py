@@ -56,7 +56,7 @@ def test_error_contains_only_the_channel(dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("kind", WIDE_KINDS, ids=lambda kind: kind.name)
-def test_plans_match_their_kind(kind: buildings.Kind) -> None:
+def test_plans_match_their_kind(kind: buildings.BuildingType) -> None:
     rng = np.random.default_rng(0)
     plans = [draw_plan(kind, rng) for _ in range(30)]
     for plan in plans:

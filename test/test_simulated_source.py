@@ -17,8 +17,8 @@ from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.recordings.mcap import McapRecording
-from uwb_mitigation.simulation.radio import TAPS, Radio
-from uwb_mitigation.simulation.scene import ROUTE, FloorPlan, along_route
+from uwb_mitigation.simulation.radio import TAPS, Receiver
+from uwb_mitigation.simulation.scene import ROUTE, Building, along_route
 from uwb_mitigation.simulation.simulated import FIRST_TAG_ID, NOT_RECEIVED, SimulatedSource, SimulatedSurvey
 from uwb_mitigation.types.measurement import Record
 
@@ -73,7 +73,7 @@ def test_truth_is_the_distance_between_anchor_and_robot() -> None:
 
 
 def test_exchanges_that_are_not_received_are_counted() -> None:
-    source = SimulatedSource(count=400, radio=Radio(tx_power_dbm=-30.0))
+    source = SimulatedSource(count=400, radio=Receiver(tx_power_dbm=-30.0))
     received = len(list(source))
     assert 0 < received < 400
     assert source.skipped == {NOT_RECEIVED: 400 - received}
@@ -83,7 +83,7 @@ def test_exchanges_that_are_not_received_are_counted() -> None:
 
 def test_line_of_sight_errors_centre_on_the_offset(survey: list[Record]) -> None:
     error = errors_of(survey, "LOS")
-    assert np.median(error) == pytest.approx(Radio().range_offset_m, abs=0.02)
+    assert np.median(error) == pytest.approx(Receiver().range_offset_m, abs=0.02)
     assert np.percentile(error, 75) - np.percentile(error, 25) < 0.06
 
 
@@ -169,7 +169,7 @@ def test_invalid_simulation_is_refused(tmp_path: Path, words: list[str], excerpt
         (lambda: SimulatedSource(route=((0.0, 0.0), (1.0, 1.0))), "route", "2", "3 to 10000"),
         (lambda: SimulatedSurvey(configurations=0), "configurations", "0", "1 to"),
         (lambda: SimulatedSurvey(exchanges=1001), "exchanges", "1001", "1 to 1000"),
-        (lambda: SimulatedSurvey(plan=FloorPlan((1.0, 9.0))), "plan size in x", "1.0", "2 to 1000"),
+        (lambda: SimulatedSurvey(plan=Building((1.0, 9.0))), "plan size in x", "1.0", "2 to 1000"),
     ],
 )
 def test_invalid_parameter_is_refused(make: Callable[[], object], name: str, value: str, valid: str) -> None:

@@ -15,14 +15,14 @@ from uwb_mitigation.simulation.radio import (
     PULSE_PEAK,
     TAP_NS,
     TAPS,
-    Radio,
+    Receiver,
     pulse,
 )
 from uwb_mitigation.simulation.scene import (
     BRICK,
     FLAT,
     ROUTE,
-    FloorPlan,
+    Building,
     Screen,
     Wall,
     along_route,
@@ -30,7 +30,7 @@ from uwb_mitigation.simulation.scene import (
     through_slab,
 )
 
-QUIET = Radio(range_offset_m=0.0, timestamp_std_m=0.0)
+QUIET = Receiver(range_offset_m=0.0, timestamp_std_m=0.0)
 
 
 def rng(seed: int = 7) -> np.random.Generator:
@@ -63,7 +63,7 @@ def test_wall_delays_by_its_optical_thickness_and_weakens() -> None:
 
 
 def test_walls_count_only_where_the_line_crosses_them() -> None:
-    plan = FloorPlan((4.0, 4.0), (Wall((2, 0), (2, 2), BRICK, 0.1), Wall((3, 0), (3, 2), BRICK, 0.1)))
+    plan = Building((4.0, 4.0), (Wall((2, 0), (2, 2), BRICK, 0.1), Wall((3, 0), (3, 2), BRICK, 0.1)))
     a = np.array([[1.0, 1.0], [1.0, 3.0], [2.5, 1.0]])
     b = np.array([[3.5, 1.0], [3.5, 3.0], [3.5, 1.0]])
     path = plan.direct_path(a, b)
@@ -73,7 +73,7 @@ def test_walls_count_only_where_the_line_crosses_them() -> None:
 
 
 def test_path_is_diffracted_at_the_nearer_edge_of_a_screen() -> None:
-    plan = FloorPlan((4.0, 4.0), screens=(Screen("cabinet", (2.0, 0.0), (2.0, 1.5)),))
+    plan = Building((4.0, 4.0), screens=(Screen("cabinet", (2.0, 0.0), (2.0, 1.5)),))
     path = plan.direct_path(np.array([[1.0, 1.0]]), np.array([[3.0, 1.0]]))
     detour = 2 * math.hypot(1.0, 0.5) - 2.0
     assert path.excess_m[0] == pytest.approx(detour)

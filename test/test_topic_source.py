@@ -27,7 +27,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError
 from uwb_mitigation.nodes.feeds.topic import TopicFeed, message_type
-from uwb_mitigation.recordings.mapping.mapping import Drop, Mapping, Value, load_mapping
+from uwb_mitigation.recordings.mapping.mapping import FieldRule, Mapping, RowFilter, load_mapping
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -256,8 +256,8 @@ def test_types_and_mappings_that_cannot_be_used_are_errors():
     with pytest.raises(ParameterError, match="eWINE is for recordings"):
         Convert("ewine")
     mapping = load_mapping("sensor_range")
-    names = Value(column="header.frame_id", names=True)
+    names = FieldRule(column="header.frame_id", names=True)
     with pytest.raises(ParameterError, match="numbers texts"):
         Convert(mapping.model_copy(update={"fields": mapping.fields.model_copy(update={"anchor": names})}))
     with pytest.raises(ParameterError, match="from_median"):
-        Convert(mapping.model_copy(update={"drop": [Drop(column="range", from_median=1.0)]}))
+        Convert(mapping.model_copy(update={"drop": [RowFilter(column="range", from_median=1.0)]}))

@@ -26,7 +26,14 @@ from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.opening import open_recording
 from uwb_mitigation.recordings.recorded_ranges import TagRecording
 from uwb_mitigation.types.anchors import anchors_path, dump_anchors, parse_anchors
-from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement, Record, Status
+from uwb_mitigation.types.measurement import (
+    Cir,
+    CorrectedBy,
+    CorrectedRange,
+    RangeMeasurement,
+    Record,
+    Status,
+)
 from uwb_mitigation.types.ros.poses import encode_pose
 from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, POSE_TYPE
 from uwb_mitigation.types.tracks import Estimate, Ranges, TruePath
@@ -48,7 +55,7 @@ def write_drive(
             writer.write(Record(measured, tag_position=tuple(at.tolist())))
             if too_long_m:
                 corrected = CorrectedRange(
-                    good, good + too_long_m, too_long_m, 0.01, Status.OK, Origin.HOST, 1
+                    good, good + too_long_m, too_long_m, 0.01, Status.OK, CorrectedBy.HOST, 1
                 )
                 write_corrected(writer, measured, corrected)
             if i % 4 == 0:

@@ -17,8 +17,8 @@ from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterErr
 from uwb_mitigation.radios.fira import messages
 from uwb_mitigation.radios.fira.capture import FIRST_LINE, CaptureWriter, UciCapture
 from uwb_mitigation.radios.fira.cir import read_cir
-from uwb_mitigation.radios.fira.joining import Joiner
-from uwb_mitigation.radios.fira.messages import Diagnostics, Kind
+from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher
+from uwb_mitigation.radios.fira.messages import Diagnostics, MessageType
 from uwb_mitigation.radios.fira.packets import MAX_GAP_NS, PacketDecoder, encode
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.settings import Role
@@ -414,7 +414,7 @@ def test_a_capture_that_is_damaged_is_refused(tmp_path, text: str, error: type):
 
 def test_responses_have_no_effect_before_their_command():
     run = Bench()
-    run.step(encode(*messages.RANGE_START, b"\0", Kind.RESPONSE) * 10)
+    run.step(encode(*messages.RANGE_START, b"\0", MessageType.RESPONSE) * 10)
     assert run.session.state
 
 
@@ -422,7 +422,7 @@ def test_the_benchmark_finds_no_wrong_join_but_would_find_one(monkeypatch: pytes
     result = uci.joins(1000, 16, 0.05, 0.01, 1, lambda _: None)
     assert (result.wrong, result.exchanges) == (0, 1000)
     assert result.with_cir > 300
-    monkeypatch.setattr(Joiner, "_accept", lambda *_, **__: True)
+    monkeypatch.setattr(DiagnosticsMatcher, "_accept", lambda *_, **__: True)
     monkeypatch.setattr(UciBoardModel, "diagnostics_packet", _previous_cir(UciBoardModel.diagnostics_packet))
     assert uci.joins(200, 16, 0.0, 0.0, 1, lambda _: None).wrong > 100
 
@@ -558,7 +558,7 @@ class Chatty(UciBoardModel):
             payload += b"\1\2\3"
         if name == messages.RANGE_DIAGNOSTICS:
             payload = payload[:12] + bytes([payload[12] + 1, 0x77, 3, 0, 1, 2, 3]) + payload[13:]
-        return encode(0xA, 0x3E, b"new", Kind.NOTIFICATION) + super()._notify(name, payload)
+        return encode(0xA, 0x3E, b"new", MessageType.NOTIFICATION) + super()._notify(name, payload)
 
 
 class Active(UciBoardModel):

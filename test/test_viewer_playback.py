@@ -42,7 +42,7 @@ from uwb_mitigation.types.ros.topics import (
 )
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import playback
-from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import AnchorPosition, Scene
@@ -74,7 +74,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def open_bag(path: Path, namespace: str | None = None) -> tuple[BagPlayer, Scene]:
     scene = Scene()
-    feed = Feed(scene, threading.Lock())
+    feed = SceneUpdater(scene, threading.Lock())
     return BagPlayer(path, feed, lambda: Mitigation(load_bundle(default_model_path())), namespace), scene
 
 
@@ -213,7 +213,7 @@ def test_truncated_bag_is_shown_up_to_the_damage(bag: Path, tmp_path: Path):
 
 def test_anchor_id_above_64_bits_is_ignored() -> None:
     scene = Scene()
-    feed = Feed(scene, threading.Lock())
+    feed = SceneUpdater(scene, threading.Lock())
     pose = SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=3.0))
     texts = "1" * 5000, str(2**64 - 1)
     feed.markers(
@@ -224,7 +224,7 @@ def test_anchor_id_above_64_bits_is_ignored() -> None:
 
 def test_implausible_values_of_standard_messages_are_ignored() -> None:
     scene = Scene()
-    feed = Feed(scene, threading.Lock())
+    feed = SceneUpdater(scene, threading.Lock())
     for covariance in (1.7e308, float("inf"), float("nan"), -1.0):
         pose = SimpleNamespace(
             position=SimpleNamespace(x=1.0, y=2.0, z=float("nan")),

@@ -30,8 +30,8 @@ def maes(found: ZeroShot) -> list[float]:
 
 
 def test_offsets_remove_a_constant_of_the_boards(model, data):
-    moved = zero_shot.run(replace(data, error_m=data.error_m + 3.0), model)
-    still = zero_shot.run(data, model)
+    moved = zero_shot.evaluate_zero_shot(replace(data, error_m=data.error_m + 3.0), model)
+    still = zero_shot.evaluate_zero_shot(data, model)
     assert moved.los_offset_m == pytest.approx(still.los_offset_m + 3.0)
     assert maes(moved)[1:] == pytest.approx(maes(still)[1:])
     assert maes(moved)[0] > maes(still)[0] + 1.0
@@ -39,12 +39,14 @@ def test_offsets_remove_a_constant_of_the_boards(model, data):
 
 def test_offset_of_a_placement_is_from_the_other_placements(model, data):
     odd = data.configurations == data.names[0]
-    moved = zero_shot.run(replace(data, error_m=data.error_m + np.where(odd, 50.0, 0.0)), model)
+    moved = zero_shot.evaluate_zero_shot(
+        replace(data, error_m=data.error_m + np.where(odd, 50.0, 0.0)), model
+    )
     assert np.abs(moved.errors["universal_offset"][odd]).min() > 45.0
 
 
 def test_without_a_los_placement_there_is_no_offset(model, data):
-    blind = zero_shot.run(replace(data, labels=np.full(len(data), "NLOS")), model)
+    blind = zero_shot.evaluate_zero_shot(replace(data, labels=np.full(len(data), "NLOS")), model)
     assert blind.los_offset_m == 0.0
     assert (blind.errors["universal_los_offset"] == blind.errors["universal"]).all()
 
@@ -53,7 +55,7 @@ def test_refused_ranges_are_unchanged(tmp_path, data):
     narrow_limits = bundle(
         tmp_path, linear_bias=LinearBiasModel(0.0), correction_limits_m=(-(2.0**-20), 2.0**-20)
     )
-    found = zero_shot.run(data, narrow_limits)
+    found = zero_shot.evaluate_zero_shot(data, narrow_limits)
     assert found.passed_through.all()
     assert (found.errors["universal"] == data.error_m).all()
     assert (found.variance_m2 == np.float32(narrow_limits.card.variance_uncorrected_m2)).all()

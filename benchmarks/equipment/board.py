@@ -12,7 +12,7 @@ from typing import Protocol
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, MAX_PAYLOAD_BYTES, PROTOCOL_VERSION, Flag, Mode
 from uwb_mitigation.radios.wire.messages import (
     BoardStatus,
@@ -117,7 +117,7 @@ class Board:
             sent += self.hello(now_us)
         return sent
 
-    def _answer(self, frame: Frame, now_us: int) -> bytes:
+    def _answer(self, frame: WireFrame, now_us: int) -> bytes:
         try:
             message = messages.decode(frame.type, frame.payload)
         except LinkError:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
-from uwb_mitigation.mitigation.embedded.compiling import run
+from uwb_mitigation.mitigation.embedded.compiling import run_tool
 from uwb_mitigation.mitigation.embedded.toolchain import Image, Kernels, Target, build_image, require_tools
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -156,7 +156,7 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
     folder = image.elf.parent
     _write_input(folder, _WINDOWS, np.ascontiguousarray(window[None], np.float32))
     trace = folder / "trace.txt"
-    run([*_command(image), "-singlestep", "-d", "exec,nochain", "-D", str(trace)], folder=folder)
+    run_tool([*_command(image), "-singlestep", "-d", "exec,nochain", "-D", str(trace)], folder=folder)
     symbols = _symbols(image)
     start = symbols["uwb_network"][0]
     first, last = symbols["run_window"]
@@ -185,7 +185,7 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
 def _symbols(image: Image) -> dict[str, tuple[int, int]]:
     """Return {function: (first address, one past the last)}."""
     found = {}
-    for line in run(["arm-none-eabi-nm", "--print-size", "--defined-only", str(image.elf)]).splitlines():
+    for line in run_tool(["arm-none-eabi-nm", "--print-size", "--defined-only", str(image.elf)]).splitlines():
         fields = line.split()
         if len(fields) == 4:
             start = int(fields[0], 16)
@@ -213,7 +213,7 @@ def _run(image: Image, kind: int, rows: NDArray[np.generic], record: np.dtype[np
     _write_input(folder, kind, rows)
     output = folder / "output.bin"
     output.unlink(missing_ok=True)
-    run(_command(image), _TIMEOUT_S, folder)
+    run_tool(_command(image), _TIMEOUT_S, folder)
     data = output.read_bytes() if output.is_file() else b""
     expected = len(rows) * record.itemsize + _REPORT.itemsize
     if len(data) != expected:
@@ -252,7 +252,7 @@ def estimate_cycles(image: Image, executed: Counter[tuple[int, bool]]) -> int:
         UwbMitigationError: an address is not that of an instruction in the image.
     """
     instructions = {}
-    for line in run(["arm-none-eabi-objdump", "-d", "-w", str(image.elf)]).splitlines():
+    for line in run_tool(["arm-none-eabi-objdump", "-d", "-w", str(image.elf)]).splitlines():
         match = _LINE.match(line)
         if match:
             instructions[int(match.group(1), 16)] = match.group(2), match.group(3) or ""

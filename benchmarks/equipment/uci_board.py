@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from benchmarks.equipment.emulated_board import PseudoTerminal
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.radios.fira import messages
-from uwb_mitigation.radios.fira.messages import Kind, SessionState
+from uwb_mitigation.radios.fira.messages import MessageType, SessionState
 from uwb_mitigation.radios.fira.packets import encode
 
 TAPS, LEAD = "rx_diag_config.cir_n_taps", "rx_diag_config.cir_fp_tap_offset"
@@ -140,7 +140,7 @@ class UciBoardModel:
             first, opcode, _, length = self._buffer[:4]
             self._parts += self._buffer[4 : 4 + length]
             del self._buffer[: 4 + length]
-            if first >> 5 != Kind.COMMAND:
+            if first >> 5 != MessageType.COMMAND:
                 self._parts.clear()
             elif not first & 0x10:
                 payload = bytes(self._parts)
@@ -290,10 +290,10 @@ class UciBoardModel:
         return self._notify(messages.SESSION_STATUS, struct.pack("<IBB", handle, state, 0))
 
     def _respond(self, name: tuple[int, int], payload: bytes) -> bytes:
-        return encode(*name, payload, Kind.RESPONSE, _FRAGMENT_BYTES)
+        return encode(*name, payload, MessageType.RESPONSE, _FRAGMENT_BYTES)
 
     def _notify(self, name: tuple[int, int], payload: bytes) -> bytes:
-        return encode(*name, payload, Kind.NOTIFICATION, _FRAGMENT_BYTES)
+        return encode(*name, payload, MessageType.NOTIFICATION, _FRAGMENT_BYTES)
 
 
 def _field(kind: int, data: bytes) -> bytes:

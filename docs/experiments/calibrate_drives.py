@@ -5,7 +5,7 @@ own offsets, one drive for calibration and another one for the test. The result 
 the same drive, and with the universal model and the true offsets.
 
 Seeds 0 to 9 were used for development; results are reported for seeds 10 to 19. For the first five of these, the MAE of
-`calibrate` is 0.124 m and of `train` 0.157 m. With a localisation that lags by 0.3 s, the time offset is found to 20 ms and the lever
+`calibrate_site` is 0.124 m and of `train` 0.157 m. With a localisation that lags by 0.3 s, the time offset is found to 20 ms and the lever
 arm to 10 mm. Thirty minutes at 40 ranges per second take 26 s and 775 MB.
 
     python docs/experiments/calibrate_drives.py --first 10 --seeds 10 -o drives.json
@@ -37,7 +37,7 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.simulation.buildings import RADIO
-from uwb_mitigation.simulation.odometry import RobotMotion
+from uwb_mitigation.simulation.odometry import SimulatedMotion
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.training import train
@@ -84,7 +84,7 @@ class Drive:
         self.anchors: AnchorMap = self._inner.anchors
         self.name = self._inner.name
 
-    def motion(self) -> RobotMotion:
+    def motion(self) -> SimulatedMotion:
         """Return the motion of the robot that carries the tag, with its odometry."""
         return self._inner.motion()
 
@@ -162,7 +162,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
         )
     else:
         solution = site_solution.solve_without_truth(site, universal, height=height, area=None)
-    found = site_calibration.calibrate(site, universal, solution, seed=0)
+    found = site_calibration.calibrate_site(site, universal, solution, seed=0)
     took = time.perf_counter() - began
     test = list(other)
     off = np.array(
@@ -224,7 +224,7 @@ def speed(minutes: float) -> dict[str, object]:
     site = read_site([drive], drive.anchors, universal.card)
     began, cpu = time.perf_counter(), time.process_time()
     solution = site_solution.solve_without_truth(site, universal, height=Height(0.0, 0.05), area=None)
-    found = site_calibration.calibrate(site, universal, solution, seed=0)
+    found = site_calibration.calibrate_site(site, universal, solution, seed=0)
     return {
         "minutes": minutes,
         "ranges": sum(map(len, site.tags)),

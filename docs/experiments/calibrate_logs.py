@@ -33,7 +33,7 @@ from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.recordings.decaranging import DecaRangingFolder
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.opening import open_mapped
-from uwb_mitigation.training.site.calibration import SiteCalibration, calibrate
+from uwb_mitigation.training.site.calibration import SiteCalibration, calibrate_site
 from uwb_mitigation.training.site.data import read_site
 from uwb_mitigation.training.site.solution import solve_without_truth
 from uwb_mitigation.types.anchors import AnchorMap
@@ -49,7 +49,7 @@ def calibrated(
 ) -> SiteCalibration:
     """Calibrate a site from one recording, without ground truth."""
     site = read_site([records], anchors, source.card)
-    return calibrate(site, source, solve_without_truth(site, source, height=height, area=None), seed=0)
+    return calibrate_site(site, source, solve_without_truth(site, source, height=height, area=None), seed=0)
 
 
 def show(found: SiteCalibration) -> None:

@@ -88,7 +88,7 @@ for group, seeds in (("configuration", splits_by_configuration), ("tag", 1), ("h
     maes, selected = [], []
     for seed in range(seeds):
         errors_by_name = {}
-        for split in splits.by_group(final, splits.Group(group), 6, seed):
+        for split in splits.by_group(final, splits.GroupKey(group), 6, seed):
             train, test = split.train, split.test
             found = {
                 name: predicted(final, columns, train, test) for name, columns in candidate_columns.items()

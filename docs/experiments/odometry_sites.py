@@ -46,7 +46,7 @@ def corrected_drive(seed: int, seconds: float) -> tuple[EstimatorConfig, Ranges,
     first, second = (Drive(seed, number, anchors, seconds) for number in (0, 1))
     site = read_site([list(first)], first.anchors, universal.card)
     solution = site_solution.solve_without_truth(site, universal, height=HEIGHT, area=None)
-    calibration = site_calibration.calibrate(site, universal, solution, seed=0)
+    calibration = site_calibration.calibrate_site(site, universal, solution, seed=0)
     records = list(second)
     with tempfile.TemporaryDirectory() as folder:
         bundle, _ = calibration.write(Path(folder) / "site.onnx", universal, "drive")

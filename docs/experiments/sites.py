@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
 from uwb_mitigation.simulation.radio import Boards
-from uwb_mitigation.simulation.scene import FloorPlan, Point
+from uwb_mitigation.simulation.scene import Building, Point
 
 SITES = ("flat", "office")
 """Types of buildings, with equal probability."""
@@ -46,7 +46,7 @@ class Site:
             float64 (c, c) sparse.
     """
 
-    plan: FloorPlan
+    plan: Building
     anchors: tuple[Point, ...]
     cells: NDArray[np.float64]
     ways: csr_array
@@ -97,7 +97,7 @@ def _along_walls(size: Point, count: int, rng: np.random.Generator) -> tuple[Poi
     return tuple((float(a), float(b)) for a, b in positions)
 
 
-def _free(plan: FloorPlan) -> tuple[NDArray[np.float64], csr_array]:
+def _free(plan: Building) -> tuple[NDArray[np.float64], csr_array]:
     """Return the largest connected part of a grid, and the distances between neighbours."""
     columns, rows = (np.arange(CELL_M, side, CELL_M) for side in plan.size)
     grid = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1)
@@ -139,7 +139,7 @@ def _away(
     return away
 
 
-def _received_share(plan: FloorPlan, anchor: Point, cells: NDArray[np.float64]) -> float:
+def _received_share(plan: Building, anchor: Point, cells: NDArray[np.float64]) -> float:
     """Return the share of positions from which a frame is received according to its mean level."""
     n = len(cells)
     boards = Boards(np.zeros(n), np.full(n, RADIO.noise_figure_db), np.full(n, float(RADIO.preamble_symbols)))

@@ -33,7 +33,7 @@ def median_of_placements(data, rows):
 for path in map(Path, sys.argv[2:]):
     bundle = load_bundle(path)
     data = build_dataset(records, bundle.preprocessing)
-    found = zero_shot.run(data, bundle)
+    found = zero_shot.evaluate_zero_shot(data, bundle)
     print(f"{path.name}, model {bundle.model_id:08x}, {found.passed_through.mean():.1%} passed through")
     is_los = data.labels == zero_shot.LOS
     offset = median_of_placements(data, is_los if is_los.any() else np.ones(len(data), bool))

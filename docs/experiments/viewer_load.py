@@ -19,9 +19,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test"))
 
 from browser import Browser, chromium
 
-from uwb_mitigation.types.measurement import Cir, CorrectedRange, Encoding, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import (
+    Cir,
+    CorrectedBy,
+    CorrectedRange,
+    Encoding,
+    RangeMeasurement,
+    Status,
+)
 from uwb_mitigation.types.ros.codec import MeasurementKey
-from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.scene import AnchorPosition, Pose, Scene
 from uwb_mitigation.viewer.server import ViewerServer
@@ -31,7 +38,7 @@ MEASURED_S, PERIOD_S = 20.0, 0.1
 SCREENSHOT = Path("build") / "screens" / "viewer_30_anchors.png"
 
 
-def feed_ranges(feed: Feed, stop: threading.Event) -> None:
+def feed_ranges(feed: SceneUpdater, stop: threading.Event) -> None:
     """Feed ranges of all pairs until `stop` is set."""
     rng = np.random.default_rng(1)
     samples = rng.integers(0, 1000, 157).astype(np.int16)
@@ -51,7 +58,7 @@ def feed_ranges(feed: Feed, stop: threading.Event) -> None:
             raw_m = 8.0 + rng.normal()
             cir = Cir(samples, Encoding.MAGNITUDE, 745, 750.4, rx_power_dbm=-85.0, first_path_power_dbm=-89.0)
             feed.measurement(RangeMeasurement(key.stamp_ns, tag, anchor, sequence, 0, raw_m, cir))
-            feed.corrected(key, CorrectedRange(raw_m - 0.4, raw_m, 0.4, 0.01, status, Origin.HOST, 1))
+            feed.corrected(key, CorrectedRange(raw_m - 0.4, raw_m, 0.4, 0.01, status, CorrectedBy.HOST, 1))
             sequence += 1
 
 
@@ -75,7 +82,7 @@ def main() -> None:
     scene = Scene()
     scene.set_anchors({n: AnchorPosition(4.0 * (n % 6), 4.5 * (n // 6), 2.0) for n in range(1, ANCHORS + 1)})
     view, stop = View(scene, threading.Lock()), threading.Event()
-    feed = Feed(scene, view.lock)
+    feed = SceneUpdater(scene, view.lock)
     with ViewerServer(view, port=0) as server, chromium() as browser:
         thread = threading.Thread(target=feed_ranges, args=(feed, stop))
         thread.start()

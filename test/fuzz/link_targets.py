@@ -8,7 +8,7 @@ from __future__ import annotations
 from benchmarks.equipment.board import Board
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.events import LinkState
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, encode_frame
+from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import MAX_ENCODED_BYTES, MAX_PAYLOAD_BYTES, Mode
 from uwb_mitigation.radios.wire.session import BoardSession
 
@@ -43,7 +43,7 @@ def decoder(data: bytes) -> None:
             assert len(frame.payload) <= MAX_PAYLOAD_BYTES
             assert FrameDecoder().feed(encode_frame(frame)) == [frame]
         assert len(fed._tail) <= MAX_ENCODED_BYTES
-    last = Frame(4, 0, 1, 2, b"the end")
+    last = WireFrame(4, 0, 1, 2, b"the end")
     assert fed.feed(encode_frame(last))[-1:] == [last]
 
 
@@ -86,8 +86,8 @@ def _made_up(kind: int, script: Script) -> bytes:
         return script.take(script.number(1))
     if kind % 4 == 1:
         hello = messages.Hello(1, script.number(1), 157, Mode(kind % 2), script.number(1), script.number(1))
-        return encode_frame(Frame(1, kind & 1, script.number(1), 0, messages.encode(hello)[1]))
-    frame = Frame(
+        return encode_frame(WireFrame(1, kind & 1, script.number(1), 0, messages.encode(hello)[1]))
+    frame = WireFrame(
         script.number(1) % 70,
         script.number(1),
         script.number(1 if kind % 4 == 2 else 4),

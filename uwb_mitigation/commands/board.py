@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.console import JsonOption, Table, print_line
+from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption, print_line
 from uwb_mitigation.errors import ModelError, ParameterError, parse_id
 from uwb_mitigation.files import write_atomically
 
@@ -135,8 +135,8 @@ def _settings(
     return settings
 
 
-def _table(found: AntennaDelay, distance_m: float, radios: int) -> Table:
-    table = Table(f"{found.ranges} ranges over {distance_m:g} m", "")
+def _table(found: AntennaDelay, distance_m: float, radios: int) -> ConsoleTable:
+    table = ConsoleTable(f"{found.ranges} ranges over {distance_m:g} m", "")
     table.columns[1].justify = "right"
     table.add_row("median error, m", f"{found.offset_m:+.4f}")
     table.add_row("standard deviation of a range, m", f"{found.sd_m:.4f}")

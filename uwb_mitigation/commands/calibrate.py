@@ -170,7 +170,7 @@ def calibrate(
                     estimate_lever_arm=estimate_lever_arm,
                     on_progress=on_progress,
                 )
-            calibration = site_calibration.calibrate(
+            calibration = site_calibration.calibrate_site(
                 site, source, solution, seed=seed, on_progress=on_progress
             )
     except DatasetError as error:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.console import JsonOption, Table, print_line
+from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption, print_line
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -325,7 +325,7 @@ def _show_inventory(found: dict[str, Any]) -> None:
     console.out.print(
         f"{found['ranges']} ranges, {found['with_truth']} with truth, {_pairs(found)}, {found['duration_s']:.1f} s"
     )
-    pairs = Table("anchor", "tag", "label", title="Pairs", title_justify="left")
+    pairs = ConsoleTable("anchor", "tag", "label", title="Pairs", title_justify="left")
     for column in ("ranges", "rate (Hz)", "mean range (m)", "mean true (m)"):
         pairs.add_column(column, justify="right")
     for pair in found["by_pair"]:
@@ -334,7 +334,7 @@ def _show_inventory(found: dict[str, Any]) -> None:
         pairs.add_row(*ids, pair["label"], str(pair["ranges"]), _number(pair["rate_hz"], 1), *means)
     console.out.print(pairs)
     if found["skipped"]:
-        oddities = Table("warning", title="Warnings", title_justify="left")
+        oddities = ConsoleTable("warning", title="Warnings", title_justify="left")
         oddities.add_column("count", justify="right")
         for kind, count in sorted(found["skipped"].items(), key=lambda item: -item[1]):
             oddities.add_row(kind, str(count))

@@ -238,7 +238,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
     from uwb_mitigation.training.data import splits
     from uwb_mitigation.training.fit.options import FitOptions
 
-    check_name("group of --cross-validate", group, [kind.value for kind in splits.Group])
+    check_name("group of --cross-validate", group, [kind.value for kind in splits.GroupKey])
     if not 1 <= seeds <= 100:
         raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
     from uwb_mitigation.mitigation.model.bundle import load_bundle
@@ -250,10 +250,10 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
     _, dataset = _dataset(data, Preprocessing(Remnet().samples, scaling))
     universal = load_bundle(default_model_path(scaling))
-    kind, recipe = splits.Group(group), Recipe(Remnet(), FitOptions())
+    kind, recipe = splits.GroupKey(group), Recipe(Remnet(), FitOptions())
     total = seeds * len(splits.by_group(dataset, kind, folds, 0))
     with console.step_bar("cross-validating", total) as on_fold:
-        result = comparison.run(dataset, recipe, kind, folds, seeds, on_fold, universal)
+        result = comparison.compare_models(dataset, recipe, kind, folds, seeds, on_fold, universal)
     model_tables.show_comparison(result)
     console.write_json(json, result.as_json())
 
@@ -263,7 +263,7 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
     from uwb_mitigation.training.data import recordings
 
     with console.reading() as on_record:
-        name, dataset = recordings.load(data, preprocessing, truth, on_record)
+        name, dataset = recordings.load_dataset(data, preprocessing, truth, on_record)
     console.show_skipped(dataset.skipped)
     return name, dataset
 

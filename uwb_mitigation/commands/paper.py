@@ -130,7 +130,9 @@ def protocol(
         )
     parts = _parts(data, max(lengths), scaling, split)
     with console.share_bar(f"{len(wanted)} networks") as update:
-        result = experiment.run(parts, output, wanted, options, _workers(workers), update, _command())
+        result = experiment.run_experiment(
+            parts, output, wanted, options, _workers(workers), update, _command()
+        )
     _show_experiment(result)
     console.write_json(json, result.model_dump(mode="json"))
 
@@ -157,14 +159,14 @@ def report(
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.training.paper import published, results
     from uwb_mitigation.training.paper import report as reports
-    from uwb_mitigation.training.paper.data import load
+    from uwb_mitigation.training.paper.data import load_paper_data
 
     trainings = None if models is None else results.read(results.ExperimentResults, models / results.RESULTS)
     bench = () if firmware is None else results.read(results.FirmwareResults, firmware).rows
     _make_folder(output)
     with console.reading() as on_record:
         longest = Preprocessing(max(published.WINDOWS), Scaling.MAX)
-        study = reports.Study(data, *load(data, longest, on_record), _command())
+        study = reports.Study(data, *load_paper_data(data, longest, on_record), _command())
     result = reports.build(study, trainings, bench)
     page = output / "report.html"
     write_atomically(page, result.html())
@@ -189,7 +191,7 @@ def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
 
     preprocessing = Preprocessing(samples, scaling_of(scaling))
     with console.reading() as on_record:
-        name, _, dataset = parts.load(path, preprocessing, on_record)
+        name, _, dataset = parts.load_paper_data(path, preprocessing, on_record)
     console.show_skipped(dataset.skipped)
     return parts.split_dataset(name, dataset, split)
 

@@ -14,7 +14,7 @@ from uwb_mitigation.commands.support.console import JsonOption, print_line, show
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.commands.offline.track import HeldOut, TagTracks
+    from uwb_mitigation.commands.offline.track import HoldoutErrors, TagTracks
     from uwb_mitigation.positioning.batch.survey import SurveyResult
     from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
@@ -331,7 +331,7 @@ def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
             )
 
 
-def _show_residuals(residuals: list[HeldOut], anchors: AnchorMap) -> None:
+def _show_residuals(residuals: list[HoldoutErrors], anchors: AnchorMap) -> None:
     rows = [
         [
             "all" if one.anchor_id is None else anchors.anchors[anchors.index[one.anchor_id]],

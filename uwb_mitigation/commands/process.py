@@ -13,7 +13,7 @@ from rich.markup import escape
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.support.checks import OffsetsOption
-from uwb_mitigation.commands.support.console import JsonOption, Table
+from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def _bag(outcome: Outcome) -> dict[str, Any]:
 
 
 def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
-    table = Table("bag", title=f"Corrected by model {result['model_id']:08x}", title_justify="left")
+    table = ConsoleTable("bag", title=f"Corrected by model {result['model_id']:08x}", title_justify="left")
     for column in ("messages", "ranges", "OK", "passed through", "replaced", "skipped"):
         table.add_column(column, justify="right")
     if any(outcome.error for outcome in outcomes):

@@ -14,7 +14,7 @@ from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
 
 if TYPE_CHECKING:
-    from uwb_mitigation.mitigation.correction import Backend
+    from uwb_mitigation.mitigation.correction import Corrector
 
 
 def view(
@@ -72,7 +72,7 @@ def view(
 
     from uwb_mitigation.positioning.geometry import Height
     from uwb_mitigation.types.anchors import anchors_path, load_anchors
-    from uwb_mitigation.viewer.feed import Feed
+    from uwb_mitigation.viewer.feed import SceneUpdater
     from uwb_mitigation.viewer.floor_plan import load_floor_plan
     from uwb_mitigation.viewer.page import View
     from uwb_mitigation.viewer.playback import BagPlayer
@@ -86,7 +86,7 @@ def view(
     for path in (bag, second):
         if path is None:
             continue
-        feed = Feed(Scene(), lock)
+        feed = SceneUpdater(Scene(), lock)
         player = BagPlayer(path, feed, partial(_backend, model, path), namespace)
         if known is not None:
             feed.anchors(known)
@@ -120,7 +120,7 @@ def view(
             time.sleep(3600.0)
 
 
-def _backend(model: Path | None, bag: Path) -> Backend:
+def _backend(model: Path | None, bag: Path) -> Corrector:
     from uwb_mitigation.mitigation.correction import Mitigation
 
     return Mitigation(bundle_for(model, bag))

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.mitigation.model.bundle import Bundle, Card, Session
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.ood import OodDetector, features
 from uwb_mitigation.types.measurement import (
+    CorrectedBy,
     CorrectedColumns,
     CorrectedRange,
-    Origin,
     RangeColumns,
     RangeMeasurement,
     Status,
@@ -33,7 +33,7 @@ _OK, _NO_CIR, _BAD_CIR, _OUT_OF_DISTRIBUTION, _MODEL_ERROR = _STATUSES
 class CorrectionRule:
     """Computes corrections and variances from predicted errors, as the card of a bundle specifies."""
 
-    def __init__(self, card: Card) -> None:
+    def __init__(self, card: ModelCard) -> None:
         self._low, self._high = (np.float32(limit) for limit in card.correction_limits_m)
         self._variance = np.float32(card.variance_m2)
         self._variance_per_m2 = np.float32(card.variance_per_m2)
@@ -74,7 +74,7 @@ class CorrectionRule:
         return correction, variance
 
 
-class Backend(ABC):
+class Corrector(ABC):
     """Corrects ranges with a bundle: `Mitigation` with ONNX Runtime, `FirmwareMitigation` with the firmware's C.
 
     Attributes:
@@ -137,7 +137,7 @@ def pass_through(
     )
     if not ranges.samples.shape[1]:
         variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
-    return CorrectedColumns(range_m, offset_m, variance, status, Origin.HOST, bundle.model_id)
+    return CorrectedColumns(range_m, offset_m, variance, status, CorrectedBy.HOST, bundle.model_id)
 
 
 def pass_other_radio(
@@ -157,7 +157,7 @@ def pass_other_radio(
     return pass_through(bundle, ranges, offset_m, np.full(len(ranges), status, np.uint8))
 
 
-class Mitigation(Backend):
+class Mitigation(Corrector):
     """Corrects ranges with one bundle, by ONNX Runtime. Not thread-safe.
 
     Predicted error = linear bias + network, correction = offset of the radios + predicted error, and corrected = range -
@@ -187,7 +187,7 @@ class Mitigation(Backend):
         self._rule = CorrectionRule(bundle.card)
 
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
-        """See `Backend`."""
+        """See `Corrector`."""
         linear_bias, n = self.bundle.linear_bias, len(ranges)
         offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
         if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
@@ -228,7 +228,7 @@ class Mitigation(Backend):
         corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
         if rows is _ALL_ROWS:
             model_id = self.bundle.model_id
-            return CorrectedColumns(corrected_m, correction, variance, status, Origin.HOST, model_id)
+            return CorrectedColumns(corrected_m, correction, variance, status, CorrectedBy.HOST, model_id)
         rejected = (status == _OK) & ~accepted
         status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
         corrected = pass_through(self.bundle, ranges, offset, status)

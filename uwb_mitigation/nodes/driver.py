@@ -24,7 +24,14 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
-from uwb_mitigation.nodes.feeds.radios import PREFIX, BoardFeed, Feed, RadioFeed, open_radios, settings_of
+from uwb_mitigation.nodes.feeds.radios import (
+    PREFIX,
+    BoardFeed,
+    RadioFeed,
+    SourceHandle,
+    open_radios,
+    settings_of,
+)
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed
 from uwb_mitigation.nodes.feeds.uci import UciFeed, uci_settings
 from uwb_mitigation.nodes.support import diagnostics, topics
@@ -110,8 +117,8 @@ class Driver(ManagedNode):
         self._ended = ended
         self._consumer = consumer
         self.exit_code = 0
-        self._make_feed: Callable[[], Feed] | None = None
-        self._feed: Feed | None = None
+        self._make_feed: Callable[[], SourceHandle] | None = None
+        self._feed: SourceHandle | None = None
         # `open` creates the publishers that its source needs.
         self._ranges: Publisher
         self._corrected: Publisher
@@ -155,7 +162,7 @@ class Driver(ManagedNode):
     def describe(self) -> Description:
         return ("none", diagnostics.OK, "", {}) if self._feed is None else self._feed.describe()
 
-    def _prepare_board(self) -> Callable[[], Feed]:
+    def _prepare_board(self) -> Callable[[], SourceHandle]:
         address = PortAddress.parse(self.value("port"))
         board_model = _model_id(self.value("board_model"))
         self._offsets = read_offsets(str(self.value("offsets")))
@@ -182,7 +189,7 @@ class Driver(ManagedNode):
 
         return make
 
-    def _prepare_radios(self) -> Callable[[], Feed]:
+    def _prepare_radios(self) -> Callable[[], SourceHandle]:
         settings_of(self.value)
 
         def make() -> RadioFeed:
@@ -191,11 +198,11 @@ class Driver(ManagedNode):
 
         return make
 
-    def _prepare_uci(self) -> Callable[[], Feed]:
+    def _prepare_uci(self) -> Callable[[], SourceHandle]:
         uci_settings(self.value)
         return lambda: UciFeed(self.value, self._publish_range, self.now_ns, self.get_logger())
 
-    def _prepare_topics(self) -> Callable[[], Feed]:
+    def _prepare_topics(self) -> Callable[[], SourceHandle]:
         # Mapping files need pandas and pydantic, which the other sources do not.
         from uwb_mitigation.nodes.feeds.topic import TopicFeed
         from uwb_mitigation.recordings.mapping.mapping import load_mapping
@@ -208,7 +215,7 @@ class Driver(ManagedNode):
         feed = TopicFeed(self, mapping, self.value("topic"), self._publish_topic_range, self.now_ns)
         return lambda: feed
 
-    def _prepare_replay(self) -> Callable[[], Feed]:
+    def _prepare_replay(self) -> Callable[[], SourceHandle]:
         source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
         self._truths = self.publisher(RangeTruth, topics.RANGE_TRUTH)
         self._places = self.publisher(Odometry, topics.ODOMETRY_TRUTH)

@@ -25,18 +25,18 @@ from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.nodes import markers
-from uwb_mitigation.nodes.robot_motion import RobotMotion, transform_type
+from uwb_mitigation.nodes.robot_motion import OdometryInput, transform_type
 from uwb_mitigation.nodes.support import diagnostics, topics
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
-from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, Tag
+from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, TagState
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
-from uwb_mitigation.types.measurement import CorrectedRange, Origin, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.ros.codec import (
     MeasurementKey,
     decode_corrected,
@@ -68,7 +68,7 @@ class _Outputs:
     `robot` is the estimator of the tag if a robot with odometry carries it.
     """
 
-    def __init__(self, node: Locator, tag: Tag, prefix: str, frame: str) -> None:
+    def __init__(self, node: Locator, tag: TagState, prefix: str, frame: str) -> None:
         def publisher(kind: type, topic: str) -> Publisher:
             head, _, tail = topic.rpartition("/")
             return node.publisher(kind, f"{head}/{prefix}{tail}")
@@ -105,12 +105,12 @@ class Locator(ManagedNode):
         self._decode: Callable[[bytes], tuple[MeasurementKey, CorrectedRange]] = decode_corrected
         self._make_estimator: Callable[[AnchorMap], MultiTagEstimator]
         self._outputs: dict[int, _Outputs] = {}
-        self._robot: RobotMotion | None = None
+        self._robot: OdometryInput | None = None
         self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._malformed = self._lost = 0
         self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
-        self._meter = diagnostics.Meter(self.now_ns)
+        self._meter = diagnostics.RateMonitor(self.now_ns)
         # Without anchors it keeps running, so that the diagnostics name the reason.
         with contextlib.suppress(ParameterError, MissingDependencyError):
             self.autostart()
@@ -151,7 +151,7 @@ class Locator(ManagedNode):
                 )
             self._tf = self.publisher(self._tf_type, topics.TF, QoSProfile(depth=100))
         if robot is not None:
-            self._robot = RobotMotion(self, path_of_base)
+            self._robot = OdometryInput(self, path_of_base)
         self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
         if kind in markers.ANCHOR_TYPES:
             # Some publishers send the anchors once for late subscribers, others repeatedly.
@@ -278,7 +278,7 @@ class Locator(ManagedNode):
             self._processing_ns.append(now_ns - began_ns)
         self._meter.add(self.now_ns() - key.stamp_ns)
 
-    def _outputs_of(self, tag: Tag) -> _Outputs:
+    def _outputs_of(self, tag: TagState) -> _Outputs:
         outputs = self._outputs.get(tag.tag_id)
         if outputs is None:
             chosen = self.value("tag")
@@ -402,7 +402,7 @@ class Locator(ManagedNode):
 def _uncorrected(measurement: RangeMeasurement, variance_m2: float) -> tuple[MeasurementKey, CorrectedRange]:
     """Return a raw range as a corrected one; a variance of NaN is replaced by `range_sd`."""
     range_m = measurement.range_m
-    corrected = CorrectedRange(range_m, range_m, 0.0, variance_m2, Status.NO_CIR, Origin.HOST, 0)
+    corrected = CorrectedRange(range_m, range_m, 0.0, variance_m2, Status.NO_CIR, CorrectedBy.HOST, 0)
     return measurement_key(measurement), corrected
 
 

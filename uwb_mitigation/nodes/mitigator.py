@@ -18,7 +18,7 @@ from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.mitigation.correction import Backend, Mitigation
+from uwb_mitigation.mitigation.correction import Corrector, Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import model_path
@@ -47,7 +47,7 @@ _PASSED_THROUGH = (Status.OUT_OF_DISTRIBUTION, Status.NO_CIR)
 """Maximum batch size: correcting queued ranges in a batch takes half the time of single ranges."""
 
 
-def load(model: str, backend: str = "onnxruntime") -> Backend:
+def load_corrector(model: str, backend: str = "onnxruntime") -> Corrector:
     """Return the bundle of the parameter `model`, ready to correct by `backend`.
 
     Raises:
@@ -82,13 +82,13 @@ class Mitigator(ManagedNode):
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
         self._sensor_ranges: topics.SensorRanges | None = None
-        self._mitigation: Backend | None = None
-        self._prepared: tuple[str, Backend] | None = None
+        self._mitigation: Corrector | None = None
+        self._prepared: tuple[str, Corrector] | None = None
         self._offsets = NO_OFFSETS
         self._prepared_offsets: Offsets | None = None
         # A driver in the same process calls `correct` from its own thread; transitions run in the executor's.
         self._lock = threading.Lock()
-        self._meter = diagnostics.Meter(self.now_ns)
+        self._meter = diagnostics.RateMonitor(self.now_ns)
         refuse_errors(self, self._prepare)
         self.add_post_set_parameters_callback(self._swap)
         self.autostart()
@@ -106,7 +106,7 @@ class Mitigator(ManagedNode):
 
     def begin(self) -> None:
         self._offsets = read_offsets(str(self.value("offsets")))
-        self._use(load(self.value("model"), self.value("backend")))
+        self._use(load_corrector(self.value("model"), self.value("backend")))
 
     def end(self) -> None:
         with self._lock:
@@ -218,7 +218,7 @@ class Mitigator(ManagedNode):
     def _on_lost(self, info: Any) -> None:
         self.health.lost += info.total_count_change
 
-    def _use(self, mitigation: Backend) -> None:
+    def _use(self, mitigation: Corrector) -> None:
         # Swap between two ranges, so that none is lost or corrected with parts of two models.
         mitigation.offsets = self._offsets
         with self._lock:
@@ -233,7 +233,7 @@ class Mitigator(ManagedNode):
             f"{bundle.card.origin}{limits}"
         )
 
-    def _reset_offset_check(self, mitigation: Backend) -> None:
+    def _reset_offset_check(self, mitigation: Corrector) -> None:
         # A linear bias model includes the offset of the boards of its training, unless another offset is set.
         self.health.excludes_offset = bool(self._offsets) or mitigation.bundle.linear_bias == LinearBiasModel(
             0.0
@@ -245,7 +245,7 @@ class Mitigator(ManagedNode):
         if "offsets" in values:
             self._prepared_offsets = read_offsets(str(values["offsets"]))
         if isinstance(model := values.get("model"), str):
-            self._prepared = model, load(model, self.value("backend"))
+            self._prepared = model, load_corrector(model, self.value("backend"))
 
     def _swap(self, changes: list[Any]) -> None:
         # ROS calls this after all callbacks accepted the set; one may refuse it after `_prepare`.

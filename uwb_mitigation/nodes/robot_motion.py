@@ -28,7 +28,7 @@ _MAX_FRAMES = 1000
 _NANOSECONDS = 1_000_000_000
 
 
-class RobotMotion:
+class OdometryInput:
     """Subscribes to the topics of the parameters `odometry` and `imu`, and to /tf_static.
 
     Args:

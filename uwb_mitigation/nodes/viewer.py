@@ -28,7 +28,7 @@ from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import VIEWER
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.ros import topics as bag_topics
-from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, MissingData, Scene
@@ -62,7 +62,7 @@ class Viewer(ManagedNode):
         self._server: ViewerServer | None = None
         self._scene = Scene()
         self._lock = threading.Lock()
-        self._feed = Feed(self._scene, self._lock)
+        self._feed = SceneUpdater(self._scene, self._lock)
         pace = ReplayClock(self.get_clock())
         self._scene.clock = lambda: pace.now_ns() / 1e9
         self._view: View | None = None

@@ -15,7 +15,7 @@ FLAT = 0.05
 """Anchors whose spread in a direction is a smaller part of their largest one have no extent in it."""
 
 
-class Shape(enum.Enum):
+class AnchorRank(enum.Enum):
     """Arrangement of a set of anchors."""
 
     POINT = "fewer than two places"
@@ -25,7 +25,7 @@ class Shape(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Geometry:
+class Dop:
     """Dilution of precision, horizontal and vertical; inf: the ranges do not determine the position."""
 
     hdop: float
@@ -104,7 +104,7 @@ def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def directions(
+def unit_vectors(
     tag: NDArray[np.float64], anchor: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return unit vectors (n, 3) from anchors to tags, and distances (n,), 0.05 m at least."""
@@ -113,19 +113,19 @@ def directions(
     return away / distance[:, None], distance
 
 
-def shape(position: NDArray[np.float64]) -> Shape:
+def anchor_rank(position: NDArray[np.float64]) -> AnchorRank:
     """Return the arrangement of anchors at float64 (m, 3)."""
     if len(position) < 2:
-        return Shape.POINT
+        return AnchorRank.POINT
     spread = np.linalg.svd(position - position.mean(axis=0), compute_uv=False)
     spread = np.pad(spread, (0, 3 - len(spread)))
     if spread[0] < 1e-6:
-        return Shape.POINT
+        return AnchorRank.POINT
     extents = int((spread > FLAT * spread[0]).sum())
-    return (Shape.LINE, Shape.PLANE, Shape.SPACE)[extents - 1]
+    return (AnchorRank.LINE, AnchorRank.PLANE, AnchorRank.SPACE)[extents - 1]
 
 
-def geometry(anchors: NDArray[np.float64], position: NDArray[np.float64], *, level: bool = False) -> Geometry:
+def dop(anchors: NDArray[np.float64], position: NDArray[np.float64], *, level: bool = False) -> Dop:
     """Return the dilution of precision for anchors float64 (m, 3) at a position float64 (3,).
 
     Args:
@@ -133,13 +133,13 @@ def geometry(anchors: NDArray[np.float64], position: NDArray[np.float64], *, lev
         position: position of the tag, float64 (3,), m.
         level: the height is known: only x and y are estimated, and VDOP is 0.
     """
-    slope = directions(position, anchors)[0][:, : 2 if level else 3]
+    slope = unit_vectors(position, anchors)[0][:, : 2 if level else 3]
     normal = slope.T @ slope
     size = len(normal)
     if len(anchors) < size or np.linalg.cond(normal) > 1e10:
-        return Geometry(math.inf, 0.0 if level else math.inf)
+        return Dop(math.inf, 0.0 if level else math.inf)
     spread = np.diag(np.linalg.inv(normal))
-    return Geometry(math.sqrt(spread[0] + spread[1]), 0.0 if level else math.sqrt(spread[2]))
+    return Dop(math.sqrt(spread[0] + spread[1]), 0.0 if level else math.sqrt(spread[2]))
 
 
 CHI2_95 = 5.991

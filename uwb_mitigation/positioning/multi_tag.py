@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.batch.smoother import Smoother, fused_with_batch
-from uwb_mitigation.positioning.geometry import Shape, protection_levels, shape
+from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, protection_levels
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
@@ -122,7 +122,7 @@ class FixedLagSmoother:
 
 
 @dataclass(slots=True)
-class Tag:
+class TagState:
     """Estimators of one tag.
 
     Attributes:
@@ -171,14 +171,14 @@ class MultiTagEstimator:
         self.robot: RobotEstimator | None = None
         self._robot_tag = robot_tag
         self.anchors = config.anchors
-        self.tags: dict[int, Tag] = {}
+        self.tags: dict[int, TagState] = {}
         self.unknown_anchors: Counter[int] = Counter()
         self.invalid = 0
         self._config = config
 
     def add(
         self, tag_id: int, anchor_id: int, stamp_ns: int, range_m: float, variance_m2: float
-    ) -> tuple[Tag, Estimate | None] | None:
+    ) -> tuple[TagState, Estimate | None] | None:
         """Update with a range.
 
         Returns:
@@ -194,7 +194,7 @@ class MultiTagEstimator:
             self.invalid += 1
             return None
         if tag is None:
-            tag = self.tags[tag_id] = Tag(
+            tag = self.tags[tag_id] = TagState(
                 tag_id, self._make_estimator(tag_id), FixedLagSmoother(self._config)
             )
         estimate = tag.estimator.add(stamp_ns, row, range_m, variance_m2)
@@ -236,9 +236,9 @@ class MultiTagEstimator:
                 f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
                 for anchor in contradicting
             ]
-            geometry = estimator.geometry()
-            if geometry is not None and geometry.hdop > 10.0:
-                found.append(f"{name}: poor geometry, HDOP {geometry.hdop:.0f}")
+            dop = estimator.dop()
+            if dop is not None and dop.hdop > 10.0:
+                found.append(f"{name}: poor geometry, HDOP {dop.hdop:.0f}")
         return found
 
     def _unknown_reason(self, estimator: TagEstimator) -> str:
@@ -246,9 +246,9 @@ class MultiTagEstimator:
         needed = self._config.dims
         if len(rows) < needed:
             return f"position unknown: {len(rows)} anchors received, {needed} or more needed"
-        kind, count = shape(self.anchors.position[rows]), estimator.candidates
+        kind, count = anchor_rank(self.anchors.position[rows]), estimator.candidates
         text = f"position ambiguous: {count} candidates" if count > 1 else "position unknown"
-        if kind is Shape.LINE or (kind is Shape.PLANE and self._config.height is None):
+        if kind is AnchorRank.LINE or (kind is AnchorRank.PLANE and self._config.height is None):
             text += f"; the received anchors are {kind.value}: set height, or an area that contains one candidate only"
         return text
 
@@ -279,12 +279,12 @@ class MultiTagEstimator:
                     ),
                     "odometry rejected": estimator.odometry.rejected,
                 }
-            geometry = estimator.geometry()
-            if geometry is not None and known is not None:
+            dop = estimator.dop()
+            if dop is not None and known is not None:
                 levels = protection_levels(known.P)
                 found |= {
-                    f"{name} HDOP": f"{geometry.hdop:.2f}",
-                    f"{name} VDOP": f"{geometry.vdop:.2f}",
+                    f"{name} HDOP": f"{dop.hdop:.2f}",
+                    f"{name} VDOP": f"{dop.vdop:.2f}",
                     f"{name} protection level m": ", ".join(f"{level:.2f}" for level in levels),
                 }
         return found

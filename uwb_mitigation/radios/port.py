@@ -30,7 +30,7 @@ QUEUE_CAPACITY = 1024
 _Event = TypeVar("_Event")
 
 
-class Connection(ABC, Generic[_Event]):
+class PortThread(ABC, Generic[_Event]):
     """Keeps hardware connected until `close`, and queues its events. Methods may be called from any thread.
 
     Hardware errors neither end the thread nor raise an exception; `problem` describes them.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import serial
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.port import QUEUE_CAPACITY, Connection, PortAddress, processes_using
+from uwb_mitigation.radios.port import QUEUE_CAPACITY, PortAddress, PortThread, processes_using
 from uwb_mitigation.radios.settings import RadioSettings
 from uwb_mitigation.radios.wire.events import Event, LinkState
 from uwb_mitigation.radios.wire.layout import Mode
@@ -51,7 +51,7 @@ class BoardReport:
     counts: dict[str, int]
 
 
-class BoardDriver(Connection[Event]):
+class BoardDriver(PortThread[Event]):
     """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise.
 
     Args:
@@ -61,7 +61,7 @@ class BoardDriver(Connection[Event]):
             USB bridge, its change resets the board.
         mode, expected_model_id: see `BoardSession`.
         stamp_clock: the clock that stamps are on, ns; a node passes its own.
-        capacity: see `Connection`.
+        capacity: see `PortThread`.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ CHANNELS = (1, 2, 3, 4, 5, 7)
 PREAMBLES = (64, 128, 256, 512, 1024, 1536, 2048, 4096)
 RATES_KBPS = (110, 850, 6800)
 PRFS_MHZ = (16, 64)
-NEVER_MS = 0xFFFFFFFF
+AGE_UNKNOWN_MS = 0xFFFFFFFF
 """`AnchorStatus.age_ms` of an anchor that was never received."""
 
 

@@ -16,7 +16,7 @@ import serial
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.fira.capture import CaptureWriter
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
-from uwb_mitigation.radios.port import Connection, PortAddress
+from uwb_mitigation.radios.port import PortAddress, PortThread
 from uwb_mitigation.radios.settings import Role
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -64,7 +64,7 @@ class UciReport:
     counts: dict[str, int]
 
 
-class UciDriver(Connection[UciEvent]):
+class UciDriver(PortThread[UciEvent]):
     """Operates one board until `close`; starts it again after a loss.
 
     Events are measurements and `UciStarted`. An anchor delivers its measurements only if its settings

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.recordings.mapping.conversion import NO_CIR, Columns, read_csv
+from uwb_mitigation.recordings.mapping.conversion import NO_CIR, ColumnDict, read_csv
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import (
     DEVICE_TICK_HZ,
@@ -371,7 +371,7 @@ def find_survey(folder: Path) -> Survey | None:
     if not (folder / "pairs.csv").is_file():
         return None
 
-    def table(name: str, *ids: str, axes: str = "", texts: tuple[str, ...] = ()) -> Columns:
+    def table(name: str, *ids: str, axes: str = "", texts: tuple[str, ...] = ()) -> ColumnDict:
         found = read_csv(folder / name, ids, dict.fromkeys(axes, (-1e6, 1e6)), texts)
         first = np.unique(found[ids[0]], return_index=True)[1]
         for row in sorted(set(range(len(found[ids[0]]))) - set(first.tolist()))[:1]:

@@ -25,15 +25,15 @@ from uwb_mitigation.simulation.channel import (
     Environment,
     direct_power_db,
 )
-from uwb_mitigation.simulation.radio import Boards, Radio
+from uwb_mitigation.simulation.radio import Boards, Receiver
 from uwb_mitigation.simulation.scene import (
     BRICK,
     CONCRETE,
     GLASS,
     PLASTERBOARD,
     WOOD,
+    Building,
     DirectPath,
-    FloorPlan,
     Screen,
     Wall,
 )
@@ -45,7 +45,7 @@ OUTDOOR: Environments = (OUTDOOR_LOS, RESIDENTIAL_NLOS)
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class BuildingType:
     """Distribution of buildings of one type.
 
     Attributes:
@@ -65,15 +65,19 @@ class Kind:
 
 
 KINDS = (
-    Kind("flat", 0.55, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
-    Kind("office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08),
-    Kind("corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06),
-    Kind("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
+    BuildingType("flat", 0.55, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
+    BuildingType(
+        "office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08
+    ),
+    BuildingType(
+        "corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06
+    ),
+    BuildingType("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
 )
 
 WIDE_KINDS = (
     *(replace(kind, share=share) for kind, share in zip(KINDS, (0.5, 0.2, 0.1, 0.1), strict=True)),
-    Kind(
+    BuildingType(
         "open",
         0.1,
         (5.0, 40.0),
@@ -99,7 +103,7 @@ PERSON_M = 0.45
 MEAN_PEOPLE = 1.0
 """Mean number per building."""
 
-RADIO = Radio(range_offset_m=0.0)
+RADIO = Receiver(range_offset_m=0.0)
 """The chip with calibrated antenna delays: the range error comes only from the channel."""
 
 GAIN_DB = (-6.0, 6.0)
@@ -127,7 +131,7 @@ CANDIDATES = 16
 """Candidate placements for each one that is kept."""
 
 
-def draw_plan(kind: Kind, rng: np.random.Generator) -> FloorPlan:
+def draw_plan(kind: BuildingType, rng: np.random.Generator) -> Building:
     """Draw a rectangle divided into rooms, most with a doorway, with metal furniture and people."""
     size = (float(rng.uniform(*kind.length_m)), float(rng.uniform(*kind.width_m)))
     room_m = float(rng.uniform(*kind.room_m))
@@ -146,7 +150,7 @@ def draw_plan(kind: Kind, rng: np.random.Generator) -> FloorPlan:
         for _ in range(rng.poisson(kind.screens_per_m2 * size[0] * size[1]))
     ]
     screens += [_screen("person", PERSON_M, size, rng) for _ in range(rng.poisson(MEAN_PEOPLE))]
-    return FloorPlan(size, tuple(walls), tuple(screens))
+    return Building(size, tuple(walls), tuple(screens))
 
 
 def _divide(
@@ -200,7 +204,7 @@ def _screen(name: str, length_m: float, size: tuple[float, float], rng: np.rando
     return Screen(name, (x - half[0], y - half[1]), (x + half[0], y + half[1]))
 
 
-def draw_boards(n: int, rng: np.random.Generator, *, wide: bool = False, radio: Radio = RADIO) -> Boards:
+def draw_boards(n: int, rng: np.random.Generator, *, wide: bool = False, radio: Receiver = RADIO) -> Boards:
     """Draw n pairs of boards: transmit power and antennas, noise, number of accumulated symbols."""
     gain_db = WIDE_GAIN_DB if wide and rng.random() < WIDE_GAIN_SHARE else GAIN_DB
     return Boards(
@@ -226,7 +230,7 @@ class Block:
 
 
 def block_of(
-    seed: int, number: int, *, wide: bool = False, radio: Radio = RADIO
+    seed: int, number: int, *, wide: bool = False, radio: Receiver = RADIO
 ) -> tuple[Block, np.random.Generator]:
     """Draw a block of `PLACEMENTS` placements in one type of building; also return the generator for fading and noise.
 
@@ -281,7 +285,7 @@ def _conditions(
     tag: NDArray[np.float64],
     path: DirectPath,
     boards: Boards,
-    radio: Radio,
+    radio: Receiver,
 ) -> NDArray[np.int64]:
     """Predict the condition of each candidate from mean levels."""
     direct, diffuse = _mean_powers_db(environments, anchor, tag, path)
@@ -298,7 +302,7 @@ def mean_level_dbm(
     tag: NDArray[np.float64],
     path: DirectPath,
     boards: Boards,
-    radio: Radio = RADIO,
+    radio: Receiver = RADIO,
 ) -> NDArray[np.float64]:
     """Return the mean receive level, dBm (n,), of pairs between antennas at float64 (n, 2) in m with obstacles `path`."""
     powers = _mean_powers_db(environments, anchor, tag, path)

@@ -48,7 +48,7 @@ _NANOSECONDS = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotMotion:
+class SimulatedMotion:
     """True and measured motion at the stamps of the odometry.
 
     Attributes:
@@ -63,7 +63,7 @@ class RobotMotion:
     imu: Imu
 
 
-def simulate_motion(route: tuple[Point, ...], speed: float, seconds: float, seed: int) -> RobotMotion:
+def simulate_motion(route: tuple[Point, ...], speed: float, seconds: float, seed: int) -> SimulatedMotion:
     """Return the motion of a robot that starts at the first point of the route.
 
     Args:
@@ -109,7 +109,7 @@ def simulate_motion(route: tuple[Point, ...], speed: float, seconds: float, seed
         measured,
         np.broadcast_to(np.diag(np.square(TWIST_SD)), (n, 3, 3)),
     )
-    return RobotMotion(position, yaw, odometry, imu)
+    return SimulatedMotion(position, yaw, odometry, imu)
 
 
 def yaw_along_route(route: tuple[Point, ...], travelled_m: NDArray[np.float64]) -> NDArray[np.float64]:

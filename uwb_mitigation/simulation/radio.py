@@ -123,8 +123,8 @@ class Boards:
     """Board properties of n pairs (both ends) that differ between boards with the same chip: float64 (n,) each.
 
     Attributes:
-        gain_db: transmit power and both antennas, relative to the `Radio`.
-        noise_figure_db, preamble_symbols: replace those of the `Radio`.
+        gain_db: transmit power and both antennas, relative to the `Receiver`.
+        noise_figure_db, preamble_symbols: replace those of the `Receiver`.
     """
 
     gain_db: NDArray[np.float64]
@@ -137,7 +137,7 @@ class Boards:
 
 
 @dataclass(frozen=True, slots=True)
-class Radio:
+class Receiver:
     """A receiver and its transmitter.
 
     Attributes:
@@ -309,7 +309,7 @@ class Radio:
         )
 
 
-DW3000_STS = Radio(
+DW3000_STS = Receiver(
     tx_power_dbm=-19.3,
     self_noise_db=-60.0,
     sensitivity_dbm=-94.0,

@@ -18,8 +18,8 @@ from uwb_mitigation.simulation.scene import (
     FLAT,
     GLASS,
     WOOD,
+    Building,
     DirectPath,
-    FloorPlan,
     Material,
     Point,
     Screen,
@@ -153,4 +153,4 @@ def obstruct(
         else:
             walls.append(Wall(start, end, obstacle.material, thickness_m))
     # Obstacles may extend beyond the room; they only have to cross the line.
-    return FloorPlan((1.0, 1.0), tuple(walls), tuple(screens)).direct_path(a[None], b[None])
+    return Building((1.0, 1.0), tuple(walls), tuple(screens)).direct_path(a[None], b[None])

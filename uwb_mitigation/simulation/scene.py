@@ -100,7 +100,7 @@ class DirectPath:
 
 
 @dataclass(frozen=True, slots=True)
-class FloorPlan:
+class Building:
     """Walls and screens inside a rectangle from the origin to `size` (m)."""
 
     size: Point
@@ -178,7 +178,7 @@ def _detour(a: NDArray[np.float64], b: NDArray[np.float64], edge: Point) -> NDAr
     return between(a, corner) + between(corner, b) - between(a, b)
 
 
-FLAT = FloorPlan(
+FLAT = Building(
     size=(7.6, 6.8),
     walls=(
         # Load-bearing concrete walls, each with a doorway in the wall or at its end.

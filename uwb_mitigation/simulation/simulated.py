@@ -20,9 +20,9 @@ from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, l
 from uwb_mitigation.simulation.buildings import PLACEMENTS, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
 from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, DiffuseField, check_range
-from uwb_mitigation.simulation.odometry import RobotMotion, simulate_motion, yaw_along_route
-from uwb_mitigation.simulation.radio import Boards, Radio, Reception
-from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, FloorPlan, Point, along_route
+from uwb_mitigation.simulation.odometry import SimulatedMotion, simulate_motion, yaw_along_route
+from uwb_mitigation.simulation.radio import Boards, Receiver, Reception
+from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point, along_route
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import (
     DEVICE_TICK_HZ,
@@ -52,7 +52,7 @@ SURVEY_RATE_HZ = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Exchanges:
+class TwrBatch:
     """n exchanges before the radio model: their numbers, ids, configurations and pairs, and headings of moving tags."""
 
     sequence: NDArray[np.int64]
@@ -69,7 +69,7 @@ class Simulated(Source):
 
     simulated = True
 
-    def __init__(self, name: str, rate_hz: float, radio: Radio, count: int) -> None:
+    def __init__(self, name: str, rate_hz: float, radio: Receiver, count: int) -> None:
         check_range("simulated source", "rate_hz", rate_hz, 0.1, 100_000)
         self.name = name
         self.skipped: Counter[str] = Counter()
@@ -77,7 +77,7 @@ class Simulated(Source):
         self._count = count
         self._radio = radio
 
-    def _batches(self) -> Iterable[tuple[Exchanges, np.random.Generator]]:
+    def _batches(self) -> Iterable[tuple[TwrBatch, np.random.Generator]]:
         """Yield batches in the order of time, each with the radio's random generator."""
         raise NotImplementedError
 
@@ -86,7 +86,7 @@ class Simulated(Source):
         for exchanges, rng in self._batches():
             yield from self._records(exchanges, rng)
 
-    def _records(self, exchanges: Exchanges, rng: np.random.Generator) -> Iterator[Record]:
+    def _records(self, exchanges: TwrBatch, rng: np.random.Generator) -> Iterator[Record]:
         pairs = exchanges.pairs
         distance = pairs.distance_m
         reception = self._radio.receive(pairs.multipath(rng), rng, exchanges.boards)
@@ -146,8 +146,8 @@ class SimulatedSource(Simulated):
         rate_hz: float = 20.0,
         tags: int = 1,
         anchors: tuple[Point, ...] = ANCHORS,
-        plan: FloorPlan = FLAT,
-        radio: Radio | None = None,
+        plan: Building = FLAT,
+        radio: Receiver | None = None,
         route: tuple[Point, ...] = ROUTE,
     ) -> None:
         check_seed(seed)
@@ -155,7 +155,7 @@ class SimulatedSource(Simulated):
         check_range("simulated source", "tags", tags, 1, 64, whole=True)
         _check_positions("anchors", anchors, 1, 64)
         _check_positions("route", route, 3, 10_000)
-        super().__init__(f"simulated flat, seed {seed}", rate_hz, radio or Radio(), count)
+        super().__init__(f"simulated flat, seed {seed}", rate_hz, radio or Receiver(), count)
         self._plan = plan
         self._seed = seed
         self._tags = tags
@@ -178,7 +178,7 @@ class SimulatedSource(Simulated):
         anchors = (ANCHORS + MORE_ANCHORS)[:number]
         return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors)
 
-    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
+    def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         pairs = self._tags * len(self._anchors)
         for segment in counting():
             first, stop = (math.ceil(s * SEGMENT_S * self._rate_hz) for s in (segment, segment + 1))
@@ -193,7 +193,7 @@ class SimulatedSource(Simulated):
 
     def _exchanges(
         self, sequence: NDArray[np.int64], segment: int, fields: tuple[DiffuseField, DiffuseField]
-    ) -> Exchanges:
+    ) -> TwrBatch:
         anchor = sequence % len(self._anchors)
         tag = sequence // len(self._anchors) % self._tags
         travelled = SPEED_M_PER_S * sequence / self._rate_hz + tag * self._spacing_m
@@ -205,7 +205,7 @@ class SimulatedSource(Simulated):
         pair = tag * len(self._anchors) + anchor
         anchors, positions = self._anchors[anchor], along_route(self._route, travelled)
         path = self._plan.direct_path(anchors, positions)
-        return Exchanges(
+        return TwrBatch(
             sequence,
             anchor_id,
             tag_id,
@@ -214,7 +214,7 @@ class SimulatedSource(Simulated):
             tag_yaw=yaw_along_route(self._route, travelled),
         )
 
-    def motion(self) -> RobotMotion:
+    def motion(self) -> SimulatedMotion:
         """Return odometry and IMU data of the robot with the first tag, for the duration of a source with a `count`."""
         return simulate_motion(self._route, SPEED_M_PER_S, self._count / self._rate_hz, self._seed)
 
@@ -242,8 +242,8 @@ class SimulatedSurvey(Simulated):
         configurations: int = 100,
         exchanges: int = 20,
         rate_hz: float = 20.0,
-        plan: FloorPlan = FLAT,
-        radio: Radio | None = None,
+        plan: Building = FLAT,
+        radio: Receiver | None = None,
     ) -> None:
         check_seed(seed)
         check_range("simulated survey", "configurations", configurations, 1, 10**7, whole=True)
@@ -251,13 +251,13 @@ class SimulatedSurvey(Simulated):
         for axis, extent in zip("xy", plan.size, strict=True):
             check_range("simulated survey", f"plan size in {axis}", extent, 2.0, 1000.0)
         super().__init__(
-            f"simulated survey, seed {seed}", rate_hz, radio or Radio(), configurations * exchanges
+            f"simulated survey, seed {seed}", rate_hz, radio or Receiver(), configurations * exchanges
         )
         self._plan = plan
         self._seed = seed
         self._exchanges = exchanges
 
-    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
+    def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         placements = -(-BATCH // self._exchanges)
         size = placements * self._exchanges
         for batch in range(-(-self._count // size)):
@@ -272,7 +272,7 @@ class SimulatedSurvey(Simulated):
             ids = np.ones(size, np.int64)
             path = self._plan.direct_path(anchor, tag).take(of)
             yield (
-                Exchanges(
+                TwrBatch(
                     sequence,
                     ids,
                     FIRST_TAG_ID * ids,
@@ -307,7 +307,7 @@ class SimulatedBuildings(Simulated):
         self._seed = seed
         self._exchanges = exchanges
 
-    def _batches(self) -> Iterator[tuple[Exchanges, np.random.Generator]]:
+    def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         each = self._exchanges
         together = max(1, BATCH // each)
         for number in range(-(-self._count // (PLACEMENTS * each))):
@@ -319,7 +319,7 @@ class SimulatedBuildings(Simulated):
                 names = [block.configuration(self._seed, number, k) for k in rows.tolist()]
                 ids = np.ones(len(of), np.int64)
                 sequence = (number * PLACEMENTS + first) * each + np.arange(len(of))
-                exchanges = Exchanges(
+                exchanges = TwrBatch(
                     sequence,
                     ids,
                     FIRST_TAG_ID * ids,

@@ -14,7 +14,7 @@ from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.training import train
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.data.splits import Group
+from uwb_mitigation.training.data.splits import GroupKey
 from uwb_mitigation.training.evaluation import baselines, zero_shot
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, coverage, mae_after_rejection
 from uwb_mitigation.training.fit import candidates
@@ -70,7 +70,7 @@ class Comparison:
     rejection: tuple[tuple[float, float], ...]
     passed_through: float
     without_levels: int
-    group: Group
+    group: GroupKey
     folds: int
     seeds: int
     configurations: int
@@ -113,10 +113,10 @@ class _HeldOut:
     passed_through: NDArray[np.bool_]
 
 
-def run(
+def compare_models(
     dataset: Dataset,
     recipe: Recipe,
-    group: Group,
+    group: GroupKey,
     folds: int,
     seeds: int,
     on_fold: Callable[[], None] = lambda: None,
@@ -139,7 +139,7 @@ def run(
     }
     zero_shot_result = None
     if universal is not None and universal.preprocessing == dataset.preprocessing and dataset.has_cirs:
-        zero_shot_result = zero_shot.run(dataset, universal)
+        zero_shot_result = zero_shot.evaluate_zero_shot(dataset, universal)
         errors_by_row |= {name: error[None] for name, error in zero_shot_result.errors.items()}
     labels = list(dict.fromkeys(dataset.labels.tolist()))
     rows = []
@@ -192,7 +192,7 @@ def _coverage(
 
 
 def _hold_out(
-    dataset: Dataset, recipe: Recipe, group: Group, folds: int, seed: int, on_fold: Callable[[], None]
+    dataset: Dataset, recipe: Recipe, group: GroupKey, folds: int, seed: int, on_fold: Callable[[], None]
 ) -> _HeldOut:
     recipe = replace(recipe, fit=replace(recipe.fit, seed=seed))
     if not dataset.has_cirs:
@@ -211,7 +211,7 @@ def _hold_out(
             integers = quantize(network, calibration_inputs(train_data, seed), exact=False)
             outputs.append(("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)))
         for name, output in outputs:
-            corrections = zero_shot.apply_card(test, card, (linear_bias + output).astype(np.float32))
+            corrections = zero_shot.correct_with_card(test, card, (linear_bias + output).astype(np.float32))
             errors[name][fold.test] -= corrections.correction_m
         variance[fold.test] = corrections.variance_m2
         sigmas95[fold.test] = card.interval95_sigmas

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, check_name
 from uwb_mitigation.mitigation.model import floating, graph
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.mitigation.model.bundle import Bundle, Card, load_bundle, save_bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, load_bundle, save_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
@@ -75,7 +75,7 @@ class TrainedBundle:
     baseline_mae_m: dict[str, float]
 
     @property
-    def helped(self) -> bool:
+    def improved(self) -> bool:
         """Whether the model has a smaller MAE than every baseline."""
         return self.mae_m < min(self.baseline_mae_m.values())
 
@@ -94,7 +94,7 @@ class TrainedBundle:
             "model_id": self.bundle.model_id,
             "n": len(dataset),
             "refused": dict(dataset.skipped),
-            "helped": self.helped,
+            "helped": self.improved,
             "rows": [{"name": row, **values} for row, values in self.validation.statistics().items()],
             "by_configuration": {name: group._asdict() for name, group in groups.items()},
             **({} if self.selection is None else {"choice": self.selection.as_json()}),
@@ -254,7 +254,7 @@ def cross_validate(
     return CrossValidation(dataset, errors, folds, seed)
 
 
-def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[Card, FloatWeights]:
+def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[ModelCard, FloatWeights]:
     """Fit a new model to the whole dataset; the intervals of the card are from a cross-validation on it.
 
     Raises:
@@ -269,7 +269,7 @@ def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[C
 
 def make_card(
     name: str, recipe: Recipe, linear_bias: LinearBiasModel, validation: CrossValidation, data: str
-) -> Card:
+) -> ModelCard:
     """Return the card of a float model that was fitted to the dataset of `validation`."""
     dataset = validation.dataset
     options = asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.model import floating
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.mitigation.model.bundle import Card
+from uwb_mitigation.mitigation.model.bundle import ModelCard
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.simulation.buildings import PLACEMENTS, RADIO
-from uwb_mitigation.simulation.radio import Radio
+from uwb_mitigation.simulation.radio import Receiver
 from uwb_mitigation.training.data.augmentation import (
     calibration_inputs,
     normalised,
@@ -64,7 +64,7 @@ class TrainingPlan:
     blocks: int = 200
     held_out_blocks: int = 40
     fit: FitOptions = RECIPE
-    radio: Radio = RADIO
+    radio: Receiver = RADIO
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ class UniversalModel:
             the training data, `constant` and `line in levels`; `float` and `int8`.
     """
 
-    card: Card
+    card: ModelCard
     network: FloatWeights
     integers: Int8Weights
     held_out: dict[str, dict[str, ErrorStatistics]]

@@ -67,7 +67,7 @@ class Status(enum.IntEnum):
     MODEL_ERROR = 4
 
 
-class Origin(enum.IntEnum):
+class CorrectedBy(enum.IntEnum):
     """Device that computed a correction; the values of the `source` field of `RangeCorrected.msg`."""
 
     HOST = 0
@@ -202,7 +202,7 @@ class CorrectedRange:
     correction_m: float
     variance_m2: float
     status: Status
-    origin: Origin
+    origin: CorrectedBy
     model_id: int
 
 
@@ -299,7 +299,7 @@ class CorrectedColumns:
     correction_m: NDArray[np.float32]
     variance_m2: NDArray[np.float32]
     status: NDArray[np.uint8]
-    origin: Origin
+    origin: CorrectedBy
     model_id: int
 
     def __len__(self) -> int:

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-_Columns = TypeVar("_Columns", bound="Columns")
+_Series = TypeVar("_Series", bound="TimeSeries")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Columns:
+class TimeSeries:
     """Base of classes with n rows in the order of their times: arrays (n, ...).
 
     Attributes:
@@ -27,13 +27,13 @@ class Columns:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def take(self: _Columns, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> _Columns:
+    def take(self: _Series, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> _Series:
         """Return the rows at `index`."""
         columns = {one.name: getattr(self, one.name) for one in fields(self)}
         taken = {name: column[index] for name, column in columns.items() if isinstance(column, np.ndarray)}
         return replace(self, **taken)
 
-    def reversed(self: _Columns, end_ns: int) -> _Columns:
+    def reversed(self: _Series, end_ns: int) -> _Series:
         """Return the rows backwards in time, from `end_ns` on."""
         back = self.take(slice(None, None, -1))
         return replace(back, stamp_ns=end_ns - back.stamp_ns)
@@ -45,7 +45,7 @@ def rows_of(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ranges(Columns):
+class Ranges(TimeSeries):
     """n ranges of one tag.
 
     Attributes:
@@ -104,7 +104,7 @@ _UNKNOWN_HEADING = (math.nan,) * 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track(Columns):
+class Track(TimeSeries):
     """n estimates.
 
     Attributes:
@@ -147,7 +147,7 @@ class Track(Columns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TruePath(Columns):
+class TruePath(TimeSeries):
     """True positions of a tag: float64 (n, 3) positions in m, and yaws (n,) in rad if known."""
 
     position: NDArray[np.float64]
@@ -175,7 +175,7 @@ class TruePath(Columns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heights(Columns):
+class Heights(TimeSeries):
     """Measured heights of a tag in the anchors' frame.
 
     Attributes:
@@ -194,7 +194,7 @@ class Heights(Columns):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Odometry(Columns):
+class Odometry(TimeSeries):
     """Motion of a robot's base in the plane, measured by its wheels or by another sensor.
 
     Attributes:
@@ -211,11 +211,11 @@ class Odometry(Columns):
 
     def reversed(self, end_ns: int) -> Odometry:
         """Return the motion backwards in time, from `end_ns` on."""
-        return replace(Columns.reversed(self, end_ns), twist=-self.twist[::-1])
+        return replace(TimeSeries.reversed(self, end_ns), twist=-self.twist[::-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Imu(Columns):
+class Imu(TimeSeries):
     """Yaw rates, and if known yaws, of an IMU whose z axis points up.
 
     Attributes:
@@ -230,7 +230,7 @@ class Imu(Columns):
 
     def reversed(self, end_ns: int) -> Imu:
         """Return the rotation backwards in time, from `end_ns` on."""
-        return replace(Columns.reversed(self, end_ns), yaw_rate=-self.yaw_rate[::-1])
+        return replace(TimeSeries.reversed(self, end_ns), yaw_rate=-self.yaw_rate[::-1])
 
 
 GAP_S = 0.5
@@ -251,7 +251,7 @@ _SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PosePath(Columns):
+class PosePath(TimeSeries):
     """Poses of a robot's frame.
 
     Contains float64 (n, 3) positions in m, and (n, 4) unit quaternions x, y, z, w that rotate the robot's axes to the map's.

@@ -48,7 +48,7 @@ MAX_HEADING_VARIANCE = 1.0
 """If the variance of the heading is larger, rad^2, the heading is unknown."""
 
 
-class Feed:
+class SceneUpdater:
     """Adds messages to a scene, with the lock that its pages hold while they draw.
 
     Attributes:

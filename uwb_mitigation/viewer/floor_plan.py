@@ -23,7 +23,7 @@ VALID = "a map_server file: image, resolution (m per pixel), origin [x, y, yaw]"
 
 
 @dataclass(frozen=True, slots=True)
-class FloorPlan:
+class MapImage:
     """A floor plan for a web page.
 
     Attributes:
@@ -39,7 +39,7 @@ class FloorPlan:
     height: float
 
 
-def load_floor_plan(path: Path) -> FloorPlan:
+def load_floor_plan(path: Path) -> MapImage:
     """Read a floor plan.
 
     Raises:
@@ -81,4 +81,4 @@ def load_floor_plan(path: Path) -> FloorPlan:
     out = io.BytesIO()
     Image.fromarray(pixels).save(out, "PNG", optimize=True)
     url = "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
-    return FloorPlan(url, x, y, yaw, width, height)
+    return MapImage(url, x, y, yaw, width, height)

@@ -26,7 +26,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from bokeh.transform import factor_mark
 
-from uwb_mitigation.viewer.floor_plan import FloorPlan
+from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.palette import (
     BLUE,
     GREEN,
@@ -116,7 +116,7 @@ class Models:
         layers: renderers of the map that are shown on request, {name: renderers}.
     """
 
-    def __init__(self, seconds: float | None, plan: FloorPlan | None = None, second: bool = False) -> None:
+    def __init__(self, seconds: float | None, plan: MapImage | None = None, second: bool = False) -> None:
         self._kinds = _LIVE if second else _LIVE[:2]
         names, looks = [status.name for status in STATUS_LOOKS], STATUS_LOOKS.values()
         colours = CategoricalColorMapper(
@@ -177,7 +177,7 @@ class Models:
             if item.visible != shown:
                 item.visible = shown
 
-    def _map(self, plan: FloorPlan | None) -> figure:
+    def _map(self, plan: MapImage | None) -> figure:
         plot = _figure(540, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20

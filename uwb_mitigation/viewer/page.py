@@ -19,7 +19,7 @@ from bokeh.models import ColumnDataSource
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.viewer.floor_plan import FloorPlan
+from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.models import COLUMNS, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
 from uwb_mitigation.viewer.palette import STATUS_LOOKS, TrackKind
 from uwb_mitigation.viewer.scene import (
@@ -77,7 +77,7 @@ class View:
     window: int = 157
     player: BagPlayer | None = None
     second: Scene | None = None
-    plan: FloorPlan | None = None
+    plan: MapImage | None = None
     missing: MissingData = field(default_factory=MissingData)
     pages: int = 0
 

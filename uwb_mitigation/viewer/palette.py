@@ -17,7 +17,7 @@ PAPER, NIGHT = "#ffffff", "#111827"
 """Backgrounds of the light and of the dark page; each is also the ink on the other one."""
 
 
-class Look(NamedTuple):
+class StatusStyle(NamedTuple):
     """Appearance of a status.
 
     Attributes:
@@ -45,13 +45,13 @@ _DISC = tuple(corner for n in range(1, 5) for corner in (_HEXAGON[0], _HEXAGON[n
 
 _RAW = ": only the offset is subtracted"
 STATUS_LOOKS = {
-    Status.OK: Look(BLUE, "circle", "\u25cf", "corrected by the model", _DISC),
-    Status.NO_CIR: Look(GREY, "square", "\u25a0", "no channel impulse response (CIR)" + _RAW, _SQUARE),
-    Status.BAD_CIR: Look(PURPLE, "diamond", "\u25c6", "the CIR is invalid" + _RAW, _DIAMOND),
-    Status.OUT_OF_DISTRIBUTION: Look(
+    Status.OK: StatusStyle(BLUE, "circle", "\u25cf", "corrected by the model", _DISC),
+    Status.NO_CIR: StatusStyle(GREY, "square", "\u25a0", "no channel impulse response (CIR)" + _RAW, _SQUARE),
+    Status.BAD_CIR: StatusStyle(PURPLE, "diamond", "\u25c6", "the CIR is invalid" + _RAW, _DIAMOND),
+    Status.OUT_OF_DISTRIBUTION: StatusStyle(
         VERMILLION, "inverted_triangle", "\u25bc", "unlike the training data of the model" + _RAW, _TRIANGLE
     ),
-    Status.MODEL_ERROR: Look(None, "x", "\u2716", "the network failed" + _RAW, _CROSS),
+    Status.MODEL_ERROR: StatusStyle(None, "x", "\u2716", "the network failed" + _RAW, _CROSS),
 }
 
 

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.mitigation.correction import Backend
+from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
-from uwb_mitigation.viewer.feed import Feed
+from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording
 from uwb_mitigation.viewer.scene import (
@@ -66,7 +66,7 @@ class BagPlayer:
     """
 
     def __init__(
-        self, path: Path, feed: Feed, backend: Callable[[], Backend], namespace: str | None = None
+        self, path: Path, feed: SceneUpdater, backend: Callable[[], Corrector], namespace: str | None = None
     ) -> None:
         self._feed, self._new_backend = feed, backend
         self._recording = recording = Recording(path, namespace)

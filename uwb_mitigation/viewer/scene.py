@@ -238,7 +238,7 @@ class Pose:
 
 
 @dataclass(slots=True)
-class Tag:
+class TagView:
     """A tag's latest pose, its time of reception on the scene's clock, and the stamp of its last raw fix."""
 
     pose: Pose | None = None
@@ -306,7 +306,7 @@ class Scene:
         self._latest_s = self._received_s = math.nan
         self.ranges = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
-        self.tags: BoundedDict[str, Tag] = BoundedDict(MAX_TAGS)
+        self.tags: BoundedDict[str, TagView] = BoundedDict(MAX_TAGS)
         self.tracks: BoundedDict[tuple[str, TrackKind], deque[tuple[float, float]]] = BoundedDict(
             4 * MAX_TAGS
         )
@@ -323,7 +323,7 @@ class Scene:
     def now_s(self) -> float:
         return self._latest_s + max(self.clock() - self._received_s, 0.0)
 
-    def age_s(self, entry: History | Tag) -> float:
+    def age_s(self, entry: History | TagView) -> float:
         """Return the time since the last data of a pair or tag."""
         return max(self.clock() - entry.received_s, 0.0)
 
@@ -371,7 +371,7 @@ class Scene:
 
     def add_pose(self, tag: str, pose: Pose) -> None:
         if _is_plausible(pose.x, pose.y):
-            entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or Tag())
+            entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or TagView())
             entry.pose, entry.received_s = pose, self.clock()
             self.add_position(tag, TrackKind.CORRECTED, pose.x, pose.y)
 
@@ -464,7 +464,7 @@ class Scene:
             if history.latest is not None:
                 yield pair, history, history.latest
 
-    def tag_of(self, tag_id: int) -> Tag | None:
+    def tag_of(self, tag_id: int) -> TagView | None:
         """Return the tag of a range: the tag of that name, else the plain tag if it is the only one without a name."""
         own = self.tags.get(tag_frame(tag_id))
         nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, RecordingError
-from uwb_mitigation.mitigation.correction import Backend
+from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.online.initialization import snapshot
@@ -101,7 +101,7 @@ class Timeline:
 
 
 def index_recording(
-    recording: Recording, anchors: AnchorMap | None, height: Height | None, backend: Backend | None
+    recording: Recording, anchors: AnchorMap | None, height: Height | None, backend: Corrector | None
 ) -> Timeline:
     """Read a recording.
 

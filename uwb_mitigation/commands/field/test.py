@@ -17,12 +17,12 @@ from uwb_mitigation.radios.dw1000.bus import bus_opener
 from uwb_mitigation.radios.dw1000.driver import RadioDriver
 from uwb_mitigation.radios.fira.capture import CaptureWriter
 from uwb_mitigation.radios.fira.session import UciSettings
-from uwb_mitigation.radios.port import Connection, PortAddress
+from uwb_mitigation.radios.port import PortAddress, PortThread
 from uwb_mitigation.radios.serial import BoardDriver
 from uwb_mitigation.radios.settings import RadioSettings, RadioStatus, Role
 from uwb_mitigation.radios.uci import UciDriver
 from uwb_mitigation.radios.wire.layout import Mode
-from uwb_mitigation.radios.wire.messages import Radio
+from uwb_mitigation.radios.wire.messages import RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 SOURCES = {
@@ -91,7 +91,7 @@ def observe(
 class _Collector:
     """Collects the events of a driver."""
 
-    def __init__(self, driver: Connection[Any], observation: Observation) -> None:
+    def __init__(self, driver: PortThread[Any], observation: Observation) -> None:
         self._driver = driver
         self._observation = observation
 
@@ -101,7 +101,7 @@ class _Collector:
             self._observation.ranges.append(event)
         elif isinstance(event, RadioStatus):
             self._observation.temperature_c, self._observation.voltage = event.temperature_c, event.voltage
-        elif isinstance(event, Radio):
+        elif isinstance(event, RadioConfigured):
             self._observation.read |= _values(event.settings)
 
     def until(self, done: Callable[[], bool], timeout_s: float) -> bool:

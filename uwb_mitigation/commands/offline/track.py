@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
-from uwb_mitigation.positioning.geometry import Shape, geometry, shape
+from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, dop
 from uwb_mitigation.positioning.online.initialization import snapshot
 from uwb_mitigation.positioning.online.robot_estimator import make_estimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
@@ -102,11 +102,11 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
     used = anchors.position[np.unique(ranges.anchor)]
     level = config.height is not None or config.heights is not None
-    hdop = float(np.median([geometry(used, position, level=level).hdop for position in sample]))
+    hdop = float(np.median([dop(used, position, level=level).hdop for position in sample]))
     warnings = []
     if not hdop <= POOR_HDOP:
         warnings.append(
-            f"poor geometry: median HDOP {hdop:.0f}. The anchors are {shape(used).value}. "
+            f"poor geometry: median HDOP {hdop:.0f}. The anchors are {anchor_rank(used).value}. "
             "Place anchors on more sides of the tag"
         )
     share = len(live) / len(ranges)
@@ -158,18 +158,18 @@ def _no_position(recording: TagRecording, config: EstimatorConfig, locator: TagE
     if locator.candidates > 1:
         what += f": {locator.candidates} positions explain them equally well"
     level = config.height is not None or config.heights is not None
-    needed, kind = 3 if level else 4, shape(used)
+    needed, kind = 3 if level else 4, anchor_rank(used)
     if locator.undetermined:
         what += ": the geometry is too weak"
     if len(used) < needed:
         what += f"; {len(used)} anchors were received, {needed} are needed"
-    if kind in (Shape.LINE, Shape.POINT) or (kind is Shape.PLANE and not level):
+    if kind in (AnchorRank.LINE, AnchorRank.POINT) or (kind is AnchorRank.PLANE and not level):
         what += f"; the anchors are {kind.value}: give a height or an area that contains only one position"
     return DatasetError(what)
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
+class HoldoutErrors:
     """Medians of absolute held-out residuals, m; NaN: unknown.
 
     Attributes:
@@ -191,7 +191,7 @@ class HeldOut:
         }
 
 
-def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[HeldOut]:
+def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[HoldoutErrors]:
     """Return the held-out residuals of each anchor, and of all anchors last.
 
     The ranges of each anchor are compared with a track that was estimated without this anchor. This needs no ground truth,
@@ -208,7 +208,7 @@ def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[HeldO
     every = [np.concatenate(kind) for kind in zip(*by_anchor, strict=True)]
     identities = [*(anchor.id for anchor in config.anchors.anchors), None]
     return [
-        HeldOut(identity, len(before), _median(before), _median(after))
+        HoldoutErrors(identity, len(before), _median(before), _median(after))
         for identity, (before, after) in zip(identities, [*by_anchor, every], strict=True)
     ]
 

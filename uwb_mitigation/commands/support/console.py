@@ -20,7 +20,7 @@ from uwb_mitigation.files import write_atomically
 MAX_ROWS = 40
 
 
-class Table(RichTable):
+class ConsoleTable(RichTable):
     """A table that wraps long words; rich would truncate them in a narrow terminal."""
 
     def add_column(self, *arguments: Any, **options: Any) -> None:
@@ -63,7 +63,7 @@ def show_table(
         left: the number of left-aligned columns; the others are right-aligned.
         max_rows: maximum number of rows.
     """
-    table = Table(title=title, title_justify="left")
+    table = ConsoleTable(title=title, title_justify="left")
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number < left else "right")
     for row in rows[:max_rows]:

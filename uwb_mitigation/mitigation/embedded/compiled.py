@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.mitigation.correction import Backend, pass_other_radio, pass_through
+from uwb_mitigation.mitigation.correction import Corrector, pass_other_radio, pass_through
 from uwb_mitigation.mitigation.embedded.compiling import (
     WARNINGS,
     Signatures,
@@ -22,7 +22,7 @@ from uwb_mitigation.mitigation.embedded.compiling import (
     compile_objects,
     declare,
     firmware_folder,
-    run,
+    run_tool,
 )
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import Bundle
@@ -131,7 +131,7 @@ def link(
     objects = library_objects(flags)
     options = (*_OPTIONS, *flags, f"-I{firmware_folder() / 'src'}", f"-I{export}")
     kind = ("-shared",) if shared else ()
-    run([*c_compiler(), *options, *kind, str(program), *objects, "-o", str(output), "-lm"])
+    run_tool([*c_compiler(), *options, *kind, str(program), *objects, "-o", str(output), "-lm"])
     return output
 
 
@@ -142,7 +142,7 @@ def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
     return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
 
 
-class FirmwareMitigation(Backend):
+class FirmwareMitigation(Corrector):
     """Corrects ranges with one bundle in the firmware; bit-identical to `Mitigation`.
 
     Raises:
@@ -161,7 +161,7 @@ class FirmwareMitigation(Backend):
             self._firmware = CompiledFirmware(folder, folder)
 
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
-        """See `Backend`."""
+        """See `Corrector`."""
         offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
         if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
             return passed

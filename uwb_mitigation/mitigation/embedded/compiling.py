@@ -59,7 +59,7 @@ def compile_objects(
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     objects = tuple(f"{folder}/{source.name}.o" for source in sources)
     for source, output in zip(sources, objects, strict=True):
-        run([*compiler, *options, "-c", str(source), "-o", output])
+        run_tool([*compiler, *options, "-c", str(source), "-o", output])
     return objects
 
 
@@ -77,7 +77,7 @@ def load_library(prefix: str, objects: Sequence[str], signatures: Signatures) ->
     folder = tempfile.mkdtemp(prefix=f"uwb_{prefix}")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     path = f"{folder}/{prefix}library.so"
-    run([*c_compiler(), "-shared", *objects, "-o", path, "-lm", "-lpthread"])
+    run_tool([*c_compiler(), "-shared", *objects, "-o", path, "-lm", "-lpthread"])
     return declare(ctypes.CDLL(path), prefix, signatures)
 
 
@@ -89,7 +89,7 @@ def declare(library: ctypes.CDLL, prefix: str, signatures: Signatures) -> ctypes
     return library
 
 
-def run(command: Sequence[str], timeout_s: float = 300, folder: Path | None = None) -> str:
+def run_tool(command: Sequence[str], timeout_s: float = 300, folder: Path | None = None) -> str:
     """Run a tool, in `folder`, and return its standard output.
 
     Raises:

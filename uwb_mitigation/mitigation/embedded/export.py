@@ -15,7 +15,7 @@ from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.embedded.packing import Channels, PackedNetwork, pack
 from uwb_mitigation.mitigation.model import graph
-from uwb_mitigation.mitigation.model.bundle import Bundle, Card, Session
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.ood import OodBands
 from uwb_mitigation.mitigation.model.requantisation import Sum
@@ -61,7 +61,9 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
     return write_header(folder, network, bundle.card, bundle.model_id, golden)
 
 
-def write_header(folder: Path, network: PackedNetwork, card: Card, model_id: int, golden: Golden) -> Path:
+def write_header(
+    folder: Path, network: PackedNetwork, card: ModelCard, model_id: int, golden: Golden
+) -> Path:
     """Write `uwb_model.h` to `folder`, which is created if it does not exist; the write is atomic."""
     path = folder / MODEL_HEADER
     try:
@@ -89,7 +91,7 @@ def compare_with_reference(bundle: Bundle) -> int:
     return int(np.sum(given.view(np.uint32) != expected.view(np.uint32)))
 
 
-def render(network: PackedNetwork, card: Card, model_id: int, golden: Golden) -> str:
+def render(network: PackedNetwork, card: ModelCard, model_id: int, golden: Golden) -> str:
     """Return the text of `uwb_model.h`: `uwb_model_data`, and golden vectors under UWB_GOLDEN_VECTORS.
 
     Floats have nine significant digits, so that they are read back with the same bits.
@@ -149,7 +151,7 @@ def _ood_bands(ood_bands: OodBands) -> str:
     return f"static const uwb_ood_bands uwb_model_ood_bands = {{{offset}, {{\n{bands}}}}};\n"
 
 
-def _model(network: PackedNetwork, card: Card, model_id: int) -> str:
+def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
     remnet = bool(network.modules)
     linear_bias, (low, high) = card.linear_bias, card.correction_limits_m
     values = [

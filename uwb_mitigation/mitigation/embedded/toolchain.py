@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, compile_objects, firmware_folder, run
+from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, compile_objects, firmware_folder, run_tool
 
 APT = "apt install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 
@@ -102,7 +102,7 @@ def build_image(
     sources = [program] if program else sorted((boards / board.value).glob("*.c"))
     script = common / ("mps2.ld" if board.value.startswith("qemu") else "nrf52832.ld")
     linking = ("-nostartfiles", "--specs=nano.specs", "-Wl,--gc-sections", "-Wl,--print-memory-usage")
-    usage = run(
+    usage = run_tool(
         [
             *(f"{_PREFIX}gcc", *options, f"-I{export}", *map(str, sources), *objects, *linking),
             *(f"-L{common}", "-T", str(script), "-o", str(elf), "-lm"),
@@ -118,4 +118,4 @@ def build_image(
 
 def write_hex(image: Image, output: Path) -> None:
     """Write an image as Intel HEX, for the USB drive of a J-Link."""
-    run([f"{_PREFIX}objcopy", "-O", "ihex", str(image.elf), str(output)])
+    run_tool([f"{_PREFIX}objcopy", "-O", "ihex", str(image.elf), str(output)])

@@ -40,7 +40,7 @@ _REMEDY = "a bundle written by `uwb-mitigation train`, `quantize` or `calibrate`
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
+class ModelCard:
     """Description of the network in a bundle.
 
     Attributes:
@@ -149,7 +149,7 @@ class Bundle:
     path: Path
     model: bytes
     model_id: int
-    card: Card
+    card: ModelCard
     session: onnxruntime.InferenceSession
 
     @property
@@ -268,7 +268,7 @@ def session_options() -> onnxruntime.SessionOptions:
     return options
 
 
-def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
+def save_bundle(path: Path, graph: bytes, card: ModelCard) -> Bundle:
     """Write a bundle atomically and return it as `load_bundle` would.
 
     Args:
@@ -284,7 +284,7 @@ def save_bundle(path: Path, graph: bytes, card: Card) -> Bundle:
     return bundle
 
 
-def build_bundle(path: Path, graph: bytes, card: Card) -> tuple[Bundle, bytes]:
+def build_bundle(path: Path, graph: bytes, card: ModelCard) -> tuple[Bundle, bytes]:
     """Return a bundle like `save_bundle`, and its bytes, which the caller must write to `path`.
 
     Raises:
@@ -294,7 +294,7 @@ def build_bundle(path: Path, graph: bytes, card: Card) -> tuple[Bundle, bytes]:
     return parse_bundle(data, path), data
 
 
-def assemble_bundle(graph: bytes, card: Card) -> bytes:
+def assemble_bundle(graph: bytes, card: ModelCard) -> bytes:
     """Return the bytes of a bundle."""
     import onnx
 
@@ -339,12 +339,12 @@ def _checksum(data: bytes, digits: int) -> int:
     return crc or 1
 
 
-def _card(metadata: dict[str, Any]) -> Card:
+def _card(metadata: dict[str, Any]) -> ModelCard:
     if metadata["format"] != FORMAT:
         raise ModelError(f"metadata format {metadata['format']!r}", valid=f"{FORMAT}")
     linear_bias = metadata["prior"]
     low, high = metadata["correction_limits_m"]
-    return Card(
+    return ModelCard(
         name=str(metadata["name"]),
         architecture=_architecture(metadata["architecture"]),
         preprocessing=Preprocessing(

@@ -36,7 +36,7 @@ _SQUARE, _LINEAR, _CONSTANT = np.float32(-4 / 3), np.float32(4), np.float32(8 / 
 
 
 @dataclass(frozen=True, slots=True)
-class Widening:
+class Margins:
     """Extension of a band beyond the training data, in half widths of the data.
 
     Attributes:
@@ -53,11 +53,11 @@ class Widening:
 # or stronger than distance and the walls of the training data explain, or a first path that is stronger than in LOS,
 # comes from another radio.
 _WIDENINGS = (
-    Widening(1.0, 2.0, 1.0),
-    Widening(0.0, 0.0, 3.0),
-    Widening(0.0, 1.0, 3.0),
-    Widening(1.0, 1.0, 1.5),
-    Widening(1.0, 1.0, 1.5),
+    Margins(1.0, 2.0, 1.0),
+    Margins(0.0, 0.0, 3.0),
+    Margins(0.0, 1.0, 3.0),
+    Margins(1.0, 1.0, 1.5),
+    Margins(1.0, 1.0, 1.5),
 )
 
 
@@ -77,7 +77,7 @@ class Band:
             raise ModelError(f"band {astuple(self)}", valid="low <= high, and a positive margin")
 
     @classmethod
-    def of(cls, values: NDArray[np.floating], widening: Widening) -> Band:
+    def of(cls, values: NDArray[np.floating], widening: Margins) -> Band:
         """Return the extended band of finite values (n,); its margin is half the width of the values."""
         low, high = float(values.min()), float(values.max())
         half_width = max((high - low) / 2, widening.min_half_width)

@@ -14,9 +14,9 @@ from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.radios.dw1000.bus import bus_opener
 from uwb_mitigation.radios.dw1000.driver import RadioDriver, RadioEvent, RadioLost
-from uwb_mitigation.radios.port import Connection
+from uwb_mitigation.radios.port import PortThread
 from uwb_mitigation.radios.serial import BoardDriver
-from uwb_mitigation.radios.settings import NEVER_MS, RadioSettings, RadioState, RadioStatus, Role
+from uwb_mitigation.radios.settings import AGE_UNKNOWN_MS, RadioSettings, RadioState, RadioStatus, Role
 from uwb_mitigation.radios.wire.events import (
     Connected,
     Disconnected,
@@ -28,7 +28,7 @@ from uwb_mitigation.radios.wire.events import (
     VersionMismatch,
 )
 from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, LogLevel, Mode
-from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Log, Radio
+from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Log, RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
@@ -51,7 +51,7 @@ _STATES = {
 _COUNTS = tuple(row.name for row in fields(RadioStatus) if row.type == "int")
 
 
-class Feed(Protocol):
+class SourceHandle(Protocol):
     """A source that is playing or connected; `stop` ends it and may be called twice."""
 
     def start(self) -> None: ...
@@ -79,19 +79,19 @@ class LiveFeed:
 
     def __init__(
         self,
-        ports: Sequence[Connection[Any]],
+        ports: Sequence[PortThread[Any]],
         on_range: Callable[[RangeMeasurement], None],
         now_ns: Callable[[], int],
         logger: Any,
     ) -> None:
         self.ranges = 0
-        self.meter = diagnostics.Meter(now_ns)
+        self.meter = diagnostics.RateMonitor(now_ns)
         self._logger = logger
         self._ports = ports
         self._on_range = on_range
         self._now_ns = now_ns
         self._publishing = threading.Lock()
-        self._problems: dict[Connection[Any], tuple[str, float, bool]] = {}
+        self._problems: dict[PortThread[Any], tuple[str, float, bool]] = {}
         self._threads = [
             threading.Thread(target=self._run, args=(port,), name="feed", daemon=True) for port in ports
         ]
@@ -112,7 +112,7 @@ class LiveFeed:
         """Handle an event that is not a range."""
         raise NotImplementedError
 
-    def check(self, port: Connection[Any]) -> None:
+    def check(self, port: PortThread[Any]) -> None:
         """Log a problem once if it lasts longer than `EVENT_TIMEOUT_S`; a handshake is shorter.
 
         Called after every event, and at least every `EVENT_TIMEOUT_S`.
@@ -126,7 +126,7 @@ class LiveFeed:
             logged = True
         self._problems[port] = problem, since_s, logged
 
-    def _run(self, port: Connection[Any]) -> None:
+    def _run(self, port: PortThread[Any]) -> None:
         while not port.closed:
             event = port.get(EVENT_TIMEOUT_S)
             if isinstance(event, RangeMeasurement):
@@ -222,7 +222,7 @@ class BoardFeed(LiveFeed):
                 self._status = event
             case RadioStatus():
                 self._radio_status = event
-            case Radio(settings=settings):
+            case RadioConfigured(settings=settings):
                 # A board may repeat its settings.
                 if settings != self._radio:
                     log.info(f"the board's radio {format_id(settings.address)}: {settings_text(settings)}")
@@ -294,12 +294,12 @@ class RadioFeed(LiveFeed):
         level = level_of(problem, next(filter(None, warnings), ""), "ranging" if is_tag else "answering")
         return hardware, *level, entries
 
-    def check(self, port: Connection[Any]) -> None:
+    def check(self, port: PortThread[Any]) -> None:
         """Do nothing: the events of a radio contain its problems."""
 
     def handle(self, event: RadioEvent, port: RadioDriver) -> None:
         match event:
-            case Radio(settings=settings):
+            case RadioConfigured(settings=settings):
                 name, text = port.report().name, settings_text(settings)
                 self._logger.info(f"radio {format_id(settings.address)} at {name}: {text}")
             case RadioLost(text=text) if not port.closed:
@@ -430,7 +430,7 @@ def anchor_values(status: RadioStatus) -> dict[str, object]:
     """Return the values of the anchors in reach for the diagnostics."""
     values: dict[str, object] = {}
     for anchor in status.anchors:
-        last_seen = "never" if anchor.age_ms == NEVER_MS else f"{anchor.age_ms / 1000:.1f} s ago"
+        last_seen = "never" if anchor.age_ms == AGE_UNKNOWN_MS else f"{anchor.age_ms / 1000:.1f} s ago"
         values[f"anchor {format_id(anchor.address)}"] = (
             f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, last seen {last_seen}"
         )

@@ -83,7 +83,7 @@ class TopicFeed:
         self.counts: Counter[str] = Counter()
         self._problem = ""
         self._node, self._mapping, self._on_range, self._now_ns = node, mapping, on_range, now_ns
-        self._meter = diagnostics.Meter(now_ns)
+        self._meter = diagnostics.RateMonitor(now_ns)
         self._type = message_type(mapping.type)
         self._converter = Converter(mapping.values)
         others = [*mapping.cir_columns, *(rule.column for rule in mapping.drop)]

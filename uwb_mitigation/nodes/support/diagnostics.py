@@ -55,7 +55,7 @@ def model_id(identity: int) -> str:
     return f"{identity:08x} ({identity})"
 
 
-class Meter:
+class RateMonitor:
     """Rate and latency since the previous call of `entries`.
 
     Args:

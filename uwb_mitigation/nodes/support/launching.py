@@ -17,7 +17,13 @@ from typing import Any
 import yaml
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, check_name, did_you_mean
-from uwb_mitigation.nodes.support.parameter_tables import KEPT_PARAMETERS, STANDARD, TABLES, Parameter, Value
+from uwb_mitigation.nodes.support.parameter_tables import (
+    KEPT_PARAMETERS,
+    STANDARD,
+    TABLES,
+    Parameter,
+    ParameterValue,
+)
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
@@ -96,7 +102,7 @@ def parameters(
     return found
 
 
-def value_of(row: Parameter, text: str) -> Value:
+def value_of(row: Parameter, text: str) -> ParameterValue:
     """Return the value of a parameter from the text of an argument.
 
     Raises:
@@ -112,7 +118,7 @@ def value_of(row: Parameter, text: str) -> Value:
     return float(value) if isinstance(row.default, float) else value
 
 
-def for_launch(value: Value) -> Value:
+def for_launch(value: ParameterValue) -> ParameterValue:
     """Return the value for launch_ros, which reads a text as YAML: a text such as 1234 needs quotes.
 
     Raises:
@@ -213,7 +219,7 @@ def from_files(node: str, own: str, shared: str = "") -> dict[str, Any]:
     return given | _parameters_in(Path(shared), node, conflicting_parameters(node)) if shared else given
 
 
-def conflicting_parameters(node: str) -> dict[str, Value]:
+def conflicting_parameters(node: str) -> dict[str, ParameterValue]:
     """Return the parameters whose names have another meaning for an earlier node, such as the viewer's port.
 
     In the section for all nodes of a shared file they belong to that earlier node, as arguments do.

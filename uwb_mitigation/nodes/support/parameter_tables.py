@@ -11,7 +11,7 @@ from typing import Any
 
 from uwb_mitigation.errors import ParameterError, did_you_mean
 
-Value = bool | int | float | str
+ParameterValue = bool | int | float | str
 
 _TYPE_NAMES = {
     bool: "true or false",
@@ -37,7 +37,7 @@ class Parameter:
     """
 
     name: str
-    default: Value
+    default: ParameterValue
     description: str
     low: float | None = None
     high: float | None = None
@@ -87,7 +87,7 @@ _SENSOR_RANGES = Parameter(
 )  # fmt: skip
 
 
-def _radio(name: str, default: Value, description: str, **options: Any) -> Parameter:
+def _radio(name: str, default: ParameterValue, description: str, **options: Any) -> Parameter:
     sources = "serial, evb1000, spi, uci" if name in _UCI else "serial, evb1000, spi"
     return Parameter(f"radio.{name}", default, f"{description} ({sources}).", live=True, **options)
 

@@ -65,7 +65,7 @@ def make_executor(context: Context | None = None) -> Executor:
     return EventsExecutor(context=context)
 
 
-def load(name: str) -> Callable[[threading.Event], list[Node]]:
+def load_node(name: str) -> Callable[[threading.Event], list[Node]]:
     """Import an executable and return the function that makes its nodes.
 
     The function gets the event that ends the process. `pipeline` is driver and mitigator in one process, and a locator
@@ -116,7 +116,7 @@ def _run(name: str) -> int:
         _initialise()
         try:
             # Load before the handlers are installed: until then a signal terminates the process immediately.
-            make_nodes = load(name)
+            make_nodes = load_node(name)
             stop = stop_event()
             nodes = make_nodes(stop)
         except (rclpy_implementation.RCLError, NameValidationException) as error:

@@ -23,7 +23,7 @@ from uwb_mitigation.positioning.batch.joint_fit import (
     observations_of,
 )
 from uwb_mitigation.positioning.batch.motion_segments import Segments
-from uwb_mitigation.positioning.geometry import Area, Height, Shape, directions, shape
+from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank, unit_vectors
 from uwb_mitigation.positioning.noise_model import Regressors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import AnchorMap
@@ -63,7 +63,7 @@ FirstPositions = Callable[
 ]
 
 
-def check_anchors(
+def detect_anchor_errors(
     anchors: AnchorMap, used: NDArray[np.intp], height: Height | None, area: Area | None = None
 ) -> None:
     """Refuse anchors that do not determine positions and offsets.
@@ -86,10 +86,10 @@ def check_anchors(
     position = anchors.position[used]
     if height is not None:
         position = position * (1.0, 1.0, 0.0)
-    kind = shape(position)
-    if kind in (Shape.POINT, Shape.LINE):
+    kind = anchor_rank(position)
+    if kind in (AnchorRank.POINT, AnchorRank.LINE):
         raise DatasetError("the anchors are all on a line", valid="one or more that are not on this line")
-    if height is None and area is None and kind is Shape.PLANE:
+    if height is None and area is None and kind is AnchorRank.PLANE:
         raise DatasetError(
             "the anchors are all in a plane: the mirror image of the track explains the ranges equally well",
             valid="--height of the tag, --area on one side of the plane, or an anchor above or below that plane",
@@ -198,7 +198,7 @@ def _displaced(row: int, found: Segments, fit: JointFit) -> tuple[float, float]:
     try:
         for _ in range(_STEPS):
             tag = position[observations.knot] + observations.relative_height[:, None] * (0.0, 0.0, 1.0)
-            unit, _ = directions(tag, moved.position[observations.anchor])
+            unit, _ = unit_vectors(tag, moved.position[observations.anchor])
             rows = np.concatenate([observations.rows, -unit[:, axes] * own], axis=1)
             shift = moved.position[row, axes] - anchors.position[row, axes]
             prior = replace(
@@ -280,7 +280,7 @@ def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
     return float(np.sqrt(squared.mean() * (groups - 1) / groups))
 
 
-def seen_by_others(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def leave_one_out_residual(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return for each range the distance of its anchor from the other anchors' track, and its standard deviation."""
     observations, used = fit.observations, np.unique(fit.observations.anchor)
     distance, sd = np.full(len(observations), np.nan), np.full(len(observations), np.nan)
@@ -297,7 +297,7 @@ def seen_by_others(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[np.float
         knot = observations.knot[own]
         tag = seen.position[knot] + observations.ahead_s[own][:, None] * seen.velocity[knot]
         tag[:, 2] += observations.relative_height[own]
-        unit, distance[own] = directions(tag, fit.config.anchors.position[observations.anchor[own]])
+        unit, distance[own] = unit_vectors(tag, fit.config.anchors.position[observations.anchor[own]])
         known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
         known[~(_gap_s(observations, received)[knot] <= FAR_S)] = np.nan
         sd[own] = known

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution
 from uwb_mitigation.positioning.batch.motion_segments import Segments
-from uwb_mitigation.positioning.geometry import directions
+from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 
@@ -254,7 +254,7 @@ def fit_joint(
     Raises:
         DatasetError: the ranges do not determine the solution.
     """
-    d, model, problem = config.dims, config.model, _Problem(config, observations, prior, around)
+    d, model, problem = config.dims, config.model, _JointProblem(config, observations, prior, around)
     x = np.zeros((len(observations.time_s), 2 * d))
     x[:, :d] = position[:, :d]
     shared = prior.mean.copy() if parameters is None else parameters
@@ -299,7 +299,7 @@ def fit_joint(
     )
 
 
-class _Problem:
+class _JointProblem:
     """The linearised problem of `fit_joint`."""
 
     def __init__(
@@ -343,7 +343,7 @@ class _Problem:
         tag = np.full((len(at), 3), self.level)
         tag[:, :d] = at[:, :d] + observations.ahead_s[:, None] * at[:, d:]
         tag[:, 2] += observations.relative_height
-        unit, distance = directions(tag, self._config.anchors.position[observations.anchor])
+        unit, distance = unit_vectors(tag, self._config.anchors.position[observations.anchor])
         return unit, observations.range_m - distance - observations.rows @ shared
 
     def _rows(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.geometry import directions
+from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import _SECOND_NS, PosePath, Ranges
@@ -123,7 +123,9 @@ def align_poses(
         chosen = np.sort(np.random.default_rng(1).choice(chosen, MAX_RANGES, replace=False))
     smoothed = [path.smoothed() for path in paths]
     anchor = anchors.position[ranges.anchor]
-    problem = _Problem(ranges, tag, of_pair.reshape(-1), anchor, known, smoothed, pairs.shape[1]).take(chosen)
+    problem = _AlignmentProblem(
+        ranges, tag, of_pair.reshape(-1), anchor, known, smoothed, pairs.shape[1]
+    ).take(chosen)
     levers = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
     start, free = levers, np.full(levers.shape, estimate_lever_arm)
     time_offset, free_time_offset = time_offset_s, time_offset_s is None
@@ -183,7 +185,7 @@ def _check_enough(count: int, alignment_unknown: bool) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _AlignmentProblem:
     """n ranges of tags (n,) and pairs (n,) to anchors at (n, 3), and the paths of the T tags. Lever arms are (T, 3)."""
 
     ranges: Ranges
@@ -194,7 +196,7 @@ class _Problem:
     paths: Sequence[PosePath]
     pairs: int
 
-    def take(self, index: NDArray[np.intp]) -> _Problem:
+    def take(self, index: NDArray[np.intp]) -> _AlignmentProblem:
         columns = {name: getattr(self, name)[index] for name in ("tag", "pair", "anchor")}
         return replace(self, ranges=self.ranges.take(index), known=self.known.take(index), **columns)
 
@@ -250,7 +252,7 @@ class _Problem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return range minus distance and known corrections (n,), and derivatives of the distance by the lever arm (n, 3)."""
         position, rotation = _poses_at(self.paths, self.tag, self.ranges.stamp_ns, time_offset)
-        unit, distance = directions(
+        unit, distance = unit_vectors(
             position + np.einsum("nij,nj->ni", rotation, lever[self.tag]), self.anchor
         )
         error = self.ranges.range_m - self.known.rows @ self.known.mean - distance

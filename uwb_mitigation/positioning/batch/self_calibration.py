@@ -16,11 +16,11 @@ from scipy.stats import chi2
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.anchor_errors import (
     check_anchor_positions,
-    check_anchors,
     check_motion,
+    detect_anchor_errors,
+    leave_one_out_residual,
     mirrored,
     position_scatter,
-    seen_by_others,
 )
 from uwb_mitigation.positioning.batch.joint_fit import KNOT_S, SLOW_S, JointFit, fit_segments
 from uwb_mitigation.positioning.batch.motion_segments import Segments, find_segments
@@ -83,13 +83,13 @@ class SelfCalibration:
     level: str
     notes: tuple[str, ...] = ()
     tag_ids: tuple[int, ...]
-    unobserved_m: float = 0.0
-    own_sd_m: float
+    common_offset_m: float = 0.0
+    individual_sd_m: float
     pseudo_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     pseudo_sd_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     position_scatter_m: tuple[float, float] = (np.nan, np.nan)
 
-    def without_ranges(self, left_out: NDArray[np.bool_]) -> SelfCalibration:
+    def raw_only(self, left_out: NDArray[np.bool_]) -> SelfCalibration:
         """Fit the same parameters and tracks without some of `segments.ranges`, bool (r,); the pseudo-truth is unchanged.
 
         Raises:
@@ -111,8 +111,8 @@ class SelfCalibration:
         at, sd = self._columns(tag, row), self.fit.config.anchors.sd
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
-        placed = sd[row] ** 2 / 2.0 if len(at) > 1 else np.mean(sd**2) / len(sd) + self.own_sd_m**2
-        variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.unobserved_m**2
+        placed = sd[row] ** 2 / 2.0 if len(at) > 1 else np.mean(sd**2) / len(sd) + self.individual_sd_m**2
+        variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.common_offset_m**2
         return float(self.fit.parameters[at].sum()), float(np.sqrt(variance))
 
     def applied(self, tag: int, row: int) -> tuple[float, float]:
@@ -140,7 +140,7 @@ class SelfCalibration:
             rows[number, self._columns(tag, row)] = 1.0
         of_mean = rows.mean(axis=0)
         placed = float(np.mean(sd**2)) / 2.0 / len(sd)
-        variance = of_mean @ self.fit.covariance @ of_mean + placed + self.unobserved_m**2
+        variance = of_mean @ self.fit.covariance @ of_mean + placed + self.common_offset_m**2
         return float(of_mean @ self.fit.parameters), float(np.sqrt(variance))
 
     def _columns(self, tag: int, row: int) -> list[int]:
@@ -154,7 +154,7 @@ class SelfCalibration:
         return [(int(tag), int(row)) for tag, row in found]
 
 
-def calibrate(
+def self_calibrate(
     anchors: AnchorMap,
     tags: Sequence[Ranges],
     regressors: Regressors | None = None,
@@ -184,7 +184,7 @@ def calibrate(
         height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), height_sd_m))
     config = EstimatorConfig(anchors, MODEL, height, area)
     known = regressors or Regressors.none(sum(map(len, tags)))
-    check_anchors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
+    detect_anchor_errors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
     notes: list[str] = []
     found = find_segments(tags)
     of_range = np.cumsum([0, *map(len, tags)])[found.tag] + found.row
@@ -255,7 +255,7 @@ def calibrate(
     fit = fit_segments(config, found, fit.prior, fit.position, fit.parameters)
     check_anchor_positions(found, fit, first_positions)
     ids = tuple(one.tag_id for one in tags)
-    result = SelfCalibration(segments=found, fit=fit, level=level, tag_ids=ids, own_sd_m=own_sd)
+    result = SelfCalibration(segments=found, fit=fit, level=level, tag_ids=ids, individual_sd_m=own_sd)
     if common_sd > MAX_COMMON_SD_M or not any(result.applied(*pair)[0] for pair in result.pairs()):
         value, sd = result.mean()
         notes.append(
@@ -265,8 +265,8 @@ def calibrate(
         zero = replace(shared, mean=np.append(0.0, shared.mean[1:]), sd=np.append(1e-4, shared.sd[1:]))
         start = np.append(0.0, fit.parameters[1 : len(zero.names)])
         fit = fit_segments(config, found, zero, fit.position, start)
-        result = replace(result, fit=fit, level="one", unobserved_m=float(np.hypot(value, sd)))
-    pseudo, pseudo_sd = seen_by_others(fit)
+        result = replace(result, fit=fit, level="one", common_offset_m=float(np.hypot(value, sd)))
+    pseudo, pseudo_sd = leave_one_out_residual(fit)
     scatter = position_scatter(fit, np.zeros(len(fit.observations))), _held_out_scatter(fit)
     return replace(
         result, notes=tuple(notes), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution
-from uwb_mitigation.positioning.geometry import directions
+from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.robot_estimator import make_estimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
@@ -177,7 +177,7 @@ class Smoother:
         at = x[self._of]
         tag = np.full((len(at), 3), height)
         tag[:, :d] = at[:, :d] + self._ahead_s[:, None] * at[:, d : 2 * d]
-        unit, distance = directions(tag, anchors[self._ranges.anchor])
+        unit, distance = unit_vectors(tag, anchors[self._ranges.anchor])
         return unit, self._ranges.range_m - distance - shared[0] - shared[1 + self._slot]
 
     def _linearised(self, x: NDArray[np.float64], shared: NDArray[np.float64]) -> LeastSquares:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.smoother import Smoothed, Smoother
-from uwb_mitigation.positioning.geometry import Shape, directions, shape
+from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, unit_vectors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Ranges, Track
@@ -114,7 +114,7 @@ def survey(
     guesses, model, used, needed = config.anchors, config.model, np.unique(ranges.anchor), config.dims + 1
     if len(used) < needed:
         raise DatasetError(f"{len(used)} anchors were received", valid=f"{needed} or more for a survey")
-    if shape(guesses.position[used]) is Shape.LINE:
+    if anchor_rank(guesses.position[used]) is AnchorRank.LINE:
         raise DatasetError("the anchors are all on a line", valid="at least one next to the line")
     deviations = np.array(
         [sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())]
@@ -230,7 +230,7 @@ def _alternative(
     # Residuals of the fit, with what it attributes to offsets: the other position has to explain the same ranges.
     range_m = found_m + fit.residual_m[own]
     for _ in range(10):
-        unit, expected = directions(other, tag)
+        unit, expected = unit_vectors(other, tag)
         z = (range_m - expected) / sd
         slope = (unit / sd[:, None])[:, :axes]
         weighted = slope * model.weight(z)[:, None]

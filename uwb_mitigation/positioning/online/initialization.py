@@ -72,7 +72,7 @@ def candidate_positions(
     if len(range_m) < dims:
         return []
     x = _starts(anchors, range_m, height)
-    problem = _Problem.of(len(x), anchors, range_m, sd_m, model, height)
+    problem = _Trilateration.of(len(x), anchors, range_m, sd_m, model, height)
     x, cost, gradient, hessian = problem.descend(x)
     # Discard starts that have not converged, unless no start has converged.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
@@ -109,7 +109,7 @@ def candidate_positions(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _Trilateration:
     """k ranges, or n sets of k ranges (n, k), and independent priors of n positions.
 
     Attributes:
@@ -133,20 +133,20 @@ class _Problem:
         sd_m: NDArray[np.float64],
         model: NoiseModel,
         height: Height | None,
-    ) -> _Problem:
+    ) -> _Trilateration:
         """Return the problem for that number of positions."""
         mean, information = np.zeros((2, count, 3))
         if height is not None:
             mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
         return cls(anchors, range_m, sd_m, model, mean, information)
 
-    def at(self, rows: NDArray[np.intp]) -> _Problem:
+    def at(self, rows: NDArray[np.intp]) -> _Trilateration:
         """Return the same ranges with the priors of those positions."""
         return replace(self, mean=self.mean[rows], information=self.information[rows])
 
     def with_walls(
         self, rows: NDArray[np.intp], wall: NDArray[np.float64], held: NDArray[np.bool_]
-    ) -> _Problem:
+    ) -> _Trilateration:
         """Return `at`, with the coordinates `held` bool (n, 3) at the boundary."""
         own = self.at(rows)
         information = np.where(held, 1.0 / _WALL_SD_M**2, own.information)
@@ -231,7 +231,7 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
     range_m, sd_m = np.where(present, latest, 0.0), np.where(present, 1.0, np.inf)
     reach = np.nanmedian(latest, axis=1, keepdims=True) if len(latest) else np.zeros((0, 1))
     exact = None if height is None else Height(height.value, 1e-4)
-    problem = _Problem.of(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
+    problem = _Trilateration.of(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
     best, least = np.zeros((len(latest), 3)), np.full(len(latest), np.inf)
     sides = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -0.5]]) + 0.01
     for side in sides:

@@ -50,7 +50,7 @@ def make_estimator(config: EstimatorConfig) -> TagEstimator:
 
 
 @dataclass(slots=True)
-class _Hypothesis:
+class _HeadingHypothesis:
     filter: OdometryFilter
     loss: float
 
@@ -71,7 +71,7 @@ class RobotEstimator(TagEstimator):
         self.odometry = odometry or DeadReckoning()
         self._robot = config.robot or RobotData()
         self._known: OdometryFilter | None = None
-        self._yaws: list[_Hypothesis] = []
+        self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
         self._last_yaw: float | None = None
         self.rejects_odometry = False
@@ -192,13 +192,13 @@ class RobotEstimator(TagEstimator):
         for number in range(NUM_YAWS):
             yaw = number * step
             one = OdometryFilter(self.filter, point, self._robot.lever_arm, center + yaw, step / 2.0)
-            self._yaws.append(_Hypothesis(one, concentration * (1.0 - math.cos(yaw))))
+            self._yaws.append(_HeadingHypothesis(one, concentration * (1.0 - math.cos(yaw))))
 
     def _prune(self) -> None:
         """Remove implausible and equal hypotheses; the best one is the first."""
         if len(self._yaws) > 1:
             self._yaws.sort(key=lambda one: one.loss)
-            least, kept = self._yaws[0].loss, list[_Hypothesis]()
+            least, kept = self._yaws[0].loss, list[_HeadingHypothesis]()
             for one in self._yaws:
                 one.loss -= least
                 apart = [abs(math.remainder(one.filter.yaw - other.filter.yaw, math.tau)) for other in kept]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.geometry import Area, Geometry, Height, geometry
+from uwb_mitigation.positioning.geometry import Area, Dop, Height, dop
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import (
@@ -107,7 +107,7 @@ class _AnchorState:
 
 
 @dataclass(slots=True)
-class _Hypothesis:
+class _PositionHypothesis:
     filter: RangeFilter
     loss: float
 
@@ -127,7 +127,7 @@ class TagEstimator:
 
     filter: RangeFilter | None
     _last_known: RangeFilter | None
-    _hypotheses: list[_Hypothesis]
+    _hypotheses: list[_PositionHypothesis]
     _ambiguous_with: list[NDArray[np.float64]]
     _origin_ns: int | None
     _time_s: float
@@ -260,12 +260,12 @@ class TagEstimator:
         contradicting = [i for i in received if abs(self._states[i].mean_z) > DISAGREES]
         return contradicting if 2 * len(contradicting) < len(received) else []
 
-    def geometry(self) -> Geometry | None:
+    def dop(self) -> Dop | None:
         """Return the geometry of the anchors that are received; None: the position is not known."""
         if self.filter is None:
             return None
         rows = self.received_anchors()
-        return geometry(self.anchors.position[rows], self.filter.position, level=self._dims == 2)
+        return dop(self.anchors.position[rows], self.filter.position, level=self._dims == 2)
 
     def _seconds(self, stamp_ns: int) -> float:
         if self._origin_ns is None:
@@ -366,7 +366,7 @@ class TagEstimator:
     def _settle(self) -> None:
         """Remove candidates that are implausible or equal; follow the last one."""
         best = min(candidate.loss for candidate in self._hypotheses)
-        kept: list[_Hypothesis] = []
+        kept: list[_PositionHypothesis] = []
         for candidate in sorted(self._hypotheses, key=lambda c: c.loss):
             if candidate.loss > best + IMPLAUSIBLE:
                 continue
@@ -461,7 +461,7 @@ class TagEstimator:
             if height is not None:
                 one.P[2, OFFSET:] = 0.0
             one.P[OFFSET:, :3] = one.P[:3, OFFSET:].T
-            self._hypotheses.append(_Hypothesis(one, candidate.loss + self._prior_loss(candidate)))
+            self._hypotheses.append(_PositionHypothesis(one, candidate.loss + self._prior_loss(candidate)))
         self._settle()
 
     def _prior_loss(self, candidate: CandidatePosition) -> float:

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from uwb_mitigation.radios.dw1000.bus import Bus
-from uwb_mitigation.radios.dw1000.native import NativeRadio, load
-from uwb_mitigation.radios.port import Connection
+from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
+from uwb_mitigation.radios.port import PortThread
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus
-from uwb_mitigation.radios.wire.messages import Radio
+from uwb_mitigation.radios.wire.messages import RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 STATUS_INTERVAL_S = 1.0
@@ -27,7 +27,7 @@ class RadioLost:
     text: str
 
 
-RadioEvent = RangeMeasurement | Radio | RadioStatus | RadioLost
+RadioEvent = RangeMeasurement | RadioConfigured | RadioStatus | RadioLost
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +51,10 @@ class RadioReport:
     overflowed: int
 
 
-class RadioDriver(Connection[RadioEvent]):
+class RadioDriver(PortThread[RadioEvent]):
     """Operates one radio until `close`, and reopens its bus after a loss.
 
-    Events are measurements, `Radio` at each start of the chip, `RadioStatus` once a second, `RadioLost`.
+    Events are measurements, `RadioConfigured` at each start of the chip, `RadioStatus` once a second, `RadioLost`.
 
     Args:
         open_bus: opens the bus; called again after it was lost.
@@ -75,7 +75,7 @@ class RadioDriver(Connection[RadioEvent]):
     ) -> None:
         super().__init__("radio", "the radio was not opened yet")
         settings.check()
-        load()
+        load_native()
         self._open_bus = open_bus
         self._stamp_clock = stamp_clock
         self._requested_settings = settings
@@ -87,7 +87,7 @@ class RadioDriver(Connection[RadioEvent]):
         self._thread.start()
 
     def set_radio(self, settings: RadioSettings) -> None:
-        """Use other settings, starting with the next exchange; a `Radio` follows.
+        """Use other settings, starting with the next exchange; a `RadioConfigured` follows.
 
         Raises:
             ParameterError: the settings are invalid.
@@ -141,7 +141,7 @@ class RadioDriver(Connection[RadioEvent]):
             events: list[RadioEvent] = []
             if not started and radio.address:
                 started = self._was_connected = True
-                events.append(Radio(radio.settings))
+                events.append(RadioConfigured(radio.settings))
             if measured is not None:
                 events.append(measured)
             now_s = time.monotonic()

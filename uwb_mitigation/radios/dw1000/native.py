@@ -22,7 +22,13 @@ from uwb_mitigation.mitigation.embedded.compiling import (
 )
 from uwb_mitigation.radios.dw1000 import structures
 from uwb_mitigation.radios.dw1000.bus import Bus
-from uwb_mitigation.radios.settings import NEVER_MS, AnchorStatus, RadioSettings, RadioState, RadioStatus
+from uwb_mitigation.radios.settings import (
+    AGE_UNKNOWN_MS,
+    AnchorStatus,
+    RadioSettings,
+    RadioState,
+    RadioStatus,
+)
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.layout import MessageType
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -55,7 +61,7 @@ class NativeRadio:
         self, bus: Bus, settings: RadioSettings, *, stamp_clock: Callable[[], int] = time.time_ns
     ) -> None:
         self._bus = bus
-        self._library = load()
+        self._library = load_native()
         config = self._config(settings)
         self._stamp_clock = stamp_clock
         self._settings = settings
@@ -161,9 +167,9 @@ class NativeRadio:
                     anchor.tried,
                     anchor.ranged,
                     anchor.rx_power_dbm,
-                    min((now_us - anchor.last_seen_us) // 1000, NEVER_MS - 1)
+                    min((now_us - anchor.last_seen_us) // 1000, AGE_UNKNOWN_MS - 1)
                     if anchor.last_seen_us
-                    else NEVER_MS,
+                    else AGE_UNKNOWN_MS,
                 )
                 for anchor in table[: count.value]
             ),
@@ -217,7 +223,7 @@ class NativeRadio:
             self._failure = error
 
 
-def load() -> ctypes.CDLL:
+def load_native() -> ctypes.CDLL:
     """Compile the firmware's driver and exchange, once per process, and load them as a shared library.
 
     Raises:

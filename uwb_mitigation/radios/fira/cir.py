@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwb_mitigation.radios.fira.messages import CirBlock, Diagnostics, Frame, FrameReport
+from uwb_mitigation.radios.fira.messages import CirBlock, Diagnostics, FrameReport, RxFrame
 from uwb_mitigation.types.measurement import Cir, RadioType, Segment
 
 _PEAK_SHARE = 0.5
@@ -15,12 +15,12 @@ _PEAK_SHARE = 0.5
 
 _MAX_COUNT = np.iinfo(np.int16).max - 1
 _NO_SAMPLES = np.zeros(0, np.int16)
-_EXCHANGE_FRAMES = frozenset(Frame)
+_EXCHANGE_FRAMES = frozenset(RxFrame)
 _SEGMENTS = {0: Segment.IPATOV} | dict.fromkeys(range(1, 5), Segment.STS)
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class CirReport:
     """A CIR and its agreement with the segment metrics.
 
     Attributes:
@@ -34,7 +34,7 @@ class Reading:
     clock_offset_ppm: float = math.nan
 
 
-def read_cir(diagnostics: Diagnostics | None, channel: int, rssi_dbm: float) -> Reading:
+def read_cir(diagnostics: Diagnostics | None, channel: int, rssi_dbm: float) -> CirReport:
     """Return the CIR of the last received frame of an exchange that has one.
 
     Args:
@@ -53,10 +53,10 @@ def read_cir(diagnostics: Diagnostics | None, channel: int, rssi_dbm: float) -> 
     chosen = (with_cir or [frame for frame in received if frame.metrics] or received)[-1:]
     radio = RadioType.QM35 if chosen and chosen[0].confidence else RadioType.DW3000
     cir = Cir(_NO_SAMPLES, rx_power_dbm=rssi_dbm, channel=channel, prf_mhz=64, radio=radio)
-    return _read(chosen[0], cir) if chosen else Reading(cir)
+    return _read(chosen[0], cir) if chosen else CirReport(cir)
 
 
-def _read(frame: FrameReport, cir: Cir) -> Reading:
+def _read(frame: FrameReport, cir: Cir) -> CirReport:
     """Return the CIR with levels and samples of a frame."""
     blocks = sorted((block for block in frame.cirs if len(block.taps)), key=lambda block: not block.primary)
     metrics = sorted(frame.metrics, key=lambda each: not each.primary)
@@ -70,7 +70,7 @@ def _read(frame: FrameReport, cir: Cir) -> Reading:
     segment = blocks[0].segment if blocks else levels.segment if levels is not None else -1
     cir = replace(cir, segment=_SEGMENTS.get(segment, Segment.UNKNOWN))
     if not blocks:
-        return Reading(cir, clock_offset_ppm=frame.clock_offset_ppm)
+        return CirReport(cir, clock_offset_ppm=frame.clock_offset_ppm)
     block, lead = blocks[0], abs(blocks[0].offset)
     consistent = lead < len(block.taps)
     start, first_path = 0, float(lead)
@@ -82,7 +82,7 @@ def _read(frame: FrameReport, cir: Cir) -> Reading:
     samples, scale = _samples(block)
     first_path = first_path if consistent else math.nan
     cir = replace(cir, samples=samples, scale=scale, start_index=start, first_path_index=first_path)
-    return Reading(cir, consistent, frame.clock_offset_ppm)
+    return CirReport(cir, consistent, frame.clock_offset_ppm)
 
 
 def _peak_fits(block: CirBlock, expected: int) -> bool:

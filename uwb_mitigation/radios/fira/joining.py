@@ -43,7 +43,7 @@ class RangeArrival:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joined:
+class MatchedRange:
     """A range with the diagnostics of its exchange; None = they were lost."""
 
     sequence: int
@@ -73,7 +73,7 @@ class _Waiting(Generic[_Content]):
     parts: int = 1
 
 
-class Joiner:
+class DiagnosticsMatcher:
     """Joins the notifications of one session with one peer, in any order.
 
     After losses or damage, two notifications are joined only if they arrived one after the other, after a notification
@@ -108,7 +108,9 @@ class Joiner:
         self._strict = 0
         self._unanswered = 0
 
-    def add_range(self, sequence: int, arrival: RangeArrival, damages: int, now_ns: int) -> list[Joined]:
+    def add_range(
+        self, sequence: int, arrival: RangeArrival, damages: int, now_ns: int
+    ) -> list[MatchedRange]:
         """Add a range.
 
         Args:
@@ -133,7 +135,7 @@ class Joiner:
         parts = waiting.parts if waiting is not None else 0
         return [*self.expire(now_ns), *self._complete(sequence, arrival, diagnostics, parts, now_ns)]
 
-    def add_diagnostics(self, diagnostics: Diagnostics, damages: int, now_ns: int) -> list[Joined]:
+    def add_diagnostics(self, diagnostics: Diagnostics, damages: int, now_ns: int) -> list[MatchedRange]:
         """Add diagnostics; see `add_range`."""
         sequence = diagnostics.sequence
         adjacent, strict, follows, gap_ns = self._observe(False, sequence, damages, now_ns)
@@ -157,7 +159,7 @@ class Joiner:
         complete = self._complete(sequence, waiting.content, diagnostics if accepted else None, 1, now_ns)
         return [*self.expire(now_ns), *complete]
 
-    def expire(self, now_ns: int) -> list[Joined]:
+    def expire(self, now_ns: int) -> list[MatchedRange]:
         """Return the ranges that have waited too long for their diagnostics."""
         for sequence, old in list(self._diagnostics.items()):
             if now_ns - old.at_ns > self._timeout_ns or len(self._diagnostics) > MAX_WAITING:
@@ -222,15 +224,15 @@ class Joiner:
 
     def _complete(
         self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None, parts: int, now_ns: int
-    ) -> list[Joined]:
+    ) -> list[MatchedRange]:
         """Return a range with its diagnostics, or keep it until their last part."""
         if diagnostics is not None and parts < self._parts:
             self._held[sequence] = now_ns, arrival, diagnostics, parts
             return []
         return [self._joined(sequence, arrival, diagnostics)]
 
-    def _joined(self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None) -> Joined:
+    def _joined(self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None) -> MatchedRange:
         if diagnostics is not None:
             self._completed = sequence
         self.counts["joined" if diagnostics is not None else "without_diagnostics"] += 1
-        return Joined(sequence, arrival, diagnostics)
+        return MatchedRange(sequence, arrival, diagnostics)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import LinkError
 
 
-class Kind(enum.IntEnum):
+class MessageType(enum.IntEnum):
     """Message type (MT) of a packet."""
 
     COMMAND = 1
@@ -27,7 +27,7 @@ class Kind(enum.IntEnum):
     NOTIFICATION = 3
 
 
-class Group(enum.IntEnum):
+class GroupId(enum.IntEnum):
     """Group identifier (GID) of a packet."""
 
     CORE = 0x0
@@ -37,22 +37,22 @@ class Group(enum.IntEnum):
     CALIBRATION = 0xE
 
 
-RESET = (Group.CORE, 0)
-DEVICE_STATUS = (Group.CORE, 1)
-DEVICE_INFO = (Group.CORE, 2)
-GENERIC_ERROR = (Group.CORE, 7)
-SESSION_INIT = (Group.SESSION, 0)
-SESSION_DEINIT = (Group.SESSION, 1)
-SESSION_STATUS = (Group.SESSION, 2)
-SET_APP_CONFIG = (Group.SESSION, 3)
-GET_SESSION_STATE = (Group.SESSION, 6)
-RANGE_START = (Group.RANGING, 0)
+RESET = (GroupId.CORE, 0)
+DEVICE_STATUS = (GroupId.CORE, 1)
+DEVICE_INFO = (GroupId.CORE, 2)
+GENERIC_ERROR = (GroupId.CORE, 7)
+SESSION_INIT = (GroupId.SESSION, 0)
+SESSION_DEINIT = (GroupId.SESSION, 1)
+SESSION_STATUS = (GroupId.SESSION, 2)
+SET_APP_CONFIG = (GroupId.SESSION, 3)
+GET_SESSION_STATE = (GroupId.SESSION, 6)
+RANGE_START = (GroupId.RANGING, 0)
 """The command that starts a session; the notification of this number contains ranges."""
-RANGE_STOP = (Group.RANGING, 1)
-RANGE_DIAGNOSTICS = (Group.VENDOR, 3)
-BOOT = (Group.VENDOR, 0x31)
-SET_CALIBRATION = (Group.CALIBRATION, 0x2A)
-GET_CALIBRATION = (Group.CALIBRATION, 0x2B)
+RANGE_STOP = (GroupId.RANGING, 1)
+RANGE_DIAGNOSTICS = (GroupId.VENDOR, 3)
+BOOT = (GroupId.VENDOR, 0x31)
+SET_CALIBRATION = (GroupId.CALIBRATION, 0x2A)
+GET_CALIBRATION = (GroupId.CALIBRATION, 0x2B)
 
 STATUS_OK = 0
 DEVICE_READY = 1
@@ -77,7 +77,7 @@ RANGE_STATUSES = {
 }
 
 
-class Frame(enum.IntEnum):
+class RxFrame(enum.IntEnum):
     """Frames of an exchange on which the radio reports a CIR (`msg_id`)."""
 
     INITIATION = 0
@@ -156,7 +156,7 @@ class FrameReport:
     """Diagnostics of one frame of an exchange.
 
     Attributes:
-        frame: `msg_id`; see `Frame`.
+        frame: `msg_id`; see `RxFrame`.
         received: the board received the frame; otherwise it transmitted it.
         emitter: address of the transmitter; None = unknown.
         clock_offset_ppm: carrier frequency offset; NaN = unknown.
@@ -205,7 +205,7 @@ def parse_ranges(payload: bytes) -> RangeNotification:
     sequence, handle, _, _, extended, _, count = _RANGE_HEADER.unpack_from(payload)
     expected = _RANGE_HEADER.size + count * _RANGE_RECORD_BYTES
     rest = payload[expected : expected + 1]
-    if len(payload) < expected or (rest and rest[0] >> 5 in (Kind.RESPONSE, Kind.NOTIFICATION)):
+    if len(payload) < expected or (rest and rest[0] >> 5 in (MessageType.RESPONSE, MessageType.NOTIFICATION)):
         raise LinkError(f"range notification of {len(payload)} bytes", valid=f"{expected}")
     width = 8 if extended else 2
     records = []

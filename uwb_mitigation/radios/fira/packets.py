@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.fira import messages
-from uwb_mitigation.radios.fira.messages import Diagnostics, Kind, RangeNotification
+from uwb_mitigation.radios.fira.messages import Diagnostics, MessageType, RangeNotification
 
 COMMAND_BYTES = 250
 """Maximum payload of a command packet; a longer command is sent in fragments."""
@@ -25,10 +25,10 @@ MAX_GAP_NS = 250 * 10**6
 
 _HEADER_BYTES = 4
 _MORE = 0x10
-_RANGES = (Kind.NOTIFICATION, *messages.RANGE_START)
-_DIAGNOSTICS = (Kind.NOTIFICATION, *messages.RANGE_DIAGNOSTICS)
+_RANGES = (MessageType.NOTIFICATION, *messages.RANGE_START)
+_DIAGNOSTICS = (MessageType.NOTIFICATION, *messages.RANGE_DIAGNOSTICS)
 _OTHERS = (messages.DEVICE_STATUS, messages.GENERIC_ERROR, messages.SESSION_STATUS, messages.BOOT)
-_NOTIFICATIONS = {_RANGES, _DIAGNOSTICS, *((Kind.NOTIFICATION, *name) for name in _OTHERS)}
+_NOTIFICATIONS = {_RANGES, _DIAGNOSTICS, *((MessageType.NOTIFICATION, *name) for name in _OTHERS)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +41,7 @@ class Message:
         content: the parsed content of ranges and diagnostics.
     """
 
-    kind: Kind
+    kind: MessageType
     group: int
     opcode: int
     payload: bytes
@@ -54,7 +54,11 @@ class Message:
 
 
 def encode(
-    group: int, opcode: int, payload: bytes, kind: Kind = Kind.COMMAND, size: int = COMMAND_BYTES
+    group: int,
+    opcode: int,
+    payload: bytes,
+    kind: MessageType = MessageType.COMMAND,
+    size: int = COMMAND_BYTES,
 ) -> bytes:
     """Return the packets of a message, in fragments of `size` bytes."""
     parts = [payload[at : at + size] for at in range(0, len(payload), size)] or [b""]
@@ -138,7 +142,7 @@ class PacketDecoder:
         self._drop_parts()
         self._lost = False
         self.counts["messages"] += 1
-        if name[0] == Kind.NOTIFICATION and name not in _NOTIFICATIONS:
+        if name[0] == MessageType.NOTIFICATION and name not in _NOTIFICATIONS:
             self.counts["unknown"] += 1
         found.append(message)
         return end
@@ -146,11 +150,11 @@ class PacketDecoder:
     def _is_header(self, at: int) -> bool:
         first, opcode, reserved = self._buffer[at : at + 3]
         kind, group = first >> 5, first & 0xF
-        plausible = kind in (Kind.RESPONSE, Kind.NOTIFICATION) and opcode < 64 and not reserved
+        plausible = kind in (MessageType.RESPONSE, MessageType.NOTIFICATION) and opcode < 64 and not reserved
         if not plausible or not self._lost:
             return plausible
         # Among damaged bytes, only believe in the packets that the host needs.
-        return kind == Kind.RESPONSE or (kind, group, opcode) in _NOTIFICATIONS
+        return kind == MessageType.RESPONSE or (kind, group, opcode) in _NOTIFICATIONS
 
     def _skip(self) -> None:
         """Skip one byte of the buffer."""
@@ -178,5 +182,5 @@ def _parsed(name: tuple[int, int, int], payload: bytes) -> Message | None:
             content = messages.parse_ranges(payload)
         elif name == _DIAGNOSTICS:
             content = messages.parse_diagnostics(payload)
-        return Message(Kind(name[0]), name[1], name[2], payload, content)
+        return Message(MessageType(name[0]), name[1], name[2], payload, content)
     return None

@@ -16,13 +16,13 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.radios.fira import messages
 from uwb_mitigation.radios.fira.cir import read_cir
-from uwb_mitigation.radios.fira.joining import Joined, Joiner, RangeArrival
+from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher, MatchedRange, RangeArrival
 from uwb_mitigation.radios.fira.messages import (
     DEVICE_READY,
     RANGE_STATUSES,
     STATUS_OK,
     Diagnostics,
-    Kind,
+    MessageType,
     RangeNotification,
     SessionState,
 )
@@ -183,13 +183,13 @@ class UciSession:
         )
         self.clock_offsets_ppm: deque[float] = deque(maxlen=200)
         self._decoder = PacketDecoder()
-        self._joined_before: Counter[str] = Counter(Joiner(0).counts)
+        self._joined_before: Counter[str] = Counter(DiagnosticsMatcher(0).counts)
         self._outgoing = bytearray()
         self._steps: _Steps | None = None
         self._pending: _Command | None = None
         self._handles: dict[int, int] = {}
         self._handle_of: dict[int, int] = {}
-        self._joiners: dict[int, Joiner] = {}
+        self._joiners: dict[int, DiagnosticsMatcher] = {}
         self._active: set[int] = set()
         self._ready = False
         self._boot_due = False
@@ -316,7 +316,7 @@ class UciSession:
             return problem
         interval_ns = self.settings.effective_interval_ms * _MS
         # The first range may arrive before the answer to the start.
-        self._handles[handle], self._joiners[handle] = peer, Joiner(interval_ns)
+        self._handles[handle], self._joiners[handle] = peer, DiagnosticsMatcher(interval_ns)
         # Notifications may contain the handle, or the number of the session.
         self._handle_of |= {self.settings.session_id(peer): handle, handle: handle}
         answer = yield _Command(messages.RANGE_START, struct.pack("<I", handle))
@@ -442,7 +442,7 @@ class UciSession:
         if self._steps is None:
             self._received_ns = now_ns
             self._asked = False
-        if message.kind is Kind.RESPONSE:
+        if message.kind is MessageType.RESPONSE:
             if name == messages.GET_SESSION_STATE and self._steps is None:
                 if message.status == STATUS_OK:
                     self._boot_due = message.payload[1:2] != bytes([SessionState.ACTIVE])
@@ -514,7 +514,7 @@ class UciSession:
         complete = self._joiners[handle].add_diagnostics(content, self._decoder.damages, now_ns)
         return self._measurements(handle, complete)
 
-    def _measurements(self, handle: int, complete: list[Joined]) -> list[RangeMeasurement]:
+    def _measurements(self, handle: int, complete: list[MatchedRange]) -> list[RangeMeasurement]:
         """Return the measurements of successful exchanges."""
         s, peer = self.settings, self._handles[handle]
         tag, anchor = (s.address, peer) if s.role is Role.TAG else (peer, s.address)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from uwb_mitigation.radios.settings import RadioStatus
 from uwb_mitigation.radios.wire.layout import Mode
-from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, Radio
+from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 
@@ -89,7 +89,7 @@ Event = (
     | Correction
     | Log
     | BoardStatus
-    | Radio
+    | RadioConfigured
     | RadioStatus
     | RadioRefused
     | OffsetsRefused

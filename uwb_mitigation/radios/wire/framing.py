@@ -36,7 +36,7 @@ _MIN_FRAME_BYTES = HEADER_BYTES + CRC_BYTES
 _header = HEADER.as_struct()
 
 
-class Frame(NamedTuple):
+class WireFrame(NamedTuple):
     """One intact frame of this protocol version; the fields of `layout.HEADER` and the payload."""
 
     type: int
@@ -76,7 +76,7 @@ class DecoderCounts:
         return self.bad_cobs + self.bad_length + self.bad_crc + self.oversize
 
 
-def encode_frame(frame: Frame, version: int = PROTOCOL_VERSION) -> bytes:
+def encode_frame(frame: WireFrame, version: int = PROTOCOL_VERSION) -> bytes:
     """Return the encoded frame, with a delimiter before and after it.
 
     The leading delimiter terminates preceding noise, boot text or partial frames, so that a frame is lost
@@ -106,7 +106,7 @@ class FrameEncoder:
 
     def encode(self, kind: int, payload: bytes, *, flags: int = 0, time_us: int = 0) -> bytes:
         """Return the next frame, encoded; see `encode_frame`."""
-        wire = encode_frame(Frame(kind, flags, self.sequence, time_us, payload), self._version)
+        wire = encode_frame(WireFrame(kind, flags, self.sequence, time_us, payload), self._version)
         self.sequence = (self.sequence + 1) % (1 << 32)
         return wire
 
@@ -123,9 +123,9 @@ class FrameDecoder:
         self._tail = b""
         self._overrun = False
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[WireFrame]:
         """Return the frames that `data` completes, in order."""
-        frames: list[Frame] = []
+        frames: list[WireFrame] = []
         for start in range(0, len(data), _SLICE_BYTES):
             self._feed_slice(data[start : start + _SLICE_BYTES], frames)
         return frames
@@ -135,7 +135,7 @@ class FrameDecoder:
         self._tail = b""
         self._overrun = False
 
-    def _feed_slice(self, data: bytes, frames: list[Frame]) -> None:
+    def _feed_slice(self, data: bytes, frames: list[WireFrame]) -> None:
         counts = self.counts
         counts.bytes_received += len(data)
         segments = data.split(DELIMITER)
@@ -158,7 +158,7 @@ class FrameDecoder:
             tail = b""
         self._tail = tail
 
-    def _decode(self, segment: bytes) -> Frame | None:
+    def _decode(self, segment: bytes) -> WireFrame | None:
         counts = self.counts
         if len(segment) > MAX_ENCODED_BYTES:
             counts.oversize += 1
@@ -180,4 +180,4 @@ class FrameDecoder:
             counts.last_foreign_version = version
             return None
         counts.frames += 1
-        return Frame(kind, flags, sequence, time_us, body[HEADER_BYTES:-CRC_BYTES])
+        return WireFrame(kind, flags, sequence, time_us, body[HEADER_BYTES:-CRC_BYTES])

@@ -22,7 +22,7 @@ from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.radios.settings import MAX_ANCHORS, AnchorStatus, RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import layout
 from uwb_mitigation.radios.wire.layout import Field, LogLevel, MessageType, Mode, OffsetScope
-from uwb_mitigation.types.measurement import Cir, CorrectedRange, Origin, RangeMeasurement
+from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
 
@@ -102,7 +102,7 @@ class TimeSyncReply:
 
 
 @dataclass(frozen=True, slots=True)
-class Radio:
+class RadioConfigured:
     """The settings of a board's radio.
 
     Attributes:
@@ -170,7 +170,7 @@ Message = (
     | Log
     | BoardStatus
     | TimeSyncReply
-    | Radio
+    | RadioConfigured
     | RadioStatus
     | OffsetsAnswer
     | GetInfo
@@ -400,12 +400,14 @@ _CODECS = (
     _Codec(MessageType.HELLO, Hello),
     _Codec(MessageType.RANGE_CIR, RangeMeasurement, ("cir", Cir), _Samples()),
     _Codec(
-        MessageType.RANGE_CORRECTED, Correction, ("corrected", partial(CorrectedRange, origin=Origin.DEVICE))
+        MessageType.RANGE_CORRECTED,
+        Correction,
+        ("corrected", partial(CorrectedRange, origin=CorrectedBy.DEVICE)),
     ),
     _Codec(MessageType.LOG, Log, tail=_Tail(has_text=True)),
     _Codec(MessageType.STATUS, BoardStatus),
     _Codec(MessageType.TIME_SYNC_REPLY, TimeSyncReply),
-    _Codec(MessageType.RADIO, Radio, ("settings", RadioSettings), _anchors_tail(has_text=True)),
+    _Codec(MessageType.RADIO, RadioConfigured, ("settings", RadioSettings), _anchors_tail(has_text=True)),
     _Codec(
         MessageType.RADIO_STATUS,
         RadioStatus,

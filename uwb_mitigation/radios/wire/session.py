@@ -27,7 +27,7 @@ from uwb_mitigation.radios.wire.events import (
     SessionCounts,
     VersionMismatch,
 )
-from uwb_mitigation.radios.wire.framing import Frame, FrameDecoder, FrameEncoder
+from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import Flag, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import (
     BoardStatus,
@@ -36,7 +36,7 @@ from uwb_mitigation.radios.wire.messages import (
     Hello,
     Log,
     OffsetsAnswer,
-    Radio,
+    RadioConfigured,
     SetOffsets,
     SetRadio,
     TimeSyncReply,
@@ -130,7 +130,7 @@ class BoardSession:
     def __init__(self, *, mode: Mode | None = None, expected_model_id: int | None = None) -> None:
         self.state = LinkState.CONNECTING
         self.hello: Hello | None = None
-        self.radio: Radio | None = None
+        self.radio: RadioConfigured | None = None
         self.foreign_version: int | None = None
         self.counts = SessionCounts()
         self.clock = DeviceClock()
@@ -198,7 +198,7 @@ class BoardSession:
         self._next_request_ns = 0
 
     def set_radio(self, settings: RadioSettings) -> None:
-        """Request `settings` now and after each start of the board; a `Radio` or `RadioRefused` follows.
+        """Request `settings` now and after each start of the board; a `RadioConfigured` or `RadioRefused` follows.
 
         Raises:
             ParameterError: no radio has such settings.
@@ -254,14 +254,14 @@ class BoardSession:
             self._send_sync(now_ns, stamp_ns)
         return events
 
-    def _handle(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+    def _handle(self, frame: WireFrame, now_ns: int, stamp_ns: int) -> list[Event]:
         try:
             return self._parse(frame, now_ns, stamp_ns)
         except LinkError:
             self.counts.malformed += 1
             return []
 
-    def _parse(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+    def _parse(self, frame: WireFrame, now_ns: int, stamp_ns: int) -> list[Event]:
         if frame.type == MessageType.HELLO:
             return self._handle_hello(frame, now_ns, stamp_ns)
         if self.state is not LinkState.READY:
@@ -282,7 +282,7 @@ class BoardSession:
         if isinstance(message, TimeSyncReply):
             self._handle_sync(message, frame.time_us, stamp_ns)
             return []
-        if isinstance(message, Radio):
+        if isinstance(message, RadioConfigured):
             return self._handle_radio(message, bool(frame.flags & Flag.ANSWER))
         if isinstance(message, OffsetsAnswer):
             return self._handle_offsets(message)
@@ -294,7 +294,7 @@ class BoardSession:
         self.counts.unknown_type[frame.type] += 1
         return []
 
-    def _handle_hello(self, frame: Frame, now_ns: int, stamp_ns: int) -> list[Event]:
+    def _handle_hello(self, frame: WireFrame, now_ns: int, stamp_ns: int) -> list[Event]:
         hello = messages.decode(frame.type, frame.payload)
         assert isinstance(hello, Hello)
         boot = (hello.board_id, hello.boot_id)
@@ -356,7 +356,7 @@ class BoardSession:
         text = f"it can store {answer.slots} offsets, but {len(self._offsets)} were requested"
         return [] if answer.accepted else [OffsetsRefused(text)]
 
-    def _handle_radio(self, radio: Radio, answer: bool) -> list[Event]:
+    def _handle_radio(self, radio: RadioConfigured, answer: bool) -> list[Event]:
         if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
             return [RadioRefused(radio.text)]
         self.radio = radio
@@ -382,7 +382,7 @@ class BoardSession:
         else:
             self.clock.exchange(sent_ns, reply.received_us, replied_us, stamp_ns)
 
-    def _in_sequence(self, frame: Frame) -> bool:
+    def _in_sequence(self, frame: WireFrame) -> bool:
         gap = (frame.sequence - self._next_sequence) % _SEQUENCES
         if gap > MAX_GAP:
             self.counts.stale += 1

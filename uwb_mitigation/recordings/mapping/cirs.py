@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.conversion import Columns, samples_of
+from uwb_mitigation.recordings.mapping.conversion import ColumnDict, samples_of
 from uwb_mitigation.recordings.mapping.mapping import CirSource, series
 from uwb_mitigation.recordings.mapping.tables import UNREADABLE, Chunk
 from uwb_mitigation.types.measurement import Cir, Encoding
@@ -62,7 +62,7 @@ class CirFile:
         self._file.close()
 
 
-def join_by_row(ranges: Columns, rows: NDArray[Any], cirs: Columns, where: str) -> None:
+def join_by_row(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, where: str) -> None:
     """Give the ranges at `rows` the CIRs of the same rows in another file."""
     known = int(cirs["row"].max(initial=-1)) + 1
     if ranges["row"][rows].max(initial=-1) >= known:
@@ -72,7 +72,7 @@ def join_by_row(ranges: Columns, rows: NDArray[Any], cirs: Columns, where: str) 
     ranges["cir"][rows] = by_row[ranges["row"][rows]]
 
 
-def join_by_time(ranges: Columns, rows: NDArray[Any], cirs: Columns, tolerance_s: float) -> None:
+def join_by_time(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, tolerance_s: float) -> None:
     """Give the ranges at `rows` the CIRs of their pairs that are nearest in time, within the tolerance."""
     import pandas as pd
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
-from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, Drop, Table, Value
+from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter, TableFormat
 from uwb_mitigation.recordings.mapping.tables import CHUNK_ROWS, LOG_TIME, TOPIC, Chunk, read_chunks
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
@@ -33,23 +33,23 @@ NO_CIR = Cir(np.zeros(0, np.int16))
 _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
 """Constant A of the DW1000's levels by PRF in MHz (user manual, section 4.7)."""
 
-Columns = dict[str, NDArray[Any]]
+ColumnDict = dict[str, NDArray[Any]]
 """{name: array (n,)} in SI units. `stamp`: ns, int64; `tag`, `anchor`: uint64; `label`, `configuration`: texts; others, such
 as `range`, `true range` and `tag x`: float64, NaN: unknown."""
 
 
-def joined(parts: list[Columns]) -> Columns:
+def joined(parts: list[ColumnDict]) -> ColumnDict:
     """Concatenate parts with the same columns."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def take(columns: Columns, rows: NDArray[Any]) -> Columns:
+def take(columns: ColumnDict, rows: NDArray[Any]) -> ColumnDict:
     """Return the chosen rows."""
     everything = rows.dtype == bool and rows.all()
     return columns if everything else {name: values[rows] for name, values in columns.items()}
 
 
-def measurement(columns: Columns, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
+def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
     """Return one range with the samples of `cir` and its own levels; `sequence` is used if the columns have none."""
 
     def number(name: str) -> float:
@@ -90,7 +90,7 @@ class Converter:
         names: numbers of named tags and anchors.
     """
 
-    values: Mapping[str, Value | None]
+    values: Mapping[str, FieldRule | None]
     names: Mapping[str, dict[str, int]] = field(default_factory=lambda: {"tag": {}, "anchor": {}})
 
     @property
@@ -101,18 +101,18 @@ class Converter:
             found |= {name: value.optional and found.get(name, True) for name in value.columns}
         return found
 
-    def convert(self, chunk: Chunk, file: str = "") -> Columns:
+    def convert(self, chunk: Chunk, file: str = "") -> ColumnDict:
         """Return the values of all rows of a chunk; `file`: its path for `file_name`.
 
         Raises:
             RecordingError: an id or a number cannot be read; `where` names the row.
         """
-        found: Columns = {}
+        found: ColumnDict = {}
         for name, value in self.values.items():
             if name == "stamp":
                 found[name] = read_stamps(value, chunk, file)
             elif name in self.names:
-                found[name] = _read_ids(value or Value(constant=1), chunk, name, file, self.names[name])
+                found[name] = _read_ids(value or FieldRule(constant=1), chunk, name, file, self.names[name])
             elif name in ("label", "configuration"):
                 found[name] = _read_texts(value, chunk, name, file)
             else:
@@ -122,7 +122,7 @@ class Converter:
         return found
 
 
-def _add_levels(columns: Columns) -> None:
+def _add_levels(columns: ColumnDict) -> None:
     """Compute both levels from the registers of a DW1000."""
     count = columns["preamble_count"]
     constant = np.where(columns["prf"] == 16, _LEVEL_OFFSETS[16], _LEVEL_OFFSETS[64])
@@ -133,7 +133,7 @@ def _add_levels(columns: Columns) -> None:
         columns[name] = np.where(np.isfinite(level), level, np.nan)
 
 
-def _read_texts(value: Value | None, chunk: Chunk, name: str, file: str) -> NDArray[Any]:
+def _read_texts(value: FieldRule | None, chunk: Chunk, name: str, file: str) -> NDArray[Any]:
     """Return a value as texts (n,), after `pattern` and `values`; empty: unknown."""
     raw = None if value is None else _raw(value, chunk, file)
     if value is None or raw is None:
@@ -144,7 +144,7 @@ def _read_texts(value: Value | None, chunk: Chunk, name: str, file: str) -> NDAr
     return np.array([texts[each] for each in given], object)
 
 
-def _text(value: Value, given: Any, name: str) -> str:
+def _text(value: FieldRule, given: Any, name: str) -> str:
     text = str(int(given)) if isinstance(given, float) and given.is_integer() else str(given).strip()
     if value.pattern:
         match = re.search(value.pattern, text)
@@ -154,7 +154,7 @@ def _text(value: Value, given: Any, name: str) -> str:
     return value.values.get(text, text)
 
 
-def read_numbers(value: Value | None, chunk: Chunk, name: str, file: str = "") -> NDArray[np.float64]:
+def read_numbers(value: FieldRule | None, chunk: Chunk, name: str, file: str = "") -> NDArray[np.float64]:
     """Return a value in SI units, float64 (n,); NaN: unknown.
 
     Raises:
@@ -192,7 +192,7 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
     return found
 
 
-def _raw(value: Value, chunk: Chunk, file: str) -> NDArray[Any] | None:
+def _raw(value: FieldRule, chunk: Chunk, file: str) -> NDArray[Any] | None:
     """Return the unconverted values of the rows; None: the column is optional and missing."""
     if rule := value.file_name or value.topic_name:
         source = [file] * chunk.count if value.file_name else chunk.columns.get(TOPIC, [""] * chunk.count)
@@ -218,7 +218,7 @@ def _raw(value: Value, chunk: Chunk, file: str) -> NDArray[Any] | None:
     return arrays[value.column]
 
 
-def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int64]:
+def read_stamps(value: FieldRule | None, chunk: Chunk, file: str) -> NDArray[np.int64]:
     """Return stamps in ns, int64 (n,); `UNKNOWN_STAMP`: unknown.
 
     Raises:
@@ -274,7 +274,9 @@ def read_stamps(value: Value | None, chunk: Chunk, file: str) -> NDArray[np.int6
     return np.where(possible, found + offset, UNKNOWN_STAMP)
 
 
-def _read_ids(value: Value, chunk: Chunk, name: str, file: str, names: dict[str, int]) -> NDArray[np.uint64]:
+def _read_ids(
+    value: FieldRule, chunk: Chunk, name: str, file: str, names: dict[str, int]
+) -> NDArray[np.uint64]:
     """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`."""
     raw = _raw(value, chunk, file)
     if raw is None:
@@ -347,7 +349,9 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
     return np.rint(flat / scale).astype(np.int16), encoding, scale
 
 
-def kept_rows(rules: list[Drop], chunk: Chunk, dropped: Counter[str], prefix: str = "") -> NDArray[np.bool_]:
+def kept_rows(
+    rules: list[RowFilter], chunk: Chunk, dropped: Counter[str], prefix: str = ""
+) -> NDArray[np.bool_]:
     """Return which rows no rule drops, and count the others by rule; `from_median` needs all files and is ignored."""
     kept = np.ones(chunk.count, bool)
     for rule in rules:
@@ -378,7 +382,7 @@ def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDA
 
 def read_csv(
     path: Path, ids: Sequence[str], numbers: Mapping[str, tuple[float, float]], optional: Sequence[str] = ()
-) -> Columns:
+) -> ColumnDict:
     """Read a CSV file of at most `CHUNK_ROWS` rows; `.xz` is decompressed.
 
     Args:
@@ -390,9 +394,9 @@ def read_csv(
     Raises:
         RecordingError: a column or a value is missing or invalid; `where` gives the row.
     """
-    values = {name: Value(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
+    values = {name: FieldRule(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
     converter = Converter(values, {name: {} for name in ids})
-    chunks = list(islice(read_chunks(Table(format="csv"), path, converter.columns), 2))
+    chunks = list(islice(read_chunks(TableFormat(format="csv"), path, converter.columns), 2))
     if len(chunks) != 1 or not chunks[0].count:
         raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
     found = converter.convert(chunks[0])

@@ -18,7 +18,7 @@ from uwb_mitigation.recordings.mapping.conversion import (
     NO_CIR,
     UNKNOWN_ID,
     UNKNOWN_STAMP,
-    Columns,
+    ColumnDict,
     Converter,
     count_bad,
     joined,
@@ -26,7 +26,15 @@ from uwb_mitigation.recordings.mapping.conversion import (
     measurement,
     take,
 )
-from uwb_mitigation.recordings.mapping.mapping import CirSource, Mapping, Poses, Table, Value, axes, series
+from uwb_mitigation.recordings.mapping.mapping import (
+    CirSource,
+    FieldRule,
+    Mapping,
+    Poses,
+    TableFormat,
+    axes,
+    series,
+)
 from uwb_mitigation.recordings.mapping.tables import find_files, read_chunks
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Record, Truth
@@ -143,15 +151,15 @@ class MappedRecording(Source):
 
     def _read(
         self,
-        table: Table,
+        table: TableFormat,
         paths: Sequence[Path],
-        values: dict[str, Value | None],
+        values: dict[str, FieldRule | None],
         what: str = "",
         cir: CirSource | None = None,
-    ) -> Columns:
+    ) -> ColumnDict:
         """Return the rows of files that no rule drops: `values`, `cir`, `row`, `file`; `what` names them in counts."""
         medians = {f"{what}{rule}": rule for rule in table.drop if rule.from_median is not None}
-        values = values | {name: Value(column=rule.column) for name, rule in medians.items()}
+        values = values | {name: FieldRule(column=rule.column) for name, rule in medians.items()}
         converter, parts, before = Converter(values, self._names), [], 0
         columns = converter.columns | dict.fromkeys(series(cir.column) if cir else (), False)
         for number, path in enumerate(paths):
@@ -176,7 +184,7 @@ class MappedRecording(Source):
             kept &= ~count_bad(np.abs(numbers - _median(numbers)) > rule.from_median, self.dropped, name)
         return take(found, kept)
 
-    def _beside(self, table: Table, file: Path, *, optional: bool = False) -> list[Path]:
+    def _beside(self, table: TableFormat, file: Path, *, optional: bool = False) -> list[Path]:
         """Return the files of a table in the folder of the ranges; topics are in the same bag."""
         if table.topics or not table.files:
             return [file]
@@ -197,7 +205,7 @@ class MappedRecording(Source):
     def _add_other_cirs(self, source: CirSource) -> None:
         """Join the CIRs of other files, by row or by time and ids."""
         join = source.join
-        keys: dict[str, Value | None] = {"first_path_index": source.first_path_index}
+        keys: dict[str, FieldRule | None] = {"first_path_index": source.first_path_index}
         if join:
             keys |= {"stamp": join.stamp, "tag": join.tag, "anchor": join.anchor}
         for number, file in enumerate(self._files):
@@ -279,7 +287,7 @@ class MappedRecording(Source):
         values, files_by_poses = self.values, defaultdict[tuple[Path, ...], list[int]](list)
         for number, file in enumerate(self._files):
             files_by_poses[tuple(self._beside(poses, file))].append(number)
-        turns: dict[str, Value | None] = {
+        turns: dict[str, FieldRule | None] = {
             f"turn {n}": value for n, value in enumerate(poses.orientation or ())
         }
         for paths, numbers in files_by_poses.items():
@@ -375,5 +383,5 @@ def _median(numbers: NDArray[np.float64]) -> float:
     return float(np.median(known)) if len(known) else 0.0
 
 
-def _stacked(columns: Columns, names: Sequence[str]) -> NDArray[np.float64]:
+def _stacked(columns: ColumnDict, names: Sequence[str]) -> NDArray[np.float64]:
     return np.stack([columns[name] for name in names], axis=1)

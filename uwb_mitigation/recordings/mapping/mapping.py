@@ -55,7 +55,7 @@ def _texts(given: Any) -> Any:
     return {str(key): str(value) for key, value in given.items()} if isinstance(given, dict) else given
 
 
-class Value(_Strict):
+class FieldRule(_Strict):
     """Where one value is: exactly one of the first six fields; a text is short for a column, a number for a constant.
 
     Attributes:
@@ -87,7 +87,7 @@ class Value(_Strict):
     optional: bool = False
 
     @model_validator(mode="after")
-    def _check(self) -> Value:
+    def _check(self) -> FieldRule:
         sources = (self.column, self.sum, self.file_name, self.topic_name, self.rate_hz)
         if sum(map(bool, sources)) + (self.constant is not None) != 1:
             raise ValueError("give one of column, constant, sum, file_name, topic_name, rate_hz")
@@ -120,15 +120,15 @@ def _value(*units: str) -> WrapValidator:
     return WrapValidator(read)
 
 
-Number = Annotated[Value, _value()]
-Time = Annotated[Value, _value(*TIME)]
-Length = Annotated[Value, _value("m", "cm", "mm")]
-Level = Annotated[Value, _value("dBm")]
-Index = Annotated[Value, _value("samples", "10.6")]
+Number = Annotated[FieldRule, _value()]
+Time = Annotated[FieldRule, _value(*TIME)]
+Length = Annotated[FieldRule, _value("m", "cm", "mm")]
+Level = Annotated[FieldRule, _value("dBm")]
+Index = Annotated[FieldRule, _value("samples", "10.6")]
 Point = tuple[Length, Length, Length]
 
 
-class Drop(_Strict):
+class RowFilter(_Strict):
     """Rule for rows that are not used: `column` and one or more conditions, of which one is sufficient.
 
     Attributes:
@@ -145,7 +145,7 @@ class Drop(_Strict):
     from_median: float | None = None
 
     @model_validator(mode="after")
-    def _check(self) -> Drop:
+    def _check(self) -> RowFilter:
         if not self.model_fields_set - {"column"}:
             raise ValueError("a rule needs equals, differs, below, above or from_median")
         return self
@@ -155,7 +155,7 @@ class Drop(_Strict):
         return f"{self.column} " + ", ".join(f"{name} {value}" for name, value in rules.items())
 
 
-class Table(_Strict):
+class TableFormat(_Strict):
     r"""Files that contain rows.
 
     Attributes:
@@ -182,14 +182,14 @@ class Table(_Strict):
     text: Literal["", "json", "pairs"] = ""
     text_field: str = "data"
     definitions: dict[str, str] = {}
-    drop: list[Drop] = []
+    drop: list[RowFilter] = []
 
 
 class Fields(_Strict):
     """The values of a range. Required: `anchor` and `range`; without a stamp the time of the message is used."""
 
     stamp: Time | None = None
-    tag: Number = Value(constant=1)
+    tag: Number = FieldRule(constant=1)
     anchor: Number
     range: Length
     sequence: Number | None = None
@@ -205,19 +205,19 @@ class Registers(_Strict):
 
     cir_power: Number
     amplitudes: tuple[Number, Number, Number]
-    prf: Number = Value(constant=64)
+    prf: Number = FieldRule(constant=64)
 
 
 class Join(_Strict):
     """Stamp and ids of a CIR in another file; the nearest range of the pair within the tolerance gets it."""
 
     stamp: Time
-    tag: Number = Value(constant=1)
+    tag: Number = FieldRule(constant=1)
     anchor: Number
     tolerance_s: float = Field(default=0.02, gt=0.0)
 
 
-class CirSource(Table):
+class CirSource(TableFormat):
     """The channel impulse response: `column` or `columns` of the ranges, or another file (`files`).
 
     Attributes:
@@ -238,7 +238,7 @@ class CirSource(Table):
     optional: bool = False
 
 
-class Poses(Table):
+class Poses(TableFormat):
     """True poses of the tag or robot in another file or on a topic; interpolated at the stamps of the ranges.
 
     Attributes:
@@ -265,7 +265,7 @@ class TruthSource(_Strict):
     range_from_positions: bool = False
 
 
-class AnchorSource(Table):
+class AnchorSource(TableFormat):
     """Positions of the anchors, and `sd` of each coordinate in m: columns of the ranges, or of other `files` with `id`."""
 
     files: str | dict[str, str] = ""
@@ -275,17 +275,17 @@ class AnchorSource(Table):
     optional: bool = False
 
 
-class Motion(Table):
+class OdometryTable(TableFormat):
     """Wheel odometry, written to the topic `/odom`: speeds in the robot's frame in m/s and rad/s."""
 
     files: str | dict[str, str] = ""
     stamp: Time
     forward: Number
-    left: Number = Value(constant=0.0)
+    left: Number = FieldRule(constant=0.0)
     yaw_rate: Number
 
 
-class Mapping(Table):
+class Mapping(TableFormat):
     """A mapping file.
 
     Attributes:
@@ -304,7 +304,7 @@ class Mapping(Table):
     cir: CirSource | None = None
     truth: TruthSource = TruthSource()
     anchors: AnchorSource | None = None
-    odometry: Motion | None = None
+    odometry: OdometryTable | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Mapping:
@@ -315,10 +315,10 @@ class Mapping(Table):
         return self
 
     @property
-    def values(self) -> dict[str, Value | None]:
+    def values(self) -> dict[str, FieldRule | None]:
         """Return everything that is in a row of the ranges, by the names of `conversion.Columns`."""
         truth, registers = self.truth, self.registers
-        found: dict[str, Value | None] = dict(self.fields)
+        found: dict[str, FieldRule | None] = dict(self.fields)
         found |= {"true range": truth.range, "error": truth.error}
         found |= {"label": truth.label, "configuration": truth.configuration}
         if registers:
@@ -333,7 +333,7 @@ class Mapping(Table):
         return series(self.cir.column) if self.cir and not self.cir.files else []
 
 
-def axes(name: str, point: Point | None) -> dict[str, Value | None]:
+def axes(name: str, point: Point | None) -> dict[str, FieldRule | None]:
     """Return the coordinates of a point by their names, such as `tag x`."""
     return {f"{name} {axis}": value for axis, value in zip("xyz", point or (None,) * 3, strict=True)}
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
-from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Table
+from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TableFormat
 
 MAX_ROWS = 4096
 """Largest number of ranges in one message."""
@@ -29,7 +29,7 @@ class MessageRows:
         columns: {path of a field, such as `nodes[].dis`: whether it is left out if a message does not contain it}.
     """
 
-    def __init__(self, table: Table, columns: Mapping[str, bool]) -> None:
+    def __init__(self, table: TableFormat, columns: Mapping[str, bool]) -> None:
         self._table, self._columns = table, columns
         self._paths = {
             column: [part for part in re.split(r"\.|(\[\])", column) if part]

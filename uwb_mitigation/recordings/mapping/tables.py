@@ -26,7 +26,7 @@ from uwb_mitigation.errors import (
     not_installed,
 )
 from uwb_mitigation.files import read_bounded
-from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Table
+from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MessageRows
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
@@ -92,7 +92,7 @@ def _kind_of(path: Path) -> str:
     return "messages" if path.is_dir() else _SUFFIXES.get(Path(name).suffix, "")
 
 
-def find_files(table: Table, root: Path, ranges: Path | None = None) -> list[Path]:
+def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> list[Path]:
     """Return the files of a table below a folder, or the file `root` itself, in the order of their names.
 
     Args:
@@ -126,7 +126,9 @@ _Choose = Callable[[Sequence[str]], dict[str, str]]
 """Returns {wanted column: column of the file}, from all columns of the file."""
 
 
-def read_chunks(table: Table, path: Path, columns: Mapping[str, bool], before: int = 0) -> Iterator[Chunk]:
+def read_chunks(
+    table: TableFormat, path: Path, columns: Mapping[str, bool], before: int = 0
+) -> Iterator[Chunk]:
     """Yield the rows of a file, only the given columns and those of the rules to drop rows.
 
     Args:
@@ -177,7 +179,7 @@ def _choose(columns: Mapping[str, bool], path: Path, known: Sequence[str]) -> di
     return {name: found for name, found in chosen.items() if found in known}
 
 
-def _csv(table: Table, path: Path, choose: _Choose) -> _Rows:
+def _csv(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
     import pandas as pd
 
     options: dict[str, Any] = {
@@ -198,7 +200,7 @@ def _csv(table: Table, path: Path, choose: _Choose) -> _Rows:
         raise RecordingError("the file is empty", where=str(path)) from error
 
 
-def _parquet(table: Table, path: Path, choose: _Choose) -> _Rows:
+def _parquet(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
     file = _installed("pyarrow.parquet").ParquetFile(path)
     chosen = choose(file.schema_arrow.names)
     for batch in file.iter_batches(batch_size=CHUNK_ROWS // 10, columns=list(chosen.values())):
@@ -206,7 +208,7 @@ def _parquet(table: Table, path: Path, choose: _Choose) -> _Rows:
         yield {name: values.to_numpy(zero_copy_only=False) for name, values in found.items()}, batch.num_rows
 
 
-def _arrays(table: Table, path: Path, choose: _Choose) -> _Rows:
+def _arrays(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
     """Read a NumPy, MATLAB, HDF5 or YAML file in slices."""
     with contextlib.ExitStack() as stack:
         arrays = _as_columns(_load(table, path, stack), table, path)
@@ -227,7 +229,7 @@ def _arrays(table: Table, path: Path, choose: _Choose) -> _Rows:
             yield part, min(rows, count - first)
 
 
-def _load(table: Table, path: Path, stack: contextlib.ExitStack) -> Any:
+def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Any:
     """Return an array, or {name: array}: the variables of a file, or of its variable `group`."""
     kind = table.format or _kind_of(path)
     if kind != "hdf5" and path.stat().st_size > MAX_ARRAY_BYTES:
@@ -268,7 +270,7 @@ def _installed(name: str) -> Any:
         raise not_installed(name.partition(".")[0]) from error
 
 
-def _as_columns(arrays: Any, table: Table, path: Path) -> Mapping[str, Any]:
+def _as_columns(arrays: Any, table: TableFormat, path: Path) -> Mapping[str, Any]:
     """Return {name: array with one entry a row}: the fields of a structure, or the columns of a matrix."""
     if isinstance(arrays, Mapping):
         return arrays
@@ -310,7 +312,7 @@ def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 _READERS = {"csv": _csv, "parquet": _parquet} | dict.fromkeys(("numpy", "matlab", "hdf5", "yaml"), _arrays)
 
 
-def _messages(table: Table, path: Path, columns: Mapping[str, bool]) -> _Rows:
+def _messages(table: TableFormat, path: Path, columns: Mapping[str, bool]) -> _Rows:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -15,7 +15,7 @@ from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.types.measurement import Record, Truth
 
 
-def load(
+def load_dataset(
     path: Path,
     preprocessing: Preprocessing,
     truth: Sequence[Path] = (),

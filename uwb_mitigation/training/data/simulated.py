@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.simulation.antenna_pairs import label
 from uwb_mitigation.simulation.buildings import RADIO, block_of
-from uwb_mitigation.simulation.radio import Radio, Reception
+from uwb_mitigation.simulation.radio import Receiver, Reception
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.types.measurement import Encoding, RangeColumns
 
@@ -26,7 +26,7 @@ def building_dataset(
     on_block: Callable[[], None] = lambda: None,
     *,
     wide: bool = False,
-    radio: Radio = RADIO,
+    radio: Receiver = RADIO,
 ) -> Dataset:
     """Return one range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
 
@@ -43,7 +43,7 @@ def building_dataset(
     return replace(Dataset.joined(parts), radios=(radio.kind,), segments=(radio.segment,))
 
 
-def _block(seed: int, preprocessing: Preprocessing, wide: bool, radio: Radio, number: int) -> Dataset:
+def _block(seed: int, preprocessing: Preprocessing, wide: bool, radio: Receiver, number: int) -> Dataset:
     block, rng = block_of(seed, number, wide=wide, radio=radio)
     reception = radio.receive(block.pairs.multipath(rng), rng, block.boards)
     distance = block.pairs.distance_m

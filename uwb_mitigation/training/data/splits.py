@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.training.data.dataset import Dataset
 
 
-class Group(str, enum.Enum):
+class GroupKey(str, enum.Enum):
     """The unit that is held out as a whole."""
 
     CONFIGURATION = "configuration"
@@ -58,7 +58,7 @@ def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) ->
     return splits
 
 
-def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Split]:
+def by_group(dataset: Dataset, group: GroupKey, folds: int, seed: int) -> list[Split]:
     """Return the splits by `group`; no configuration is in both parts of a split.
 
     CONFIGURATION: `folds` folds of configurations. TAG: each tag location is held out in turn. HALF: the anchors are
@@ -67,16 +67,16 @@ def by_group(dataset: Dataset, group: Group, folds: int, seed: int) -> list[Spli
     Raises:
         ParameterError, DatasetError: see `by_configuration`; TAG and HALF need at least two tags or anchors.
     """
-    if group is Group.CONFIGURATION:
+    if group is GroupKey.CONFIGURATION:
         return by_configuration(dataset.configurations, folds, seed)
-    ids = dataset.tags if group is Group.TAG else dataset.anchors
+    ids = dataset.tags if group is GroupKey.TAG else dataset.anchors
     found = np.unique(ids) if ids is not None else np.zeros(0, np.uint64)
     if ids is None or len(found) < 2:
         raise DatasetError(
-            f"{len(found)} {'tags' if group is Group.TAG else 'anchors'} do not make a split",
+            f"{len(found)} {'tags' if group is GroupKey.TAG else 'anchors'} do not make a split",
             valid="2 or more",
         )
-    parts = found[:, None] if group is Group.TAG else np.array_split(found, 2)
+    parts = found[:, None] if group is GroupKey.TAG else np.array_split(found, 2)
     splits = []
     for held_out_ids in parts:
         held_out = np.isin(ids, held_out_ids)

@@ -35,7 +35,7 @@ class Intervals:
     sigmas95: float
 
 
-def calibrate(
+def fit_intervals(
     residual_m: NDArray[np.floating], predicted_m: NDArray[np.floating], configurations: NDArray[np.str_]
 ) -> Intervals:
     """Compute intervals from residuals and predicted errors on held-out configurations, each of shape (n,).

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.correction import CorrectionRule
-from uwb_mitigation.mitigation.model.bundle import Bundle, Card, Session
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.training.data.dataset import Dataset
 
 LOS = "LOS"
@@ -46,7 +46,7 @@ class CardCorrections:
     passed_through: NDArray[np.bool_]
 
 
-def apply_card(dataset: Dataset, card: Card, predicted_m: NDArray[np.float32]) -> CardCorrections:
+def correct_with_card(dataset: Dataset, card: ModelCard, predicted_m: NDArray[np.float32]) -> CardCorrections:
     """Apply the limits, the OOD score and the variances of a card to predictions, shape (n,)."""
     rule = CorrectionRule(card)
     score = rule.score(
@@ -64,7 +64,7 @@ def apply_card(dataset: Dataset, card: Card, predicted_m: NDArray[np.float32]) -
     )
 
 
-def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
+def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     """Correct a dataset that is preprocessed as for `bundle`.
 
     The offset of a pair of boards is a median over placements: errors of one placement are not independent.
@@ -74,7 +74,7 @@ def run(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     """
     linear_bias = bundle.card.linear_bias.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
     predicted = (linear_bias + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
-    corrections = apply_card(dataset, bundle.card, predicted)
+    corrections = correct_with_card(dataset, bundle.card, predicted)
     residual = dataset.error_m - corrections.correction_m
 
     names, configuration_index = np.unique(dataset.configurations, return_inverse=True)

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.model.architecture import Architecture
-from uwb_mitigation.mitigation.model.bundle import Card
+from uwb_mitigation.mitigation.model.bundle import ModelCard
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import OodBands, features
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.evaluation.intervals import calibrate
+from uwb_mitigation.training.evaluation.intervals import fit_intervals
 
 
 def card_of(
@@ -26,7 +26,7 @@ def card_of(
     residual_m: NDArray[np.floating],
     training: Mapping[str, Any],
     ood_bands: OodBands | None = None,
-) -> Card:
+) -> ModelCard:
     """Return the card of a float model.
 
     Variances are conformal (see `evaluation.intervals`). The variance of corrected ranges is computed from the residuals
@@ -47,9 +47,9 @@ def card_of(
     """
     low, high = float(dataset.error_m.min()), float(dataset.error_m.max())
     margin = max(high - low, 0.1) / 2
-    corrected = calibrate(residual_m, held_out.error_m - residual_m, held_out.configurations)
-    uncorrected = calibrate(dataset.error_m, np.zeros(len(dataset)), dataset.configurations)
-    return Card(
+    corrected = fit_intervals(residual_m, held_out.error_m - residual_m, held_out.configurations)
+    uncorrected = fit_intervals(dataset.error_m, np.zeros(len(dataset)), dataset.configurations)
+    return ModelCard(
         name=name,
         architecture=architecture,
         preprocessing=dataset.preprocessing,

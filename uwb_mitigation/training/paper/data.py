@@ -77,7 +77,7 @@ def open_data(path: Path) -> Source:
     return DeepUwbRecording(path) if path.suffix == ".pkl" else open_recording(path)
 
 
-def load(
+def load_paper_data(
     path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
 ) -> tuple[str, bool, Dataset]:
     """Return the recording's name, whether it is simulated, and its labelled measurements.

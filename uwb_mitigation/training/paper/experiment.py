@@ -17,7 +17,7 @@ from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbM
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.model import floating, graph
 from uwb_mitigation.mitigation.model.architecture import Architecture, Mlp, Remnet
-from uwb_mitigation.mitigation.model.bundle import Card, save_bundle, session_options
+from uwb_mitigation.mitigation.model.bundle import ModelCard, save_bundle, session_options
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
@@ -99,7 +99,7 @@ def list_tasks(networks: Sequence[str], windows: Sequence[int], seeds: int) -> l
     ]
 
 
-def run(
+def run_experiment(
     parts: Parts,
     folder: Path,
     tasks: Sequence[Task],
@@ -168,7 +168,7 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     training_s = time.perf_counter() - start
     files = {form: folder / f"{task.name}_{form}.onnx" for form in FORMS}
     card = make_card(task.name, architecture, parts, options)
-    maes, best, integers = calibrate(weights, train.inputs, train.error_m, options.seed)
+    maes, best, integers = calibrate_quantization(weights, train.inputs, train.error_m, options.seed)
     save_bundle(files["float"], graph.float_model(weights), card)
     # Use only optimisations that do not depend on the processor, so that the file runs on other ones.
     settings = session_options()
@@ -199,7 +199,7 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     )
 
 
-def calibrate(
+def calibrate_quantization(
     weights: FloatWeights, inputs: NDArray[np.float32], targets: NDArray[np.floating], seed: int
 ) -> tuple[dict[str, float], str, Int8Weights]:
     """Quantise with every one of `CALIBRATIONS` on inputs (n, K) of the training part, and keep the best.
@@ -268,7 +268,7 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
     return (*rows, row("line", np.nan_to_num(linear_bias_m(line, test))))
 
 
-def make_card(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> Card:
+def make_card(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> ModelCard:
     """Return the card of a float network without a linear bias model that was fitted to the whole training part.
 
     Its variance comes from a second network, fitted to a fifth of the training configurations and tested on the others.

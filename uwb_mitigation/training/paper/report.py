@@ -18,7 +18,7 @@ from uwb_mitigation.training.paper import figures, published, tables
 from uwb_mitigation.training.paper.data import TEST_ROOM
 from uwb_mitigation.training.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
 from uwb_mitigation.training.paper.rooms import ROOM_ROWS, ROOMS, has_rooms, parse_configuration
-from uwb_mitigation.training.paper.tables import Cell, Provenance, Table
+from uwb_mitigation.training.paper.tables import Cell, Provenance, ReportTable
 
 LOS = "LOS"
 MAX_SAMPLES = 3
@@ -60,7 +60,7 @@ class Report:
     command: str
     lacking: dict[str, str]
     notices: tuple[str, ...]
-    tables: tuple[Table, ...]
+    tables: tuple[ReportTable, ...]
     figures: tuple[Picture, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -189,7 +189,7 @@ def _notices(study: Study, trainings: ExperimentResults | None) -> tuple[str, ..
     return tuple(notices)
 
 
-def _data_table(study: Study) -> Table:
+def _data_table(study: Study) -> ReportTable:
     labels = study.labels
 
     def row(name: str, selected: NDArray[np.bool_], published_rows: int | None = None) -> tuple[Cell, ...]:
@@ -213,7 +213,7 @@ def _data_table(study: Study) -> Table:
     names = sorted(np.unique(labels).tolist(), key=lambda name: (name != LOS, name))
     rows += [row(f"label {name}", labels == name) for name in names]
     rows.append(row("all", np.ones(len(labels), np.bool_), sum(ROOM_ROWS) if study.has_rooms else None))
-    return Table(
+    return ReportTable(
         "data",
         "The data before any correction",
         "MAE and standard deviation of the range error, measured minus true. "

@@ -14,15 +14,15 @@ import numpy as np
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, place
 from uwb_mitigation.simulation.channel import check_range
-from uwb_mitigation.simulation.radio import Radio
+from uwb_mitigation.simulation.radio import Receiver
 from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
 from uwb_mitigation.simulation.scene import DirectPath
 from uwb_mitigation.simulation.simulated import (
     BATCH,
     FIRST_TAG_ID,
     SURVEY_RATE_HZ,
-    Exchanges,
     Simulated,
+    TwrBatch,
     check_seed,
 )
 from uwb_mitigation.training.paper.deepuwb import CIR_SAMPLES, FIRST_ANCHOR_ID, FIRST_PATH_INDEX, FULL_SCALE
@@ -57,7 +57,7 @@ class SimulatedDeepUwb(Simulated):
         check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
         check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
         # The published raw errors are too small for uncalibrated antenna delays.
-        radio = Radio(range_offset_m=0.0)
+        radio = Receiver(range_offset_m=0.0)
         super().__init__(f"simulated like DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
         self._seed = seed
         self._exchanges = exchanges
@@ -81,7 +81,7 @@ class SimulatedDeepUwb(Simulated):
             label = "LOS" if truth.label == "LOS" else "NLOS"
             yield Record(replace(record.measurement, cir=cir), replace(truth, label=label))
 
-    def _batch(self, number: int, batch: int) -> tuple[Exchanges, np.random.Generator]:
+    def _batch(self, number: int, batch: int) -> tuple[TwrBatch, np.random.Generator]:
         room = ROOMS[number]
         placements = -(-BATCH // self._exchanges)
         size = placements * self._exchanges
@@ -103,7 +103,7 @@ class SimulatedDeepUwb(Simulated):
         sequence = round(number * 86_400 * SURVEY_RATE_HZ) + batch * size + np.arange(size)
         ids = np.ones(size, np.int64)
         return (
-            Exchanges(
+            TwrBatch(
                 sequence,
                 (FIRST_ANCHOR_ID + number) * ids,
                 FIRST_TAG_ID * ids,

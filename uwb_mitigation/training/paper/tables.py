@@ -55,7 +55,7 @@ class Provenance:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class ReportTable:
     """One table.
 
     Attributes:
@@ -92,7 +92,9 @@ def numbers(values: Iterable[float | None], form: str, kind: str) -> list[Cell]:
     return [number(value, form, kind) for value in values]
 
 
-def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str, measured: str) -> Table:
+def accuracy(
+    trainings: ExperimentResults, provenance: Provenance, missing: str, measured: str
+) -> ReportTable:
     """Return Table 1, MAE before and after graph optimisation and quantisation; `measured` heads our columns."""
     rows = []
     for heads, parameters, models, published_row in _networks(trainings):
@@ -118,7 +120,7 @@ def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str,
         for name, baseline in baselines_by_name.items()
         if baseline.reason
     ]
-    return Table(
+    return ReportTable(
         "table1",
         "Table 1. Accuracy for each length of the CIR, before and after optimisation",
         "MAE on the test part, m; mean ± standard deviation over seeds. Optimised: ONNX Runtime's graph. "
@@ -133,13 +135,13 @@ def accuracy(trainings: ExperimentResults, provenance: Provenance, missing: str,
     )
 
 
-def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) -> Table:
+def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) -> ReportTable:
     """Return Table 2, file sizes."""
     rows = []
     for heads, parameters, models, published_row in _networks(trainings):
         paper = numbers(published_row.size_kb if published_row else [None] * 3, "{:.3f}", "paper")
         rows.append((*heads, parameters, *paper, *_forms(models, "bytes", 1000.0, 3)))
-    return Table(
+    return ReportTable(
         "table2",
         "Table 2. Size for each length of the CIR, before and after optimisation",
         "Files on disk, kB of 1000 bytes. Paper: TensorFlow Lite. Measured: ONNX with the model's card.",
@@ -152,7 +154,7 @@ def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) ->
     )
 
 
-def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str) -> Table:
+def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str) -> ReportTable:
     """Return Table 3, rate and energy on the microcontroller."""
     rows_by_key = {(row.network, row.samples, row.first_kernel, row.kernels): row for row in bench}
     paper_keys = [
@@ -180,7 +182,7 @@ def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str)
             ]
         heads = [Cell(text, "head") for text in (name, str(samples), NAMES.get(kernels, kernels))]
         rows.append((*heads, *paper, *measured_cells))
-    return Table(
+    return ReportTable(
         "table3",
         "Table 3. Real-time performance on the microcontroller",
         "Paper: measured on an Arduino Nano 33 BLE Sense. Here: instructions, memory and equality with ONNX Runtime "

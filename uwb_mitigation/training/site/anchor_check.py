@@ -64,7 +64,7 @@ class _AnchorRanges:
         return np.append(found.x, 0.0)
 
 
-def check_anchors(site: SiteData, antenna: NDArray[np.float64], known: NDArray[np.bool_]) -> None:
+def validate_anchor_map(site: SiteData, antenna: NDArray[np.float64], known: NDArray[np.bool_]) -> None:
     """Raise an error if other anchor positions fit the ranges much better.
 
     Args:

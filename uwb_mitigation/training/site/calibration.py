@@ -203,7 +203,7 @@ def offsets_file(bundle: Path) -> Path:
     return bundle.with_suffix(".offsets.yaml")
 
 
-def calibrate(
+def calibrate_site(
     site: SiteData,
     universal: Bundle,
     solution: SiteSolution,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.mitigation.correction import MAX_RANGE_M
-from uwb_mitigation.mitigation.model.bundle import Card
+from uwb_mitigation.mitigation.model.bundle import ModelCard
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.training.data.dataset import CirSources, Dataset
 from uwb_mitigation.types.anchors import AnchorMap
@@ -129,7 +129,7 @@ class SiteData:
 def read_site(
     recordings: Iterable[Iterable[Record]],
     anchors: AnchorMap,
-    card: Card,
+    card: ModelCard,
     on_record: Callable[[], None] = lambda: None,
     *,
     stamp_offset_s: float = 0.0,

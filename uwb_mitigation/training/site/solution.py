@@ -14,11 +14,11 @@ from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.floating import float_network
 from uwb_mitigation.positioning.batch.pose_alignment import PoseAlignment, align_poses
 from uwb_mitigation.positioning.batch.self_calibration import SelfCalibration
-from uwb_mitigation.positioning.batch.self_calibration import calibrate as self_calibrate
+from uwb_mitigation.positioning.batch.self_calibration import self_calibrate as self_calibrate
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import MAD_TO_SD, NETWORK_SD, SLOPE_SD, Regressors
 from uwb_mitigation.training.fit.candidates import network_m
-from uwb_mitigation.training.site.anchor_check import check_anchors
+from uwb_mitigation.training.site.anchor_check import validate_anchor_map
 from uwb_mitigation.training.site.data import SiteData
 from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.tracks import PosePath
@@ -144,7 +144,7 @@ def solve_without_truth(
         offsets = Offsets(common, anchors=anchor_offsets)
 
     def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
-        recalibrated = calibration.without_ranges(_whole_segments(used[held_out], used, track.of))
+        recalibrated = calibration.raw_only(_whole_segments(used[held_out], used, track.of))
         return {
             (calibration.tag_ids[tag], ids[row]): recalibrated.pair(tag, row)[0]
             - calibration.pair(tag, row)[0]
@@ -221,7 +221,7 @@ def solve_with_truth(
     error = site.ranges.range_m - alignment.distance_m
     is_used, outliers = _without_outliers(error, np.isfinite(error))
     rows = np.flatnonzero(is_used & usable_ranges(site))
-    check_anchors(site, alignment.position, is_used)
+    validate_anchor_map(site, alignment.position, is_used)
     ids = [anchor.id for anchor in site.anchors.anchors]
     pairs = {
         (site.tags[tag].tag_id, ids[row]): alignment.pair(tag, row, float(site.anchors.sd[row]))

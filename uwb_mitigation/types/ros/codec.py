@@ -17,9 +17,9 @@ import numpy as np
 from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.types.measurement import (
     Cir,
+    CorrectedBy,
     CorrectedRange,
     Encoding,
-    Origin,
     RadioType,
     RangeMeasurement,
     Segment,
@@ -48,7 +48,7 @@ _RADIOS = {int(radio): radio for radio in RadioType}
 _SEGMENTS = {int(segment): segment for segment in Segment}
 _ENCODINGS = {int(encoding): encoding for encoding in Encoding}
 _STATUSES = {int(status): status for status in Status}
-_ORIGINS = {int(origin): origin for origin in Origin}
+_ORIGINS = {int(origin): origin for origin in CorrectedBy}
 
 
 class MeasurementKey(NamedTuple):
