@@ -258,7 +258,7 @@ def test_pair_with_few_ranges_gets_the_common_offset(site):
 def test_offsets_above_a_metre_are_refused(site):
     done = run("calibrate", "far.mcap", *LEVEL, "-o", "far.onnx", "--json", "far.json", folder=site)
     assert done.returncode == 1
-    assert "antenna-delay" in json.loads((site / "far.json").read_text())["refused"]
+    assert "antenna delays" in json.loads((site / "far.json").read_text())["refused"]
     assert not (site / "far.onnx").exists()
     done = run(
         "calibrate", "odd.mcap", *LEVEL, *WITH_TRUTH, "-o", "far.onnx", "--json", "far.json", folder=site

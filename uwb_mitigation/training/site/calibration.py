@@ -305,5 +305,5 @@ def _check_offsets(pairs: Pairs) -> None:
         if abs(value) > MAX_OFFSET_M:
             raise DatasetError(
                 what,
-                valid=f"at most {MAX_OFFSET_M:g} m: set the antenna delay first (`uwb-mitigation board antenna-delay`)",
+                valid=f"at most {MAX_OFFSET_M:g} m: check the unit (metres) and the antenna delays of the radios",
             )
