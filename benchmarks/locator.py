@@ -22,6 +22,7 @@ from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.ros.codec import encode_corrected
+from uwb_mitigation.types.stamps import to_ns
 
 ANCHORS = AnchorMap(
     [
@@ -31,7 +32,6 @@ ANCHORS = AnchorMap(
 )
 _NOISE_M = 0.03
 _WARM_S = 2.0
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,7 @@ def _measure(
     arrived: dict[int, int] = {}
 
     def on_pose(message: PoseWithCovarianceStamped) -> None:
-        stamp = message.header.stamp
-        arrived.setdefault(stamp.sec * _SECOND_NS + stamp.nanosec, time.time_ns())
+        arrived.setdefault(to_ns(message.header.stamp), time.time_ns())
 
     probe.subscribe(PoseWithCovarianceStamped, topics.POSE, on_pose)
     publisher = probe.publisher(RangeCorrected, topics.RANGE_CORRECTED)

@@ -35,6 +35,7 @@ from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.ros.codec import first_field_offset
+from uwb_mitigation.types.stamps import NS_PER_S
 
 WINDOW = 157
 """Number of complex samples per range that the network reads."""
@@ -278,7 +279,7 @@ def read_stamp_and_sequence(data: bytes) -> tuple[int, int]:
     """Return stamp, ns, and sequence of a serialised RangeCir or RangeCorrected, which begin with the same fields."""
     seconds, nanoseconds, length = _STAMP.unpack_from(data)
     (sequence,) = _SEQUENCE.unpack_from(data, first_field_offset(_STAMP.size + length))
-    return seconds * 10**9 + nanoseconds, sequence
+    return seconds * NS_PER_S + nanoseconds, sequence
 
 
 def count_missing(sequences: Sequence[int]) -> int:

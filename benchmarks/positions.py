@@ -29,6 +29,7 @@ from uwb_mitigation.simulation.simulated import SimulatedSource, SimulatedSurvey
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track, TruePath
 
 TIME_OFFSET_S = 0.2
@@ -36,8 +37,6 @@ TIME_OFFSET_S = 0.2
 
 HEIGHT = Height(1.0, 0.2)
 """Height of the tag in the Hanyang runs."""
-
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
     run = open_mapped(folder, "hanyang")
     ranges, _ = columns(run, run.anchors)
     shifted = Ranges(
-        ranges.stamp_ns - round(TIME_OFFSET_S * _SECOND_NS),
+        ranges.stamp_ns - round(TIME_OFFSET_S * NS_PER_S),
         ranges.anchor,
         ranges.range_m,
         ranges.variance_m2,

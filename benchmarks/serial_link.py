@@ -26,6 +26,7 @@ from uwb_mitigation.nodes.support.processes import spinning_node, wait
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import to_ns
 
 WINDOW = 157
 """Number of complex samples per range that the network reads."""
@@ -100,9 +101,8 @@ class _Listener:
         probe.subscribe(RangeCir, topics.RANGE_RAW, self._on_range)
 
     def _on_range(self, message: RangeCir) -> None:
-        stamp = message.header.stamp
         self.last_ns = time.monotonic_ns()
-        self.late_ns.append(time.time_ns() - stamp.sec * 10**9 - stamp.nanosec)
+        self.late_ns.append(time.time_ns() - to_ns(message.header.stamp))
 
 
 @contextmanager

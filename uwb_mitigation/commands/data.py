@@ -15,6 +15,7 @@ import typer
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption, print_line
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
+from uwb_mitigation.types.stamps import NS_PER_S
 
 if TYPE_CHECKING:
     from uwb_mitigation.types.source import Source
@@ -172,7 +173,7 @@ def _write(
     kinds = {source.simulated for source in sources}
     simulated = "true" if True in kinds else "unknown" if None in kinds else "false"
     origin = {"source": "; ".join(source.name for source in sources), "simulated": simulated}
-    pauses = PauseShortener(longest_pause, int(time.time() // 86_400) * 86_400 * 10**9)
+    pauses = PauseShortener(longest_pause, int(time.time() // 86_400) * 86_400 * NS_PER_S)
     damage: list[DamagedRecordingError] = []
     robot = _motion_of(sources[0], pauses.start_ns)
     row = 0

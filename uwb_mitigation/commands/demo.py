@@ -25,6 +25,7 @@ from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spin
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import AnchorMap, dump_anchors
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import TruePath
 
 SIMULATED_EXCHANGES = 600
@@ -110,7 +111,7 @@ def _stamped(messages: list[Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any,
     rows = {}
     for message in messages:
         at = message.pose.pose.position
-        rows[message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec] = (at.x, at.y, at.z)
+        rows[to_ns(message.header.stamp)] = (at.x, at.y, at.z)
     stamps = sorted(rows)
     return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps], np.float64)
 

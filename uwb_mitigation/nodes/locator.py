@@ -45,6 +45,7 @@ from uwb_mitigation.types.ros.codec import (
     measurement_key,
 )
 from uwb_mitigation.types.ros.poses import BodyTwist, encode_odometry, encode_pose, tag_frame, tag_of_frame
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heading
 
 BATCH = 64
@@ -56,7 +57,6 @@ PERIOD_S = 0.2
 PREDICT_AFTER_S, PREDICT_UNTIL_S = 0.3, 30.0
 """A tag without ranges is predicted between these ages of its last range; later the covariance exceeds most halls."""
 
-_NANOSECONDS = 1_000_000_000
 
 _REPEAT_AFTER_NS = 300_000_000
 """After this time without estimates, map to odom is repeated."""
@@ -133,15 +133,15 @@ class Locator(ManagedNode):
         kind, _, topic = path.partition(":")
         if kind not in markers.ANCHOR_TYPES:
             self._estimator = self._make_estimator(load_anchors(Path(path).expanduser()))
-        self._period_ns = round(_NANOSECONDS / self.value("rate")) if self.value("rate") > 0 else 0
-        self._offset_ns = round(self.value("stamp_offset") * _NANOSECONDS)
+        self._period_ns = round(NS_PER_S / self.value("rate")) if self.value("rate") > 0 else 0
+        self._offset_ns = round(self.value("stamp_offset") * NS_PER_S)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
         if tag_of_frame(self._plain_frame) not in (None, self.value("tag")) or self._plain_frame == self._map:
             raise ParameterError(
                 f"parameter tag_frame = {self._plain_frame!r} is the frame of another tag or of the map",
                 valid="a name of its own, such as uwb_tag",
             )
-        self._tolerance_ns = round(self.value("transform_tolerance") * _NANOSECONDS)
+        self._tolerance_ns = round(self.value("transform_tolerance") * NS_PER_S)
         if self.value("publish_tf"):
             self._tf_type = transform_type()
             if self._tf_type is None:
@@ -268,7 +268,7 @@ class Locator(ManagedNode):
         outputs = self._outputs_of(tag)
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
         if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
-            if stamp_ns < outputs.published_ns - _NANOSECONDS:
+            if stamp_ns < outputs.published_ns - NS_PER_S:
                 # A replay starts again.
                 outputs.transform_ns = stamp_ns - 1
             outputs.published_ns = stamp_ns
@@ -363,7 +363,7 @@ class Locator(ManagedNode):
             return
         for tag in list(estimator.tags.values()):
             outputs = self._outputs_of(tag)
-            age_s = (stamp_ns - tag.latest_ns) / _NANOSECONDS
+            age_s = (stamp_ns - tag.latest_ns) / NS_PER_S
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
                 ahead = tag.estimator.at(stamp_ns)
                 if ahead is not None:

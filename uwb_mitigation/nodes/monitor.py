@@ -23,6 +23,7 @@ from uwb_mitigation.nodes.support.processes import spinning_node
 from uwb_mitigation.nodes.support.spinning import stop_event
 from uwb_mitigation.types.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_truth
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.scene import MAX_TRUTHS, BoundedDict, History, Pair, Sample
 
 REFRESH_HZ = 5
@@ -64,7 +65,7 @@ class RangeStatistics:
         sample = Sample.of(arrival_s, corrected, self._truths.pop(key, None))
         self.corrected += 1
         self.statuses[sample.status] += 1
-        self._latencies_s.append(arrival_s - key.stamp_ns / 1e9)
+        self._latencies_s.append(arrival_s - key.stamp_ns / NS_PER_S)
         self.pairs.setdefault((key.anchor_id, key.tag_id), History()).add(sample, arrival_s)
         if math.isfinite(sample.true_m) and math.isfinite(sample.raw_m):
             raw_m, corrected_m = abs(sample.raw_m - sample.true_m), abs(sample.range_m - sample.true_m)
@@ -92,7 +93,7 @@ class Monitor(Node):
             self.statistics.add_truth(*decode_truth(data))
 
     def _on_corrected(self, data: bytes) -> None:
-        now_s = self.get_clock().now().nanoseconds / 1e9
+        now_s = self.get_clock().now().nanoseconds / NS_PER_S
         # A malformed message counts as missing.
         with contextlib.suppress(RecordingError):
             self.statistics.add_corrected(*decode_corrected(data), now_s)

@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 
 CORRELATION_S = 1.0
 """Errors of positions within this time are correlated. EKF2 takes them as independent, so their variance is increased."""
@@ -21,7 +22,6 @@ MAX_VALUE = 1e6
 """Positions (m) and variances (m^2) beyond this, NaN, and stamps before 1970 are not sent."""
 
 _NAN3 = (math.nan,) * 3
-_NANOSECONDS = 1_000_000_000
 
 
 class Px4(Node):
@@ -51,14 +51,14 @@ class Px4(Node):
         self.get_logger().info(f"sends {topics.POSE} to {topics.PX4_ODOMETRY}")
 
     def _on_pose(self, pose: PoseWithCovarianceStamped) -> None:
-        stamp_ns = pose.header.stamp.sec * _NANOSECONDS + pose.header.stamp.nanosec
+        stamp_ns = to_ns(pose.header.stamp)
         at, covariance = pose.pose.pose.position, pose.pose.covariance
         # x is east and y is north; each position counts as much as the time since the previous one.
         values = [at.y, at.x, -at.z]
         variances = [covariance[7], covariance[0], covariance[14]]
         increase, is_reset = 1.0, False
         if self._latest_ns is not None:
-            since_s = (stamp_ns - self._latest_ns) / _NANOSECONDS
+            since_s = (stamp_ns - self._latest_ns) / NS_PER_S
             if -CORRELATION_S < since_s <= 0.0:
                 return
             increase = max(1.0, CORRELATION_S / abs(since_s))

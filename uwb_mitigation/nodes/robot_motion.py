@@ -17,6 +17,7 @@ from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.recordings.bag.odometry import yaw_of
 from uwb_mitigation.types.ros.poses import BodyTwist
+from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
 
 Vector = tuple[float, float, float]
@@ -25,7 +26,6 @@ HOLD_S = 30.0
 """The last map to odom is repeated for this time: odometry alone is useful for as long."""
 
 _MAX_FRAMES = 1000
-_NANOSECONDS = 1_000_000_000
 
 
 class OdometryInput:
@@ -95,7 +95,7 @@ class OdometryInput:
 
     def last_map_to_odom(self, stamp_ns: int, tolerance_ns: int) -> TransformStamped | None:
         """Return the last transform with a new stamp, for `HOLD_S`; None: later, or no heading was known yet."""
-        if self._last is None or not 0 <= stamp_ns - self._last_ns <= HOLD_S * _NANOSECONDS:
+        if self._last is None or not 0 <= stamp_ns - self._last_ns <= HOLD_S * NS_PER_S:
             return None
         self._last.header = topics.header(stamp_ns + tolerance_ns, self._map)
         return self._last
@@ -140,7 +140,7 @@ class OdometryInput:
             self.base_frame = self.base_frame or message.child_frame_id
             self._log.info(f"odometry of {self.base_frame} in {frame}")
         self.path.add(
-            _stamp_ns(message),
+            to_ns(message.header.stamp),
             (pose.position.x, pose.position.y, yaw_of(pose.orientation)),
             (twist.linear.x, twist.linear.y, twist.angular.z),
             (covariance[0], covariance[7], covariance[35]),
@@ -154,7 +154,7 @@ class OdometryInput:
         # The same mark for orientations.
         uses_yaw = self._uses_orientation and message.orientation_covariance[0] != -1.0
         yaw = yaw_of(message.orientation) if uses_yaw else math.nan
-        self.path.add_imu(_stamp_ns(message), rate, variance, yaw)
+        self.path.add_imu(to_ns(message.header.stamp), rate, variance, yaw)
 
     def _on_static(self, message: Any) -> None:
         for one in message.transforms:
@@ -176,7 +176,3 @@ def transform_type() -> Any:
     except ImportError:
         return None
     return TFMessage
-
-
-def _stamp_ns(message: Any) -> int:
-    return int(message.header.stamp.sec) * _NANOSECONDS + int(message.header.stamp.nanosec)

@@ -28,6 +28,7 @@ from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import VIEWER
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.ros import topics as bag_topics
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.page import View
@@ -64,7 +65,7 @@ class Viewer(ManagedNode):
         self._lock = threading.Lock()
         self._feed = SceneUpdater(self._scene, self._lock)
         pace = ReplayClock(self.get_clock())
-        self._scene.clock = lambda: pace.now_ns() / 1e9
+        self._scene.clock = lambda: pace.now_ns() / NS_PER_S
         self._view: View | None = None
         self.autostart()
 

@@ -21,6 +21,7 @@ from uwb_mitigation.positioning.online.tag_estimator import (
     TagEstimator,
     is_valid,
 )
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track
 
 MAX_TAGS = 256
@@ -36,7 +37,6 @@ _BEFORE_S = 0.5
 _EVERY_S = 0.1
 _MAX_RANGES = 400
 _ITERATIONS = 3
-_SECOND_NS = 1_000_000_000
 
 
 class FixedLagSmoother:
@@ -67,9 +67,9 @@ class FixedLagSmoother:
         if self._ranges and stamp_ns < self._ranges[-1][0]:
             self.clear()
         self._ranges.append((stamp_ns, anchor, range_m, variance_m2))
-        if not self._states or stamp_ns - self._states[-1][0] >= _EVERY_S * _SECOND_NS:
+        if not self._states or stamp_ns - self._states[-1][0] >= _EVERY_S * NS_PER_S:
             self._states.append((stamp_ns, known.copy(), estimate))
-        oldest = stamp_ns - round((LAG_S + _BEFORE_S + _EVERY_S) * _SECOND_NS)
+        oldest = stamp_ns - round((LAG_S + _BEFORE_S + _EVERY_S) * NS_PER_S)
         for kept in (self._states, self._ranges, self._heights):
             while kept and kept[0][0] < oldest:
                 kept.popleft()
@@ -85,7 +85,7 @@ class FixedLagSmoother:
         if not self._states or len(self._ranges) < 2:
             return None
         config, (start_ns, known, _) = self._config, self._states[0]
-        wanted_ns = self._ranges[-1][0] - round(LAG_S * _SECOND_NS)
+        wanted_ns = self._ranges[-1][0] - round(LAG_S * NS_PER_S)
         after = [row for row in self._ranges if row[0] > start_ns]
         if start_ns > wanted_ns or len(after) < 2:
             return None
@@ -94,7 +94,7 @@ class FixedLagSmoother:
         stamp, anchor, range_m, variance = (np.array(column) for column in zip(*after, strict=True))
         ranges = Ranges(stamp, anchor, range_m, variance, np.full(len(after), np.nan))
         first = known.copy()
-        first.predict(first.time_s + (int(stamp[0]) - start_ns) / _SECOND_NS)
+        first.predict(first.time_s + (int(stamp[0]) - start_ns) / NS_PER_S)
         states = [(at, one) for at, one, _ in self._states if at > start_ns] or [(int(stamp[0]), first)]
         initial = Track.of([one.estimate(at) for at, one in states])
         if self._heights:
@@ -106,9 +106,9 @@ class FixedLagSmoother:
             return None
         at = int(np.abs(track.stamp_ns - wanted_ns).argmin())
         batch = track.take(slice(at, at + 1))
-        batch.position[:] += (wanted_ns - int(track.stamp_ns[at])) / _SECOND_NS * batch.velocity
+        batch.position[:] += (wanted_ns - int(track.stamp_ns[at])) / NS_PER_S * batch.velocity
         live_ns, live, estimate = [state for state in self._states if state[0] <= wanted_ns][-1]
-        after_s = (wanted_ns - live_ns) / _SECOND_NS
+        after_s = (wanted_ns - live_ns) / NS_PER_S
         if estimate.heading is None:
             live = live.copy()
             live.predict(live.time_s + after_s)

@@ -20,8 +20,9 @@ from uwb_mitigation.radios.wire.layout import Mode
 from uwb_mitigation.radios.wire.messages import Hello
 from uwb_mitigation.radios.wire.session import BoardSession
 from uwb_mitigation.types.offsets import Offsets
+from uwb_mitigation.types.stamps import NS_PER_S
 
-REOPEN_TIMEOUT_NS = 10 * 10**9
+REOPEN_TIMEOUT_NS = 10 * NS_PER_S
 """Timeout after which the port is reopened. After a suspend, an open port may never receive data again."""
 
 _TICK_S = 0.05

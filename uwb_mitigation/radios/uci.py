@@ -19,9 +19,10 @@ from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import PortAddress, PortThread
 from uwb_mitigation.radios.settings import Role
 from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.stamps import NS_PER_S
 
 BAUD = 115_200
-REOPEN_NS = 10 * 10**9
+REOPEN_NS = 10 * NS_PER_S
 """Time without ranging after which the port is opened again."""
 
 _TICK_S = 0.02

@@ -34,6 +34,7 @@ from uwb_mitigation.types.measurement import (
     Truth,
 )
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import NS_PER_S
 
 MAX_ACCUMULATOR = 1016
 """Samples of the accumulator at 64 MHz PRF; 992 at 16 MHz (DW1000 user manual, section 7.2.38)."""
@@ -208,7 +209,7 @@ class DecaRangingLog(Source):
                 time, cir = frames.get(self._cir_frame, (latest or 0, empty))
                 if len(cir) == 0:
                     self._count(Anomaly.NO_CIR)
-                stamp_ns = base_ns + ticks * 1_000_000_000 // int(DEVICE_TICK_HZ)
+                stamp_ns = base_ns + ticks * NS_PER_S // int(DEVICE_TICK_HZ)
                 range_m = self._number(match["range"], -3e38, 3e38)
                 yield RangeMeasurement(stamp_ns, tag, anchor, 0, time, range_m, cir)
                 frames.clear()
@@ -283,7 +284,7 @@ def _start_ns(head: bytes) -> int:
     except ValueError:
         return 0
     # The 64-bit nanoseconds of ROS and NumPy end in 2262.
-    return int(start.timestamp()) * 1_000_000_000 if 1970 <= start.year < 2262 else 0
+    return int(start.timestamp()) * NS_PER_S if 1970 <= start.year < 2262 else 0
 
 
 class DecaRangingFolder(Source):

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import NS_PER_S
 
-_SECOND_NS = 1e9
-
-FIRST_DATE_NS = 946_684_800 * 10**9
+FIRST_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01T00:00:00Z: earlier stamps come from a clock without a date."""
 
 
@@ -63,7 +62,7 @@ class Inventory:
             "ranges": self.ranges,
             "with_truth": self.with_truth,
             "pairs": len({key[:2] for key in self._rows}),
-            "duration_s": (last - first) / _SECOND_NS,
+            "duration_s": (last - first) / NS_PER_S,
             "skipped": dict(self.skipped),
             "by_pair": [_pair(*key, rows) for key, rows in self._rows.items()],
         }
@@ -77,7 +76,7 @@ def _pair(anchor_id: int, tag_id: int, label: str, rows: tuple[Any, Any, Any]) -
         "tag_id": tag_id,
         "label": label,
         "ranges": len(stamps),
-        "rate_hz": (len(stamps) - 1) * _SECOND_NS / span_ns if span_ns > 0 else None,
+        "rate_hz": (len(stamps) - 1) * NS_PER_S / span_ns if span_ns > 0 else None,
         "mean_range_m": _mean(np.array(ranges_m)),
         "mean_true_range_m": _mean(np.array(true_m)),
     }

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.simulation.scene import Point, along_route
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Imu, Odometry
 
 RATE_HZ = 50.0
@@ -43,8 +44,6 @@ POSE_SHARE = 0.05
 
 _CORNER_M = 0.5
 """Length of the route over which `along_route` rounds a corner."""
-
-_NANOSECONDS = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +85,7 @@ def simulate_motion(route: tuple[Point, ...], speed: float, seconds: float, seed
     driven = np.cumsum(np.hypot(twist[:, 0], twist[:, 1])) * step_s
 
     imu_rate = twist[:, 2] + rng.normal(0.0, GYRO_BIAS_SD) + rng.normal(0.0, GYRO_SD, n)
-    stamp_ns = np.rint(time_s * _NANOSECONDS).astype(np.int64)
+    stamp_ns = np.rint(time_s * NS_PER_S).astype(np.int64)
     imu = Imu(stamp_ns, imu_rate, np.full(n, GYRO_SD**2 + GYRO_BIAS_SD**2), np.full(n, np.nan), np.zeros(n))
 
     distance_scale, turn_scale = 1.0 + SCALE_ERROR * rng.choice([-1.0, 1.0], 2)

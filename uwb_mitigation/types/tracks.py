@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from uwb_mitigation.types.stamps import NS_PER_S
+
 _Series = TypeVar("_Series", bound="TimeSeries")
 
 
@@ -162,7 +164,7 @@ class TruePath(TimeSeries):
         found = np.stack([np.interp(wanted, own, axis, np.nan, np.nan) for axis in self.position.T], axis=1)
         after = np.clip(np.searchsorted(own, wanted), 1, max(len(own) - 1, 1))
         if len(own) > 1:
-            found[own[after] - own[after - 1] > 1_000_000_000] = np.nan
+            found[own[after] - own[after - 1] > NS_PER_S] = np.nan
         return found
 
     def yaw_at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -247,9 +249,6 @@ _MAX_NEIGHBOURS = 20
 _WORST_CONDITION = 1e6
 
 
-_SECOND_NS = 1_000_000_000
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PosePath(TimeSeries):
     """Poses of a robot's frame.
@@ -266,7 +265,7 @@ class PosePath(TimeSeries):
 
     def smoothed(self) -> PosePath:
         """Return poses with positions from parabolas through those of `SMOOTHED_S` before and after each (Savitzky and Golay, 1964)."""
-        time_s = (self.stamp_ns - self.stamp_ns[0]) / _SECOND_NS
+        time_s = (self.stamp_ns - self.stamp_ns[0]) / NS_PER_S
         # Sums over neighbours of 1, t, t^2, t^3, t^4, and of the positions times the first three.
         moments, right = np.zeros((len(self), 5)), np.zeros((len(self), 3, 3))
         reach = (
@@ -311,9 +310,9 @@ class PosePath(TimeSeries):
         self, stamp_ns: NDArray[np.int64], later_s: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside and in gaps > `GAP_S`."""
-        wanted = stamp_ns + round(later_s * _SECOND_NS)
+        wanted = stamp_ns + round(later_s * NS_PER_S)
         after = np.searchsorted(self.stamp_ns, wanted).clip(1, len(self) - 1)
-        gap = self.stamp_ns[after] - self.stamp_ns[after - 1] > GAP_S * _SECOND_NS
+        gap = self.stamp_ns[after] - self.stamp_ns[after - 1] > GAP_S * NS_PER_S
         unknown = (wanted < self.stamp_ns[0]) | (wanted > self.stamp_ns[-1]) | gap
         position, rotation = self.interpolated(wanted)
         matrices = rotation.as_matrix()

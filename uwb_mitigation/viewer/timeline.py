@@ -26,6 +26,7 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_RAW,
     RANGE_TRUTH,
 )
+from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import Estimate, Ranges
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
@@ -145,7 +146,7 @@ def index_recording(
                 name = str(message.child_frame_id) if kind is TrackKind.TRUE else tag
                 at, stamp = message.pose.pose.position, message.header.stamp
                 if np.isfinite([at.x, at.y]).all() and (len(points) < 4 * MAX_TAGS or (name, kind) in points):
-                    time_s = seconds(stamp.sec * 1_000_000_000 + stamp.nanosec)
+                    time_s = seconds(to_ns(stamp))
                     points.setdefault((name, kind), []).append((time_s, at.x, at.y, at.z))
     flush()
     ranges.sort(key=lambda row: row[0].stamp_ns)

@@ -28,6 +28,7 @@ from uwb_mitigation.types.ros.poses import (
     tag_topic,
 )
 from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, ODOMETRY_TYPE, POSE_SMOOTHED, POSE_TYPE
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Ranges, Track, TruePath
 
 KINDS = ("live", "smoothed", "snapshot")
@@ -284,7 +285,7 @@ def _body_twist(estimate: Estimate) -> BodyTwist | None:
 def tum(track: Track) -> str:
     """Return a track in TUM's format: stamp in s, position, and orientation, which is the identity if it is unknown."""
     lines = (
-        f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d} {x:.6f} {y:.6f} {z:.6f} {_quaternion_text(yaw)}\n"
+        f"{stamp // NS_PER_S}.{stamp % NS_PER_S:09d} {x:.6f} {y:.6f} {z:.6f} {_quaternion_text(yaw)}\n"
         for stamp, (x, y, z), yaw in zip(
             track.stamp_ns.tolist(), track.position.tolist(), track.yaw[:, 0].tolist(), strict=True
         )

@@ -18,6 +18,7 @@ from uwb_mitigation.nodes.support.lifecycle import clock_reader
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import NS_PER_S
 
 TICK_S = 0.02
 """Interval at which commands and a simulated clock are checked, and /clock is published."""
@@ -121,7 +122,7 @@ class ReplayFeed:
         self._uses_recorded_stamps = value("publish_clock")
         self._requested_rate = self._rate = float(value("rate"))
         self._pause_requested, self._paused = value("paused"), False
-        self._seeks = deque([int(value("seek_to") * 1e9)])
+        self._seeks = deque([int(value("seek_to") * NS_PER_S)])
         self._late: list[tuple[Record, int]] = []
         # The played time `_reference_ns` is due at `_reference_clock_ns`.
         self._reference_ns = self._reference_clock_ns = 0
@@ -148,7 +149,7 @@ class ReplayFeed:
         if "paused" in changed:
             self._pause_requested = value("paused")
         if "seek_to" in changed:
-            self._seeks.append(int(value("seek_to") * 1e9))
+            self._seeks.append(int(value("seek_to") * NS_PER_S))
 
     def describe(self) -> Description:
         simulated = self._source.simulated
@@ -161,7 +162,7 @@ class ReplayFeed:
         level, text = diagnostics.OK, "paused" if self._pause_requested else "replaying"
         if simulated:
             level, text = diagnostics.WARN, f"{text} simulated ranges"
-        late_s = max(self.late_ns / 1e9, 0.0)
+        late_s = max(self.late_ns / NS_PER_S, 0.0)
         if late_s > LATE_WARNING_S:
             level = diagnostics.WARN
             text = f"{text}; {late_s:.1f} s behind: the rate is too high for this machine"
@@ -216,7 +217,7 @@ class ReplayFeed:
         """
         first_ns: int | None = None
         last_ns: int | None = None
-        pause_ns, longest_ns = 1, int(self._value("longest_pause") * 1e9)
+        pause_ns, longest_ns = 1, int(self._value("longest_pause") * NS_PER_S)
         try:
             for record in self._source:
                 recorded_ns = record.measurement.stamp_ns
@@ -269,7 +270,7 @@ class ReplayFeed:
             if ahead_ns <= 0 and not self._paused:
                 return -ahead_ns
             self._flush()
-            self._stopping.wait(TICK_S if self._paused else min(ahead_ns / 1e9, TICK_S))
+            self._stopping.wait(TICK_S if self._paused else min(ahead_ns / NS_PER_S, TICK_S))
 
     def _clock_ns(self, due_ns: int) -> int:
         """Return the time of the replay clock at which a played time is due."""

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.stamps import NS_PER_S
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -76,7 +77,7 @@ class RateMonitor:
     def entries(self) -> dict[str, object]:
         """Return rate and percentiles of the latency, and begin a new period."""
         now_ns = self._now_ns()
-        period_s, self._since_ns = (now_ns - self._since_ns) / 1e9, now_ns
+        period_s, self._since_ns = (now_ns - self._since_ns) / NS_PER_S, now_ns
         passed, self._reported = self._passed - self._reported, self._passed
         # A simulated clock may pause, or jump back when a recording restarts.
         rate = f"{passed / period_s:.1f}" if period_s > 0 else "unknown"

@@ -24,6 +24,7 @@ from std_msgs.msg import Header
 
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.types.measurement import CorrectedRange
+from uwb_mitigation.types.stamps import NS_PER_S
 
 RANGE_RAW = "uwb/range_raw"
 RANGE_CORRECTED = "uwb/range_corrected"
@@ -157,7 +158,7 @@ def incompatible_publishers(node: LifecycleNode) -> list[str]:
 
 def header(stamp_ns: int, frame_id: str) -> Header:
     """Return a message header."""
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
 
 

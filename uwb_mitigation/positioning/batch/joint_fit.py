@@ -19,6 +19,7 @@ from uwb_mitigation.positioning.batch.motion_segments import Segments
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.types.stamps import NS_PER_S
 
 KNOT_S = 0.15
 LEAST_SCALE_M = 0.02
@@ -39,7 +40,6 @@ AROUND_M = 5.0
 FAR_S = 0.5
 """A range further in time from every knot has no position on a track."""
 
-_SECOND_NS = 1_000_000_000
 _ITERATIONS = 25
 _HUBER_ITERATIONS = 4
 _CONVERGED_M = 1e-3
@@ -104,7 +104,7 @@ def observations_of(segments: Segments, parameters: Regressors, model: NoiseMode
             time_s = np.zeros(1)
             knot[own] = known
         else:
-            since = (ranges.stamp_ns[own] - ranges.stamp_ns[own][0]) / _SECOND_NS
+            since = (ranges.stamp_ns[own] - ranges.stamp_ns[own][0]) / NS_PER_S
             index, of = np.unique(np.rint(since / KNOT_S).astype(np.int64), return_inverse=True)
             time_s = index * KNOT_S
             knot[own], ahead[own] = known + of, since - time_s[of]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.noise_model import MAD_TO_SD
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges
 
 STILL_M = 0.06
@@ -24,8 +25,6 @@ LEAST_S = 4.0
 
 GAP_S = 10.0
 """After a longer pause a tag may be anywhere."""
-
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +92,7 @@ def _segments(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
     # Ignore pauses: pairs may have been recorded one after the other.
     if _is_sparse(ranges, rows) or _is_stationary(ranges, rows):
         return [(rows, True)]
-    parts = np.split(rows, np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * _SECOND_NS) + 1)
+    parts = np.split(rows, np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * NS_PER_S) + 1)
     return [segment for part in parts for segment in _parts(ranges, part)]
 
 
@@ -101,7 +100,7 @@ def _parts(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp
     """Divide a segment without gaps at the start and end of stationary parts."""
     if _is_sparse(ranges, rows) or _is_stationary(ranges, rows):
         return [(rows, True)]
-    number = (ranges.stamp_ns[rows] - ranges.stamp_ns[rows[0]]) // round(BIN_S * _SECOND_NS)
+    number = (ranges.stamp_ns[rows] - ranges.stamp_ns[rows[0]]) // round(BIN_S * NS_PER_S)
     # Whether the tag has one position in a bin and the next one: the ranges of each anchor are similar.
     bins = int(number[-1]) + 1
     starts = np.searchsorted(number, np.arange(bins + 1))

@@ -17,7 +17,8 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.tracks import _SECOND_NS, PosePath, Ranges
+from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.types.tracks import PosePath, Ranges
 
 MAX_TIME_OFFSET_S = 2.0
 COARSE_OFFSETS_S = np.arange(-MAX_TIME_OFFSET_S, MAX_TIME_OFFSET_S + 0.01, 0.1)
@@ -305,7 +306,7 @@ class _AlignmentProblem:
         x = np.array([time_offset, *lever.reshape(-1), *offsets, *np.zeros(size - pairs.stop)])
         # The errors of a pair persist for about this time (see `noise_model`).
         since = self.ranges.stamp_ns - self.ranges.stamp_ns.min()
-        group = since // round(2.0 * _MODEL.persistence_s * _SECOND_NS) * self.pairs + self.pair
+        group = since // round(2.0 * _MODEL.persistence_s * NS_PER_S) * self.pairs + self.pair
         every = np.arange(len(self.pair))
         for iteration in range(_ITERATIONS):
             arm = x[arms].reshape(lever.shape)
@@ -330,7 +331,7 @@ class _AlignmentProblem:
                 break
         # Errors persist for longer than a group, and those of the localisation are in all pairs: the sandwich estimator
         # with the scores of long blocks includes both (Liang and Zeger, Biometrika 1986).
-        block = since // round(BLOCK_S * _SECOND_NS)
+        block = since // round(BLOCK_S * NS_PER_S)
         parts = [known & (block == number) for number in np.unique(block[known])]
         scores = np.array(
             [_normal_equations(rows[p], left[p], group[p], self.known.noise_group[p])[1] for p in parts]

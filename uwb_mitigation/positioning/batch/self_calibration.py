@@ -29,6 +29,7 @@ from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
 from uwb_mitigation.positioning.online.initialization import CandidatePosition, candidate_positions
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 
 MAX_COMMON_SD_M = 0.2
@@ -57,8 +58,6 @@ OFFSETS_M = np.arange(-1.0, 2.01, 0.5)
 START_SD_M = 0.2
 WINDOW_S = 0.5
 MAX_WINDOWS = 12
-
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -358,7 +357,7 @@ def likely_offset(config: EstimatorConfig, found: Segments, expected_m: NDArray[
     """
     rng = np.random.default_rng(1)
     moments = []
-    window = (found.ranges.stamp_ns - found.ranges.stamp_ns[0]) // round(WINDOW_S * _SECOND_NS)
+    window = (found.ranges.stamp_ns - found.ranges.stamp_ns[0]) // round(WINDOW_S * NS_PER_S)
     key = np.where(found.is_stationary[found.of], -1 - found.of, window * len(found) + found.of)
     for one in rng.permutation(np.unique(key)).tolist():
         row, value = _medians(found.ranges, np.flatnonzero(key == one), expected_m)
@@ -409,9 +408,9 @@ def _candidate_positions(
 
 
 def _at_knots(track: Track, ranges: Ranges) -> NDArray[np.float64]:
-    since = (ranges.stamp_ns - ranges.stamp_ns[0]) / _SECOND_NS
+    since = (ranges.stamp_ns - ranges.stamp_ns[0]) / NS_PER_S
     knots = np.unique(np.rint(since / KNOT_S).astype(np.int64)) * KNOT_S
-    own = (track.stamp_ns - ranges.stamp_ns[0]) / _SECOND_NS
+    own = (track.stamp_ns - ranges.stamp_ns[0]) / NS_PER_S
     return np.stack([np.interp(knots, own, axis) for axis in track.position.T], axis=1)
 
 

@@ -25,6 +25,7 @@ from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.robot_estimator import make_estimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 
 KNOT_S = 0.1
@@ -33,8 +34,7 @@ BATCH_BIAS_M = 0.2
 
 _ITERATIONS = 12
 _CONVERGED_M = 2e-3
-_OLDEST_NS = 1_000_000_000
-_SECOND_NS = 1_000_000_000
+_OLDEST_NS = NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Smoothed:
 
 def knots_of(stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Return the knots, int64 (K,) ns since the first stamp, and the knot of each stamp, int (n,)."""
-    spacing = round(KNOT_S * _SECOND_NS)
+    spacing = round(KNOT_S * NS_PER_S)
     number, of = np.unique((stamp_ns - stamp_ns[0] + spacing // 2) // spacing, return_inverse=True)
     return number * spacing, of
 
@@ -97,8 +97,8 @@ class Smoother:
         self._ranges = ranges
         self._origin_ns = int(ranges.stamp_ns[0])
         self._knots_ns, self._of = knots_of(ranges.stamp_ns)
-        self._time_s = self._knots_ns / _SECOND_NS
-        self._ahead_s = (ranges.stamp_ns - self._origin_ns - self._knots_ns[self._of]) / _SECOND_NS
+        self._time_s = self._knots_ns / NS_PER_S
+        self._ahead_s = (ranges.stamp_ns - self._origin_ns - self._knots_ns[self._of]) / NS_PER_S
         self._variance = model.variances(ranges.variance_m2)
         median = np.array([np.median(self._variance[self._slot == s]) for s in range(len(self._used))])
         self._persisting = (1.0 - model.white) * median
@@ -116,7 +116,7 @@ class Smoother:
             DatasetError: the ranges do not determine it.
         """
         knots, d, p = len(self._time_s), self._d, len(self._offset_sd)
-        stamp = (initial.stamp_ns - self._origin_ns) / _SECOND_NS
+        stamp = (initial.stamp_ns - self._origin_ns) / NS_PER_S
         x = np.zeros((knots, 2 * d + len(self._used)))
         for axis in range(d):
             x[:, axis] = np.interp(self._time_s, stamp, initial.position[:, axis])
@@ -304,7 +304,7 @@ def _at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64],
         return np.full((len(stamp_ns), 6), np.nan), np.full((len(stamp_ns), 6, 6), np.nan)
     latest = np.searchsorted(track.stamp_ns, stamp_ns, side="right") - 1
     age_ns = stamp_ns - track.stamp_ns[latest]
-    age_s = age_ns[:, None] / _SECOND_NS
+    age_s = age_ns[:, None] / NS_PER_S
     state = np.concatenate(
         [track.position[latest] + age_s * track.velocity[latest], track.velocity[latest]], axis=1
     )

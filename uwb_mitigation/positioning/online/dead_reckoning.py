@@ -7,6 +7,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from uwb_mitigation.types.stamps import NS_PER_S
+
 ODOMETRY_TIMEOUT_S = 0.5
 """Motion is extrapolated by at most this time; a longer gap is missing odometry."""
 
@@ -30,7 +32,6 @@ JUMP_SPEED, JUMP_YAW_RATE = 3.0, 10.0
 
 _MAX_VARIANCE = 1e3
 _NUM_SAMPLES = 512
-_SECOND_NS = 1_000_000_000
 
 
 class PathPoint(NamedTuple):
@@ -112,17 +113,17 @@ class DeadReckoning:
             pose = None
         last = self._samples[-1] if self._samples else None
         gap_ns = 0 if last is None else stamp_ns - last.stamp_ns
-        if last is not None and -_SECOND_NS <= gap_ns <= 0:
+        if last is not None and -NS_PER_S <= gap_ns <= 0:
             self.rejected += 1
             return
         imu_yaw = self._yaw_of_imu(stamp_ns)
-        if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
+        if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * NS_PER_S:
             self._part += 1
             self._samples.clear()
             self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 7, pose))
             self._imu_yaw, self.twist = imu_yaw, None
             return
-        dt = gap_ns / _SECOND_NS
+        dt = gap_ns / NS_PER_S
         if pose is not None and last.pose is not None:
             moved = _relative(last.pose, pose)
             poses = (moved[0] / dt, moved[1] / dt, moved[2] / dt)
@@ -169,15 +170,15 @@ class DeadReckoning:
         """
         turned, latest = 0.0, self._imu
         gap_ns = 1 if latest is None else stamp_ns - latest[0]
-        if not abs(yaw_rate) <= MAX_YAW_RATE or -_SECOND_NS < gap_ns <= 0:
+        if not abs(yaw_rate) <= MAX_YAW_RATE or -NS_PER_S < gap_ns <= 0:
             self.rejected += 1
             return
         if latest is not None:
-            turned = 0.5 * (latest[1] + yaw_rate) * gap_ns / _SECOND_NS
+            turned = 0.5 * (latest[1] + yaw_rate) * gap_ns / NS_PER_S
             if math.isfinite(difference := yaw - latest[4]):
                 turned = math.remainder(difference, math.tau)
             turned += latest[3]
-            if not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * _SECOND_NS:
+            if not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * NS_PER_S:
                 # The rotation in a gap is unknown, also after a wrong stamp.
                 self._imu_yaw = None
         self._imu = stamp_ns, yaw_rate, _known_variance(variance, YAW_RATE_SD), turned, yaw
@@ -205,12 +206,12 @@ class DeadReckoning:
     def _before(self, stamp_ns: int) -> tuple[_Sample, tuple[float, ...], float] | None:
         """Return the latest sample before a time, the rates after it, and the time since, s."""
         samples = self._samples
-        if not samples or stamp_ns > samples[-1].stamp_ns + ODOMETRY_TIMEOUT_S * _SECOND_NS:
+        if not samples or stamp_ns > samples[-1].stamp_ns + ODOMETRY_TIMEOUT_S * NS_PER_S:
             return None
         rates = samples[-1].rates
         for sample in reversed(samples):
             if sample.stamp_ns <= stamp_ns:
-                return sample, rates, (stamp_ns - sample.stamp_ns) / _SECOND_NS
+                return sample, rates, (stamp_ns - sample.stamp_ns) / NS_PER_S
             rates = sample.rates
         return None
 
@@ -218,7 +219,7 @@ class DeadReckoning:
         if self._imu is None:
             return None
         at_ns, rate, _, yaw, _ = self._imu
-        dt = (stamp_ns - at_ns) / _SECOND_NS
+        dt = (stamp_ns - at_ns) / NS_PER_S
         return yaw + rate * dt if abs(dt) <= IMU_TIMEOUT_S else None
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 
 IMPLAUSIBLE = 9.0
@@ -26,7 +27,6 @@ _SPHERE = 96
 _LEAST_SQUARES = NoiseModel(long=100.0, short=100.0)
 _FRESH_S = 0.5
 _EVERY_S = 0.1
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,7 +248,7 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
 
 def _latest(count: int, ranges: Ranges) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return stamps int64 (t,) and the latest range of each anchor within `_FRESH_S`, float64 (t, count); NaN: none."""
-    every = round(_EVERY_S * _SECOND_NS)
+    every = round(_EVERY_S * NS_PER_S)
     number = (ranges.stamp_ns - ranges.stamp_ns[:1]) // every
     # The last range of each interval.
     ends = np.flatnonzero(np.diff(number, append=number[-1:] + 1)) if len(number) else np.zeros(0, np.intp)
@@ -259,5 +259,5 @@ def _latest(count: int, ranges: Ranges) -> tuple[NDArray[np.int64], NDArray[np.f
         some = before >= 0
         last = own[before[some]]
         age = ranges.stamp_ns[ends[some]] - ranges.stamp_ns[last]
-        found[some, row] = np.where(age <= _FRESH_S * _SECOND_NS, ranges.range_m[last], np.nan)
+        found[some, row] = np.where(age <= _FRESH_S * NS_PER_S, ranges.range_m[last], np.nan)
     return ranges.stamp_ns[ends], found

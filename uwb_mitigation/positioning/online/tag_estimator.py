@@ -21,6 +21,7 @@ from uwb_mitigation.positioning.online.initialization import (
     candidate_positions,
 )
 from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heights, Imu, Odometry, Ranges, Track, rows_of
 
 WINDOW_S = 1.0
@@ -53,7 +54,6 @@ _KEPT_RANGES = 400
 _MAX_CANDIDATES = 12
 _RETRY_S = 0.25
 _SPARE_ANCHORS = 2
-_NANOSECONDS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +270,7 @@ class TagEstimator:
     def _seconds(self, stamp_ns: int) -> float:
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
-        return (stamp_ns - self._origin_ns) / _NANOSECONDS
+        return (stamp_ns - self._origin_ns) / NS_PER_S
 
     def _filters(self) -> list[RangeFilter]:
         return [self.filter] if self.filter is not None else [c.filter for c in self._hypotheses]

@@ -20,11 +20,11 @@ from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.settings import Role
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import NS_PER_S
 
 FIRST_LINE = "# uwb_mitigation UCI capture 1"
 MAX_LINE = 1 << 18
-_NS = 10**9
-_TAIL_NS = 2 * _NS
+_TAIL_NS = 2 * NS_PER_S
 
 
 class CaptureWriter:
@@ -58,7 +58,7 @@ class CaptureWriter:
     def add(self, number: int, data: bytes, *, sent: bool) -> None:
         """Write bytes that were sent to a board or received from it."""
         if data:
-            seconds = (time.monotonic_ns() - self._began_ns) / _NS
+            seconds = (time.monotonic_ns() - self._began_ns) / NS_PER_S
             self._write(f"{seconds:.6f} {number} {'>' if sent else '<'} {data.hex()}")
 
     def close(self) -> None:
@@ -117,7 +117,11 @@ class UciCapture(Source):
                         (reported.discard if _is_silent(settings) else reported.add)(board)
                         continue
                     seconds, board_text, direction, digits = words
-                    now_ns, board, data = round(float(seconds) * _NS), int(board_text), bytes.fromhex(digits)
+                    now_ns, board, data = (
+                        round(float(seconds) * NS_PER_S),
+                        int(board_text),
+                        bytes.fromhex(digits),
+                    )
                     session = boards[board]
                 except (ValueError, KeyError, IndexError, TypeError, OverflowError, ParameterError) as error:
                     raise DamagedRecordingError(

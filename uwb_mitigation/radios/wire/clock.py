@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import bisect
 
+from uwb_mitigation.types.stamps import NS_PER_S
+
 _FLOOR_NS = 20e3
 """Standard deviation of the best round trip, limited by the timestamps of both sides."""
 
@@ -30,7 +32,7 @@ _OFFSET_WALK_NS2_PER_S = 1e6
 _STEP_NS = 100e6
 """A larger correction means that a clock was set."""
 
-_MAX_AGE_NS = 10 * 10**9
+_MAX_AGE_NS = 10 * NS_PER_S
 """If a measurement is older than this when it arrives, the board's clock is wrong."""
 
 _MAX_HISTORY = 1024

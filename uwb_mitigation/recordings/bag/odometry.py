@@ -16,6 +16,7 @@ from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.ros.schemas import typestore
 from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, ROBOT_IMU, ROBOT_ODOMETRY, TF, TF_TYPE
+from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Imu, Odometry
 
 ODOM, BASE_LINK = "odom", "base_link"
@@ -26,8 +27,6 @@ _PLANE = np.array([0, 1, 5])
 
 _UNMEASURED = 1e6
 """Variance of values that wheels do not measure: z, roll and pitch."""
-
-_NANOSECONDS = 1_000_000_000
 
 
 def encode_odometry_row(odometry: Odometry, row: int, frame_id: str = ODOM, child: str = BASE_LINK) -> bytes:
@@ -119,7 +118,7 @@ def read_odometry(path: Path, topic: str) -> Odometry:
         values = [pose.position.x, pose.position.y, yaw_of(pose.orientation)]
         values += [twist.linear.x, twist.linear.y, twist.angular.z]
         covariances = [_three(one.covariance).ravel() for one in (decoded.pose, decoded.twist)]
-        rows[_stamp_ns(decoded)] = np.concatenate([values, *covariances])
+        rows[to_ns(decoded.header.stamp)] = np.concatenate([values, *covariances])
     # Some robots publish twists only: their orientation is zero, and the yaw NaN.
     stamp_ns, columns = _columns(rows, path, topic, slice(3, None))
     pose, twist, of_pose, of_twist = np.split(columns, [3, 6, 15], axis=1)
@@ -141,7 +140,7 @@ def read_imu(path: Path, topic: str) -> Imu:
         yaw = math.nan if orientation[0] == -1.0 else yaw_of(decoded.orientation)
         known = math.isfinite(yaw)
         row = (decoded.angular_velocity.z, turning[8], yaw if known else 0.0, orientation[8], known)
-        rows[_stamp_ns(decoded)] = np.array(row, np.float64)
+        rows[to_ns(decoded.header.stamp)] = np.array(row, np.float64)
     stamp_ns, values = _columns(rows, path, topic)
     yaw_rate, yaw_rate_variance, yaw, yaw_variance, known_yaw = values.T
     return Imu(stamp_ns, yaw_rate, yaw_rate_variance, np.where(known_yaw, yaw, np.nan), yaw_variance)
@@ -176,11 +175,6 @@ def _columns(
     return np.array(stamps, np.int64), np.array([finite[stamp] for stamp in stamps])
 
 
-def _stamp_ns(decoded: Any) -> int:
-    stamp = decoded.header.stamp
-    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
-
-
 def _six(plane: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a 6x6 covariance, flat, from that of x, y and yaw."""
     covariance = np.diag(np.full(6, _UNMEASURED))
@@ -208,7 +202,7 @@ def _serialize(message: Any, kind: str) -> bytes:
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     stamp = _make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     return _make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 

@@ -29,6 +29,7 @@ from uwb_mitigation.types.ros.topics import (
     TF_STATIC,
     TF_TYPE,
 )
+from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import Heights, PosePath, TruePath
 
 if TYPE_CHECKING:
@@ -42,7 +43,6 @@ MOVES_M = 0.05
 HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
 _READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES, IMU_TYPE)))
 _MAX_FRAMES = 64
-_NANOSECONDS = 1_000_000_000
 _Row = tuple[int, float, float, float, float, float, float, float]
 
 
@@ -62,9 +62,9 @@ def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, True
     for decoded in decode_messages(bag, [topic], where):
         # An unknown heading has a very large variance, or a type without variances.
         if getattr(decoded.pose, "covariance", (math.inf,) * 36)[35] < UNOBSERVED:
-            stamp, q = decoded.header.stamp, decoded.pose.pose.orientation
+            q = decoded.pose.pose.orientation
             child = _frame(getattr(decoded, "child_frame_id", ""))
-            yaws.setdefault(child, {})[stamp.sec * _NANOSECONDS + stamp.nanosec] = 2.0 * math.atan2(q.z, q.w)
+            yaws.setdefault(child, {})[to_ns(decoded.header.stamp)] = 2.0 * math.atan2(q.z, q.w)
     found = {}
     for child, one in bodies.items():
         own = yaws.get(child, {})
@@ -193,9 +193,8 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
             height, variance = float(decoded.pose.pose.position.z), float(decoded.pose.covariance[14])
             valid = True
         if valid and math.isfinite(height):
-            stamp = decoded.header.stamp
             known = math.isfinite(variance) and variance > 0.0
-            rows[stamp.sec * _NANOSECONDS + stamp.nanosec] = height, variance if known else sd_m**2
+            rows[to_ns(decoded.header.stamp)] = height, variance if known else sd_m**2
     if not rows:
         raise RecordingError("no valid height", where=where, valid="finite heights within the sensor's range")
     stamps = sorted(rows)
@@ -255,7 +254,7 @@ def _row(stamp: Any, position: Any, orientation: Any) -> _Row | None:
     turn = (0.0, 0.0, 0.0, 1.0)
     if orientation is not None:
         turn = (orientation.x, orientation.y, orientation.z, orientation.w)
-    row = (stamp.sec * _NANOSECONDS + stamp.nanosec, position.x, position.y, position.z, *turn)
+    row = (to_ns(stamp), position.x, position.y, position.z, *turn)
     length = math.hypot(*turn)
     if not all(map(math.isfinite, row)) or not 0.5 < length < 2.0:
         return None

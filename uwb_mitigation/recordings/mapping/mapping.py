@@ -23,11 +23,12 @@ from pydantic import (
 
 from uwb_mitigation.errors import ParameterError, did_you_mean
 from uwb_mitigation.files import read_bounded
+from uwb_mitigation.types.stamps import NS_PER_S
 
 MAX_BYTES = 1 << 20
 _FOLDER = Path(__file__).parents[1] / "mappings"
 
-TIME = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "iso8601": 1}
+TIME = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_S, "iso8601": 1}
 """Nanoseconds per unit of time."""
 
 SCALES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "samples": 1.0, "10.6": 1 / 64, "dBm": 1.0}

@@ -12,6 +12,7 @@ import numpy as np
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TableFormat
+from uwb_mitigation.types.stamps import NS_PER_S
 
 MAX_ROWS = 4096
 """Largest number of ranges in one message."""
@@ -84,7 +85,7 @@ def _walk(value: Any, path: list[str], column: str) -> Any:
     seconds = getattr(value, "sec", getattr(value, "secs", None))
     if seconds is not None:
         nanoseconds = getattr(value, "nanosec", getattr(value, "nsecs", 0))
-        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+        return int(seconds) * NS_PER_S + int(nanoseconds)
     return value
 
 

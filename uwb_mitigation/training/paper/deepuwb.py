@@ -24,6 +24,7 @@ from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.training.paper.rooms import MATERIALS, ROOMS, configuration_of
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement, Record, Truth
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import NS_PER_S
 
 MAX_BYTES, MAX_ERROR_M = 1 << 29, 1000.0
 CIR_SAMPLES = 157
@@ -31,7 +32,7 @@ NOMINAL_RANGE_M = 10.0
 FIRST_PATH_INDEX = float(WINDOW_LEAD)
 """With this index the window of the preprocessing is the whole CIR, which the authors cut at the first path."""
 
-FIRST_STAMP_NS, STAMP_STEP_NS = 1_577_836_800 * 10**9, 10_000_000  # 2020-01-01T00:00:00Z, 10 ms
+FIRST_STAMP_NS, STAMP_STEP_NS = 1_577_836_800 * NS_PER_S, 10_000_000  # 2020-01-01T00:00:00Z, 10 ms
 TAG_ID, FIRST_ANCHOR_ID = 1, 1000
 FULL_SCALE = np.iinfo(np.int16).max - 1  # the maximum itself means a saturated sample
 

@@ -18,6 +18,7 @@ from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.training.data.dataset import CirSources, Dataset
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Heights, Ranges
 
 MIN_CIR_SHARE = 0.5
@@ -30,7 +31,6 @@ FOLD_S = 10.0
 """Duration of the segments of motion that are held out as a whole."""
 
 RECORDING_GAP_NS = 3_600_000_000_000
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +102,7 @@ class SiteData:
         tag = np.array([one.tag_id for one in self.tags], np.uint64)[self.tag[rows]]
         segment_start_ns = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
         np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
-        elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / _SECOND_NS
+        elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / NS_PER_S
         part = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
         fold = np.where(is_stationary, 0, elapsed_s // FOLD_S).astype(int)
         names = [
@@ -162,7 +162,7 @@ def read_site(
         for record in recording:
             on_record()
             measured = record.measurement
-            stamp_ns = measured.stamp_ns + round(stamp_offset_s * _SECOND_NS)
+            stamp_ns = measured.stamp_ns + round(stamp_offset_s * NS_PER_S)
             if shift is None:
                 is_later = end_of_previous is None or stamp_ns > end_of_previous
                 shift = 0 if is_later else end_of_previous - stamp_ns + RECORDING_GAP_NS  # type: ignore[operator]

@@ -26,10 +26,10 @@ from uwb_mitigation.types.measurement import (
     Status,
     Truth,
 )
+from uwb_mitigation.types.stamps import NS_PER_S
 
 LITTLE_ENDIAN = b"\x00\x01"
 """The supported encapsulation (OMG DDSI-RTPS 2.5, section 10.2)."""
-_NANOSECONDS = 1_000_000_000
 
 # Each block starts at a multiple of 8; `x` is the padding of CDR.
 _PREFIX = struct.Struct("<4siII")  # encapsulation, seconds, nanoseconds, length of frame_id
@@ -256,7 +256,7 @@ def first_field_offset(end: int) -> int:
 
 
 def _encode_header(measurement: RangeMeasurement) -> bytes:
-    seconds, nanoseconds = divmod(measurement.stamp_ns, _NANOSECONDS)
+    seconds, nanoseconds = divmod(measurement.stamp_ns, NS_PER_S)
     frame = measurement.frame_id.encode() + b"\0"
     prefix = _PREFIX.pack(LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame))
     return prefix + frame + bytes(-(len(prefix) - 4 + len(frame)) % 8)
@@ -269,10 +269,10 @@ def _decode_header(data: bytes) -> tuple[int, str, int]:
     if not encapsulation.startswith(LITTLE_ENDIAN):
         kind = "big-endian CDR" if encapsulation.startswith(b"\0\0") else "an unknown encapsulation"
         raise RecordingError(f"message in {kind}", where=encapsulation.hex(" "), valid="little-endian CDR")
-    if nanoseconds >= _NANOSECONDS:
+    if nanoseconds >= NS_PER_S:
         raise RecordingError("message with an invalid time stamp", where=f"nanosec {nanoseconds}")
     frame_id, at = _decode_string(data, _PREFIX.size - _LENGTH.size)
-    return seconds * _NANOSECONDS + nanoseconds, frame_id, first_field_offset(at)
+    return seconds * NS_PER_S + nanoseconds, frame_id, first_field_offset(at)
 
 
 def _append_string(data: bytes, text: str) -> bytes:

@@ -14,6 +14,7 @@ import numpy as np
 from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.types.ros.codec import LITTLE_ENDIAN
 from uwb_mitigation.types.ros.topics import ODOMETRY_TYPE
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heading
 
 MAP = "map"
@@ -32,7 +33,6 @@ POSITION_TYPES = (
 )
 """Message types with a position."""
 
-_NANOSECONDS = 1_000_000_000
 _PREFIX = struct.Struct("<4siII")
 _LENGTH = struct.Struct("<I")
 _POSE = struct.Struct("<43d")
@@ -160,11 +160,11 @@ def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, flo
         return None
     known = covariance[-1] < UNOBSERVED and math.isfinite(sine + cosine)
     yaw = 2.0 * math.atan2(sine, cosine) if known else None
-    return seconds * _NANOSECONDS + nanoseconds, tag_id, (x, y, z), yaw
+    return seconds * NS_PER_S + nanoseconds, tag_id, (x, y, z), yaw
 
 
 def _header(stamp_ns: int, frame_id: str) -> bytes:
-    seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     frame = frame_id.encode() + b"\0"
     return _PREFIX.pack(LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame)) + frame
 

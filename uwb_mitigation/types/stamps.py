@@ -1,0 +1,13 @@
+"""Time stamps: integer nanoseconds, since 1970 if they are those of a clock."""
+
+from __future__ import annotations
+
+from typing import Any
+
+NS_PER_S = 1_000_000_000
+"""Nanoseconds per second."""
+
+
+def to_ns(stamp: Any) -> int:
+    """Return the time of a `builtin_interfaces/Time`, ns."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
