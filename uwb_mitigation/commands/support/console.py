@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import enum
 import itertools
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import format_id
 from uwb_mitigation.files import write_atomically
 
 MAX_ROWS = 40
@@ -46,32 +50,73 @@ def warn(text: str) -> None:
 
 def show_table(
     title: str,
-    columns: Iterable[str],
-    rows: Sequence[Iterable[object]],
+    columns: Mapping[str, str] | Iterable[str],
+    rows: Sequence[Any],
     bold_row: str = "",
     *,
     left: int = 1,
     max_rows: int = MAX_ROWS,
+    optional: Sequence[str] = (),
 ) -> None:
-    """Print the first rows of a table; numbers have three decimals.
+    """Print the first rows of a table.
 
     Args:
         title: title above the table; may be empty.
-        columns: heads of the columns.
-        rows: cells of each row.
+        columns: {title with unit: "KEY" or "KEY:FORMAT"}: KEY is an attribute or key of each row, with dots for nested
+            ones; FORMAT is a format specification, or `id` for ids. Numbers are right-aligned, and unknown values (None,
+            NaN) are shown as "-". Or only the titles, if each row is a sequence of cells.
+        rows: the rows of the result, as they are given to `write_json`; or sequences of cells.
         bold_row: the row with this name is bold.
-        left: the number of left-aligned columns; the others are right-aligned.
+        left: with titles only: the number of left-aligned columns.
         max_rows: maximum number of rows.
+        optional: titles of columns that are omitted, the last one first, until the table fits the terminal.
     """
-    table = ConsoleTable(title=title, title_justify="left")
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number < left else "right")
-    for row in rows[:max_rows]:
-        cells = [f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row]
-        table.add_row(*cells, style="bold" if bold_row and bold_row in cells else None)
-    out.print(table)
+    titles = list(columns)
+    if isinstance(columns, Mapping):
+        keys = [key.partition(":") for key in columns.values()]
+        shown = [[_cell(_value(row, key), form) for key, _, form in keys] for row in rows[:max_rows]]
+        is_left = [form in ("", "id") for _, _, form in keys]
+    else:
+        shown = [[_cell(cell, "") for cell in row] for row in rows[:max_rows]]
+        is_left = [number < left for number in range(len(titles))]
+
+    def build(omitted: Sequence[str]) -> ConsoleTable:
+        table = ConsoleTable(title=escape(title), title_justify="left")
+        selected = [number for number, name in enumerate(titles) if name not in omitted]
+        for number in selected:
+            table.add_column(titles[number], justify="left" if is_left[number] else "right")
+        for cells in shown:
+            bold = "bold" if bold_row and bold_row in cells else None
+            table.add_row(*(escape(cells[number]) for number in selected), style=bold)
+        return table
+
+    num_omitted = 0
+    while num_omitted < len(optional) and (
+        out.measure(build(optional[len(optional) - num_omitted :])).maximum > out.width
+    ):
+        num_omitted += 1
+    omitted = optional[len(optional) - num_omitted :]
+    out.print(build(omitted))
     if len(rows) > max_rows:
         print_line(f"and {len(rows) - max_rows} more rows")
+    if omitted:
+        print_line(f"In wider terminals and with --json: {', '.join(omitted)}")
+
+
+def _value(row: Any, key: str) -> Any:
+    for name in key.split("."):
+        row = row.get(name) if isinstance(row, Mapping) else getattr(row, name)
+    return row
+
+
+def _cell(value: Any, form: str) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "-"
+    if form == "id":
+        return format_id(value)
+    if isinstance(value, enum.Enum):
+        value = to_json(value)
+    return format(value, form or (".3f" if isinstance(value, float) else ""))
 
 
 def progress() -> Progress:
@@ -137,19 +182,55 @@ def show_skipped(skipped: Mapping[str, int]) -> None:
         err.print(f"skipped: {count} x {reason}", markup=False)
 
 
-def write_json(path: Path | None, result: Mapping[str, Any]) -> None:
-    """Write `result` to `path` atomically; do nothing without a path.
+def to_json(value: Any) -> Any:
+    """Return a result as JSON values.
+
+    Dataclasses and named tuples become objects with their public fields, or what their method `as_json` returns; arrays
+    become lists, paths and errors text, enumerations their names (text values: their values), tuples as keys `A-B`.
+    Numbers that are not finite become null.
+    """
+    if isinstance(value, enum.Enum):
+        return value.value if isinstance(value.value, str) else value.name
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "as_json"):
+        return to_json(value.as_json())
+    if hasattr(value, "_asdict"):
+        return to_json(value._asdict())
+    if dataclasses.is_dataclass(value):
+        names = (field.name for field in dataclasses.fields(value))
+        return {name: to_json(getattr(value, name)) for name in names if not name.startswith("_")}
+    if isinstance(value, Mapping):
+        return {_json_key(key): to_json(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return to_json(value.tolist())
+    if isinstance(value, Path | Exception):
+        return str(value)
+    return [to_json(item) for item in value]
+
+
+def _json_key(key: Any) -> str:
+    return "-".join(map(str, key)) if isinstance(key, tuple) else str(to_json(key))
+
+
+def write_json(path: Path | None, *results: object) -> None:
+    """Write one or more results, whose keys are merged, to `path` atomically; do nothing without a path.
+
+    A command computes one result, shows it with `show_table`, and gives the same object to this function:
+
+        result = summarize(recording)  # a frozen dataclass whose fields are the keys of the JSON file
+        show_table("Pairs", {"anchor": "anchor_id:id", "mean range, m": "mean_range_m:.3f"}, result.by_pair)
+        write_json(json, result, {"output": output})
 
     Raises:
         UwbMitigationError: the file cannot be written.
     """
     if path is None:
         return
-    try:
-        text = json.dumps(result, indent=2, allow_nan=False) + "\n"
-    except ValueError as error:
-        raise UwbMitigationError(f"cannot write the result: {error}", where=str(path)) from error
-    write_atomically(path, text)
+    merged = {key: value for result in results for key, value in to_json(result).items()}
+    write_atomically(path, json.dumps(merged, indent=2, allow_nan=False) + "\n")
 
 
 def _check_json_target(path: Path | None) -> Path | None:
