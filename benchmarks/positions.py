@@ -1,6 +1,6 @@
 """Measure position errors on real recordings and in the simulated flat. Needs neither ROS nor torch.
 
-The recordings are not part of the repository; see `sources/hanyang.py` and `sources/decaranging.py`.
+The recordings are not part of the repository.
 """
 
 from __future__ import annotations

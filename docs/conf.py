@@ -42,7 +42,7 @@ include_patterns = [
     "docs/background/*.md",
     "models/*.md",
     "firmware/README.md",
-    "benchmarks/dw1000_model/chip/README.md",
+    "benchmarks/equipment/dw1000_model/chip/README.md",
 ]
 # Sphinx does not need to search these folders.
 exclude_patterns = [".[a-z]*", "build", "install", "log", "test", "uwb_mitigation", "requirements"]

@@ -28,7 +28,7 @@ def test_layers_hold_and_only_nodes_import_rclpy_and_only_training_torch():
 
 
 @NEEDS_CC
-@pytest.mark.parametrize("folder", ["firmware/src", "benchmarks/dw1000_model/chip"])
+@pytest.mark.parametrize("folder", ["firmware/src", "benchmarks/equipment/dw1000_model/chip"])
 def test_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
     sources = REPOSITORY / folder
     objects = compile_objects(("cc",), (f"-I{sources}",), tuple(sorted(sources.glob("*.c"))))

@@ -145,7 +145,7 @@ def without(absent: Iterable[str], name: str) -> list[str]:
     code = (
         f"import sys; sys.path.insert(0, {str(REPOSITORY)!r})\n"
         f"sys.modules.update(dict.fromkeys({sorted(absent)!r}))\n"
-        f"from uwb_mitigation import entry; entry.{name}()"
+        f"from uwb_mitigation.commands import entry; entry.{name}()"
     )
     return [sys.executable, "-c", code]
 
@@ -186,8 +186,8 @@ def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, name: str, a
 
 CORRECT_WITH_THE_FIRMWARE = """
 import uwb_mitigation
-from uwb_mitigation.firmware_export.compiled import FirmwareMitigation
-from uwb_mitigation.firmware_export.compiling import firmware_folder
+from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
+from uwb_mitigation.mitigation.embedded.compiling import firmware_folder
 from uwb_mitigation.model.bundle import load_bundle
 from uwb_mitigation.model.shipped import default_model_path
 FirmwareMitigation(load_bundle(default_model_path()))

@@ -347,7 +347,7 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
     # As the system does if memory runs out.
     (tmp_path / "sitecustomize.py").write_text(
         "import os, signal\n"
-        "from uwb_mitigation.processing import job\n"
+        "from uwb_mitigation.commands.offline import process as job\n"
         "load = job.BagReader\n"
         "def killed(path):\n"
         "    if path.name == 'in1.mcap':\n"

@@ -1,4 +1,4 @@
-/* The board's side of the wire protocol, used by sketches and bare-metal programs. uwb_mitigation/link/board.py is the
+/* The board's side of the wire protocol, used by sketches and bare-metal programs. benchmarks/equipment/board.py is the
  * same in Python.
  *
  * No allocation, no globals, no blocking: if the host does not read in time, complete frames are dropped and

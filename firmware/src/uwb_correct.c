@@ -19,7 +19,7 @@ static float linear_bias_m(const uwb_model *model, float rx_power_dbm, float fir
     return model->linear_bias_offset_m + level + slope;
 }
 
-/* OOD score. Every step is one IEEE-754 operation, as in uwb_mitigation/model/ood.py; volatile prevents the
+/* OOD score. Every step is one IEEE-754 operation, as in uwb_mitigation/mitigation/model/ood.py; volatile prevents the
  * compiler from fusing two. */
 
 enum { LEAD_TAPS = 3, FIRST_PATH_TAP = 6, FIRST_PATH_TAPS = 3 };

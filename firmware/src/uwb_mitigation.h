@@ -92,7 +92,7 @@ typedef struct {
     float per_unit;
 } uwb_band;
 
-/* What the model was trained on; uwb_mitigation/model/ood.py defines the features. */
+/* What the model was trained on; uwb_mitigation/mitigation/model/ood.py defines the features. */
 typedef struct {
     float known_offset_m; /* correction of a measurement that is out of distribution */
     uwb_band bands[UWB_FEATURES];

@@ -114,7 +114,7 @@ def train(
     check_output(output)
     with needs_torch():
         from uwb_mitigation.training import train as training
-        from uwb_mitigation.training.fit import candidates
+        from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)
 
     if data is not None:
         check_name("recipe", recipe_name, (training.AUTO, *candidates.NEW_MODELS))

@@ -1,7 +1,7 @@
 """Mapping files: where the values of ranges are in the files or messages of other software, and in which unit.
 
 A mapping is a YAML file. `data import --map` reads recordings with it, and the driver (`source:=topic`) live topics.
-The mappings in `uwb_mitigation/mappings` are found by their names. docs/guides/recordings.md describes the format.
+The mappings in `recordings/mappings` are found by their names. docs/guides/recordings.md describes the format.
 """
 
 from __future__ import annotations

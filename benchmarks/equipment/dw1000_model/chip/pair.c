@@ -10,7 +10,7 @@
 #define DEFAULT_AMPLITUDE 8000.0
 #define DEFAULT_NOISE 12.0
 #define PULSE_SAMPLES 2.4 /* full width at half amplitude of a lone path */
-/* Noise is measured well before a first path can arrive, as uwb_mitigation/sources/simulation/radio.py does. */
+/* Noise is measured well before a first path can arrive, as uwb_mitigation/simulation/radio.py does. */
 #define NOISE_FROM 64
 #define NOISE_TO 576
 
@@ -71,7 +71,7 @@ static double find_first_path(const radio_pair *pair) {
     return (double)after - (high > low ? (high - half) / (high - low) : 0);
 }
 
-/* The same sums as in uwb_mitigation/sources/simulation/radio.py, so that the register values are equal. */
+/* The same sums as in uwb_mitigation/simulation/radio.py, so that the register values are equal. */
 static void measure(radio_pair *pair, const dw1000_pair_config *config) {
     double energy = 0, noise = 0, sum = 0;
     for (size_t i = 0; i < ACCUMULATOR_SAMPLES; i++) {
