@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -297,6 +299,9 @@ class PosePath(TimeSeries):
 
         Between two poses the quaternion is interpolated linearly and normalised: rotations are small there.
         """
+        # The driver needs the other classes of this file, and not SciPy, which imports slowly.
+        from scipy.spatial.transform import Rotation
+
         after = np.searchsorted(self.stamp_ns, stamp_ns).clip(0, len(self) - 1)
         before = np.maximum(after - 1, 0)
         span_ns = np.maximum(self.stamp_ns[after] - self.stamp_ns[before], 1)
