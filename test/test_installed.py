@@ -188,8 +188,8 @@ CORRECT_WITH_THE_FIRMWARE = """
 import uwb_mitigation
 from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
 from uwb_mitigation.mitigation.embedded.compiling import firmware_folder
-from uwb_mitigation.model.bundle import load_bundle
-from uwb_mitigation.model.shipped import default_model_path
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 FirmwareMitigation(load_bundle(default_model_path()))
 print(uwb_mitigation.__file__, default_model_path(), firmware_folder(), sep="\\n")
 """
