@@ -27,7 +27,7 @@ from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes.support import topics
 from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
 from uwb_mitigation.radios.wire import messages as wire
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement
 

@@ -24,7 +24,7 @@ from uwb_mitigation.positioning.online.initialization import candidate_positions
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.track_errors import TrackErrors, errors_of, track_errors
 from uwb_mitigation.recordings.decaranging import DecaRangingFolder
-from uwb_mitigation.recordings.opening import open_mapped
+from uwb_mitigation.recordings.formats import open_mapped
 from uwb_mitigation.simulation.simulated import SimulatedSource, SimulatedSurvey
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
 from uwb_mitigation.types.anchors import AnchorMap

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import pytest
 
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.types.measurement import Record
 
 

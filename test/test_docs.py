@@ -28,7 +28,7 @@ from benchmarks import cli as benchmarks
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 
 PAGES = sorted(
     path

@@ -15,7 +15,7 @@ from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
-from uwb_mitigation.recordings import opening
+from uwb_mitigation.recordings import formats
 from uwb_mitigation.training.evaluation.accuracy import evaluate
 from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
 
@@ -35,7 +35,7 @@ def recording(monkeypatch):
         replace(item, truth=replace(item.truth, label="NLOS" if index >= 24 else "LOS"))
         for index, item in enumerate(records)
     ]
-    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(records))
+    monkeypatch.setattr(formats, "open_recording", lambda path: Recorded(records))
     return records
 
 

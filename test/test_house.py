@@ -47,7 +47,7 @@ def test_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):
 def test_importing_the_package_and_its_command_line_needs_neither_ros_nor_torch():
     code = (
         "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'torch', 'uwb_mitigation_msgs']))\n"
-        "import uwb_mitigation.commands.cli, uwb_mitigation.mitigation.correction, uwb_mitigation.recordings.opening\n"
+        "import uwb_mitigation.commands.cli, uwb_mitigation.mitigation.correction, uwb_mitigation.recordings.formats\n"
         "import uwb_mitigation.recordings.mcap, uwb_mitigation.recordings.decaranging"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)

@@ -14,10 +14,10 @@ from command_line import run
 
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 from uwb_mitigation.recordings.bag.odometry import read_odometry
+from uwb_mitigation.recordings.formats import open_mapped
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shipped_mappings
 from uwb_mitigation.recordings.mcap import McapRecording
-from uwb_mitigation.recordings.opening import open_mapped
 from uwb_mitigation.types.measurement import Encoding
 
 DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))

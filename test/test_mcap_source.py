@@ -14,8 +14,8 @@ from mcap.writer import CompressionType
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mcap import McapRecording
-from uwb_mitigation.recordings.opening import open_recording
 from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_odometry
 from uwb_mitigation.types.ros.topics import (

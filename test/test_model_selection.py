@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.recordings import opening
+from uwb_mitigation.recordings import formats
 from uwb_mitigation.recordings.truth_table import load_truth, with_truth
 from uwb_mitigation.training.fit import linear_fit
 from uwb_mitigation.types.measurement import Record, Truth
@@ -204,7 +204,7 @@ def eight_places(monkeypatch) -> Recorded:
         for place in range(8)
         for number in range(4)
     ]
-    monkeypatch.setattr(opening, "open_recording", lambda path: Recorded(ranges))
+    monkeypatch.setattr(formats, "open_recording", lambda path: Recorded(ranges))
     return Recorded(ranges)
 
 

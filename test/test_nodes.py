@@ -28,7 +28,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.recordings.decaranging import open_decaranging
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros.codec import encode_range

@@ -9,7 +9,7 @@ import pytest
 from bag_material import START_NS, record
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.recordings.inventory import PauseShortener
+from uwb_mitigation.recordings.summary import PauseShortener
 
 DAY_NS = 86_400 * 10**9
 TODAY_NS = START_NS + 500 * DAY_NS

@@ -22,8 +22,8 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-from uwb_mitigation.recordings.opening import open_recording
 from uwb_mitigation.recordings.recorded_ranges import TagRecording
 from uwb_mitigation.types.anchors import anchors_path, dump_anchors, parse_anchors
 from uwb_mitigation.types.measurement import (

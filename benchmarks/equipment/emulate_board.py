@@ -82,7 +82,7 @@ def open_source(recording: Path | None, rate: float, seed: int) -> Source:
         from uwb_mitigation.simulation.simulated import SimulatedSource
 
         return SimulatedSource(seed=seed, rate_hz=rate)
-    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.recordings.formats import open_recording
 
     return open_recording(recording)
 

@@ -31,8 +31,8 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.recordings.decaranging import DecaRangingFolder
+from uwb_mitigation.recordings.formats import open_mapped
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-from uwb_mitigation.recordings.opening import open_mapped
 from uwb_mitigation.training.site.calibration import SiteCalibration, calibrate_site
 from uwb_mitigation.training.site.data import read_site
 from uwb_mitigation.training.site.solution import solve_without_truth

@@ -20,7 +20,7 @@ import numpy as np
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import SHIPPED, shipped_model_path
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 
 
 def main(recordings: list[Path]) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.mitigation.model.bundle import load_bundle
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.training.data.dataset import build_dataset
 from uwb_mitigation.training.evaluation import zero_shot
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, coverage

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.training.data.dataset import build_dataset
 from uwb_mitigation.training.evaluation.metrics import coverage
 from uwb_mitigation.training.paper.data import split_by_name

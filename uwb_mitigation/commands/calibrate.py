@@ -211,7 +211,7 @@ def _gather(
     from contextlib import ExitStack
 
     from uwb_mitigation.recordings.bag.pose_paths import read_heights
-    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.training.site.data import read_site
 
     heights = None if height_topic is None else [read_heights(bag, height_topic, height_sd) for bag in bags]

@@ -90,7 +90,7 @@ def import_recordings(
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
     from uwb_mitigation.commands.support import mapped_report
-    from uwb_mitigation.recordings.opening import open_mapped
+    from uwb_mitigation.recordings.formats import open_mapped
 
     if dry_run and not mapping:
         raise ParameterError("--dry-run needs --map", valid="--map FILE")
@@ -167,9 +167,9 @@ def _write(
     """
     from uwb_mitigation.recordings.bag.odometry import write_robot
     from uwb_mitigation.recordings.bag.writer import BagWriter
-    from uwb_mitigation.recordings.inventory import Inventory, PauseShortener
+    from uwb_mitigation.recordings.summary import PauseShortener, RecordingSummary
 
-    inventory = Inventory()
+    summary = RecordingSummary()
     kinds = {source.simulated for source in sources}
     simulated = "true" if True in kinds else "unknown" if None in kinds else "false"
     origin = {"source": "; ".join(source.name for source in sources), "simulated": simulated}
@@ -182,27 +182,27 @@ def _write(
         for source in sources:
             try:
                 with source:
-                    for record in inventory.watch(source):
+                    for record in summary.watch(source):
                         record = pauses.without(record)
                         if robot is not None:
                             row = write_robot(bag, *robot, row, record.measurement.stamp_ns)
                         bag.write(record)
-                        if inventory.ranges % _STRIDE == 0:
-                            done = inventory.ranges
+                        if summary.ranges % _STRIDE == 0:
+                            done = summary.ranges
                             bar.update(task, completed=done, description=f"writing: {done} ranges")
             except DamagedRecordingError as error:  # noqa: PERF203 - once a source
                 damage.append(error)
-        if inventory.ranges == 0:
+        if summary.ranges == 0:
             raise (
                 damage[0]
                 if damage
                 else RecordingError("the recording contains no ranges", where=origin["source"])
             )
-    found = inventory.as_json()
+    found = summary.as_json()
     for source in sources:
         _show_source(source)
     if total is None:
-        _show_inventory(found)
+        _show_summary(found)
     if pauses.cut:
         print_line(
             f"Shortened {pauses.cut} pauses to {pauses.longest_s:g} s, {pauses.cut_s:.0f} s in total; "
@@ -211,9 +211,9 @@ def _write(
     if len(sources) == 1:
         _save_anchors(sources[0], output)
     messages = bag.counts.total()
-    lost = ", ".join(f"{count} x {reason}" for reason, count in inventory.skipped.items())
+    lost = ", ".join(f"{count} x {reason}" for reason, count in summary.skipped.items())
     print_line(
-        f"Wrote {messages} messages, {inventory.ranges} ranges of {_pairs(found)}, to {bag.file}"
+        f"Wrote {messages} messages, {summary.ranges} ranges of {_pairs(found)}, to {bag.file}"
         + (f"; skipped: {lost}." if lost and total is not None else ".")
     )
     console.write_json(json, {"messages": messages, "output": str(bag.file), **found, **(extra or {})})
@@ -223,8 +223,8 @@ def _write(
 
 def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu | None] | None:
     """Return odometry and IMU data of a simulated drive that starts at `start_ns`, or the odometry of a mapping."""
-    from uwb_mitigation.recordings.inventory import FIRST_DATE_NS
     from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+    from uwb_mitigation.recordings.summary import FIRST_DATE_NS
     from uwb_mitigation.simulation.simulated import SimulatedSource
 
     if isinstance(source, MappedRecording) and (odometry := source.motion) is not None:
@@ -264,7 +264,7 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
 
 def _open(path: Path, cir: CirChoice) -> Source:
     """Open any recording, including DeepUWB's pickle; raises the errors of `open_recording`."""
-    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.recordings.formats import open_recording
 
     if path.suffix == ".pkl":
         from uwb_mitigation.training.paper.deepuwb import DeepUwbRecording
@@ -280,22 +280,22 @@ def info(
     json: JsonOption = None,
 ) -> None:
     """Show the contents of a recording: pairs, counts, warnings."""
-    from uwb_mitigation.recordings.inventory import Inventory
     from uwb_mitigation.recordings.mcap import McapRecording
+    from uwb_mitigation.recordings.summary import RecordingSummary
 
     source = _open(path, cir)
-    inventory = Inventory()
+    summary = RecordingSummary()
     try:
         with source, console.reading() as on_record:
-            for _ in inventory.watch(source):
+            for _ in summary.watch(source):
                 on_record()
     finally:
         # Show the readable part before an error of the rest is raised.
-        found = inventory.as_json()
-        if inventory.ranges or inventory.skipped:
+        found = summary.as_json()
+        if summary.ranges or summary.skipped:
             _show_source(source)
-            _show_inventory(found)
-    messages = source.message_count if isinstance(source, McapRecording) else inventory.ranges
+            _show_summary(found)
+    messages = source.message_count if isinstance(source, McapRecording) else summary.ranges
     about = {"messages": messages, "source": source.name, "simulated": source.simulated}
     console.write_json(json, {**about, **found})
 
@@ -322,7 +322,7 @@ def _show_source(source: Source) -> None:
     console.out.print(_KINDS[source.simulated])
 
 
-def _show_inventory(found: dict[str, Any]) -> None:
+def _show_summary(found: dict[str, Any]) -> None:
     console.out.print(
         f"{found['ranges']} ranges, {found['with_truth']} with truth, {_pairs(found)}, {found['duration_s']:.1f} s"
     )

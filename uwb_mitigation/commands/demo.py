@@ -77,8 +77,8 @@ def offset_of(source: Source) -> float | None:
 
 def recorded(path: Path, rate: float) -> DemoPlan:
     """Return the demo of a recording; at the default rate it lasts about 15 s."""
+    from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.recordings.mcap import McapRecording
-    from uwb_mitigation.recordings.opening import open_recording
 
     count, length_s, last_ns = 0, 0.0, None
     with open_recording(path) as source:

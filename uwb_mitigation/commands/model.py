@@ -221,7 +221,7 @@ def evaluate(
     if unused := _options_given(context, _CROSS_VALIDATION_OPTIONS):
         raise ParameterError(f"{unused} without --cross-validate", valid="only with --cross-validate")
     from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.training.evaluation import accuracy
     from uwb_mitigation.types.offsets import read_offsets
 

@@ -63,7 +63,7 @@ def offset(
     """
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.training.site import radio_offsets
     from uwb_mitigation.types.offsets import dump_offsets
 

@@ -1,1 +1,1 @@
-"""Recordings: bags, DecaRanging logs, and files with a mapping; `opening` selects the reader by path."""
+"""Recordings: bags, DecaRanging logs, and files with a mapping; `formats` selects the reader by path."""

@@ -44,7 +44,7 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
 
 def _lacks_counts(recording: Path) -> bool:
     """Return whether the first CIR has no preamble count; False if it is damaged. The command reports read errors."""
-    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.recordings.formats import open_recording
 
     try:
         with open_recording(recording) as source:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing, Scaling
-from uwb_mitigation.recordings import opening
+from uwb_mitigation.recordings import formats
 from uwb_mitigation.recordings.truth_table import load_truth, with_truth
 from uwb_mitigation.training.data import dataset as datasets
 from uwb_mitigation.training.data.dataset import Dataset
@@ -33,7 +33,7 @@ def load_dataset(
         RecordingError, DatasetError: it cannot be read, or no measurement is usable.
     """
     truth_segments = [row for table in truth for row in load_truth(table)]
-    with opening.open_recording(path) as source:
+    with formats.open_recording(path) as source:
         try:
             records = with_truth(source, truth_segments) if truth_segments else source
             dataset = datasets.build_dataset(records, preprocessing, on_record)
@@ -56,7 +56,7 @@ def load_inputs(
     Raises:
         RecordingError, DatasetError: it cannot be read, or no CIR is usable.
     """
-    with opening.open_recording(path) as source:
+    with formats.open_recording(path) as source:
         found = datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
     if not found.has_cirs:
         raise DatasetError("the recording has no CIRs", where=str(path))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError, check_name
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.recordings.opening import open_recording
+from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.data.splits import Split

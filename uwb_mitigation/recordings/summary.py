@@ -21,7 +21,7 @@ FIRST_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01T00:00:00Z: earlier stamps come from a clock without a date."""
 
 
-class Inventory:
+class RecordingSummary:
     """Statistics of the records read so far.
 
     Attributes:
