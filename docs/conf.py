@@ -6,14 +6,12 @@ The pages are the Markdown files of the repository. The reference pages are gene
 from __future__ import annotations
 
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import generated
-import scipy.stats  # noqa: F401 - must be imported before autodoc mocks torch: scipy checks for torch classes
 from sphinx.application import Sphinx
 
 import uwb_mitigation
@@ -29,7 +27,6 @@ release = uwb_mitigation.__version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
@@ -63,11 +60,8 @@ html_extra_path = ["site"]  # redirects from the top folder to docs/index.html
 html_search_scorer = str(DOCS / "style" / "scorer.js")
 
 # The API reference is generated from docstrings in Google style, with names in single backticks.
-templates_path = [str(DOCS / "templates")]
 default_role = "code"
 autodoc_member_order = "bysource"
-# `make docs` does not install these packages. An installed package is not mocked, because scipy checks for torch classes.
-autodoc_mock_imports = [name for name in ("torch", "distributed", "matplotlib") if find_spec(name) is None]
 napoleon_use_ivar = True  # otherwise attributes with docstrings are listed twice
 napoleon_attr_annotations = False  # the signature of the class shows the types
 # Annotations contain types of other libraries, which have no pages here.

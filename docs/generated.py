@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import ast
 import enum
+import inspect
 import re
-import shutil
 import textwrap
 from collections.abc import Iterator
 from functools import partial
@@ -20,16 +20,12 @@ from pathlib import Path
 import typer
 from typer.cli import get_docs_for_click
 
+import uwb_mitigation
 from uwb_mitigation.commands import cli
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
 from uwb_mitigation.radios.settings import MAX_ANCHORS, RadioState, Role
 from uwb_mitigation.radios.wire import layout
 from uwb_mitigation.radios.wire.layout import Layout, MessageType
-
-try:
-    import tomllib
-except ModuleNotFoundError:  # Python 3.10, for which Sphinx and pytest install it
-    import tomli as tomllib
 
 DOCS = Path(__file__).resolve().parent
 TEMPLATES = DOCS / "templates" / "reference"
@@ -75,8 +71,6 @@ def write_reference() -> None:
     A page whose text has not changed keeps its modification time.
     """
     pages = reference()
-    # Sphinx generates the pages of modules again, but does not delete old ones.
-    shutil.rmtree(REFERENCE / "api", ignore_errors=True)
     for old in set(REFERENCE.glob("*.md")) | set(REFERENCE.glob("commands/*.md")):
         if old not in pages:
             old.unlink()
@@ -225,28 +219,18 @@ def wire_limits() -> str:
 | samples of a RANGE_CIR ({layout.MAX_SAMPLES // 2} complex ones) | {layout.MAX_SAMPLES} |"""
 
 
-def layers() -> str:
-    """Return the layers of the package, top layer first, from the contract in pyproject.toml."""
-    return "\n".join(["```text", *(layer.replace(" |", ",") for layer in _layers()), "```"])
-
-
-def parts() -> str:
-    """Return a table of the packages with the first paragraphs of their docstrings."""
-    lines = ["| package | contents |", "|---|---|"]
-    for name in (name for layer in _layers() for name in re.findall(r"\w+", layer)):
-        folder = (PACKAGE / name).is_dir()
-        module = PACKAGE / name / "__init__.py" if folder else PACKAGE / f"{name}.py"
-        told = ast.get_docstring(ast.parse(module.read_text(encoding="utf-8"))) or ""
-        about = " ".join(told.partition("\n\n")[0].split()).replace("|", "\\|")
-        lines.append(f"| `{name}{'/' if folder else '.py'}` | {about} |")
-    return "\n".join(lines)
-
-
-def _layers() -> list[str]:
-    with (REPOSITORY / "pyproject.toml").open("rb") as file:
-        contracts = tomllib.load(file)["tool"]["importlinter"]["contracts"]
-    (found,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
-    return [str(layer) for layer in found]
+def api() -> str:
+    """Return directives of autodoc for the public names."""
+    lines = ["```{eval-rst}"]
+    for name in uwb_mitigation.__all__:
+        value = getattr(uwb_mitigation, name)
+        kind = "function" if inspect.isfunction(value) else "class"
+        lines += [
+            f".. auto{kind}:: uwb_mitigation.{name}",
+            *["   :members:", "   :inherited-members:"][: 2 * (kind == "class")],
+            "",
+        ]
+    return "\n".join([*lines, "```"])
 
 
 _C_TYPES = {"B": "uint8_t", "H": "uint16_t", "I": "uint32_t", "Q": "uint64_t", "i": "int32_t", "f": "float"}
@@ -320,8 +304,7 @@ PARTS = {
     "parameters": parameters,
     "thresholds": thresholds,
     "command_list": command_list,
-    "layers": layers,
-    "parts": parts,
+    "api": api,
     "wire_limits": wire_limits,
     "wire_modes": partial(wire_values, layout.Mode),
     "wire_roles": partial(wire_values, Role),

@@ -1,8 +1,81 @@
-"""Range error mitigation for ultra-wideband radios.
+"""Correct the range error of ultra-wideband (UWB) radios, and estimate positions.
 
-The names most callers need live one level down: `measurement` (what a range is), `sources` (where
-ranges come from), `mitigation` (a range in, a corrected range out) and `nodes` (the same over ROS 2).
-Importing this package needs neither ROS nor torch.
+    from uwb_mitigation import Mitigation, load_model, open_recording
+
+    mitigation = Mitigation(load_model("universal"), offsets=0.22)
+    for record in open_recording("drive.mcap"):
+        print(mitigation.correct(record.measurement).range_m)
+
+The names in `__all__` are the public API and remain stable; everything else is internal. Importing this package needs
+neither ROS nor PyTorch nor pandas: a name is imported when it is used.
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from uwb_mitigation.errors import UwbMitigationError
+    from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.shipped import load_model
+    from uwb_mitigation.positioning.tag_locator import TagLocator
+    from uwb_mitigation.recordings.dataframe import to_dataframe
+    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
+    from uwb_mitigation.types.measurement import Cir, CorrectedRange, RangeMeasurement, Record, Status
+    from uwb_mitigation.types.offsets import Offsets
+    from uwb_mitigation.types.tracks import Estimate
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "Anchor",
+    "AnchorMap",
+    "Cir",
+    "CorrectedRange",
+    "Estimate",
+    "Mitigation",
+    "Offsets",
+    "RangeMeasurement",
+    "Record",
+    "Status",
+    "TagLocator",
+    "UwbMitigationError",
+    "load_anchors",
+    "load_model",
+    "open_recording",
+    "to_dataframe",
+]
+
+_MODULES = {
+    "Anchor": "types.anchors",
+    "AnchorMap": "types.anchors",
+    "Cir": "types.measurement",
+    "CorrectedRange": "types.measurement",
+    "Estimate": "types.tracks",
+    "Mitigation": "mitigation.correction",
+    "Offsets": "types.offsets",
+    "RangeMeasurement": "types.measurement",
+    "Record": "types.measurement",
+    "Status": "types.measurement",
+    "TagLocator": "positioning.tag_locator",
+    "UwbMitigationError": "errors",
+    "load_anchors": "types.anchors",
+    "load_model": "mitigation.model.shipped",
+    "open_recording": "recordings.opening",
+    "to_dataframe": "recordings.dataframe",
+}
+"""Modules of the lazy names."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

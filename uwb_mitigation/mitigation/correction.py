@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.ood import OodDetector, features
 from uwb_mitigation.types.measurement import (
@@ -16,12 +20,16 @@ from uwb_mitigation.types.measurement import (
     CorrectedRange,
     RangeColumns,
     RangeMeasurement,
+    Record,
     Status,
 )
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
 
 MAX_RANGE_M = 1e6
 """Upper limit of valid ranges: the radio reaches a few hundred metres."""
+
+BATCH = 256
+"""Number of records that `Corrector.correct_records` reads ahead."""
 
 _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
@@ -89,11 +97,21 @@ class Corrector(ABC):
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """Return the corrected ranges; never raises because of the content of a measurement."""
 
-    def correct(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]:
-        """Return the corrected range of each measurement; never raises because of their content.
+    @overload
+    def correct(self, measurements: RangeMeasurement) -> CorrectedRange: ...
+
+    @overload
+    def correct(self, measurements: Sequence[RangeMeasurement]) -> list[CorrectedRange]: ...
+
+    def correct(
+        self, measurements: RangeMeasurement | Sequence[RangeMeasurement]
+    ) -> CorrectedRange | list[CorrectedRange]:
+        """Return the corrected range of a measurement, or of each one; never raises because of their content.
 
         Measurements whose CIRs have the same encoding and length are corrected in one batch.
         """
+        if isinstance(measurements, RangeMeasurement):
+            return self.correct([measurements])[0]
         results: list[CorrectedRange | None] = [None] * len(measurements)
         for indices, ranges in RangeColumns.grouped(measurements):
             corrected = self.correct_columns(ranges)
@@ -111,6 +129,38 @@ class Corrector(ABC):
                     corrected.model_id,
                 )
         return [result for result in results if result is not None]
+
+    def correct_records(self, records: Iterable[Record]) -> Iterator[tuple[Record, CorrectedRange]]:
+        """Yield each record of a recording with its corrected range.
+
+        `BATCH` records are read ahead, because a batch is faster: with live measurements, use `correct`.
+
+        Raises:
+            RecordingError: from `records`, after everything before the error has been yielded.
+        """
+        stream = iter(records)
+        error: UwbMitigationError | None = None
+        while error is None:
+            batch: list[Record] = []
+            try:
+                batch.extend(islice(stream, BATCH))
+            except UwbMitigationError as problem:
+                error = problem
+            if not batch:
+                break
+            yield from zip(batch, self.correct([record.measurement for record in batch]), strict=True)
+        if error is not None:
+            raise error
+
+    def correct_arrays(
+        self, range_m: Any, cir: Any, first_path_index: Any, **fields: Any
+    ) -> CorrectedColumns:
+        """Return n corrected ranges as arrays; the arguments are those of `RangeColumns.from_arrays`.
+
+        Raises:
+            ParameterError: the shapes are inconsistent.
+        """
+        return self.correct_columns(RangeColumns.from_arrays(range_m, cir, first_path_index, **fields))
 
 
 def pass_through(
@@ -174,15 +224,17 @@ class Mitigation(Corrector):
 
     Args:
         bundle: the model.
-        offsets: offsets of the radios, in addition to the bundle's prediction.
+        offsets: offsets of the radios, in addition to the bundle's prediction: one offset in m for all, `Offsets`, or a
+            file written by `uwb-mitigation offset` or `calibrate`.
 
     Raises:
         ModelError: ONNX Runtime rejects the bundle's network.
+        ParameterError: the offset is not finite, too large, or no such file exists.
     """
 
-    def __init__(self, bundle: Bundle, offsets: Offsets = NO_OFFSETS) -> None:
+    def __init__(self, bundle: Bundle, offsets: Offsets | float | str | Path = NO_OFFSETS) -> None:
         self.bundle = bundle
-        self.offsets = offsets
+        self.offsets = offsets if isinstance(offsets, Offsets) else read_offsets(str(offsets))
         self._session = Session(bundle)
         self._rule = CorrectionRule(bundle.card)
 

@@ -24,16 +24,25 @@ _XZ_MAGIC = b"\xfd7zXZ\x00"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
-def open_recording(path: Path, *, cir: Literal["final", "poll"] = "final") -> Source:
+def open_recording(path: Path | str, *, mapping: str = "", cir: Literal["final", "poll"] = "final") -> Source:
     """Return the source for `path`, selected by its content; only logs are recognised by their suffix.
 
     Args:
         path: a file or folder.
+        mapping: mapping file for other formats, or the name of a shipped mapping; empty: a format that is recognised.
         cir: which frame's CIR of a DecaRanging exchange to use: `final` or `poll`.
 
+    Returns:
+        An iterable of `Record`, which may be iterated several times. Its attribute `skipped` counts invalid data.
+
     Raises:
-        RecordingError: `path` does not exist, or no source can read it.
+        RecordingError: `path` does not exist, or no source can read it. Iterating raises it, too, after everything before
+            the damage.
+        ParameterError: the mapping is invalid.
     """
+    path = Path(path)
+    if mapping:
+        return open_mapped(path, mapping)
     try:
         is_bag = _is_bag(path)
     except OSError as error:

@@ -193,12 +193,13 @@ def anchors_path(bag: Path) -> Path:
     return bag.with_name(bag.name.removesuffix(".mcap") + ".anchors.yaml")
 
 
-def load_anchors(path: Path) -> AnchorMap:
-    """Read an anchors file.
+def load_anchors(path: Path | str) -> AnchorMap:
+    """Read an anchors file (format: docs/background/positioning.md).
 
     Raises:
         ParameterError: it cannot be read, or does not have the format of `positioning.anchors`.
     """
+    path = Path(path)
     data = read_bounded(
         path, MAX_TEXT, ParameterError, "an anchors file (format: docs/background/positioning.md)"
     )

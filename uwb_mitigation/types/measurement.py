@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.errors import ParameterError
+
 DEVICE_TICK_HZ = 128 * 499.2e6
 """Rate of the DW1000's timestamp counter (DW1000 user manual, section 2.5.8: 1 / 15.65 ps)."""
 
@@ -234,6 +236,64 @@ class RangeColumns:
     radio: RadioType = RadioType.UNKNOWN
     segment: Segment = Segment.UNKNOWN
 
+    @classmethod
+    def from_arrays(
+        cls,
+        range_m: Any,
+        cir: Any,
+        first_path_index: Any,
+        *,
+        preamble_count: Any = 0,
+        rx_power_dbm: Any = math.nan,
+        first_path_power_dbm: Any = math.nan,
+        **constants: Any,
+    ) -> RangeColumns:
+        """Return the columns of n ranges from arrays; numbers are valid for all ranges.
+
+        Args:
+            range_m: float (n,), measured ranges.
+            cir: complex (n, m), accumulator samples; or real (n, m), their magnitudes. Integers of 16 bits remain unchanged;
+                other values are rounded to 1/30,000 of the largest sample of the range.
+            first_path_index: float (n,), index in `cir` of the first path, sub-sample; NaN = unknown.
+            preamble_count: (n,), accumulated preamble symbols; 0 = unknown.
+            rx_power_dbm: float (n,), receive levels; NaN = unknown.
+            first_path_power_dbm: float (n,), first-path levels; NaN = unknown.
+            **constants: `radio` and `segment` of all CIRs; `tag_id` and `anchor_id`, integers (n,), which select offsets.
+
+        Raises:
+            ParameterError: the arrays have other shapes.
+        """
+        samples = np.asarray(cir)
+        if samples.ndim != 2 or not np.issubdtype(samples.dtype, np.number):
+            raise ParameterError(f"cir of shape {samples.shape}", valid="(n, m) real or complex samples")
+        encoding = Encoding.COMPLEX_INT16 if np.iscomplexobj(samples) else Encoding.MAGNITUDE
+        int16, scale = _as_int16(samples)
+
+        def column(name: str, value: Any, dtype: Any = np.float64) -> NDArray[Any]:
+            try:
+                return np.broadcast_to(np.asarray(value, dtype), len(samples))
+            except (ValueError, TypeError, OverflowError) as error:
+                shape = f"{name} of shape {np.shape(value)} with a cir of shape {samples.shape}"
+                raise ParameterError(shape, valid="one number, or one for each row of the cir") from error
+
+        tag_id, anchor_id = (
+            column(name, constants.pop(name, 0), np.uint64) for name in ("tag_id", "anchor_id")
+        )
+        return cls(
+            tag_id,
+            anchor_id,
+            column("range_m", range_m),
+            encoding,
+            int16,
+            np.zeros(len(samples)),
+            column("first_path_index", first_path_index),
+            scale,
+            column("preamble_count", preamble_count),
+            column("rx_power_dbm", rx_power_dbm),
+            column("first_path_power_dbm", first_path_power_dbm),
+            **constants,
+        )
+
     @staticmethod
     def grouped(measurements: Sequence[RangeMeasurement]) -> Iterator[tuple[list[int], RangeColumns]]:
         """Yield columns of measurements whose CIRs have the same form and source, with their indices."""
@@ -282,6 +342,19 @@ class RangeColumns:
     def __len__(self) -> int:
         """The number of exchanges."""
         return len(self.range_m)
+
+
+def _as_int16(cir: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
+    """Return samples for `Cir.samples`, int16 (n, m or 2 m), and scales (n,), NaN for rows that are not finite."""
+    values = (np.stack([cir.real, cir.imag], axis=2) if np.iscomplexobj(cir) else cir).astype(np.float64)
+    values = values.reshape(len(cir), math.prod(values.shape[1:]))
+    largest = np.abs(values).max(axis=1, initial=0.0)
+    is_int16 = (largest <= np.iinfo(np.int16).max) & (values == np.rint(values)).all(axis=1)
+    scale = np.where(is_int16, 1.0, largest / 30_000.0)  # below the limit of saturated samples
+    is_finite = np.isfinite(largest)
+    scale[~is_finite] = np.nan
+    scaled = np.where(is_finite[:, None], values, 0.0) / np.where(is_finite, scale, 1.0)[:, None]
+    return np.rint(scaled).astype(np.int16), scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,13 +33,12 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
     Raises:
         ModelError: the bundle cannot be loaded.
     """
-    from uwb_mitigation.mitigation.model.bundle import load_bundle
-    from uwb_mitigation.mitigation.model.shipped import AMPLITUDE, model_path
+    from uwb_mitigation.mitigation.model.shipped import AMPLITUDE, load_model
 
     if named is None and _lacks_counts(recording):
         console.err.print(f"the CIRs have no preamble count: using the model {AMPLITUDE}", style="yellow")
         named = Path(AMPLITUDE)
-    return load_bundle(model_path(named))
+    return load_model(named)
 
 
 def _lacks_counts(recording: Path) -> bool:

@@ -11,6 +11,7 @@ from uwb_mitigation.errors import ModelError, did_you_mean
 
 if TYPE_CHECKING:
     # `doctor` must work without NumPy.
+    from uwb_mitigation.mitigation.model.bundle import Bundle
     from uwb_mitigation.mitigation.preprocessing import Scaling
 
 DEFAULT, AMPLITUDE = "universal", "universal_amplitude"
@@ -20,6 +21,17 @@ SHIPPED = (DEFAULT, AMPLITUDE, "evk1000_apartment", "dw3000_sts")
 """All models; an example of a surveyed site and an experimental one for the DW3000 are used only if they are named."""
 
 _SHARE = Path("share", "uwb_mitigation")
+
+
+def load_model(named: str | Path | None = None) -> Bundle:
+    """Load a model: a file, or the name of a shipped one (`SHIPPED`); `universal` for None.
+
+    Raises:
+        ModelError: there is no such model or file, or it is damaged.
+    """
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+
+    return load_bundle(model_path(named))
 
 
 def default_model_path(scaling: Scaling | None = None) -> Path:

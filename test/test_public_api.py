@@ -1,0 +1,141 @@
+"""The public API: the names of `uwb_mitigation`, and the examples of its page."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+
+import uwb_mitigation
+from uwb_mitigation import Mitigation, RangeMeasurement, Record, TagLocator, load_model, to_dataframe
+from uwb_mitigation.errors import DamagedRecordingError, ParameterError
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.anchors import save_anchors
+
+PAGE = REPOSITORY / "docs" / "guides" / "python.md"
+EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `drive.mcap` and `anchors.yaml`."""
+    path = tmp_path_factory.mktemp("drive")
+    source = SimulatedSource(seed=1, count=400)
+    with BagWriter(path / "drive.mcap", {"simulated": "true"}) as bag:
+        for record in source:
+            bag.write(record)
+    save_anchors(path / "anchors.yaml", source.anchors)
+    return path
+
+
+@pytest.fixture(scope="module")
+def records() -> list[Record]:
+    return list(SimulatedSource(seed=2, count=300))
+
+
+@pytest.fixture(scope="module")
+def mitigation() -> Mitigation:
+    return Mitigation(load_model("universal"), offsets=0.22)
+
+
+def test_import_loads_no_other_package_and_all_names_exist():
+    code = (
+        "import sys\nbefore = set(sys.modules)\nimport uwb_mitigation\n"
+        "new = {name.partition('.')[0] for name in set(sys.modules) - before} - sys.stdlib_module_names\n"
+        "assert new == {'uwb_mitigation'}, new\n"
+        "from uwb_mitigation import *\n"
+        "assert not {'rclpy', 'torch', 'pandas', 'onnxruntime'} & set(sys.modules)\n"
+        "assert set(uwb_mitigation.__all__) <= set(dir(uwb_mitigation)) & set(globals())\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
+    assert uwb_mitigation.__all__ == list(uwb_mitigation._MODULES)
+    with pytest.raises(AttributeError, match="no attribute 'Mitigator'"):
+        uwb_mitigation.Mitigator  # noqa: B018
+
+
+@pytest.mark.parametrize("number", range(len(EXAMPLES)))
+def test_examples_of_the_page_run(number: int, folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(folder)
+    exec(compile(EXAMPLES[number], f"{PAGE.name}, example {number + 1}", "exec"), {})
+
+
+def samples(measurement: RangeMeasurement) -> np.ndarray:
+    pairs = measurement.cir.samples.reshape(-1, 2)
+    return pairs[:, 0] + 1j * pairs[:, 1]
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.37])
+def test_arrays_are_corrected_like_measurements(mitigation: Mitigation, records: list[Record], gain: float):
+    measurements = [record.measurement for record in records]
+    cirs = [measurement.cir for measurement in measurements]
+    model = mitigation if gain == 1.0 else Mitigation(load_model("universal_amplitude"), 0.22)
+    expected = model.correct(measurements)
+    result = model.correct_arrays(
+        [measurement.range_m for measurement in measurements],
+        gain * np.stack([samples(measurement) for measurement in measurements]),
+        [cir.first_path_index - cir.start_index for cir in cirs],
+        preamble_count=[cir.preamble_count for cir in cirs],
+        rx_power_dbm=[cir.rx_power_dbm for cir in cirs],
+        first_path_power_dbm=[cir.first_path_power_dbm for cir in cirs],
+    )
+    limit = 0.0 if gain == 1.0 else 0.03
+    assert np.abs(result.range_m - [corrected.range_m for corrected in expected]).max() <= limit
+    assert model.correct(measurements[0]) == expected[0]
+
+
+def test_cir_that_is_not_finite_is_not_used(mitigation: Mitigation, records: list[Record]):
+    measurement = records[0].measurement
+    cir = np.stack([samples(measurement)] * 2)
+    cir[0, 900] = np.nan
+    index = measurement.cir.first_path_index - measurement.cir.start_index
+    result = mitigation.correct_arrays(measurement.range_m, cir, index, preamble_count=100)
+    assert result.status.tolist()[0] == uwb_mitigation.Status.BAD_CIR
+
+
+@pytest.mark.parametrize(
+    "changes", [{"cir": [1.0, 2.0]}, {"range_m": [1.0, 2.0, 3.0]}, {"first_path_index": "x"}, {"tag_id": -1}]
+)
+def test_arrays_of_other_shapes_are_refused(mitigation: Mitigation, changes: dict):
+    arguments = {"range_m": 1.0, "cir": np.ones((2, 200)), "first_path_index": 20.0} | changes
+    with pytest.raises(ParameterError, match=next(iter(changes))):
+        mitigation.correct_arrays(**arguments)
+
+
+def test_records_before_the_damage_are_corrected(mitigation: Mitigation, records: list[Record]):
+    def damaged():
+        yield from records
+        raise DamagedRecordingError("truncated")
+
+    pairs = []
+    with pytest.raises(DamagedRecordingError):
+        pairs.extend(mitigation.correct_records(damaged()))
+    assert [record for record, _ in pairs] == records
+
+
+def test_data_frame_has_raw_and_corrected_ranges(mitigation: Mitigation, records: list[Record]):
+    frame = to_dataframe(mitigation.correct_records(records))
+    raw, corrected = (
+        (frame[name] - frame.true_range_m).abs().mean() for name in ("range_m", "corrected_range_m")
+    )
+    assert corrected < 0.5 * raw
+    assert list(to_dataframe(records)) == list(frame)[:-3]
+    assert to_dataframe([]).empty
+
+
+def test_locator_follows_a_simulated_tag(mitigation: Mitigation):
+    source = SimulatedSource(seed=2, count=400)
+    locator = TagLocator(source.anchors, height_m=0.4)
+    errors = [
+        np.hypot(*(estimate.position - record.tag_position)[:2])
+        for record, corrected in mitigation.correct_records(source)
+        if (estimate := locator.add(record.measurement, corrected)) is not None
+    ]
+    assert len(errors) > 200
+    assert np.median(errors) < 0.3
+    assert isinstance(locator.warnings(), list)
