@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.positioning.tag_locator import TagLocator
     from uwb_mitigation.recordings.dataframe import to_dataframe
-    from uwb_mitigation.recordings.opening import open_recording
+    from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
     from uwb_mitigation.types.measurement import Cir, CorrectedRange, RangeMeasurement, Record, Status
     from uwb_mitigation.types.offsets import Offsets
@@ -63,7 +63,7 @@ _MODULES = {
     "UwbMitigationError": "errors",
     "load_anchors": "types.anchors",
     "load_model": "mitigation.model.shipped",
-    "open_recording": "recordings.opening",
+    "open_recording": "recordings.formats",
     "to_dataframe": "recordings.dataframe",
 }
 """Modules of the lazy names."""
