@@ -13,12 +13,17 @@ import pytest
 
 SCREENS = Path(__file__).resolve().parents[1] / "build" / "screens"
 TIMEOUT_S = 240.0
+CALL_S = 10.0
+"""Timeout of one call; a call that a reload of the page interrupts is repeated."""
 
 _OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-dev-shm-usage",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
 )  # fmt: skip
 
+
+INTERRUPTED = "aborted by navigation", "execution context", "stale element", "not found in the current frame"
+"""Errors of calls whose page was replaced meanwhile."""
 
 ROLES = {
     "button": "button", "checkbox": "input", "combobox": "select", "searchbox": "input", "slider": "input",
@@ -36,9 +41,15 @@ class Browser:
     def open(self, url: str, width: int = 1280, height: int = 1000) -> None:
         self.resize(width, height)
         # Discard errors of an earlier page.
-        self.driver.get("about:blank")
+        self._load("about:blank")
         self.driver.get_log("browser")
+        self._load(url)
+
+    def _load(self, url: str) -> None:
+        """Open a URL, and wait for the document. Another fragment does not load it again."""
         self.driver.get(url)
+        loaded = "return document.readyState === 'complete' && location.href.startsWith(arguments[0])"
+        self.wait(url, lambda: self.run(loaded, url.partition("#")[0]))
 
     def resize(self, width: int, height: int) -> None:
         self.driver.execute_cdp_cmd(
@@ -85,15 +96,35 @@ class Browser:
         self.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
     def run(self, script: str, *arguments: object) -> Any:
-        return self.driver.execute_script(script, *arguments)
+        """Return the result of a script."""
+        return self._repeat(lambda: self.driver.execute_script(script, *arguments))
+
+    def _repeat(self, call: Callable[[], Any]) -> Any:
+        """Return the result of a call; it is repeated if the page does not answer or is reloaded meanwhile."""
+        from selenium.common.exceptions import TimeoutException, WebDriverException
+        from urllib3.exceptions import ReadTimeoutError
+
+        end_s = time.monotonic() + TIMEOUT_S
+        while True:
+            try:
+                return call()
+            except (TimeoutException, ReadTimeoutError) as error:
+                problem: Exception = error
+            except WebDriverException as error:
+                if not any(text in str(error) for text in INTERRUPTED):
+                    raise
+                problem = error
+            if time.monotonic() > end_s:
+                raise problem
+            time.sleep(0.1)
 
     def wait(self, what: str, condition: Callable[[], Any]) -> Any:
         """Wait until `condition` is true, and return its result."""
         end_s = time.monotonic() + TIMEOUT_S
-        while not (found := condition()):
+        while not (result := condition()):
             assert time.monotonic() < end_s, f"not within {TIMEOUT_S} s: {what}"
             time.sleep(0.05)
-        return found
+        return result
 
     def ready(self) -> bool:
         """Return whether a Bokeh page is loaded and drawn."""
@@ -101,8 +132,12 @@ class Browser:
 
     def find(self, role: str, name: str) -> Any:
         """Return the element with an ARIA role and an accessible name; None if it does not exist."""
-        elements = self.driver.find_elements("css selector", ROLES[role])
-        return next((e for e in elements if e.aria_role == role and e.accessible_name == name), None)
+
+        def search() -> Any:
+            elements = self.driver.find_elements("css selector", ROLES[role])
+            return next((e for e in elements if e.aria_role == role and e.accessible_name == name), None)
+
+        return self._repeat(search)
 
     def click(self, role: str, name: str) -> None:
         """Click an element as soon as it exists."""
@@ -173,10 +208,14 @@ def chromium() -> Iterator[Browser]:
 
     options = webdriver.ChromeOptions()
     options.binary_location = binary
+    # Otherwise a call waits for the end of any navigation, also of one that the page starts by itself.
+    options.page_load_strategy = "none"
     for option in _OPTIONS:
         options.add_argument(option)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     window = webdriver.Chrome(options=options, service=Service(driver))
+    window.command_executor.client_config.timeout = 3 * CALL_S
+    window.set_script_timeout(CALL_S)
     try:
         yield Browser(window)
     finally:

@@ -32,7 +32,7 @@ def test_counts_rate_latency_and_sigma():
     assert (statistics.corrected, statistics.missing, statistics.errors) == (100, 1, {})
     assert statistics.latency_ms(50) == pytest.approx(2.0)
     assert statistics.pairs[7, 1].rate_hz() == pytest.approx(10.0, rel=1e-2)
-    assert statistics.pairs[7, 1].samples[-1].sigma_m == pytest.approx(0.2)
+    assert statistics.pairs[7, 1].corrected.variance_m2 == pytest.approx(0.04)
 
 
 def test_errors_are_absolute_and_grouped_by_label():

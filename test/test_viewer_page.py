@@ -24,9 +24,9 @@ from PIL import Image
 from benchmarks.equipment.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
+from uwb_mitigation.types.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.page import Page, View
-from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
     AnchorPosition,

@@ -13,11 +13,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.nodes.support import topics
 from uwb_mitigation.positioning.geometry import horizontal_ellipse
+from uwb_mitigation.types import palette
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.palette import STATUS_LOOKS
 from uwb_mitigation.types.tracks import Estimate
-from uwb_mitigation.viewer import palette
-from uwb_mitigation.viewer.palette import STATUS_LOOKS
 
 TRAIL = 400
 
@@ -40,11 +40,11 @@ def anchors_in(message: Any) -> AnchorMap | None:
     if isinstance(message, PoseArray):
         points = {number: pose.position for number, pose in enumerate(message.poses)}
     else:
-        added = [each for each in message.markers if each.action == Marker.ADD and each.id >= 0]
-        points = {each.id: each.pose.position for each in reversed(added)}
-    found = [Anchor(number, (point.x, point.y, point.z)) for number, point in sorted(points.items())]
-    found = [each for each in found if np.isfinite(each.position).all()]
-    return AnchorMap(found[:MAX_ANCHORS], "anchors") if found else None
+        added = [marker for marker in message.markers if marker.action == Marker.ADD and marker.id >= 0]
+        points = {marker.id: marker.pose.position for marker in reversed(added)}
+    anchors = [Anchor(number, (point.x, point.y, point.z)) for number, point in sorted(points.items())]
+    anchors = [anchor for anchor in anchors if np.isfinite(anchor.position).all()]
+    return AnchorMap(anchors[:MAX_ANCHORS], "anchors") if anchors else None
 
 
 class TagPicture:
@@ -72,7 +72,7 @@ class TagPicture:
 
 def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
     """Return a sphere and a label for every anchor."""
-    found = []
+    markers = []
     for row, anchor in enumerate(anchors.anchors):
         pose = Pose(position=_point(anchor.position), orientation=Quaternion(w=1.0))
         size = max(0.2, 2.0 * anchor.sd)
@@ -84,8 +84,8 @@ def anchor_markers(anchors: AnchorMap, frame: str, stamp_ns: int) -> list[Any]:
         x, y, z = anchor.position
         text.pose = Pose(position=_point((x, y, z + 0.3)), orientation=Quaternion(w=1.0))
         text.scale, text.text = Vector3(z=0.25), str(anchor)
-        found += [ball, text]
-    return found
+        markers += [ball, text]
+    return markers
 
 
 def tag_markers(
@@ -104,30 +104,30 @@ def tag_markers(
     symbols = marker("statuses", Marker.TRIANGLE_LIST, _colour(palette.GREY))
     symbols.scale = Vector3(x=1.0, y=1.0, z=1.0)
     x, y, z = estimate.position.tolist()
-    here = _point((x, y, z))
+    tag_point = _point((x, y, z))
     for row in received:
         if (status := picture.statuses.get(row)) is None:
             continue
         look, anchor = STATUS_LOOKS[status], anchors.anchors[row].position
-        rays.points += [_point(anchor), here]
+        rays.points += [_point(anchor), tag_point]
         rays.colors += [_colour(look.colour)] * 2
-        at = ((anchor[0] + x) / 2, (anchor[1] + y) / 2, (anchor[2] + z) / 2)
+        middle = ((anchor[0] + x) / 2, (anchor[1] + y) / 2, (anchor[2] + z) / 2)
         symbols.points += [
-            _point((at[0] + SYMBOL_M * u, at[1] + SYMBOL_M * v, at[2])) for u, v in look.triangles
+            _point((middle[0] + SYMBOL_M * u, middle[1] + SYMBOL_M * v, middle[2])) for u, v in look.triangles
         ]
         symbols.colors += [_colour(look.colour)] * len(look.triangles)
     if not symbols.points:
         # RViz reports a list without triangles as an error.
         symbols.action = Marker.DELETE
     tag = marker("tags", Marker.SPHERE, _colour(palette.BLUE))
-    tag.pose.position, tag.scale = here, Vector3(x=0.2, y=0.2, z=0.2)
+    tag.pose.position, tag.scale = tag_point, Vector3(x=0.2, y=0.2, z=0.2)
     name = marker("tag_names", Marker.TEXT_VIEW_FACING, _colour(None))
     name.pose.position = _point((x, y, z + 0.3))
     name.scale, name.text = Vector3(z=0.25), picture.name
     major, minor, angle = horizontal_ellipse(estimate.covariance)
     ellipse = marker("ellipses", Marker.CYLINDER, _colour(palette.BLUE, 0.3))
-    turned = Quaternion(z=math.sin(angle / 2), w=math.cos(angle / 2))
-    ellipse.pose = Pose(position=here, orientation=turned)
+    rotation = Quaternion(z=math.sin(angle / 2), w=math.cos(angle / 2))
+    ellipse.pose = Pose(position=tag_point, orientation=rotation)
     ellipse.scale = Vector3(x=2.0 * major, y=2.0 * minor, z=0.02)
     trail = marker("trails", Marker.LINE_STRIP, _colour(palette.BLUE))
     trail.scale.x = 0.03

@@ -24,12 +24,36 @@ from uwb_mitigation.nodes.support.spinning import stop_event
 from uwb_mitigation.types.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_truth
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.viewer.scene import MAX_TRUTHS, BoundedDict, History, Pair, Sample
 
 REFRESH_HZ = 5
 
 MAX_LATENCIES = 100_000
 """Number of latest latencies in the summary; bounds the memory of a monitor that runs for days."""
+
+
+MAX_TRUTHS = 10_000
+"""Number of latest truths that wait for their corrected ranges."""
+
+
+class PairStatistics:
+    """The latest range of one pair.
+
+    Attributes:
+        corrected, truth: of the latest range; `truth` is None if unknown.
+        arrivals_s: arrival times of the latest ranges.
+    """
+
+    def __init__(self) -> None:
+        self.corrected: CorrectedRange | None = None
+        self.truth: Truth | None = None
+        self.arrivals_s: deque[float] = deque(maxlen=20)
+
+    def rate_hz(self) -> float:
+        """Return the rate of the latest ranges; NaN before the second one."""
+        # Copy in one step: another thread adds ranges.
+        arrivals_s = list(self.arrivals_s)
+        span_s = arrivals_s[-1] - arrivals_s[0] if arrivals_s else 0.0
+        return (len(arrivals_s) - 1) / span_s if span_s > 0.0 else math.nan
 
 
 class RangeStatistics:
@@ -40,13 +64,13 @@ class RangeStatistics:
     """
 
     def __init__(self) -> None:
-        self.pairs: dict[Pair, History] = {}
+        self.pairs: dict[tuple[int, int], PairStatistics] = {}
         self.raw = 0
         self.corrected = 0
         self.statuses: Counter[Status] = Counter()
         self.errors: defaultdict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(3))
         self._latencies_s: deque[float] = deque(maxlen=MAX_LATENCIES)
-        self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
+        self._truths: dict[MeasurementKey, Truth] = {}
 
     @property
     def missing(self) -> int:
@@ -58,18 +82,24 @@ class RangeStatistics:
         return float(np.percentile(self._latencies_s or [math.nan], percentile)) * 1e3
 
     def add_truth(self, key: MeasurementKey, truth: Truth) -> None:
-        self._truths.add(key, truth)
+        self._truths[key] = truth
+        if len(self._truths) > MAX_TRUTHS:
+            self._truths.pop(next(iter(self._truths)))
 
     def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange, arrival_s: float) -> None:
         """Add a corrected range; `arrival_s` is on the clock of its stamp."""
-        sample = Sample.of(arrival_s, corrected, self._truths.pop(key, None))
+        truth = self._truths.pop(key, None)
         self.corrected += 1
-        self.statuses[sample.status] += 1
+        self.statuses[corrected.status] += 1
         self._latencies_s.append(arrival_s - key.stamp_ns / NS_PER_S)
-        self.pairs.setdefault((key.anchor_id, key.tag_id), History()).add(sample, arrival_s)
-        if math.isfinite(sample.true_m) and math.isfinite(sample.raw_m):
-            raw_m, corrected_m = abs(sample.raw_m - sample.true_m), abs(sample.range_m - sample.true_m)
-            self.errors[sample.label] += (1, raw_m, corrected_m)
+        pair = self.pairs.setdefault((key.anchor_id, key.tag_id), PairStatistics())
+        pair.truth, pair.corrected = truth, corrected
+        pair.arrivals_s.append(arrival_s)
+        if truth is not None and math.isfinite(truth.range_m) and math.isfinite(corrected.range_raw_m):
+            raw_m, corrected_m = (
+                abs(range_m - truth.range_m) for range_m in (corrected.range_raw_m, corrected.range_m)
+            )
+            self.errors[truth.label] += (1, raw_m, corrected_m)
 
 
 class Monitor(Node):
@@ -110,15 +140,19 @@ def live_table(statistics: RangeStatistics, title: str) -> Table:
         table.add_column(
             column, justify="left" if column in ("status", "label") else "right", overflow="fold"
         )
-    for (anchor, tag), history in sorted(statistics.pairs.copy().items()):
-        sample = history.samples[-1]
+    for (anchor, tag), pair in sorted(statistics.pairs.copy().items()):
+        corrected, truth = pair.corrected, pair.truth
+        if corrected is None:
+            continue
+        sigma_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
+        true_m = math.nan if truth is None else truth.range_m
         table.add_row(
             format_id(anchor),
             format_id(tag),
-            _text(history.rate_hz(), 1),
-            *map(_text, (sample.raw_m, sample.range_m, sample.sigma_m, sample.true_m)),
-            Text(sample.status.name, style="green" if sample.status is Status.OK else "yellow"),
-            sample.label,
+            _text(pair.rate_hz(), 1),
+            *map(_text, (corrected.range_raw_m, corrected.range_m, sigma_m, true_m)),
+            Text(corrected.status.name, style="green" if corrected.status is Status.OK else "yellow"),
+            "" if truth is None else truth.label,
         )
     return table
 

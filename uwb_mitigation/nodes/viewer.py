@@ -135,8 +135,8 @@ class Viewer(ManagedNode):
     ) -> None:
         """Subscribe to a topic; `plain` is its name in a bag."""
         if topic not in self._subscribed:
-            made = self.create_subscription(kind, topic, partial(self._feed.add, plain, tag=tag), qos)
-            self._subscribed[topic] = self.destroy_at_close(made, self.destroy_subscription)
+            subscription = self.create_subscription(kind, topic, partial(self._feed.add, plain, tag=tag), qos)
+            self._subscribed[topic] = self.destroy_at_close(subscription, self.destroy_subscription)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
         """Subscribe to a topic of ranges; they are queued until `_read_queued_ranges`."""
@@ -172,10 +172,10 @@ class Viewer(ManagedNode):
             self._range_node.destroy_subscription(self._ranges.pop(topics.RANGE_RAW))
         # The locator publishes every further tag on a separate topic; a remapping of the plain topic does not apply to it.
         head, _, tail = self.resolve_topic_name(topics.POSE, only_expand=True).rpartition("/")
-        own = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
+        tag_topic = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():
-            if (found := own.fullmatch(topic)) and len(self._subscribed) < MAX_TAGS:
-                self._subscribe(PoseWithCovarianceStamped, topic, bag_topics.POSE, found[1])
+            if (match := tag_topic.fullmatch(topic)) and len(self._subscribed) < MAX_TAGS:
+                self._subscribe(PoseWithCovarianceStamped, topic, bag_topics.POSE, match[1])
 
     def _missing(self) -> MissingData:
         """Return the reasons for an empty page, such as a node that is not running."""

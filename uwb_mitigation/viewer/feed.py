@@ -17,10 +17,10 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_ellipse
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
+from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
 from uwb_mitigation.types.tracks import Estimate
-from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
     MAX_ID_DIGITS,
@@ -62,8 +62,8 @@ class SceneUpdater:
         self.lock = lock
         self._adders: dict[str, Callable[[str, Any], None]] = {
             topics.RANGE_RAW: lambda _, measurement: self.measurement(measurement),
-            topics.RANGE_TRUTH: lambda _, found: self._truth(*found),
-            topics.RANGE_CORRECTED: lambda _, found: self.corrected(*found),
+            topics.RANGE_TRUTH: lambda _, decoded: self._truth(*decoded),
+            topics.RANGE_CORRECTED: lambda _, decoded: self.corrected(*decoded),
             topics.POSE: self._pose,
             topics.ODOMETRY: self._pose,
             topics.POSE_SMOOTHED: partial(self._position, TrackKind.SMOOTHED),
@@ -154,7 +154,7 @@ class SceneUpdater:
 
         A marker of the namespace `anchors` has the id of the anchor as its text, that of `names` with the same number its label.
         """
-        found: dict[int, AnchorPosition] = {}
+        anchors: dict[int, AnchorPosition] = {}
         labels = {marker.id: str(marker.text) for marker in message.markers if marker.ns == "names"}
         for marker in message.markers:
             position, text = marker.pose.position, marker.text
@@ -163,10 +163,10 @@ class SceneUpdater:
             if text.isascii() and text.isdigit() and len(text) <= MAX_ID_DIGITS:
                 label = labels.get(marker.id, "")
                 name = label.partition(" (")[2].removesuffix(")")[:MAX_TEXT]
-                found[int(text)] = AnchorPosition(position.x, position.y, position.z, name)
-        if found:
+                anchors[int(text)] = AnchorPosition(position.x, position.y, position.z, name)
+        if anchors:
             with self.lock:
-                self.scene.set_anchors(found)
+                self.scene.set_anchors(anchors)
 
     def anchors(self, anchors: AnchorMap) -> None:
         """Set the anchors of an anchors file."""

@@ -26,8 +26,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from bokeh.transform import factor_mark
 
-from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.palette import (
+from uwb_mitigation.types.palette import (
     BLUE,
     GREEN,
     GREY,
@@ -38,6 +37,7 @@ from uwb_mitigation.viewer.palette import (
     VERMILLION,
     TrackKind,
 )
+from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.scene import CELL_M, HISTORY_S, WATERFALL
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180

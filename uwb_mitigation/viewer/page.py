@@ -19,9 +19,9 @@ from bokeh.models import ColumnDataSource
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.palette import STATUS_LOOKS, TrackKind
 from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.models import COLUMNS, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
-from uwb_mitigation.viewer.palette import STATUS_LOOKS, TrackKind
 from uwb_mitigation.viewer.scene import (
     CELL_M,
     ERROR_EDGES_M,

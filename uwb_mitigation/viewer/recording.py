@@ -67,25 +67,25 @@ class Recording:
 
     def __init__(self, path: Path, namespace: str | None = None) -> None:
         self.path, self._bag = path, BagReader(path)
-        known, bounds = self._bag.topics, self._bag.bounds_ns
-        self.prefix = prefix = _namespace(path, known) if namespace is None else namespace.rstrip("/")
+        types, bounds = self._bag.topics, self._bag.bounds_ns
+        self.prefix = prefix = _namespace(path, types) if namespace is None else namespace.rstrip("/")
         for channel in self._bag.channels:
             if kind := _RANGE_TYPES.get(channel.topic.removeprefix(prefix)):
                 check_channel(channel, kind, path)
         self._topics: dict[str, tuple[str, str]] = {}
-        for topic, kind in known.items():
+        for topic, kind in types.items():
             plain, tag = topic.removeprefix(prefix), DEFAULT_TAG
             if match := _POSITION_TOPIC.fullmatch(topic):
                 plain, tag = f"/uwb/{match[3]}", match[2] or DEFAULT_TAG
-            is_own = match[1] == prefix if match else topic in (prefix + plain, DIAGNOSTICS)
-            if is_own and kind.replace("/msg/", "/") == _TYPES.get(plain, "").replace("/msg/", "/"):
+            is_selected = match[1] == prefix if match else topic in (prefix + plain, DIAGNOSTICS)
+            if is_selected and kind.replace("/msg/", "/") == _TYPES.get(plain, "").replace("/msg/", "/"):
                 self._topics[topic] = plain, tag
         if topics.POSE in self.contents:
             # Tracks (the output of `track`) are used only if there are no poses.
-            other = POSITIONS - {topics.POSE}
-            self._topics = {topic: found for topic, found in self._topics.items() if found[0] not in other}
+            tracks = POSITIONS - {topics.POSE}
+            self._topics = {topic: names for topic, names in self._topics.items() if names[0] not in tracks}
         if bounds is None or not self.contents & (RANGES | POSITIONS):
-            raise _no_ranges(path, known)
+            raise _no_ranges(path, types)
         self.start_ns, self.seconds = bounds[0], (bounds[1] - bounds[0]) / 1e9
         self.rate_hz = self._bag.message_count / max(self.seconds, 1e-9)
 
@@ -98,16 +98,16 @@ class Recording:
         """Whether the bag contains raw ranges only."""
         return self.contents & RANGES == {topics.RANGE_RAW}
 
-    def events(self, wanted: Collection[str], start_ns: int = 0) -> Iterator[Event]:
+    def events(self, selected: Collection[str], start_ns: int = 0) -> Iterator[Event]:
         """Yield the messages of topics from a time since the beginning.
 
         Raises:
             RecordingError: the bag is damaged; every message before the damage has been yielded.
         """
-        names = [topic for topic, (plain, _) in self._topics.items() if plain in wanted]
-        for found in self._bag.messages(names, self.start_ns + start_ns):
-            plain, tag = self._topics[found.channel.topic]
-            yield Event(found.log_time_ns - self.start_ns, plain, _decode(plain, found.data), tag)
+        names = [topic for topic, (plain, _) in self._topics.items() if plain in selected]
+        for message in self._bag.messages(names, self.start_ns + start_ns):
+            plain, tag = self._topics[message.channel.topic]
+            yield Event(message.log_time_ns - self.start_ns, plain, _decode(plain, message.data), tag)
 
 
 def _decode(topic: str, data: bytes) -> Any:
@@ -119,20 +119,20 @@ def _decode(topic: str, data: bytes) -> Any:
         return None
 
 
-def _namespace(path: Path, known: dict[str, str]) -> str:
+def _namespace(path: Path, types: dict[str, str]) -> str:
     """Return the only namespace with ranges, or with tracks if there are no ranges."""
-    found = {topic.removesuffix(name) for topic in known for name in RANGES if topic.endswith(name)}
-    found = found or {match[1] for topic in known if (match := _POSITION_TOPIC.fullmatch(topic))}
-    if len(found) > 1:
-        names = ", ".join(map(repr, sorted(found)))
+    prefixes = {topic.removesuffix(name) for topic in types for name in RANGES if topic.endswith(name)}
+    prefixes = prefixes or {match[1] for topic in types if (match := _POSITION_TOPIC.fullmatch(topic))}
+    if len(prefixes) > 1:
+        names = ", ".join(map(repr, sorted(prefixes)))
         raise ParameterError("several namespaces", where=str(path), valid=f"--namespace with one of: {names}")
-    if not found:
-        raise _no_ranges(path, known)
-    return found.pop()
+    if not prefixes:
+        raise _no_ranges(path, types)
+    return prefixes.pop()
 
 
-def _no_ranges(path: Path, known: dict[str, str]) -> RecordingError:
-    found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(known.items()))
+def _no_ranges(path: Path, types: dict[str, str]) -> RecordingError:
+    contents = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items()))
     return RecordingError(
-        "no ranges and no tracks", where=str(path), valid=f"the bag contains: {found or 'no topic'}"
+        "no ranges and no tracks", where=str(path), valid=f"the bag contains: {contents or 'no topic'}"
     )

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, CorrectedRange, Encoding, Status, Truth
+from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.poses import tag_frame
-from uwb_mitigation.viewer.palette import TrackKind
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_ANCHORS = 256, 64, 64, 256
