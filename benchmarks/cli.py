@@ -20,7 +20,7 @@ from benchmarks.equipment.emulate_evb1000 import emulate_evb1000
 from benchmarks.equipment.emulate_uci import emulate_uci
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption
-from uwb_mitigation.errors import UwbMitigationError, missing_dependency
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
 
 if TYPE_CHECKING:
     from benchmarks.nodes import SubjectResult
@@ -94,52 +94,57 @@ def soak(
 
 @app.command()
 def locator(
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder with hanyang_outdoor and evk1000_apartment; default: simulated drives only."
-        ),
-    ] = None,
     rate: Annotated[float, typer.Option(min=1.0, max=5000.0, help="Ranges per second to the node.")] = 1000.0,
     seconds: Annotated[float, typer.Option(min=1.0, help="Duration of the stream.")] = 20.0,
     json: JsonOption = None,
 ) -> None:
-    """Locator: position errors, time of the filter, latency and loss of the node."""
+    """Locator: time of the filter, latency and loss of the node. `positions` measures errors."""
     from benchmarks import locator as cost
-    from benchmarks import positions
 
     with console.progress() as bar:
         task = bar.add_task("filter", total=None)
         us_per_range = cost.filter_us()
         node = cost.node(rate, seconds, lambda text: bar.update(task, description=text))
-        runs, static = [], None
-        if data is not None:
-            for folder in sorted((data / "hanyang_outdoor").glob("*_*")):
-                bar.update(task, description=f"Hanyang {folder.name}")
-                runs.append(positions.hanyang(folder))
-            if (data / "evk1000_apartment").is_dir():
-                bar.update(task, description="EVK1000 apartment")
-                static = positions.apartment(data / "evk1000_apartment")
-        flats = []
-        for count in (4, 6, 8):
-            bar.update(task, description=f"simulated flat, {count} anchors")
-            flats.append(positions.flat(count))
     result: dict[str, Any] = {
         "us_per_range": us_per_range,
         "node_p50_ms": node.p50_ms if math.isfinite(node.p50_ms) else None,
         "node_p99_ms": node.p99_ms if math.isfinite(node.p99_ms) else None,
         "lost": node.lost,
         "sent": node.sent,
-        "hanyang": {run.name: run.as_json() for run in runs},
-        "flat": [
-            {"anchors": flat.anchors}
-            | {kind: getattr(flat, kind).as_json() for kind in ("raw", "corrected", "universal")}
-            for flat in flats
-        ],
     }
-    if static is not None:
-        result["apartment"] = asdict(static)
     _report(result, json)
+
+
+@app.command()
+def positions(
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with a folder for each data set, named like a shipped mapping (hanyang, labyrinth, rcv); "
+            "default: simulated drives only."
+        ),
+    ] = None,
+    simulated: Annotated[bool, typer.Option(help="Also evaluate simulated drives.")] = True,
+    calibrate: Annotated[
+        bool, typer.Option(help="Also calibrate each run on another one; this takes most of the time.")
+    ] = True,
+    json: JsonOption = None,
+) -> None:
+    """Position errors from raw, corrected and calibrated ranges, next to simple filters."""
+    from benchmarks import positions as bench
+
+    if data is not None and not data.is_dir():
+        raise ParameterError("no such folder", where=str(data), valid="a folder of data sets")
+    with console.progress() as bar:
+        task = bar.add_task("reading", total=1.0)
+        result = bench.measure(
+            data,
+            calibrate=calibrate,
+            simulated=simulated,
+            advance=lambda text, share: bar.update(task, description=text, completed=share),
+        )
+    _show_positions(result)
+    console.write_json(json, result)
 
 
 @app.command()
@@ -358,6 +363,41 @@ def _report(result: Mapping[str, Any], json: Path | None) -> None:
     if scalars.row_count:
         console.out.print(scalars)
     console.write_json(json, result)
+
+
+def _show_positions(result: Mapping[str, Any]) -> None:
+    """Print the RMSE of each row of each run, and the summary."""
+    from benchmarks.positions import ROWS
+
+    titles = [row.replace("raw_", "").replace("_locator", "").replace("_", " ") for row in ROWS]
+    columns = ("set", "run", *titles, "ratio", "coverage", "NEES")
+    rows = []
+    for entry in result["sets"]:
+        scores = entry["rows"]
+        locator = scores.get("raw_locator", {})
+        rows.append(
+            [
+                entry["name"],
+                entry["run"],
+                *(_text(scores.get(row, {}).get("rmse_m", "")) for row in ROWS),
+                *(_text(entry["ratio_to_best_baseline"]), _text(locator.get("coverage95", ""))),
+                _text(locator.get("nees_per_dof", "")),
+            ]
+        )
+    console.show_table("Horizontal RMSE, m", columns, rows, left=2, max_rows=len(rows))
+    summary = dict(result["summary"])
+    by_set = summary.pop("by_set")
+    console.show_table(
+        "Summary", ("figure", *by_set, "all"),
+        [[key, *(_text(one[key]) if key in one else "" for one in by_set.values()), _text(value)]
+         for key, value in summary.items()],
+        max_rows=len(summary),
+    )  # fmt: skip
+    for entry in result["sets"]:
+        for row, reason in entry["failed"].items():
+            console.warn(f"{entry['name']} {entry['run']}: no {row}: {reason}")
+    for entry in result["skipped"]:
+        console.warn(f"skipped {entry['path']}: {entry['reason']}")
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

@@ -1,245 +1,350 @@
-"""Measure position errors on real recordings and in the simulated flat. Needs neither ROS nor torch.
+"""Measure the chain from raw ranges to positions, next to simple filters. Needs neither ROS nor torch (except for calibration).
 
-The recordings are not part of the repository.
+Every row is evaluated at the ranges from `WARM_UP_S` after the first one on, against the true path. The ratio to the best baseline
+compares the locator on raw ranges with the baselines at the times at which all of them have an estimate.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.mitigation.correction import Mitigation
-from uwb_mitigation.mitigation.model.bundle import load_bundle
-from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.model.shipped import default_model_path
+from benchmarks.baselines import run_ekf
+from benchmarks.position_data import Run, RunSource, real_runs, simulated_runs
+from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.positioning.batch.smoother import smooth
-from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.initialization import candidate_positions, snapshot
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.track_errors import TrackErrors, errors_of, track_errors
-from uwb_mitigation.recordings.decaranging import DecaRangingFolder
-from uwb_mitigation.recordings.formats import open_mapped
-from uwb_mitigation.simulation.simulated import SimulatedSource, SimulatedSurvey
-from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
-from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.source import Source
+from uwb_mitigation.positioning.online.initialization import snapshot
+from uwb_mitigation.positioning.online.robot_estimator import make_estimator
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.track_errors import track_errors
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.types.tracks import Ranges, Track, TruePath
+from uwb_mitigation.types.tracks import Odometry, Ranges, Track, TruePath
 
-TIME_OFFSET_S = 0.2
-"""Time offset of the ranges relative to the ground truth in every Hanyang run."""
+WARM_UP_S = 5.0
+"""As long as a heading takes to be found."""
 
-HEIGHT = Height(1.0, 0.2)
-"""Height of the tag in the Hanyang runs."""
-
-
-@dataclass(frozen=True, slots=True)
-class Errors:
-    """Errors of one recording: live, smoothed, and from snapshots of raw ranges."""
-
-    name: str
-    live: TrackErrors
-    smoothed: TrackErrors
-    snapshot: TrackErrors
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the errors by kind of track."""
-        return {kind: getattr(self, kind).as_json() for kind in ("live", "smoothed", "snapshot")}
+BASELINE_OFFSET_SD_M = 0.15
+BASELINES = ("raw_least_squares", "raw_ekf", "raw_ekf_offset")
+ROWS = (*BASELINES, "raw_locator", "corrected_locator", "calibrated_locator", "odometry_locator", "smoothed")
+SCORES = ("rmse_m", "median_m", "p95_m", "coverage95", "nees_per_dof", "protection_exceeded", "height_rmse_m")
 
 
-def columns(source: Source, anchors: AnchorMap, variance_m2: float = math.nan) -> tuple[Ranges, TruePath]:
-    """Return the ranges of a source with one tag, and its true path."""
-    records = list(source)
-    stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
-    known = [i for i, record in enumerate(records) if record.tag_position is not None]
-    truth = TruePath(stamps[known], np.array([records[i].tag_position for i in known], float).reshape(-1, 3))
-    ranges = Ranges(
-        stamps,
-        np.array([anchors.index[record.measurement.anchor_id] for record in records], np.intp),
-        np.array([record.measurement.range_m for record in records], float),
-        np.full(len(records), variance_m2),
-        np.array([record.measurement.cir.rx_power_dbm for record in records], float),
-        records[0].measurement.tag_id,
-    )
-    return ranges, truth
+def evaluate(source: RunSource, *, calibrate: bool = True, smoothed: bool = True) -> dict[str, Any]:
+    """Return the entry of a run.
 
-
-def hanyang_run(folder: Path) -> tuple[AnchorMap, Ranges, TruePath, TruePath]:
-    """Return anchors, ranges without their time offset, and the true path of a run: complete, and in the authors' window.
-
-    The window of trajectory A is from the first x > 49.3 and y > -5 to the next x <= 12 and y > 3.4; that of B from
-    the first x < 8.6 and y < -7 to the next x > 8.6 and y < -7.
+    Raises:
+        UwbMitigationError: it cannot be read, or has no estimate to compare.
     """
-    run = open_mapped(folder, "hanyang")
-    ranges, _ = columns(run, run.anchors)
-    shifted = Ranges(
-        ranges.stamp_ns - round(TIME_OFFSET_S * NS_PER_S),
-        ranges.anchor,
-        ranges.range_m,
-        ranges.variance_m2,
-        ranges.rx_power_dbm,
-        ranges.tag_id,
-    )
-    kind_a = folder.name.rpartition("_")[2].startswith("A")
-    return run.anchors, shifted, run.truth, _window(run.truth, kind_a)
+    run = source.read()
+    if len(run.ranges) < 20 or len(run.truth) < 10:
+        raise DatasetError(f"{len(run.ranges)} ranges and {len(run.truth)} true positions")
+    tracks: dict[str, tuple[Track, float]] = {}
+    failed: dict[str, str] = {}
+    truth = _after_warm_up(run)
+
+    def add(row: str, make: Callable[[], Track], count: int = len(run.ranges)) -> None:
+        began = time.process_time()
+        try:
+            tracks[row] = make(), (time.process_time() - began) / count * 1e6
+        except (UwbMitigationError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+            failed[row] = f"{type(error).__name__}: {error}"
+
+    ekf = partial(run_ekf, run.anchors, run.ranges, height=run.height, heights=run.heights)
+    add("raw_least_squares", lambda: snapshot(run.anchors, run.ranges, run.height))
+    start = tracks["raw_least_squares"][0]
+    add("raw_ekf", lambda: ekf(start))
+    add("raw_ekf_offset", lambda: ekf(start, offset_sd_m=BASELINE_OFFSET_SD_M))
+    add("raw_locator", lambda: locate(run, run.ranges))
+    if run.has_cirs:
+        add("corrected_locator", lambda: locate(run, run.corrected()))
+    if source.donor is not None and calibrate:
+        donor = source.donor
+        add("calibrated_locator", lambda: locate(run, calibrated(run, donor.read())))
+    if run.robot is not None:
+        add("odometry_locator", lambda: locate(run, run.ranges, run.robot))
+    if smoothed and "raw_locator" in tracks:
+        config = EstimatorConfig(run.anchors, NoiseModel(), run.height, heights=run.heights)
+        add("smoothed", lambda: smooth(config, run.ranges, tracks["raw_locator"][0]))
+    rows = {
+        row: errors | {"us_per_range": took_us}
+        for row, (track, took_us) in tracks.items()
+        if (errors := scores(track, truth)) is not None
+    }
+    result: dict[str, Any] = {
+        "name": run.set_name,
+        "run": run.name,
+        "simulated": run.simulated,
+        "epochs": rows.get("raw_locator", {}).get("epochs", 0),
+        "availability": _availability(run.ranges, truth, tracks["raw_locator"][0]),
+        "rows": rows,
+        "failed": failed,
+    }
+    result |= _ratio(tracks, truth)
+    if run.robot is not None:
+        result["odometry_faults"] = _fault_ratios(run, truth)
+    return result
 
 
-def hanyang(folder: Path, model: NoiseModel | None = None) -> Errors:
-    """Return the errors of one run in the authors' window, with known height."""
-    model = model or NoiseModel()
-    anchors, ranges, _, truth = hanyang_run(folder)
-    live = TagEstimator(EstimatorConfig(anchors, model, height=HEIGHT)).run(ranges)
-    smoothed = smooth(EstimatorConfig(anchors, model, HEIGHT), ranges, live)
-    tracks = (live, smoothed, snapshot(anchors, ranges, HEIGHT))
-    return Errors(folder.name, *(at_truths(track, truth) for track in tracks))
+def locate(run: Run, ranges: Ranges, robot: RobotData | None = None) -> Track:
+    """Return the live track of the product.
 
-
-def _window(path: TruePath, kind_a: bool) -> TruePath:
-    x, y, _ = path.position.T
-    enters = (x > 49.3) & (y > -5.0) if kind_a else (x < 8.6) & (y < -7.0)
-    leaves = (x <= 12.0) & (y > 3.4) if kind_a else (x > 8.6) & (y < -7.0)
-    first = int(np.flatnonzero(enters)[0])
-    last = first + int(np.flatnonzero(leaves[first:])[0])
-    return TruePath(path.stamp_ns[first:last], path.position[first:last])
-
-
-def at_truths(track: Track, truth: TruePath) -> TrackErrors:
-    """Compare each true position with the latest estimate at its time."""
-    latest = np.searchsorted(track.stamp_ns, truth.stamp_ns, side="right") - 1
-    some = latest >= 0
-    return errors_of(track.position[latest[some]], track.covariance[latest[some]], truth.position[some])
-
-
-@dataclass(frozen=True, slots=True)
-class StaticErrors:
-    """Errors of stationary tags with ranges to three or more anchors.
-
-    Contains the number of tags, the mean horizontal error with raw and with corrected ranges in m, and the mean NEES
-    per degree of freedom with corrected ranges.
+    Raises:
+        DatasetError: no position was determined.
     """
+    config = EstimatorConfig(run.anchors, NoiseModel(), run.height, heights=run.heights, robot=robot)
+    track = make_estimator(config).run(ranges)
+    if len(track) < 2:
+        raise DatasetError("no position was determined")
+    return track
 
-    tags: int
-    raw_m: float
-    corrected_m: float
-    nees_per_dof: float
 
+def calibrated(run: Run, donor: Run) -> Ranges:
+    """Return the ranges of a run with the calibration from another one, which is made without ground truth.
 
-def apartment(folder: Path) -> StaticErrors:
-    """Locate each tag of the EVK1000 logs with a line in received power that was fitted to the *other* tags.
-
-    The area is the bounding box of all anchors plus half a metre, which resolves mirror images.
+    Raises:
+        DatasetError: the calibration was refused.
     """
-    with DecaRangingFolder(folder) as source:
-        records = [
-            record for record in source if record.truth is not None and record.tag_position is not None
-        ]
-        anchors = source.anchors
-    tag = np.array([record.measurement.tag_id for record in records])
-    row = np.array([anchors.index[record.measurement.anchor_id] for record in records])
-    configuration = np.array([record.truth.configuration for record in records if record.truth is not None])
-    range_m = np.array([record.measurement.range_m for record in records])
-    error = range_m - np.array([record.truth.range_m for record in records if record.truth is not None])
-    power = np.array([record.measurement.cir.rx_power_dbm for record in records], np.float32)
-    first = np.array([record.measurement.cir.first_path_power_dbm for record in records], np.float32)
-    low, high = anchors.position.min(axis=0) - 0.5, anchors.position.max(axis=0) + 0.5
-    area = Area((low[0], low[1], -1.0), (high[0], high[1], 1.0))
-    raw: list[float] = []
-    corrected: list[float] = []
-    nees: list[float] = []
-    for tag_id in np.unique(tag):
-        is_tag, model = tag == tag_id, NoiseModel()
-        used = np.unique(row[is_tag])
-        if len(used) < 3:
-            continue
-        linear_bias = fit_linear_bias(configuration[~is_tag], power[~is_tag], first[~is_tag], error[~is_tag])
-        corrected_range_m = range_m - linear_bias.predict_m(power, first)
-        residual = [
-            np.nanmean((corrected_range_m - range_m + error)[~is_tag & (configuration == c)])
-            for c in np.unique(configuration[~is_tag])
-        ]
-        # The line fit minimises the mean absolute error; 1.25 times it is the standard deviation of a normal error.
-        sd = 1.2533 * float(np.nanmean(np.abs(residual)))
-        true_position = np.array(
-            next(r.tag_position for r, is_own in zip(records, is_tag, strict=True) if is_own)
-        )
-        for values, range_sd_m, errors in (
-            (range_m, model.range_sd, raw),
-            (corrected_range_m, sd, corrected),
-        ):
-            means = np.array([np.nanmedian(values[is_tag & (row == a)]) for a in used])
-            inputs = anchors.position[used], means, np.full(len(used), range_sd_m), model
-            inside = candidate_positions(*inputs, height=Height(0.0), area=area)
-            estimate = (inside or candidate_positions(*inputs, height=Height(0.0)))[0]
-            difference = estimate.position[:2] - true_position[:2]
-            errors.append(float(np.hypot(*difference)))
-        nees.append(float(difference @ np.linalg.solve(estimate.covariance[:2, :2], difference)) / 2.0)
-    return StaticErrors(len(raw), float(np.mean(raw)), float(np.mean(corrected)), float(np.mean(nees)))
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import default_model_path
+    from uwb_mitigation.training.site.calibration import calibrate_site
+    from uwb_mitigation.training.site.data import read_site
+    from uwb_mitigation.training.site.solution import solve_without_truth
+
+    universal = load_bundle(default_model_path())
+    heights = None if donor.heights is None else [donor.heights]
+    site = read_site([donor.read_records()], donor.anchors, universal.card, heights=heights)
+    solution = solve_without_truth(site, universal, height=donor.height, area=None)
+    calibration = calibrate_site(site, universal, solution, seed=0)
+    if calibration.lacks_gain:
+        raise DatasetError(f"refused: {calibration.summary()}")
+    with tempfile.TemporaryDirectory() as folder:
+        bundle, _ = calibration.write(Path(folder) / "site.onnx", universal, "drive")
+        return run.corrected(bundle, calibration.offsets)
 
 
-@dataclass(frozen=True, slots=True)
-class FlatErrors:
-    """Errors of a drive through the simulated flat.
+def scores(track: Track, truth: TruePath) -> dict[str, Any] | None:
+    """Return the errors of a track at its own times; None: it has no estimate with a true position."""
+    errors = track_errors(track, truth)
+    if not errors.epochs:
+        return None
+    values = errors.as_json()
+    values["rmse_m"] = values.pop("horizontal_rmse_m")
+    values["rmse_3d_m"] = math.hypot(errors.rmse, errors.height_rmse)
+    return {key: values[key] for key in (*SCORES, "epochs", "rmse_3d_m", "heading_rmse_deg")}
 
-    Compares raw ranges, ranges corrected by a line in received power, and by the universal model, which was not
-    trained in this flat and does not remove the offset of the radios.
+
+def _after_warm_up(run: Run) -> TruePath:
+    begin_ns = int(run.ranges.stamp_ns[0]) + round(WARM_UP_S * NS_PER_S)
+    return run.truth.take(run.truth.stamp_ns >= begin_ns)
+
+
+def _availability(ranges: Ranges, truth: TruePath, track: Track) -> float:
+    due = np.isfinite(truth.at(ranges.stamp_ns)[:, 0])
+    return float(np.isin(ranges.stamp_ns[due], track.stamp_ns).mean()) if due.any() else math.nan
+
+
+def _ratio(tracks: dict[str, tuple[Track, float]], truth: TruePath) -> dict[str, Any]:
+    """Compare with the baselines at the times of all of them; least squares has positions at some of the ranges only."""
+    compared = {row: tracks[row][0] for row in ("raw_ekf", "raw_ekf_offset", "raw_locator")}
+    stamps = compared["raw_locator"].stamp_ns
+    for track in compared.values():
+        stamps = np.intersect1d(stamps, track.stamp_ns)
+    errors = {
+        row: scores(track.take(np.isin(track.stamp_ns, stamps)), truth) for row, track in compared.items()
+    }
+    errors["raw_least_squares"] = scores(tracks["raw_least_squares"][0], truth)
+    known = {row: error for row, error in errors.items() if error is not None}
+    if "raw_locator" not in known or len(known) < 2:
+        return {"best_baseline": None, "ratio_to_best_baseline": None}
+    locator = known.pop("raw_locator")
+    best = min(known, key=lambda row: float(known[row]["rmse_m"]))
+    best_3d = min(error["rmse_3d_m"] for error in known.values())
+    return {
+        "best_baseline": best,
+        "ratio_to_best_baseline": locator["rmse_m"] / known[best]["rmse_m"],
+        "ratio_3d_to_best_baseline": locator["rmse_3d_m"] / best_3d,
+    }
+
+
+def _twists(odometry: Odometry, change: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Odometry:
+    """Return odometry without poses and with changed twists (n, 3)."""
+    return replace(odometry, pose=np.full_like(odometry.pose, np.nan), twist=change(odometry.twist))
+
+
+def _in_world_axes(twist: NDArray[np.float64], stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    yaw = np.cumsum(twist[:, 2] * np.diff(stamp_ns / NS_PER_S, prepend=stamp_ns[0] / NS_PER_S))
+    x, y, rate = twist.T
+    rotated: NDArray[np.float64] = np.stack(
+        [np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, rate], axis=1
+    )
+    return rotated
+
+
+def _with_turn(twist: NDArray[np.float64], stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    turned: NDArray[np.float64] = twist.copy()
+    middle = len(turned) // 2
+    turned[middle, 2] += math.pi / 2.0 / ((stamp_ns[middle] - stamp_ns[middle - 1]) / NS_PER_S)
+    return turned
+
+
+def odometry_faults(odometry: Odometry) -> dict[str, Odometry]:
+    """Return wrong odometry, {fault: messages}."""
+    stamps = odometry.stamp_ns
+    return {
+        "world axes": _twists(odometry, lambda twist: _in_world_axes(twist, stamps)),
+        "sign of yaw rate": _twists(odometry, lambda twist: twist * (1.0, 1.0, -1.0)),
+        "scale 0.5": _twists(odometry, lambda twist: twist * (0.5, 0.5, 1.0)),
+        "jump of 90 degrees": _twists(odometry, lambda twist: _with_turn(twist, stamps)),
+        "stuck at zero": _twists(odometry, lambda twist: twist * 0.0),
+        "late by 1 s": replace(odometry, stamp_ns=stamps + NS_PER_S),
+    }
+
+
+def _fault_ratios(run: Run, truth: TruePath) -> dict[str, float]:
+    """Return the RMSE with wrong odometry, relative to ranges only."""
+    assert run.robot is not None
+    assert run.robot.odometry is not None
+    ranges_only = scores(locate(run, run.ranges), truth)
+    ratios = {}
+    for fault, odometry in odometry_faults(run.robot.odometry).items():
+        faulty = scores(locate(run, run.ranges, replace(run.robot, odometry=odometry)), truth)
+        if ranges_only and faulty:
+            ratios[fault] = faulty["rmse_m"] / ranges_only["rmse_m"]
+    return ratios
+
+
+def ambiguous_drives() -> list[dict[str, Any]]:
+    """Return the protection levels with two anchors, on both sides of them, and while crossing the line of three (simulated)."""
+    line = [(0.0, 0.0, 1.5), (5.0, 0.0, 1.5), (10.0, 0.0, 1.5)]
+    results = []
+    for name, places, crosses in (
+        ("two anchors", line[::2], False),
+        ("two anchors, crossing their line", line[::2], True),
+        ("three collinear anchors", line, False),
+        ("three collinear anchors, crossing their line", line, True),
+    ):
+        anchors = AnchorMap([Anchor(n, place, 0.02) for n, place in enumerate(places, 1)])
+        for seed in range(3):
+            track, truth, count = _ambiguous_drive(anchors, crosses, seed)
+            errors = track_errors(track, truth)
+            exceeded = errors.exceeded if errors.epochs else 0.0
+            results.append(
+                {
+                    "name": name,
+                    "seed": seed,
+                    "protection_exceeded": exceeded,
+                    "availability": len(track) / count,
+                }
+            )
+    return results
+
+
+def _ambiguous_drive(anchors: AnchorMap, crosses: bool, seed: int) -> tuple[Track, TruePath, int]:
+    from uwb_mitigation.positioning.geometry import Area, Height
+
+    rng, n = np.random.default_rng(seed), 2400
+    time_s, row = np.arange(n) / 40.0, np.arange(n) % len(anchors)
+    y = 0.5 + 2.5 * np.cos(0.2 * time_s) if crosses else 2.5 + np.cos(0.2 * time_s)
+    position = np.stack([5.0 + 3.0 * np.sin(0.17 * time_s), y, np.ones(n)], axis=1)
+    distance = np.linalg.norm(position - anchors.position[row], axis=1)
+    stamps = np.rint(time_s * 1e9).astype(np.int64)
+    unknown = np.full(n, np.nan)
+    ranges = Ranges(stamps, row, distance + rng.normal(0.05, 0.05, n), unknown, unknown)
+    area = Area((-1.0, -8.0 if crosses else -0.5, 0.0), (11.0, 8.0, 2.0))
+    config = EstimatorConfig(anchors, NoiseModel(), Height(1.0, 0.05), area)
+    return make_estimator(config).run(ranges), TruePath(stamps, position), n
+
+
+def measure(
+    data: Path | None, *, calibrate: bool, simulated: bool, advance: Callable[[str, float], None]
+) -> dict[str, Any]:
+    """Return the result of `python -m benchmarks positions`.
+
+    Args:
+        data: folder with one folder for each data set; None: simulated drives only.
+        calibrate: also calibrate on another run; this takes most of the time.
+        simulated: also evaluate simulated drives.
+        advance: called with the last run and the finished share.
     """
-
-    anchors: int
-    raw: Errors
-    corrected: Errors
-    universal: Errors
-
-
-def flat(anchor_count: int, seed: int = 1, ranges: int = 3000) -> FlatErrors:
-    """Drive past 4 to 8 anchors; the line is fitted to a survey of 150 other placements in the same flat."""
-    linear_bias, variance = _flat_line()
-    drive = SimulatedSource.with_anchors(anchor_count, seed=seed, count=ranges, rate_hz=40.0)
-    records = list(drive)
-    raw, truth = columns(drive, drive.anchors)
-    first = np.array([record.measurement.cir.first_path_power_dbm for record in records], np.float32)
-    predicted = linear_bias.predict_m(raw.rx_power_dbm.astype(np.float32), first)
-    corrections = Mitigation(load_bundle(default_model_path())).correct(
-        [record.measurement for record in records]
-    )
-    by_line = raw.range_m - predicted, np.full(len(raw), variance)
-    by_network = (
-        np.array([result.range_m for result in corrections]),
-        np.array([result.variance_m2 for result in corrections]),
-    )
-    lines, networks = (
-        replace(raw, range_m=np.maximum(range_m, 0.0), variance_m2=variance_m2)
-        for range_m, variance_m2 in (by_line, by_network)
-    )
-    found = [
-        _flat_errors(name, drive.anchors, some, truth)
-        for name, some in (("raw", raw), ("line", lines), ("universal", networks))
-    ]
-    return FlatErrors(anchor_count, *found)
+    sources, skipped = ([], []) if data is None else real_runs(data)
+    sources += simulated_runs() if simulated else []
+    results: dict[int, dict[str, Any]] = {}
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        futures = {
+            pool.submit(evaluate, source, calibrate=calibrate): number
+            for number, source in enumerate(sources)
+        }
+        for done, future in enumerate(as_completed(futures), 1):
+            number = futures[future]
+            name = f"{sources[number].set_name} {sources[number].name}"
+            try:
+                results[number] = future.result()
+            except Exception as error:  # The other runs continue.
+                skipped.append({"path": name, "reason": f"{type(error).__name__}: {error}"})
+            advance(name, done / len(sources))
+    sets = [results[number] for number in sorted(results)]
+    ambiguous = ambiguous_drives() if simulated else []
+    return {"sets": sets, "ambiguous": ambiguous, "summary": summarize(sets, ambiguous), "skipped": skipped}
 
 
-def _flat_errors(name: str, anchors: AnchorMap, ranges: Ranges, truth: TruePath) -> Errors:
-    model, height = NoiseModel(), Height(0.0, 0.05)
-    live = TagEstimator(EstimatorConfig(anchors, model, height=height)).run(ranges)
-    smoothed = smooth(EstimatorConfig(anchors, model, height), ranges, live)
-    tracks = (live, smoothed, snapshot(anchors, ranges, height))
-    return Errors(name, *(track_errors(track, truth) for track in tracks))
+def summarize(sets: Sequence[dict[str, Any]], ambiguous: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures that summarise all runs, and those of each set."""
+    names = list(dict.fromkeys(entry["name"] for entry in sets))
+    by_set = {name: _summary_of([entry for entry in sets if entry["name"] == name]) for name in names}
+    exceeded = [entry["protection_exceeded"] for entry in ambiguous]
+    return {
+        **_summary_of(sets),
+        "ambiguous_protection_exceeded": max(exceeded) if exceeded else None,
+        "by_set": by_set,
+    }
 
 
-def _flat_line() -> tuple[LinearBiasModel, float]:
-    """Return the line and the variance of its residuals, from the mean absolute error, which the fit minimises."""
-    survey = list(SimulatedSurvey(seed=11, configurations=150, exchanges=6))
-    truths = [record.truth for record in survey if record.truth is not None]
-    error: NDArray[np.float64] = np.array([record.measurement.range_m for record in survey]) - [
-        truth.range_m for truth in truths
-    ]
-    power = np.array([record.measurement.cir.rx_power_dbm for record in survey], np.float32)
-    first = np.array([record.measurement.cir.first_path_power_dbm for record in survey], np.float32)
-    linear_bias = fit_linear_bias(np.array([truth.configuration for truth in truths]), power, first, error)
-    residual = np.abs(error - linear_bias.predict_m(power, first))
-    return linear_bias, (1.2533 * float(residual.mean())) ** 2
+def _summary_of(sets: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def values(read: Callable[[dict[str, Any]], Any]) -> list[float]:
+        found = []
+        for entry in sets:
+            try:
+                value = read(entry)
+            except KeyError:
+                continue
+            found += [] if value is None else [float(value)]
+        return found or [math.nan]
+
+    def row(entry: dict[str, Any], name: str, score: str = "rmse_m") -> float:
+        return float(entry["rows"][name][score])
+
+    ratio = values(lambda entry: entry["ratio_to_best_baseline"])
+    coverage = values(lambda entry: row(entry, "raw_locator", "coverage95"))
+    nees = values(lambda entry: row(entry, "raw_locator", "nees_per_dof"))
+    by_calibration = values(lambda entry: row(entry, "calibrated_locator") / row(entry, "raw_locator"))
+    by_correction = values(lambda entry: row(entry, "corrected_locator") / row(entry, "raw_locator"))
+    by_odometry = values(lambda entry: row(entry, "odometry_locator") / row(entry, "raw_locator"))
+    faults = values(lambda entry: max(entry["odometry_faults"].values()))
+    summary = {
+        "runs": len(sets),
+        "ratio_mean": float(np.mean(ratio)),
+        "ratio_max": max(ratio),
+        "coverage95_min": min(coverage),
+        "coverage95_max": max(coverage),
+        "nees_per_dof_min": min(nees),
+        "nees_per_dof_max": max(nees),
+        "corrected_to_raw_mean": float(np.mean(by_correction)),
+        "calibrated_to_raw_mean": float(np.mean(by_calibration)),
+        "calibrated_to_raw_max": max(by_calibration),
+        "odometry_to_raw_mean": float(np.mean(by_odometry)),
+        "odometry_fault_ratio_max": max(faults),
+    }
+    return {key: value if math.isfinite(value) else None for key, value in summary.items()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +12,8 @@ import pytest
 from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, Robot, drive, wrapped
 
+from benchmarks.position_data import real_runs
+from benchmarks.positions import evaluate
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
@@ -391,12 +392,12 @@ def test_real_robot_reaches_the_documented_errors():
     folder = root / "chemnitz_labyrinth"
     if not folder.is_dir():
         pytest.skip(f"the Labyrinth data set is not at {folder}: set UWB_MITIGATION_DATA to run this test")
-    experiment = runpy.run_path(str(REPOSITORY / "docs" / "experiments" / "odometry_real_run.py"))
-    _, without = experiment["evaluate"](folder, with_odometry=False)
-    _, errors = experiment["evaluate"](folder, with_odometry=True)
-    assert errors.rmse <= 0.085 < without.rmse
-    assert errors.coverage95 >= 0.85
-    assert errors.heading_rmse_deg <= 15.0
+    runs, _ = real_runs(root)
+    entry = evaluate(next(run for run in runs if run.set_name == "labyrinth"), calibrate=False)
+    row = entry["rows"]["odometry_locator"]
+    assert row["rmse_m"] <= 0.07
+    assert row["coverage95"] >= 0.89
+    assert row["heading_rmse_deg"] <= 14.0
 
 
 def test_twist_is_unknown_after_a_gap_of_the_odometry():

@@ -22,13 +22,11 @@ import math
 import resource
 import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from sites import draw_site
 
+from benchmarks.sites import RATE_HZ, Drive
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
@@ -36,10 +34,6 @@ from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.track_errors import track_errors
-from uwb_mitigation.simulation.buildings import RADIO
-from uwb_mitigation.simulation.odometry import SimulatedMotion
-from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE
-from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.training import train
 from uwb_mitigation.training.data.dataset import build_dataset
 from uwb_mitigation.training.site import calibration as site_calibration
@@ -50,49 +44,7 @@ from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.tracks import PosePath, Ranges, TruePath
 
-UNSEEN = 7_000_000
-"""Added to the seed of a building: the seeds of the universal model begin at 0 and at 1 000 003."""
-
-RATE_HZ = 40.0
 TIME_OFFSET_S, LEVER_M = 0.3, (0.4, 0.0, 0.0)
-
-
-class Drive:
-    """A drive at a simulated site; a `Source` whose pairs have offsets.
-
-    Args:
-        flat: use the flat of the simulator instead of a random building.
-    """
-
-    simulated = True
-
-    def __init__(self, seed: int, drive: int, anchors: int, seconds: float, flat: bool = False) -> None:
-        rng = np.random.default_rng(UNSEEN + seed)
-        self.offset_m = 0.2 + rng.normal(0.0, 0.12, anchors)
-        if flat:
-            plan, places = FLAT, (ANCHORS + MORE_ANCHORS)[:anchors]
-            route = ROUTE[drive * 5 :] + ROUTE[: drive * 5]
-        else:
-            site = draw_site(anchors, rng)
-            plan, places = site.plan, site.anchors
-            route = site.route(np.random.default_rng([UNSEEN + seed, drive]))
-        self._inner = SimulatedSource(
-            seed=seed * 1000 + drive, count=round(seconds * RATE_HZ), rate_hz=RATE_HZ,
-            anchors=places, plan=plan, radio=RADIO, route=route,
-        )  # fmt: skip
-        self.plan = plan
-        self.anchors: AnchorMap = self._inner.anchors
-        self.name = self._inner.name
-
-    def motion(self) -> SimulatedMotion:
-        """Return the motion of the robot that carries the tag, with its odometry."""
-        return self._inner.motion()
-
-    def __iter__(self) -> Iterator[Record]:
-        for record in self._inner:
-            measured = record.measurement
-            off = float(self.offset_m[measured.anchor_id - 1])
-            yield replace(record, measurement=replace(measured, range_m=measured.range_m + off))
 
 
 def error_of(records: list[Record], bundle: Bundle | None, offsets: Offsets) -> float:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.positions import TIME_OFFSET_S, at_truths, hanyang_run
+from benchmarks.position_data import HANYANG_TIME_OFFSET_S, hanyang_run
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
@@ -67,7 +67,8 @@ def hanyang(folder: Path, name: str) -> None:
     show(found)
     for other in sorted(path for path in folder.iterdir() if path.is_dir() and path.name != name):
         test = open_mapped(other, "hanyang")
-        anchors, ranges, _, truth = hanyang_run(other)
+        drive = hanyang_run(other)
+        anchors, ranges, truth = drive.anchors, drive.ranges, drive.truth
         ids = np.array([anchor.id for anchor in anchors.anchors], np.uint64)
         off = found.offsets.of(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
         first = np.array([record.measurement.cir.first_path_power_dbm for record in test])
@@ -79,7 +80,7 @@ def hanyang(folder: Path, name: str) -> None:
             smoothed = (
                 Smoother(EstimatorConfig(anchors, NoiseModel(), height=HEIGHT), shifted).fit(live).track
             )
-            one, two = (at_truths(track, truth) for track in (live, smoothed))
+            one, two = (track_errors(track, truth) for track in (live, smoothed))
             print(
                 f"{other.name} {kind}: live {one.rmse:.3f} m, in ellipse {one.coverage95:.1%}; "
                 f"smoothed {two.rmse:.3f} m, {two.coverage95:.1%}",
@@ -124,7 +125,7 @@ def _against_truth(
 ) -> tuple[float, float, np.ndarray]:
     """Return MAE of ranges, RMSE of the live track, and median error per anchor, m, without the time offset."""
     measured = [record.measurement for record in records]
-    stamp = np.array([one.stamp_ns for one in measured], np.int64) - round(TIME_OFFSET_S * 1e9)
+    stamp = np.array([one.stamp_ns for one in measured], np.int64) - round(HANYANG_TIME_OFFSET_S * 1e9)
     row = np.array([run.anchors.index[one.anchor_id] for one in measured])
     value, variance = np.array([one.range_m for one in measured]), np.full(len(measured), np.nan)
     if bundle is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.positions import HEIGHT, hanyang_run
+from benchmarks.position_data import HEIGHTS, hanyang_run
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.survey import displacements, survey
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
@@ -18,7 +18,8 @@ OFF_M = 1.5
 
 again = int(sys.argv[2]) if len(sys.argv) > 2 else 2
 for folder in sorted(Path(sys.argv[1]).glob("*_*")):
-    anchors, ranges, _, _ = hanyang_run(folder)
+    run = hanyang_run(folder)
+    anchors, ranges = run.anchors, run.ranges
     for seed in range(again):
         away = np.zeros((len(anchors), 3))
         away[:, :2] = np.random.default_rng(seed).normal(0.0, 1.0, (len(anchors), 2))
@@ -26,7 +27,7 @@ for folder in sorted(Path(sys.argv[1]).glob("*_*")):
         guesses = anchors.moved(anchors.position + away, anchors.sd)
         before = np.sqrt((displacements(guesses.position, anchors.position)[:, :2] ** 2).sum(axis=1).mean())
         try:
-            found = survey(EstimatorConfig(guesses, height=HEIGHT), ranges, off_m=OFF_M)
+            found = survey(EstimatorConfig(guesses, height=HEIGHTS["hanyang"]), ranges, off_m=OFF_M)
         except DatasetError as error:
             print(f"{folder.name:8} guess {seed}: {error}", flush=True)
             continue

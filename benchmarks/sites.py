@@ -1,12 +1,14 @@
-"""Random sites: buildings small enough that every anchor receives a tag almost everywhere, and drives through their doorways.
+"""Random simulated sites, and drives through them.
 
-Sizes, clearances and positions of anchors are assumed; everything else is as in the simulated buildings.
+The buildings are small enough that every anchor receives a tag almost everywhere. Sizes, clearances and positions of anchors
+are assumed; everything else is as in the simulated buildings.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,12 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
+from uwb_mitigation.simulation.odometry import SimulatedMotion
 from uwb_mitigation.simulation.radio import Boards
-from uwb_mitigation.simulation.scene import Building, Point
+from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import Record
 
 SITES = ("flat", "office")
 """Types of buildings, with equal probability."""
@@ -33,6 +39,11 @@ CLEARANCE_M = 0.3
 
 CELL_M = 0.15
 WAYPOINTS = 12
+
+UNSEEN = 7_000_000
+"""Added to the seed of a building: the seeds of the universal model begin at 0 and at 1 000 003."""
+
+RATE_HZ = 40.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,3 +157,41 @@ def _received_share(plan: Building, anchor: Point, cells: NDArray[np.float64]) -
     here = np.tile(anchor, (n, 1))
     level = mean_level_dbm(RESIDENTIAL, here, cells, plan.direct_path(here, cells), boards)
     return float((level >= RADIO.sensitivities_dbm(boards)).mean())
+
+
+class Drive:
+    """A drive at a simulated site; a `Source` whose pairs have offsets.
+
+    Args:
+        flat: use the flat of the simulator instead of a random building.
+    """
+
+    simulated = True
+
+    def __init__(self, seed: int, drive: int, anchors: int, seconds: float, flat: bool = False) -> None:
+        rng = np.random.default_rng(UNSEEN + seed)
+        self.offset_m = 0.2 + rng.normal(0.0, 0.12, anchors)
+        if flat:
+            plan, places = FLAT, (ANCHORS + MORE_ANCHORS)[:anchors]
+            route = ROUTE[drive * 5 :] + ROUTE[: drive * 5]
+        else:
+            site = draw_site(anchors, rng)
+            plan, places = site.plan, site.anchors
+            route = site.route(np.random.default_rng([UNSEEN + seed, drive]))
+        self._inner = SimulatedSource(
+            seed=seed * 1000 + drive, count=round(seconds * RATE_HZ), rate_hz=RATE_HZ,
+            anchors=places, plan=plan, radio=RADIO, route=route,
+        )  # fmt: skip
+        self.plan = plan
+        self.anchors: AnchorMap = self._inner.anchors
+        self.name = self._inner.name
+
+    def motion(self) -> SimulatedMotion:
+        """Return the motion of the robot that carries the tag, with its odometry."""
+        return self._inner.motion()
+
+    def __iter__(self) -> Iterator[Record]:
+        for record in self._inner:
+            measured = record.measurement
+            off = float(self.offset_m[measured.anchor_id - 1])
+            yield replace(record, measurement=replace(measured, range_m=measured.range_m + off))
