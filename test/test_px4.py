@@ -5,25 +5,19 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
-import shutil
 import signal
 import sys
-import sysconfig
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from builtin_interfaces.msg import Time
-from conftest import REPOSITORY
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, PoseWithCovarianceStamped
+from message_package import build
 from ros_harness import Ros
 from std_msgs.msg import Header
-
-import bootstrap
 
 pytestmark = pytest.mark.ros
 
@@ -63,17 +57,9 @@ rclpy.spin(node)
 
 
 @pytest.fixture(scope="module")
-def px4_msgs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the prefix of a message package with the name and the fields of px4_msgs."""
-    folder, prefix = tmp_path_factory.mktemp("px4"), tmp_path_factory.mktemp("prefix")
-    shutil.copytree(REPOSITORY / "cmake" / "tf2_msgs", folder / "px4_msgs")
-    (folder / "px4_msgs" / "msg" / "VehicleOdometry.msg").write_text(MESSAGE)
-    for name in ("CMakeLists.txt", "package.xml"):
-        file = folder / "px4_msgs" / name
-        text = file.read_text().replace("tf2_msgs", "px4_msgs").replace("TFMessage", "VehicleOdometry")
-        file.write_text(text)
-    bootstrap.build_messages([folder / "px4_msgs"], prefix)
-    return prefix
+def px4_msgs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Return the environment with a message package that has the name and the fields of px4_msgs."""
+    return build("px4_msgs", {"VehicleOdometry": MESSAGE}, tmp_path_factory.mktemp("px4"))
 
 
 def pose(seconds: float, x: float, variance: float = 0.04) -> PoseWithCovarianceStamped:
@@ -88,15 +74,10 @@ def pose(seconds: float, x: float, variance: float = 0.04) -> PoseWithCovariance
 
 @pytest.mark.slow
 def test_positions_are_sent_in_ned_without_orientation_and_velocity(
-    ros: Ros, px4_msgs: Path, monkeypatch: pytest.MonkeyPatch
+    ros: Ros, px4_msgs: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ):
-    packages = Path(sysconfig.get_path("platlib", vars={"platbase": str(px4_msgs), "base": str(px4_msgs)}))
-    for name, entry in (
-        ("AMENT_PREFIX_PATH", px4_msgs),
-        ("LD_LIBRARY_PATH", px4_msgs / "lib"),
-        ("PYTHONPATH", packages),
-    ):
-        monkeypatch.setenv(name, f"{entry}{os.pathsep}{os.environ.get(name, '')}".rstrip(os.pathsep))
+    for name, value in px4_msgs.items():
+        monkeypatch.setenv(name, value)
     node, receiver = ros.start("px4"), ros.run([sys.executable, "-c", RECEIVER])
     publisher = ros.node.create_publisher(PoseWithCovarianceStamped, "/uwb/pose", 10)
     ros.wait_for_subscribers("/uwb/pose", 1)

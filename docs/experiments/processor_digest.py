@@ -3,7 +3,7 @@
     python docs/experiments/processor_digest.py RECORDING...
 
 Run it on both processors with the same recordings and compare the lines. It needs only the packages in
-`requirements/runtime.txt`. Simulate a recording once and copy it, because the simulator uses functions (exp, log) that differ
+`requirements/lock.txt`. Simulate a recording once and copy it, because the simulator uses functions (exp, log) that differ
 between processors. An aarch64 system can be emulated: unpack the arm64 packages of Python with `dpkg -x`, add the wheels
 (`pip download --platform manylinux_2_28_aarch64 --only-binary=:all:`) and `qemu-aarch64-static`, and use `chroot`.
 """
