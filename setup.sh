@@ -29,7 +29,7 @@ for tool in cmake make gcc g++; do command -v $tool >/dev/null || missing+=($too
 [ ${#missing[@]} = 0 ] || fail "missing tools. Install them with: sudo apt-get install ${missing[*]}"
 
 # An environment does not work after its checkout was moved, and not with another Python.
-origin="$PWD $("$python" -c 'import sys; print(sys.executable, sys.version)') $site"
+origin="$PWD $("$python" -c 'import os, sys; print(os.path.realpath(sys._base_executable), sys.version)') $site"
 if [ "$(cat .venv/origin 2>/dev/null)" != "$origin" ]; then
   step environment
   rm -rf .venv
@@ -43,12 +43,12 @@ if [ "$(cat .venv/origin 2>/dev/null)" != "$origin" ]; then
   echo "$origin" > .venv/origin
 fi
 
-install() { .venv/bin/uv pip install --quiet --python .venv/bin/python "$@"; }
+quiet=--quiet
+if [ -t 2 ]; then quiet=; fi  # with progress bars
+install() { .venv/bin/uv pip install $quiet --python .venv/bin/python "$@"; }
 case $goal in run) ;; develop) parts+=(develop training) ;; docs) parts+=(docs) ;; *) fail "unknown goal $goal" ;; esac
 step packages
-# Progress bars are shown on a terminal only.
-.venv/bin/uv pip install --python .venv/bin/python --constraint $lock $(printf -- '-r requirements/%s.in ' "${parts[@]}") 2>&1 |
-  { grep -vE '^(Resolved|Prepared|Audited|Using)|^ [+~-] ' || true; }
+install --constraint $lock $(printf -- '-r requirements/%s.in ' "${parts[@]}")
 install --no-deps --no-build-isolation --editable .
 if [ "$goal" = develop ] && ! .venv/bin/python -c "import importlib.metadata as m, sys; sys.exit(not m.version('torch').startswith('$torch'))" 2>/dev/null; then
   step torch
