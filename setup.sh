@@ -79,10 +79,11 @@ if [ "$(cat .venv/messages 2>/dev/null)" != "$sources" ]; then
   echo "$sources" > .venv/messages
 fi
 
-# Compile now: with PYTHONDONTWRITEBYTECODE, nodes take twice as long to start.
+# Compile what nodes and commands import: with PYTHONDONTWRITEBYTECODE, nodes take twice as long to start.
 installed=$(.venv/bin/uv pip freeze --quiet --python .venv/bin/python | sha256sum)
 if [ "$(cat .venv/compiled 2>/dev/null)" != "$installed" ]; then
   step bytecode
-  .venv/bin/python -m compileall -q -j 0 .venv/lib uwb_mitigation >/dev/null || true  # templates do not compile
+  .venv/bin/python -m compileall -q -j 0 -x '/(torch|sympy|networkx|sklearn|matplotlib|pyarrow|dask|distributed|selenium)/' .venv/lib uwb_mitigation \
+    >/dev/null || true  # templates do not compile
   echo "$installed" > .venv/compiled
 fi
