@@ -16,6 +16,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
+    CorrectedColumns,
     CorrectedRange,
     Encoding,
     RadioType,
@@ -94,6 +95,62 @@ def test_messages_equal_rosbags(
         (codec.decode_corrected(ours[2]), (key, correction)),
     ):
         assert repr(decoded) == repr(expected)
+
+
+@given(measurements, st.data())
+def test_batch_equals_single_messages_or_is_refused(
+    measurement: RangeMeasurement, data: st.DataObject
+) -> None:
+    count = len(measurement.cir.samples)
+    samples = st.lists(st.integers(-9, 9), min_size=count, max_size=count).map(
+        lambda x: np.array(x, np.int16)
+    )
+    messages = []
+    for _ in range(3):
+        cir = replace(measurement.cir, samples=data.draw(samples), rx_power_dbm=data.draw(float32))
+        numbers = {"tag_id": data.draw(uint64), "range_m": data.draw(float32), "sequence": data.draw(uint16)}
+        messages.append(codec.encode_range(replace(measurement, cir=cir, **numbers)))
+    if is_changed := data.draw(st.booleans()):
+        changed = bytearray(messages[2])
+        changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(st.integers(0, 255))
+        messages[2] = bytes(changed)
+    try:
+        batch = codec.RangeBatch(messages)
+    except RecordingError:
+        # A frame_id that is not ASCII is decoded singly.
+        assert is_changed or not (measurement.frame_id.isascii() and measurement.frame_id)
+        return
+    fields = ("range_m", "correction_m", "variance_m2")
+    columns = {
+        name: np.array(data.draw(st.lists(float32, min_size=3, max_size=3)), np.float32) for name in fields
+    }
+    status = np.array([0, 3, 4], np.uint8)
+    corrected = CorrectedColumns(*columns.values(), status, CorrectedBy.DEVICE, 77)
+    encoded = batch.encode_corrected(corrected)
+    for row, message in enumerate(messages):
+        decoded, ranges = codec.decode_range(message), batch.columns
+        assert (decoded.cir.encoding, decoded.cir.radio) == (ranges.encoding, ranges.radio)
+        assert np.array_equal(decoded.cir.samples, ranges.samples[row])
+        names = ("start_index", "first_path_index", "scale", "preamble_count")
+        expected = [
+            *(getattr(decoded.cir, name) for name in (*names, "rx_power_dbm", "first_path_power_dbm"))
+        ]
+        assert repr(expected) == repr(
+            [
+                column[row].item()
+                for column in (
+                    *(getattr(ranges, name) for name in names),
+                    ranges.rx_power_dbm,
+                    ranges.first_path_power_dbm,
+                )
+            ]
+        )
+        values = (float(column[row]) for column in columns.values())
+        range_m, correction_m, variance_m2 = values
+        single = CorrectedRange(
+            range_m, decoded.range_m, correction_m, variance_m2, Status(status[row]), CorrectedBy.DEVICE, 77
+        )
+        assert encoded[row] == codec.encode_corrected(decoded, single)
 
 
 @given(measurements, st.integers(0, 3))

@@ -122,12 +122,20 @@ class Preprocessing:
             else:
                 start = width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
                 window = samples[start : start + size] if start >= 0 else samples[:0]
-                fault = CirFault.OUTSIDE if len(window) < size else _content_fault(window, total, is_complex)
+                fault = CirFault.OUTSIDE if len(window) < size else 0
             faults.append(fault)
             if not fault:
                 windows.append(window)
                 scales.append(scale)
                 symbols.append(PREAMBLE_DIVISOR * count)
+        if windows and not _are_usable(np.array(windows), total, is_complex):
+            usable = [row for row, fault in enumerate(faults) if not fault]
+            for row, window in zip(usable, windows, strict=True):
+                faults[row] = _content_fault(window, total, is_complex)
+            rows = [number for number, row in enumerate(usable) if not faults[row]]
+            windows, scales, symbols = (
+                [values[row] for row in rows] for values in (windows, scales, symbols)
+            )
         if not windows:
             return np.array(faults, np.uint8), np.empty((0, self.samples), np.float32)
 
@@ -156,6 +164,13 @@ class Preprocessing:
             faults[indices] = found
             inputs[np.array(indices)[found == 0]] = windows
         return faults.tolist(), inputs
+
+
+def _are_usable(windows: NDArray[np.int16], total: int, is_complex: bool) -> bool:
+    """Return whether no window has a `_content_fault`; checks all windows at once."""
+    lowest, highest = int(np.minimum.reduce(windows, axis=None)), int(np.maximum.reduce(windows, axis=None))
+    in_range = lowest > -SATURATED and highest < SATURATED and (total % 2 == 0 if is_complex else lowest >= 0)
+    return in_range and bool(np.logical_or.reduce(windows, axis=1).all())
 
 
 def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:

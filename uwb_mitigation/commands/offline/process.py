@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from uwb_mitigation.errors import (
     DamagedRecordingError,
     RecordingError,
@@ -23,10 +25,10 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.recordings.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.recordings.bag.writer import METADATA_RECORD, BagWriter
-from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment, Status
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.ros import schemas
-from uwb_mitigation.types.ros.codec import decode_range, encode_corrected
+from uwb_mitigation.types.ros.codec import RangeBatch, decode_range, encode_corrected
 from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 
 BATCH = 256
@@ -178,42 +180,63 @@ class _Corrector:
         self.replaced = 0
 
     def write(self, batch: list[RawMessage]) -> None:
+        """Write the messages of a batch, and after each raw range its corrected range."""
+        channels, out = self._channels, self._out
         raw = [message for message in batch if message.channel.topic == RANGE_RAW]
-        for message in raw:
-            if id(message.channel) not in self._channels:
-                check_channel(message.channel, RANGE_CIR_TYPE, self._source)
-                self._channels[id(message.channel)] = self._out.copy_channel(message.channel)
+        for channel in {id(message.channel): message.channel for message in raw}.values():
+            if id(channel) not in channels:
+                check_channel(channel, RANGE_CIR_TYPE, self._source)
+                channels[id(channel)] = out.copy_channel(channel)
         corrected = iter(self._correct([message.data for message in raw]))
-        out = self._out
-        for message in batch:
-            channel, sequence, log_ns, publish_ns, data = message
+        for channel, sequence, log_ns, publish_ns, data in batch:
             if channel.topic == RANGE_CORRECTED:
                 self.replaced += 1
                 continue
-            number = self._channels.get(id(channel))
-            if number is None:
-                number = self._channels[id(channel)] = out.copy_channel(channel)
-            out.write_serialized(number, data, log_ns, publish_ns, sequence)
-            if channel.topic == RANGE_RAW:
-                message_data = next(corrected)
-                if message_data is not None:
-                    out.write_serialized(self._corrected, message_data, log_ns, publish_ns, sequence)
+            if id(channel) not in channels:
+                channels[id(channel)] = out.copy_channel(channel)
+            out.write_serialized(channels[id(channel)], data, log_ns, publish_ns, sequence)
+            if channel.topic == RANGE_RAW and (message := next(corrected)) is not None:
+                out.write_serialized(self._corrected, message, log_ns, publish_ns, sequence)
 
     def _correct(self, messages: list[bytes]) -> list[bytes | None]:
         """Return `RangeCorrected` for each message; None if it does not decode."""
         encoded: list[bytes | None] = [None] * len(messages)
-        decoded: dict[int, RangeMeasurement] = {}
-        for number, message in enumerate(messages):
+        groups: dict[tuple[int, bytes], list[int]] = {}
+        for index, message in enumerate(messages):
+            groups.setdefault(RangeBatch.key(message), []).append(index)
+        for indices in groups.values():
             try:
-                decoded[number] = decode_range(message)
+                batch = RangeBatch([messages[index] for index in indices])
+            except RecordingError:
+                self._correct_singly(messages, indices, encoded)
+                continue
+            ranges = batch.columns
+            corrected = self._mitigation.correct_columns(ranges)
+            for status, count in zip(*np.unique(corrected.status, return_counts=True), strict=True):
+                self.statuses[Status(status).name] += int(count)
+            self._count_mismatches(ranges.radio, ranges.segment, ranges.samples.shape[1] > 0, len(ranges))
+            for index, message in zip(indices, batch.encode_corrected(corrected), strict=True):
+                encoded[index] = message
+        return encoded
+
+    def _correct_singly(self, messages: list[bytes], indices: list[int], encoded: list[bytes | None]) -> None:
+        """Correct messages of different forms, and count those that do not decode."""
+        decoded: dict[int, RangeMeasurement] = {}
+        for index in indices:
+            try:
+                decoded[index] = decode_range(messages[index])
             except RecordingError as error:  # noqa: PERF203
                 self.skipped[error.what] += 1
-        card = self._mitigation.bundle.card
         corrected = self._mitigation.correct([*decoded.values()])
-        for (number, measurement), result in zip(decoded.items(), corrected, strict=True):
-            encoded[number] = encode_corrected(measurement, result)
+        for (index, measurement), result in zip(decoded.items(), corrected, strict=True):
+            encoded[index] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
             cir = measurement.cir
-            if not card.fits(cir.radio, cir.segment, len(cir) > 0):
-                self.mismatches[card.mismatch(cir.source)] += 1
-        return encoded
+            self._count_mismatches(cir.radio, cir.segment, len(cir) > 0, 1)
+
+    def _count_mismatches(self, radio: RadioType, segment: Segment, has_cir: bool, count: int) -> None:
+        card = self._mitigation.bundle.card
+        if not card.fits(radio, segment, has_cir):
+            self.mismatches[card.mismatch(f"{radio.name} {segment.name if has_cir else 'without CIR'}")] += (
+                count
+            )

@@ -51,11 +51,11 @@ def recorded_qos(text: str) -> list[dict[str, Any]]:
 
 
 def describe(
-    file_name: str, topics: Sequence[TopicCount], first_ns: int, last_ns: int, custom: Mapping[str, str]
+    file_name: str, topics: Sequence[TopicCount], bounds_ns: tuple[int, int], custom: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return the content of `metadata.yaml` below its only key, for a bag of one file."""
-    start = {"nanoseconds_since_epoch": first_ns}
-    duration = {"nanoseconds": last_ns - first_ns}
+    start = {"nanoseconds_since_epoch": bounds_ns[0]}
+    duration = {"nanoseconds": bounds_ns[1] - bounds_ns[0]}
     total = sum(topic.messages for topic in topics)
     return {
         "version": VERSION,

@@ -1,6 +1,6 @@
 """Writes a bag that `ros2 bag`, Foxglove and the `rosbags` library open: MCAP, profile ros2, zstd chunks.
 
-The `mcap` library writes the records. The output is atomic: data goes to a `.part` file, which is renamed at the end
+The output is atomic: data goes to a `.part` file, which is renamed at the end
 and removed if an error or Ctrl-C ends the writer.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -15,12 +16,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
-from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
-from mcap.writer import Writer
+from mcap.well_known import MessageEncoding, SchemaEncoding
 
 import uwb_mitigation
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.files import partial_path, write_atomically
+from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import Channel, Schema
 from uwb_mitigation.recordings.bag.rosbag2 import (
     METADATA_NAME,
@@ -73,7 +74,6 @@ class BagWriter:
 
     Attributes:
         file: the MCAP file.
-        counts: messages written, {topic: count}.
 
     Raises:
         RecordingError: the bag exists and `force` is not given, or the path cannot be written.
@@ -84,14 +84,11 @@ class BagWriter:
         self.file = _bag_file(path)
         self._partial = partial_file(path)
         self._metadata = {"version": uwb_mitigation.__version__, **metadata}
-        self.counts: Counter[str] = Counter()
         self._own_channels: dict[str, int] = {}
         self._channel_ids: dict[tuple[object, ...], int] = {}
         self._topic_of_channel: dict[int, str] = {}
         self._topics: dict[str, TopicCount] = {}
         self._schemas: dict[Schema, int] = {}
-        self._first_ns: int | None = None
-        self._last_ns = 0
         self._stream: BinaryIO | None = None
 
         if self._folder is not None and path.exists() and not path.is_dir():
@@ -107,10 +104,16 @@ class BagWriter:
             if self._folder is not None:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._stream = self._partial.open("wb")
-            library = f"uwb_mitigation {uwb_mitigation.__version__}"
-            self._mcap = Writer(self._stream)
-            self._mcap.start(Profile.ROS2, library)
+            self._mcap = McapFile(self._stream, f"uwb_mitigation {uwb_mitigation.__version__}")
             self._mcap.add_metadata(METADATA_RECORD, self._metadata)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Messages written, {topic: count}."""
+        counts = Counter[str]()
+        for channel, count in self._mcap.counts.items():
+            counts[self._topic_of_channel[channel]] += count
+        return counts
 
     def write(self, record: Record) -> None:
         """Write a measurement to `/uwb/range_raw` and, if known, its truth to `/uwb/range_truth`.
@@ -160,15 +163,13 @@ class BagWriter:
         Raises:
             RecordingError: a time is negative, or the bag cannot be written.
         """
-        if log_time_ns < 0 or publish_time_ns < 0:
-            raise RecordingError(f"time {min(log_time_ns, publish_time_ns)} ns is before the epoch")
         try:
             self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
+        except struct.error as error:
+            times = f"{log_time_ns} and {publish_time_ns} ns"
+            raise RecordingError(f"times {times} of a message", valid="0 to 2^64 - 1 ns") from error
         except OSError as error:
             raise self._write_error(error) from error
-        self.counts[self._topic_of_channel[channel]] += 1
-        self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns, log_time_ns)
-        self._last_ns = max(self._last_ns, log_time_ns)
 
     def __enter__(self) -> BagWriter:
         return self
@@ -210,9 +211,9 @@ class BagWriter:
             return self._channel_ids[key]
         with self._translate_os_errors():
             if schema is not None and schema not in self._schemas:
-                self._schemas[schema] = self._mcap.register_schema(schema.name, schema.encoding, schema.data)
+                self._schemas[schema] = self._mcap.add_schema(schema.name, schema.encoding, schema.data)
             schema_id = _NO_SCHEMA if schema is None else self._schemas[schema]
-            number = self._mcap.register_channel(topic, channel.encoding, schema_id, metadata)
+            number = self._mcap.add_channel(topic, channel.encoding, schema_id, metadata)
         self._channel_ids[key], self._topic_of_channel[number] = number, topic
         # A topic may have several channels, of several publishers; rosbag2 lists it once.
         kind, qos = schema.name if schema else "", recorded_qos(metadata[_QOS_KEY])
@@ -220,12 +221,12 @@ class BagWriter:
         return number
 
     def _finish(self) -> None:
-        topics = [replace(topic, messages=self.counts[topic.topic]) for topic in self._topics.values()]
-        first_ns = 0 if self._first_ns is None else self._first_ns
-        document = describe(self.file.name, topics, first_ns, self._last_ns, self._metadata)
+        counts = self.counts
+        topics = [replace(topic, messages=counts[topic.topic]) for topic in self._topics.values()]
+        document = describe(self.file.name, topics, self._mcap.bounds_ns, self._metadata)
         with self._translate_os_errors():
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": dump(document)})
-            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._mcap.finish()
             self._close()
             self._partial.replace(self.file)
             if self._folder is not None:

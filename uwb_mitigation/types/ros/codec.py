@@ -3,24 +3,28 @@
 The layouts are fixed except for strings and one array, so each consists of a few packed blocks. Every length
 is checked before use. CDR aligns each value to its size, counted from the end of the four-byte
 encapsulation header (OMG DDSI-RTPS 2.5, section 10.2; OMG CDR, section 15.3). Only little-endian plain CDR is
-supported, the format of ROS 2. A library is not used, because `columns` decodes batches of messages by these offsets, and
-nodes need no type store.
+supported, the format of ROS 2. A library is not used, because `RangeBatch` decodes many messages at once by these offsets,
+and a live range is decoded twice as fast.
 """
 
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
+    CorrectedColumns,
     CorrectedRange,
     Encoding,
     RadioType,
+    RangeColumns,
     RangeMeasurement,
     Segment,
     Status,
@@ -239,6 +243,95 @@ def decode_corrected(data: bytes) -> tuple[MeasurementKey, CorrectedRange]:
     return MeasurementKey(stamp_ns, tag_id, anchor_id, sequence), CorrectedRange(
         range_m, raw_m, correction_m, variance_m2, _STATUSES[status], _ORIGINS[origin], model_id
     )
+
+
+class RangeBatch:
+    """Messages `RangeCir` of the same form as columns, without a copy of each.
+
+    Args:
+        messages: one or more.
+
+    Attributes:
+        columns: the ranges.
+
+    Raises:
+        RecordingError: the first message cannot be decoded, or another one has another form: length of the message or
+            frame_id, encoding, number of samples, radio, segment; or it must be decoded on its own to know what is wrong.
+    """
+
+    def __init__(self, messages: Sequence[bytes]) -> None:
+        first, size = decode_range(messages[0]), len(messages[0])
+        frame_end = _PREFIX.size + _PREFIX.unpack_from(messages[0])[3]
+        start, samples = first_field_offset(frame_end), first.cir.samples
+        powers = start + _RANGE_CIR.size + samples.nbytes + _CIR_COUNTS.size + samples.nbytes % 4
+        if {len(message) for message in messages} != {size} or size < powers + _CIR_POWERS.size:
+            raise RecordingError("messages of several lengths")
+        table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), size)
+        # Encapsulation, length of frame_id, its terminator and padding; encoding, sample count, radio and segment.
+        fixed = np.r_[
+            0:4, 12:16, frame_end - 1 : start, start + 48, start + 56 : start + 60, powers + 10 : powers + 12
+        ]
+        frame = table[:, _PREFIX.size : frame_end]
+        if frame_end == _PREFIX.size or table[0, frame_end:start].any() or messages[0][2:4] != b"\0\0":
+            raise RecordingError("messages in an unusual form")
+        if (table[:, fixed] != table[0, fixed]).any() or (frame > 127).any():
+            raise RecordingError("messages of several forms")
+
+        def column(offset: int, kind: str) -> NDArray[Any]:
+            values = table[:, offset : offset + np.dtype(kind).itemsize]
+            return np.ascontiguousarray(values).view(kind)[:, 0]
+
+        if (column(8, "<u4") >= NS_PER_S).any():
+            raise RecordingError("message with an invalid time stamp")
+        self._header = table[:, :start]
+        self._sequence = column(start + 16, "<u4")
+        end = start + _RANGE_CIR.size
+        self.columns = RangeColumns(
+            column(start, "<u8"),
+            column(start + 8, "<u8"),
+            column(start + 32, "<f4").astype(np.float64),
+            first.cir.encoding,
+            np.ascontiguousarray(table[:, end : end + samples.nbytes]).view("<i2"),
+            column(start + 40, "<i4"),
+            column(start + 44, "<f4").astype(np.float64),
+            column(start + 52, "<f4").astype(np.float64),
+            column(end + samples.nbytes, "<u2"),
+            column(powers, "<f4").astype(np.float64),
+            column(powers + 4, "<f4").astype(np.float64),
+            first.cir.radio,
+            first.cir.segment,
+        )
+
+    @staticmethod
+    def key(message: bytes) -> tuple[int, bytes]:
+        """Return a key that messages of the same form share: the lengths of the message and of its frame_id."""
+        return len(message), message[12:16]
+
+    def encode_corrected(self, corrected: CorrectedColumns) -> list[bytes]:
+        """Encode `RangeCorrected` in CDR for each message."""
+        ranges, start = self.columns, self._header.shape[1]
+        # The fields of `_CORRECTED`, after the header.
+        fields: tuple[tuple[int, str, Any], ...] = (
+            (0, "<u8", ranges.tag_id),
+            (8, "<u8", ranges.anchor_id),
+            (16, "<u4", self._sequence),
+            (20, "<f4", corrected.range_m),
+            (24, "<f4", ranges.range_m),
+            (28, "<f4", corrected.correction_m),
+            (32, "<f4", corrected.variance_m2),
+            (36, "u1", corrected.status),
+            (37, "u1", int(corrected.origin)),
+            (40, "<u4", corrected.model_id),
+        )
+        table = np.zeros((len(ranges), start + _CORRECTED.size), np.uint8)
+        table[:, :start] = self._header
+        for offset, kind, values in fields:
+            column = np.broadcast_to(np.asarray(values, kind), len(ranges))
+            width = column.dtype.itemsize
+            table[:, start + offset : start + offset + width] = (
+                np.ascontiguousarray(column).view(np.uint8).reshape(-1, width)
+            )
+        return [row.tobytes() for row in table]
 
 
 def decode_frame_id(data: bytes) -> str:
