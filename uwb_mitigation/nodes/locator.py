@@ -45,6 +45,7 @@ from uwb_mitigation.types.ros.codec import (
     measurement_key,
 )
 from uwb_mitigation.types.ros.poses import BodyTwist, encode_odometry, encode_pose, tag_frame, tag_of_frame
+from uwb_mitigation.types.ros.schemas import typestore
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heading
 
@@ -116,6 +117,8 @@ class Locator(ManagedNode):
             self.autostart()
 
     def open(self) -> None:
+        # Loading takes 0.1 s, which the first pose must not wait for.
+        typestore()
         path = self.value("anchors")
         if not path:
             raise ParameterError(

@@ -1,10 +1,10 @@
-"""Odometry, IMU data and transforms of a robot as standard messages: encode to CDR, and read from bags."""
+"""Odometry, IMU data and transforms of a robot as standard messages: encode, and read from bags."""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace as Fields
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,10 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import check_topic, decode_messages
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.ros.schemas import typestore
+from uwb_mitigation.types.ros.poses import header, quaternion, vector
+from uwb_mitigation.types.ros.schemas import serialize
 from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, ROBOT_IMU, ROBOT_ODOMETRY, TF, TF_TYPE
-from uwb_mitigation.types.stamps import NS_PER_S, to_ns
+from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import Imu, Odometry
 
 ODOM, BASE_LINK = "odom", "base_link"
@@ -33,26 +34,15 @@ def encode_odometry_row(odometry: Odometry, row: int, frame_id: str = ODOM, chil
     """Return one row as `nav_msgs/Odometry` in CDR."""
     x, y, yaw = odometry.pose[row].tolist()
     vx, vy, yaw_rate = odometry.twist[row].tolist()
-    message = _make(
+    pose = Fields(position=vector(x, y), orientation=quaternion(yaw))
+    twist = Fields(linear=vector(vx, vy), angular=vector(z=yaw_rate))
+    return serialize(
         ODOMETRY_TYPE,
-        header=_header(int(odometry.stamp_ns[row]), frame_id),
+        header=header(int(odometry.stamp_ns[row]), frame_id),
         child_frame_id=child,
-        pose=_make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=_make(
-                "geometry_msgs/msg/Pose",
-                position=_make("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
-                orientation=_quaternion(yaw),
-            ),
-            covariance=_six(odometry.pose_covariance[row]),
-        ),
-        twist=_make(
-            "geometry_msgs/msg/TwistWithCovariance",
-            twist=_make("geometry_msgs/msg/Twist", linear=_vector(vx, vy), angular=_vector(z=yaw_rate)),
-            covariance=_six(odometry.twist_covariance[row]),
-        ),
+        pose=Fields(pose=pose, covariance=_six(odometry.pose_covariance[row])),
+        twist=Fields(twist=twist, covariance=_six(odometry.twist_covariance[row])),
     )
-    return _serialize(message, ODOMETRY_TYPE)
 
 
 def encode_imu_row(imu: Imu, row: int, frame_id: str = BASE_LINK) -> bytes:
@@ -63,29 +53,27 @@ def encode_imu_row(imu: Imu, row: int, frame_id: str = BASE_LINK) -> bytes:
     if math.isfinite(yaw):
         orientation[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_variance[row]
     turning[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_rate_variance[row]
-    message = _make(
+    return serialize(
         IMU_TYPE,
-        header=_header(int(imu.stamp_ns[row]), frame_id),
-        orientation=_quaternion(yaw if math.isfinite(yaw) else 0.0),
+        header=header(int(imu.stamp_ns[row]), frame_id),
+        orientation=quaternion(yaw if math.isfinite(yaw) else 0.0),
         orientation_covariance=orientation,
-        angular_velocity=_vector(z=float(imu.yaw_rate[row])),
+        angular_velocity=vector(z=float(imu.yaw_rate[row])),
         angular_velocity_covariance=turning,
-        linear_acceleration=_vector(),
+        linear_acceleration=vector(),
         linear_acceleration_covariance=acceleration,
     )
-    return _serialize(message, IMU_TYPE)
 
 
 def encode_transform_row(odometry: Odometry, row: int, frame_id: str = ODOM, child: str = BASE_LINK) -> bytes:
     """Return the pose of one row as `tf2_msgs/TFMessage` in CDR."""
     x, y, yaw = odometry.pose[row].tolist()
-    transform = _make(
-        "geometry_msgs/msg/TransformStamped",
-        header=_header(int(odometry.stamp_ns[row]), frame_id),
+    transform = Fields(
+        header=header(int(odometry.stamp_ns[row]), frame_id),
         child_frame_id=child,
-        transform=_make("geometry_msgs/msg/Transform", translation=_vector(x, y), rotation=_quaternion(yaw)),
+        transform=Fields(translation=vector(x, y), rotation=quaternion(yaw)),
     )
-    return _serialize(_make(TF_TYPE, transforms=[transform]), TF_TYPE)
+    return serialize(TF_TYPE, transforms=[transform])
 
 
 def write_robot(bag: BagWriter, odometry: Odometry, imu: Imu | None, row: int, until_ns: int) -> int:
@@ -186,30 +174,3 @@ def _three(covariance: Any) -> NDArray[np.float64]:
     six = np.asarray(covariance, np.float64).reshape(6, 6)
     plane: NDArray[np.float64] = six[np.ix_(_PLANE, _PLANE)]
     return plane
-
-
-@lru_cache(maxsize=64)
-def _type(name: str) -> Any:
-    return typestore().types[name]
-
-
-def _make(kind: str, **fields: Any) -> Any:
-    return _type(kind)(**fields)
-
-
-def _serialize(message: Any, kind: str) -> bytes:
-    return bytes(typestore().serialize_cdr(message, kind))
-
-
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    stamp = _make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return _make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
-
-
-def _vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
-    return _make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
-
-def _quaternion(yaw: float) -> Any:
-    return _make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0))

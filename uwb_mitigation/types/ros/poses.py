@@ -1,4 +1,4 @@
-"""Encode and decode estimates as standard messages in CDR: poses and odometry, in the frame of the anchors.
+"""Encode and decode estimates as standard messages: poses and odometry, in the frame of the anchors.
 
 The orientation is unobservable: it is the identity with a large variance. `pose_paths` reads poses from bags.
 """
@@ -6,15 +6,15 @@ The orientation is unobservable: it is the identity with a large variance. `pose
 from __future__ import annotations
 
 import math
-import struct
 from dataclasses import dataclass
+from types import SimpleNamespace as Fields
 
 import numpy as np
 
-from uwb_mitigation.errors import RecordingError, format_id
-from uwb_mitigation.types.ros.codec import LITTLE_ENDIAN
-from uwb_mitigation.types.ros.topics import ODOMETRY_TYPE
-from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.errors import format_id
+from uwb_mitigation.types.ros.schemas import deserialize, serialize
+from uwb_mitigation.types.ros.topics import ODOMETRY_TYPE, POSE_TYPE
+from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate, Heading
 
 MAP = "map"
@@ -29,14 +29,10 @@ UNOBSERVED = 1e6
 POSITION_TYPES = (
     ODOMETRY_TYPE,
     "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    POSE_TYPE,
 )
 """Message types with a position."""
 
-_PREFIX = struct.Struct("<4siII")
-_LENGTH = struct.Struct("<I")
-_POSE = struct.Struct("<43d")
-_TWIST = struct.Struct("<42d")
 _TAG_FRAME = "tag_"
 
 
@@ -64,9 +60,7 @@ def tag_topic(topic: str, tag_id: int | None) -> str:
 
 def encode_pose(estimate: Estimate, frame_id: str = MAP) -> bytes:
     """Return `geometry_msgs/PoseWithCovarianceStamped` in CDR."""
-    data = _header(estimate.stamp_ns, frame_id)
-    data += bytes((4 - len(data)) % 8)
-    return data + _pose(estimate)
+    return serialize(POSE_TYPE, header=header(estimate.stamp_ns, frame_id), pose=_pose(estimate))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,20 +94,22 @@ def encode_odometry(
         twist: in the axes of the child frame; None: the child frame has the axes of `frame_id`, and the velocity of the
             estimate is used.
     """
-    data = _header(estimate.stamp_ns, frame_id)
-    child = child_frame_id.encode() + b"\0"
-    data += bytes(-len(data) % 4) + _LENGTH.pack(len(child)) + child
-    data += bytes((4 - len(data)) % 8)
     covariance = np.zeros((6, 6))
     if twist is None:
-        velocity = (*estimate.velocity, 0.0, 0.0, 0.0)
+        velocity = Fields(linear=vector(*estimate.velocity), angular=vector())
         covariance[:3, :3] = estimate.covariance[3:, 3:]
         covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
     else:
-        velocity = (twist.vx, twist.vy, 0.0, 0.0, 0.0, twist.yaw_rate)
+        velocity = Fields(linear=vector(twist.vx, twist.vy), angular=vector(z=twist.yaw_rate))
         variances = (twist.speed_variance, twist.speed_variance, *[UNOBSERVED] * 3, twist.yaw_rate_variance)
         np.fill_diagonal(covariance, variances)
-    return data + _pose(estimate) + _TWIST.pack(*velocity, *covariance.reshape(-1))
+    return serialize(
+        ODOMETRY_TYPE,
+        header=header(estimate.stamp_ns, frame_id),
+        child_frame_id=child_frame_id,
+        pose=_pose(estimate),
+        twist=Fields(twist=velocity, covariance=covariance.ravel()),
+    )
 
 
 def encode_true_position(
@@ -141,41 +137,39 @@ def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, flo
     Raises:
         RecordingError: the bytes are not an Odometry.
     """
-    try:
-        encapsulation, seconds, nanoseconds, length = _PREFIX.unpack_from(data)
-        at = _PREFIX.size + length
-        at += -at % 4
-        (length,) = _LENGTH.unpack_from(data, at)
-        at += _LENGTH.size
-        child = bytes(data[at : at + length])
-        at += length
-        at += (4 - at) % 8
-        x, y, z, _, _, sine, cosine, *covariance = _POSE.unpack_from(data, at)
-    except struct.error as error:
-        raise RecordingError("an odometry message that is cut short") from error
-    if encapsulation[:2] != LITTLE_ENDIAN:
-        raise RecordingError("an odometry message in another encoding")
-    tag_id = tag_of_frame(child.rstrip(b"\0").decode(errors="replace"))
-    if tag_id is None or not all(map(math.isfinite, (x, y, z))):
+    odometry = deserialize(ODOMETRY_TYPE, data)
+    position, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
+    xyz, tag_id = (position.x, position.y, position.z), tag_of_frame(odometry.child_frame_id)
+    if tag_id is None or not all(map(math.isfinite, xyz)):
         return None
-    known = covariance[-1] < UNOBSERVED and math.isfinite(sine + cosine)
-    yaw = 2.0 * math.atan2(sine, cosine) if known else None
-    return seconds * NS_PER_S + nanoseconds, tag_id, (x, y, z), yaw
+    has_yaw = odometry.pose.covariance[-1] < UNOBSERVED and math.isfinite(turn.z + turn.w)
+    return to_ns(odometry.header.stamp), tag_id, xyz, 2.0 * math.atan2(turn.z, turn.w) if has_yaw else None
 
 
-def _header(stamp_ns: int, frame_id: str) -> bytes:
+def header(stamp_ns: int, frame_id: str) -> Fields:
+    """Return the fields of `std_msgs/Header`."""
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    frame = frame_id.encode() + b"\0"
-    return _PREFIX.pack(LITTLE_ENDIAN + b"\0\0", seconds, nanoseconds, len(frame)) + frame
+    return Fields(stamp=Fields(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
 
 
-def _pose(estimate: Estimate) -> bytes:
+def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Fields:
+    """Return the fields of a `geometry_msgs` Vector3 or Point."""
+    return Fields(x=x, y=y, z=z)
+
+
+def quaternion(yaw: float) -> Fields:
+    """Return the fields of `geometry_msgs/Quaternion` for a rotation about z, rad."""
+    return Fields(x=0.0, y=0.0, z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0))
+
+
+def _pose(estimate: Estimate) -> Fields:
+    """Return the fields of `geometry_msgs/PoseWithCovariance`."""
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = estimate.covariance[:3, :3]
     covariance[[3, 4, 5], [3, 4, 5]] = UNOBSERVED
-    sine, cosine = 0.0, 1.0
-    if (heading := estimate.heading) is not None:
-        sine, cosine = math.sin(heading.yaw / 2.0), math.cos(heading.yaw / 2.0)
+    if estimate.heading is not None:
         rows = [0, 1, 2, 5]
-        covariance[5, rows] = covariance[rows, 5] = heading.covariance
-    return _POSE.pack(*estimate.position, 0.0, 0.0, sine, cosine, *covariance.reshape(-1))
+        covariance[5, rows] = covariance[rows, 5] = estimate.heading.covariance
+    orientation = quaternion(estimate.heading.yaw if estimate.heading else 0.0)
+    pose = Fields(position=vector(*estimate.position), orientation=orientation)
+    return Fields(pose=pose, covariance=covariance.ravel())

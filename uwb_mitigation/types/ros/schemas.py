@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
+from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED_TYPE, RANGE_TRUTH_TYPE
 
 if TYPE_CHECKING:
@@ -43,6 +45,23 @@ def typestore() -> Typestore:
         types.update(get_types_from_msg(_message_text(name), f"{PACKAGE}/msg/{name}"))
     store.register(types)
     return store
+
+
+def serialize(type_name: str, **fields: Any) -> bytes:
+    """Return a message in CDR; nested messages are objects with the names of their fields, such as `SimpleNamespace`."""
+    return bytes(typestore().serialize_cdr(SimpleNamespace(**fields), type_name))
+
+
+def deserialize(type_name: str, data: bytes) -> Any:
+    """Return a message with its fields as attributes.
+
+    Raises:
+        RecordingError: the bytes are not such a message.
+    """
+    try:
+        return typestore().deserialize_cdr(data, type_name)
+    except Exception as error:  # Of no common type.
+        raise RecordingError(f"a message that is not {type_name}", where=f"{len(data)} bytes") from error
 
 
 @lru_cache(maxsize=8)
