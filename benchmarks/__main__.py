@@ -3,4 +3,4 @@
 from uwb_mitigation.commands.entry import run_program
 
 if __name__ == "__main__":
-    run_program("benchmarks.cli")
+    run_program("benchmarks.cli", "main")

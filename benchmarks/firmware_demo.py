@@ -24,12 +24,12 @@ from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.support import topics
 from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
 from uwb_mitigation.radios.wire import messages as wire
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement
+from uwb_mitigation.types.ros import topics
 
 TIMEOUT_S = 60.0
 """Timeout for mode DEVICE and for the next corrected range; after it, the remaining ranges count as lost."""

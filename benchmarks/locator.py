@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from benchmarks.equipment.probe import Probe
-from uwb_mitigation.nodes.support import processes, topics
+from uwb_mitigation.nodes.support import processes
 from uwb_mitigation.nodes.support.processes import spinning_node, wait
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import encode_corrected
 from uwb_mitigation.types.stamps import to_ns
 

@@ -29,11 +29,12 @@ from benchmarks.equipment.probe import Probe
 from benchmarks.equipment.relay import RELAYED
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.nodes.support import processes, topics
+from uwb_mitigation.nodes.support import processes
 from uwb_mitigation.nodes.support.processes import spinning_node, wait
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import first_field_offset
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -143,7 +144,9 @@ class Subject:
         self._cpu_s = self._chain_cpu_s = 0.0
         self._counted = self._counted_hz = 0
         arrived, now_ns = self._received.append, time.time_ns
-        bench.probe.subscribe(kind, f"/{name}/{topic}", lambda data: arrived((now_ns(), data)), raw=True)
+        bench.probe.subscribe(
+            kind, f"/{name}/{topics.relative(topic)}", lambda data: arrived((now_ns(), data)), raw=True
+        )
         # The measured node is the first process.
         self.processes = [bench.start(node, name) for node in nodes]
         self.play(50.0)
@@ -206,8 +209,8 @@ class Subject:
             raise UwbMitigationError(f"{self.name}: no ranges arrive at {rate_hz} Hz")
         # Sum over slices, because the system counts in hundredths of a second. The sums include settling and
         # pause, which play at the same rate.
-        share = seconds / (seconds + _SETTLE_S)
-        spent_s = [(b - a) * share for a, b in zip(before, after, strict=True)]
+        weight = seconds / (seconds + _SETTLE_S)
+        spent_s = [(b - a) * weight for a, b in zip(before, after, strict=True)]
         if rate_hz != self._counted_hz:
             self._counted_hz, self._counted, self._cpu_s, self._chain_cpu_s = rate_hz, 0, 0.0, 0.0
         self._cpu_s, self._chain_cpu_s = self._cpu_s + spent_s[0], self._chain_cpu_s + sum(spent_s)
@@ -433,12 +436,12 @@ def soak(messages: int, rate_hz: float, *, one_process: bool, advance: Callable[
         pids = [process.pid for process in subject.processes]
 
         def sample_usage(ranges: int) -> Usage:
-            seen = [process_usage(pid) for pid in pids]
+            usages = [process_usage(pid) for pid in pids]
             return Usage(
                 ranges,
-                sum(of.memory_mb for of in seen),
-                sum(of.descriptors for of in seen),
-                sum(of.threads for of in seen),
+                sum(usage.memory_mb for usage in usages),
+                sum(usage.descriptors for usage in usages),
+                sum(usage.threads for usage in usages),
             )
 
         subject.reset_counts()

@@ -23,10 +23,10 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.equipment.probe import Probe
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
-from uwb_mitigation.nodes.support import topics
 from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
 from uwb_mitigation.simulation.scene import ANCHORS
 from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.ros import topics
 
 TAG_POSITIONS = ((6.5, 3.1), (6.501, 3.1), (6.5, 3.101))
 """Position of the tag, a corner of the robot's route: one anchor in LOS, the others behind concrete."""

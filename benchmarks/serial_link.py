@@ -21,10 +21,11 @@ from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.probe import Probe
 from benchmarks.nodes import process_usage
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.nodes.support import processes, topics
+from uwb_mitigation.nodes.support import processes
 from uwb_mitigation.nodes.support.processes import spinning_node, wait
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import to_ns
 

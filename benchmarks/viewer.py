@@ -22,8 +22,8 @@ from benchmarks.nodes import (
     run_steps,
     searches,
 )
-from uwb_mitigation.nodes.support import topics
 from uwb_mitigation.nodes.support.processes import wait
+from uwb_mitigation.types.ros import topics
 
 RATE_HZ = 100.0
 SENT_HZ = 500

@@ -20,7 +20,7 @@ PARAMETERS = {
     for name, rows in launching.arguments(NODES).items()
     if name not in ("source", "port", "path", "frame_id")
 }
-OWN = {
+ARGUMENTS = {
     "params": ("", "Parameter file of all nodes; it overrides the files of single nodes."),
     "use_sim_time": ("false", "Take the time from /clock: true or false."),
     "log_level": ("info", f"Log level of every node: {', '.join(launching.LOG_LEVELS)}."),
@@ -31,17 +31,17 @@ FILES = tuple(f"{node}_params" for node in NODES)
 
 @launching.report_errors
 def nodes_of(context):
-    names = (*PARAMETERS, *OWN, *FILES, "boards")
+    names = (*PARAMETERS, *ARGUMENTS, *FILES, "boards")
     launching.check_names(getattr(context, "argv", ()), names)
     texts = {name: LaunchConfiguration(name).perform(context) for name in names}
-    flag_names = {name: launching.choice(name, texts[name]) == "true" for name in ("use_sim_time", "respawn")}
+    flags = {name: launching.choice(name, texts[name]) == "true" for name in ("use_sim_time", "respawn")}
     level = launching.choice("log_level", texts["log_level"], launching.LOG_LEVELS)
     files = {node: [texts[f"{node}_params"], *filter(None, [texts["params"]])] for node in NODES}
     for node in NODES:
         launching.from_files(node, *files[node])
     values = launching.parameters({name: texts[name] for name in PARAMETERS}, NODES, NODES)
-    common = {"use_sim_time": flag_names["use_sim_time"]}
-    kept = launching.kept_parameters()
+    common = {"use_sim_time": flags["use_sim_time"]}
+    environment = launching.kept_parameters()
     nodes = []
     for entry in texts["boards"].split():
         name, separator, port = entry.partition("=")
@@ -56,11 +56,11 @@ def nodes_of(context):
                     executable=node,
                     name=node,
                     namespace=name,
-                    parameters=[*files[node], node_values, common],
+                    parameters=[*files[node], launching.quoted(node_values), common],
                     output="screen",
-                    respawn=flag_names["respawn"],
+                    respawn=flags["respawn"],
                     respawn_delay=0.5,
-                    additional_env=kept,
+                    additional_env=environment,
                     ros_arguments=["--log-level", level],
                 )
             )
@@ -69,7 +69,7 @@ def nodes_of(context):
 
 def generate_launch_description():
     params = PathJoinSubstitution([FindPackageShare("uwb_mitigation"), "params"])
-    texts = {name: ("", launching.description(rows)) for name, rows in PARAMETERS.items()} | OWN
+    texts = {name: ("", launching.description(rows)) for name, rows in PARAMETERS.items()} | ARGUMENTS
     return LaunchDescription(
         [
             DeclareLaunchArgument("boards", description="NAME=PORT of each board, separated by spaces."),

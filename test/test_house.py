@@ -39,6 +39,14 @@ def test_drawing_of_the_layers_agrees_with_the_contract_and_its_files_exist():
     assert [path for path in paths if not (REPOSITORY / path).exists()] == []
 
 
+def test_only_nodes_import_rclpy_at_run_time():
+    """The contracts see import statements; this finds imports by name, and programs in strings."""
+    dynamic = re.compile(r"(import_module|find_spec|__import__)\(\s*[\"'](rclpy|torch)|(import|from) rclpy\b")
+    paths = [path for path in PACKAGE.rglob("*.py") if PACKAGE / "nodes" not in path.parents]
+    assert len(paths) > 100
+    assert [path for path in paths if dynamic.search(path.read_text(encoding="utf-8"))] == []
+
+
 @NEEDS_CC
 @pytest.mark.parametrize("folder", ["firmware/src", "benchmarks/equipment/dw1000_model/chip"])
 def test_modules_of_the_firmware_do_not_call_each_other_in_circles(folder: str):

@@ -99,11 +99,6 @@ def test_invalid_qos_override_is_refused(ros: Ros, value: str):
     assert "Traceback" not in mitigator.output
 
 
-def test_override_for_a_topic_that_a_node_lacks_is_reported(ros: Ros):
-    mitigator = ros.start("mitigator", "qos_overrides./uwb/range_rwa.subscription.depth:=5")
-    mitigator.wait_for_output("/uwb/range_raw.subscription.depth")
-
-
 def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):
     bag = tmp_path / "no_frames.mcap"
     with BagWriter(bag, {"source": "a test", "simulated": "true"}) as writer:

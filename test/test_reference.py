@@ -17,7 +17,7 @@ from ros_harness import Ros, domain
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.types.ros import topics
 
 pytestmark = pytest.mark.ros
 

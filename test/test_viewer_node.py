@@ -17,7 +17,7 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
 from benchmarks.equipment.page_clients import PageClients
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support import endpoints
 
 pytestmark = pytest.mark.ros
 
@@ -97,7 +97,7 @@ def test_anchor_markers_are_published_without_a_locator(ros: ros_harness.Ros, tm
     anchors = tmp_path / "anchors.yaml"
     anchors.write_text("anchors:\n  - {id: 5, x: 1.0, y: 2.0, z: 3.0, name: door}\n")
     shown: list[MarkerArray] = []
-    ros.node.create_subscription(MarkerArray, "/uwb/anchors", shown.append, topics.LATCHED)
+    ros.node.create_subscription(MarkerArray, "/uwb/anchors", shown.append, endpoints.LATCHED)
     viewer = ros.start("viewer", "port:=0", f"anchors:={anchors}", "map_frame:=site")
     ros.spin_until(lambda: bool(shown))
     ball, name = shown[0].markers

@@ -10,8 +10,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from uwb_mitigation_msgs.msg import RangeCir
 
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.spinning import spin, stop_event
+from uwb_mitigation.types.ros import topics
 
 RELAYED = "uwb/range_relayed"
 
@@ -20,8 +21,10 @@ class Relay(Node):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__("relay")
         serialised = bool(self.declare_parameter("serialised", False).value)
-        publisher = self.create_publisher(RangeCir, RELAYED, topics.RANGES)
-        self.create_subscription(RangeCir, topics.RANGE_RAW, publisher.publish, topics.RANGES, raw=serialised)
+        publisher = self.create_publisher(RangeCir, RELAYED, endpoints.RANGES)
+        self.create_subscription(
+            RangeCir, topics.relative(topics.RANGE_RAW), publisher.publish, endpoints.RANGES, raw=serialised
+        )
 
 
 if __name__ == "__main__":

@@ -20,10 +20,11 @@ from rich.live import Live
 
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import AnchorMap, dump_anchors
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import TruePath
@@ -110,8 +111,8 @@ def position_rmse(poses: list[Any], truth: list[Any]) -> float:
 def _stamped(messages: list[Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     rows = {}
     for message in messages:
-        at = message.pose.pose.position
-        rows[to_ns(message.header.stamp)] = (at.x, at.y, at.z)
+        position = message.pose.pose.position
+        rows[to_ns(message.header.stamp)] = (position.x, position.y, position.z)
     stamps = sorted(rows)
     return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps], np.float64)
 
@@ -122,10 +123,14 @@ def watch(plan: DemoPlan, console: Console) -> list[str]:
         statistics = monitor.statistics
         poses: list[Any] = []
         truth: list[Any] = []
-        monitor.create_subscription(PoseWithCovarianceStamped, topics.POSE, poses.append, topics.RANGES)
-        monitor.create_subscription(Odometry, topics.ODOMETRY_TRUTH, truth.append, topics.RANGES)
+        monitor.create_subscription(
+            PoseWithCovarianceStamped, topics.relative(topics.POSE), poses.append, endpoints.RANGES
+        )
+        monitor.create_subscription(
+            Odometry, topics.relative(topics.ODOMETRY_TRUTH), truth.append, endpoints.RANGES
+        )
         raw, corrected, anchors = (
-            monitor.resolve_topic_name(name)
+            monitor.resolve_topic_name(topics.relative(name))
             for name in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS)
         )
         title, offset_m = plan.title, plan.offset_m
@@ -189,6 +194,6 @@ def demo(
     raise typer.Exit(code)
 
 
-def main() -> None:
+def run_demo_command() -> None:
     """Run the demo with the options of the command line."""
     typer.run(demo)

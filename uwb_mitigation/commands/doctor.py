@@ -33,11 +33,6 @@ _TOOLS = {
     "arm-none-eabi-gcc": "building the firmware",
     "qemu-system-arm": "running the firmware without a board",
 }
-_ROS = """
-from rclpy.utilities import get_rmw_implementation_identifier as middleware
-from uwb_mitigation_msgs import msg
-print(middleware(), msg.RangeCir.__class__.__import_type_support__() or "")
-"""
 
 
 class Finding(NamedTuple):
@@ -72,7 +67,8 @@ def examine() -> Iterator[Finding]:
     yield from _ports()
     yield _check("torch", partial(metadata.version, "torch"), "torch", "training: make setup-training")
     for tool, use in _TOOLS.items():
-        yield Finding(tool, "ok" if (found := shutil.which(tool)) else "optional", found or f"for {use}")
+        path = shutil.which(tool)
+        yield Finding(tool, "ok" if path else "optional", path or f"for {use}")
 
 
 def _check(name: str, look: Callable[[], str], distribution: str = "", purpose: str = "") -> Finding:
@@ -92,10 +88,11 @@ def _version(distribution: str) -> str:
 
 def _load_ros() -> str:
     """Load ROS in a separate process, since it aborts the process if it cannot load its middleware."""
-    done = subprocess.run([sys.executable, "-c", _ROS], capture_output=True, text=True, timeout=60)
-    if done.returncode:
-        raise RuntimeError(done.stderr or f"exit code {done.returncode}")
-    return done.stdout.strip()
+    command = [sys.executable, "-m", "uwb_mitigation.nodes.support.middleware"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    if result.returncode:
+        raise RuntimeError(result.stderr or f"exit code {result.returncode}")
+    return result.stdout.strip()
 
 
 def _compare_model() -> str:

@@ -53,15 +53,15 @@ def viewer() -> None:
 
 def command_line() -> None:
     """Run the command `uwb-mitigation`."""
-    run_program("uwb_mitigation.commands.cli")
+    run_program("uwb_mitigation.commands.cli", "main")
 
 
-def run_program(module: str) -> None:
-    """Import a module and call its `main`, which receives Ctrl-C as KeyboardInterrupt.
+def run_program(module: str, function: str) -> None:
+    """Import a module and call a function in it, which receives Ctrl-C as KeyboardInterrupt.
 
     A signal during the import ends the process without a traceback, with exit code 128 + its number.
     """
-    run = _load(module)
+    run = _load(module, function)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     run()
@@ -80,31 +80,31 @@ def _node(name: str) -> None:
         print(help_text(name))
     elif name == "monitor":
         # The monitor draws in this thread and spins in another.
-        _load("uwb_mitigation.nodes.monitor")()
+        _load("uwb_mitigation.nodes.monitor", "run_monitor")()
     else:
         if name == "viewer":
             # On a loaded CPU, correcting ranges has priority. Set this before the middleware starts its threads.
             os.nice(10)
         # It installs signal handlers after the node is loaded.
-        _load("uwb_mitigation.nodes.support.spinning")(name)
+        _load("uwb_mitigation.nodes.support.spinning", "run_node")(name)
 
 
-def _load(module: str) -> Callable[..., Any]:
-    """Return `main` of a module; a signal during the import exits immediately with 128 + its number.
+def _load(module: str, function: str) -> Callable[..., Any]:
+    """Return a function of a module; a signal during the import exits immediately with 128 + its number.
 
     If a dependency is missing, the process exits with a one-line error.
     """
     for number in _SIGNALS:
         signal.signal(number, _end)
     try:
-        main: Callable[..., Any] = importlib.import_module(module).main
+        loaded: Callable[..., Any] = getattr(importlib.import_module(module), function)
     except ImportError as error:
         from uwb_mitigation.errors import missing_dependency
 
         if (absent := missing_dependency(error)) is None:
             raise
         sys.exit(f"error: {absent}")
-    return main
+    return loaded
 
 
 def _end(number: int, frame: Any) -> None:
@@ -114,6 +114,6 @@ def _end(number: int, frame: Any) -> None:
 if __name__ == "__main__":
     name = sys.argv.pop(1)
     if name == "demo":
-        run_program("uwb_mitigation.commands.demo")
+        run_program("uwb_mitigation.commands.demo", "run_demo_command")
     else:
         _node(name)

@@ -17,7 +17,6 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -34,7 +33,7 @@ from uwb_mitigation.nodes.feeds.radios import (
 )
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed
 from uwb_mitigation.nodes.feeds.uci import UciFeed, uci_settings
-from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
@@ -45,6 +44,7 @@ from uwb_mitigation.radios.wire.layout import Mode
 from uwb_mitigation.radios.wire.messages import Correction
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.types.offsets import NO_OFFSETS, read_offsets
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import encode_corrected, encode_range, encode_truth
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import RANGE_RAW
@@ -125,7 +125,7 @@ class Driver(ManagedNode):
         self._truths: Publisher
         self._places: Publisher
         self._clock_publisher: Publisher
-        self._sensor_ranges: topics.SensorRanges | None = None
+        self._sensor_ranges: endpoints.SensorRanges | None = None
         self._frame_id: str = self.value("frame_id")
         refuse_errors(self, self._check)
         self._offsets = self._prepared_offsets = NO_OFFSETS
@@ -168,7 +168,9 @@ class Driver(ManagedNode):
         self._offsets = read_offsets(str(self.value("offsets")))
         self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            self._sensor_ranges = self.destroy_at_close(topics.SensorRanges(self), topics.SensorRanges.close)
+            self._sensor_ranges = self.destroy_at_close(
+                endpoints.SensorRanges(self), endpoints.SensorRanges.close
+            )
 
         def make() -> BoardFeed:
             port = BoardDriver(
@@ -319,8 +321,3 @@ class Driver(ManagedNode):
             self.get_logger().error(str(error))
             self.exit_code = 1
         self._ended.set()
-
-
-def make_nodes(ended: threading.Event) -> list[Node]:
-    """Return the nodes of the process `driver`."""
-    return [Driver(ended)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -16,7 +15,6 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -26,7 +24,7 @@ from visualization_msgs.msg import MarkerArray
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.nodes import markers
 from uwb_mitigation.nodes.robot_motion import OdometryInput, transform_type
-from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
@@ -37,6 +35,7 @@ from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import (
     MeasurementKey,
     decode_corrected,
@@ -155,15 +154,15 @@ class Locator(ManagedNode):
             self._tf = self.publisher(self._tf_type, topics.TF, QoSProfile(depth=100))
         if robot is not None:
             self._robot = OdometryInput(self, path_of_base)
-        self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
+        self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, endpoints.LATCHED)
         if kind in markers.ANCHOR_TYPES:
             # Some publishers send the anchors once for late subscribers, others repeatedly.
-            for qos in (topics.LATCHED, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)):
+            for qos in (endpoints.LATCHED, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)):
                 sent = self.create_subscription(markers.ANCHOR_TYPES[kind], topic, self._on_anchors, qos)
                 self.destroy_at_close(sent, self.destroy_subscription)
         self._subscribe_to_ranges(self.value("ranges"))
         if topic := self.value("height_topic"):
-            heights = topics.create_subscription(
+            heights = endpoints.create_subscription(
                 self, PoseWithCovarianceStamped, topic, self._on_height, ReliabilityPolicy.BEST_EFFORT
             )
             self.destroy_at_close(heights, self.destroy_subscription)
@@ -221,11 +220,13 @@ class Locator(ManagedNode):
     def _subscribe_to_ranges(self, source: str) -> None:
         if source and self._subscribe_to_mapping(source):
             return
-        kind, name = (RangeCir, source) if source else (RangeCorrected, topics.RANGE_CORRECTED)
+        kind, name = (
+            (RangeCir, source) if source else (RangeCorrected, topics.relative(topics.RANGE_CORRECTED))
+        )
         self._decode = (
             (lambda data: _uncorrected(decode_range(data), math.nan)) if source else decode_corrected
         )
-        ranges = topics.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
+        ranges = endpoints.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
         self._ranges = self.destroy_at_close(ranges, self.destroy_subscription)
 
     def _on_anchors(self, message: Any) -> None:
@@ -243,8 +244,8 @@ class Locator(ManagedNode):
         # Subscriptions stay active while a lifecycle node is inactive.
         if self._estimator is not None and self._ranges is not None and self.is_active:
             # Also process the queued messages; the executor then finds the queue empty.
-            for each, _ in chain([(data, number)], topics.take_queued(self._ranges, BATCH)):
-                self._take(self._estimator, each)
+            for message_data, _ in chain([(data, number)], endpoints.take_queued(self._ranges, BATCH)):
+                self._take(self._estimator, message_data)
 
     def _take(self, estimator: MultiTagEstimator, data: bytes) -> None:
         try:
@@ -259,15 +260,15 @@ class Locator(ManagedNode):
     def _add(self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange) -> None:
         began_ns = time.perf_counter_ns()
         stamp_ns = key.stamp_ns + self._offset_ns
-        found = estimator.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
-        if found is None:
+        result = estimator.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
+        if result is None:
             if key.anchor_id in estimator.unknown_anchors and key.anchor_id not in self._unknown_anchors:
                 self._unknown_anchors.add(key.anchor_id)
                 self.get_logger().warning(
                     f"ranges of anchor {format_id(key.anchor_id)} are left out: it is not in the anchors file"
                 )
             return
-        tag, estimate = found
+        tag, estimate = result
         outputs = self._outputs_of(tag)
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
         if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
@@ -323,7 +324,7 @@ class Locator(ManagedNode):
         else:
             x, y, z = estimate.position.tolist()
             transform = TransformStamped(
-                header=topics.header(estimate.stamp_ns, self._map),
+                header=endpoints.header(estimate.stamp_ns, self._map),
                 child_frame_id=outputs.frame,
                 transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
             )
@@ -368,9 +369,9 @@ class Locator(ManagedNode):
             outputs = self._outputs_of(tag)
             age_s = (stamp_ns - tag.latest_ns) / NS_PER_S
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
-                ahead = tag.estimator.at(stamp_ns)
-                if ahead is not None:
-                    self._publish_estimate(outputs, ahead)
+                predicted = tag.estimator.at(stamp_ns)
+                if predicted is not None:
+                    self._publish_estimate(outputs, predicted)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():
                 outputs.smoothed_ns = tag.latest_ns
                 smoothed = tag.smoother.estimate()
@@ -407,8 +408,3 @@ def _uncorrected(measurement: RangeMeasurement, variance_m2: float) -> tuple[Mea
     range_m = measurement.range_m
     corrected = CorrectedRange(range_m, range_m, 0.0, variance_m2, Status.NO_CIR, CorrectedBy.HOST, 0)
     return measurement_key(measurement), corrected
-
-
-def make_nodes(stop: threading.Event) -> list[Node]:
-    """Return the nodes of the process `locator`."""
-    return [Locator()]

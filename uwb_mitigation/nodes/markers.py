@@ -11,7 +11,7 @@ from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.positioning.geometry import horizontal_ellipse
 from uwb_mitigation.types import palette
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
@@ -137,7 +137,7 @@ def tag_markers(
 
 def _marker(namespace: str, number: int, kind: int, frame: str, stamp_ns: int, colour: ColorRGBA) -> Any:
     return Marker(
-        header=topics.header(stamp_ns, frame),
+        header=endpoints.header(stamp_ns, frame),
         ns=namespace,
         id=number,
         type=kind,

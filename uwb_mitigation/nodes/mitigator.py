@@ -11,7 +11,6 @@ from itertools import chain
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
@@ -23,7 +22,7 @@ from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
-from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.support.parameter_tables import MITIGATOR
@@ -36,6 +35,7 @@ from uwb_mitigation.types.measurement import (
     Status,
 )
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import decode_range, encode_corrected
 
 # ONNX Runtime is imported later: fail early if it is missing.
@@ -43,8 +43,9 @@ if importlib.util.find_spec("onnxruntime") is None:
     raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
 
 BATCH = 16
-_PASSED_THROUGH = (Status.OUT_OF_DISTRIBUTION, Status.NO_CIR)
 """Maximum batch size: correcting queued ranges in a batch takes half the time of single ranges."""
+
+_PASSED_THROUGH = (Status.OUT_OF_DISTRIBUTION, Status.NO_CIR)
 
 
 def load_corrector(model: str, backend: str = "onnxruntime") -> Corrector:
@@ -81,7 +82,7 @@ class Mitigator(ManagedNode):
         self._subscribe = subscribe
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
-        self._sensor_ranges: topics.SensorRanges | None = None
+        self._sensor_ranges: endpoints.SensorRanges | None = None
         self._mitigation: Corrector | None = None
         self._prepared: tuple[str, Corrector] | None = None
         self._offsets = NO_OFFSETS
@@ -96,11 +97,15 @@ class Mitigator(ManagedNode):
     def open(self) -> None:
         self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
         if self.value("sensor_ranges"):
-            self._sensor_ranges = self.destroy_at_close(topics.SensorRanges(self), topics.SensorRanges.close)
+            self._sensor_ranges = self.destroy_at_close(
+                endpoints.SensorRanges(self), endpoints.SensorRanges.close
+            )
         if self._subscribe:
             # Subscribe to serialised messages: decoding them here takes a third of the time of rclpy.
             self._raw = self.destroy_at_close(
-                topics.create_raw_subscription(self, RangeCir, topics.RANGE_RAW, self._on_raw, self._on_lost),
+                endpoints.create_raw_subscription(
+                    self, RangeCir, topics.relative(topics.RANGE_RAW), self._on_raw, self._on_lost
+                ),
                 self.destroy_subscription,
             )
 
@@ -164,9 +169,9 @@ class Mitigator(ManagedNode):
         if failed:
             level, text = diagnostics.ERROR, "the model fails on some ranges"
         entries |= self._meter.entries()
-        other, self.health.other_source = self.health.other_source, ""
-        if other and (mitigation := self._mitigation) is not None and not failed:
-            reason = mitigation.bundle.card.mismatch(other)
+        untrained_source, self.health.other_source = self.health.other_source, ""
+        if untrained_source and (mitigation := self._mitigation) is not None and not failed:
+            reason = mitigation.bundle.card.mismatch(untrained_source)
             level, text = diagnostics.WARN, f"ranges are not corrected: {reason}"
         if (mitigation := self._mitigation) is not None:
             entries |= {
@@ -185,7 +190,7 @@ class Mitigator(ManagedNode):
             return
         batch = []
         # Also process the queued messages; the executor then finds the queue empty.
-        for message_data, sequence in chain([(data, number)], topics.take_queued(self._raw, BATCH - 1)):
+        for message_data, sequence in chain([(data, number)], endpoints.take_queued(self._raw, BATCH - 1)):
             self.health.loss_counter.add(sequence)
             measurement = self._decode(message_data)
             if measurement is not None:
@@ -263,8 +268,3 @@ class Mitigator(ManagedNode):
                 self.error = None
                 if self._mitigation is not None:
                     self._use(prepared[1])
-
-
-def make_nodes(stop: threading.Event) -> list[Node]:
-    """Return the nodes of the process `mitigator`."""
-    return [Mitigator()]

@@ -18,10 +18,11 @@ from rich.text import Text
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.processes import spinning_node
 from uwb_mitigation.nodes.support.spinning import stop_event
 from uwb_mitigation.types.measurement import CorrectedRange, Status, Truth
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_truth
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -113,7 +114,7 @@ class Monitor(Node):
             (RangeCir, topics.RANGE_RAW, self._on_raw),
             (RangeCorrected, topics.RANGE_CORRECTED, self._on_corrected),
         ):
-            self.create_subscription(kind, topic, callback, topics.RANGES, raw=True)
+            self.create_subscription(kind, topics.relative(topic), callback, endpoints.RANGES, raw=True)
 
     def _on_raw(self, data: bytes) -> None:
         self.statistics.raw += 1
@@ -186,7 +187,7 @@ def summary(statistics: RangeStatistics) -> Group:
     return Group(*lines)
 
 
-def main() -> None:
+def run_monitor() -> None:
     """Show the ranges on the topics until Ctrl-C."""
     stop = stop_event()
     console = Console()

@@ -6,13 +6,12 @@ It sends positions only. Orientation and velocity are NaN, so that EKF2 takes th
 from __future__ import annotations
 
 import math
-import threading
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
 from uwb_mitigation.errors import MissingDependencyError
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 
 CORRELATION_S = 1.0
@@ -46,15 +45,17 @@ class Px4(Node):
         self._type = VehicleOdometry
         self._latest_ns: int | None = None
         self._resets = 0
-        self._publisher = self.create_publisher(VehicleOdometry, topics.PX4_ODOMETRY, 10)
-        self.create_subscription(PoseWithCovarianceStamped, topics.POSE, self._on_pose, 10)
-        self.get_logger().info(f"sends {topics.POSE} to {topics.PX4_ODOMETRY}")
+        self._publisher = self.create_publisher(VehicleOdometry, topics.relative(topics.PX4_ODOMETRY), 10)
+        poses = self.create_subscription(
+            PoseWithCovarianceStamped, topics.relative(topics.POSE), self._on_pose, 10
+        )
+        self.get_logger().info(f"sends {poses.topic_name} to {self._publisher.topic_name}")
 
     def _on_pose(self, pose: PoseWithCovarianceStamped) -> None:
         stamp_ns = to_ns(pose.header.stamp)
-        at, covariance = pose.pose.pose.position, pose.pose.covariance
+        position, covariance = pose.pose.pose.position, pose.pose.covariance
         # x is east and y is north; each position counts as much as the time since the previous one.
-        values = [at.y, at.x, -at.z]
+        values = [position.y, position.x, -position.z]
         variances = [covariance[7], covariance[0], covariance[14]]
         increase, is_reset = 1.0, False
         if self._latest_ns is not None:
@@ -85,8 +86,3 @@ class Px4(Node):
                 reset_counter=self._resets % 256,
             )
         )
-
-
-def make_nodes(stop: threading.Event) -> list[Node]:
-    """Return the node of the executable `px4`."""
-    return [Px4()]

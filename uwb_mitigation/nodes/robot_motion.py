@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.nodes.support import topics
+from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.recordings.bag.odometry import yaw_of
 from uwb_mitigation.types.ros.poses import BodyTwist
+from uwb_mitigation.types.ros.topics import TF_STATIC, relative
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
 
@@ -60,7 +61,9 @@ class OdometryInput:
         self._static: dict[str, tuple[str, Vector, Rotation]] = {}
 
         def subscribe(kind: type, topic: str, callback: Any) -> None:
-            received = topics.create_subscription(node, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT)
+            received = endpoints.create_subscription(
+                node, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT
+            )
             node.destroy_at_close(received, node.destroy_subscription)
 
         subscribe(Odometry, node.value("odometry"), self._on_odometry)
@@ -71,7 +74,7 @@ class OdometryInput:
             qos = QoSProfile(
                 depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
             )
-            static = node.create_subscription(message, "/tf_static", self._on_static, qos)
+            static = node.create_subscription(message, relative(TF_STATIC), self._on_static, qos)
             node.destroy_at_close(static, node.destroy_subscription)
 
     def lever_arm(self, frame: str) -> Vector | None:
@@ -97,7 +100,7 @@ class OdometryInput:
         """Return the last transform with a new stamp, for `HOLD_S`; None: later, or no heading was known yet."""
         if self._last is None or not 0 <= stamp_ns - self._last_ns <= HOLD_S * NS_PER_S:
             return None
-        self._last.header = topics.header(stamp_ns + tolerance_ns, self._map)
+        self._last.header = endpoints.header(stamp_ns + tolerance_ns, self._map)
         return self._last
 
     def map_to_odom(self, base: Estimate, tolerance_ns: int) -> TransformStamped | None:
@@ -117,7 +120,7 @@ class OdometryInput:
         )
         self._last_ns = base.stamp_ns
         self._last = TransformStamped(
-            header=topics.header(stamp_ns, self._map),
+            header=endpoints.header(stamp_ns, self._map),
             child_frame_id=self.odom_frame,
             transform=Transform(
                 translation=translation,
@@ -157,8 +160,8 @@ class OdometryInput:
         self.path.add_imu(to_ns(message.header.stamp), rate, variance, yaw)
 
     def _on_static(self, message: Any) -> None:
-        for one in message.transforms:
-            t, r = one.transform.translation, one.transform.rotation
+        for transform in message.transforms:
+            t, r = transform.transform.translation, transform.transform.rotation
             norm = math.hypot(r.x, r.y, r.z, r.w)
             if (
                 len(self._static) < _MAX_FRAMES
@@ -166,7 +169,8 @@ class OdometryInput:
                 and 0.9 < norm < 1.1  # false for NaN
             ):
                 rotation = Rotation.from_quat((r.x, r.y, r.z, r.w))
-                self._static[one.child_frame_id] = one.header.frame_id, (t.x, t.y, t.z), rotation
+                parent = transform.header.frame_id
+                self._static[transform.child_frame_id] = parent, (t.x, t.y, t.z), rotation
 
 
 def transform_type() -> Any:

@@ -23,11 +23,12 @@ from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.nodes import markers
 from uwb_mitigation.nodes.feeds.replay import ReplayClock
-from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import VIEWER
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
-from uwb_mitigation.types.ros import topics as bag_topics
+from uwb_mitigation.types.ros import topics
+from uwb_mitigation.types.ros.topics import relative
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
@@ -73,12 +74,12 @@ class Viewer(ManagedNode):
         if path := self.value("anchors"):
             self._anchors = load_anchors(Path(path).expanduser())
             self._feed.anchors(self._anchors)
-            self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, topics.LATCHED)
+            self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, endpoints.LATCHED)
         else:
-            self._subscribe(MarkerArray, topics.ANCHORS, bag_topics.ANCHORS, qos=topics.LATCHED)
+            self._subscribe(MarkerArray, relative(topics.ANCHORS), topics.ANCHORS, qos=endpoints.LATCHED)
         self._subscribe(DiagnosticArray, topics.DIAGNOSTICS, topics.DIAGNOSTICS)
-        self._subscribe(PoseWithCovarianceStamped, topics.POSE, bag_topics.POSE)
-        self._subscribe(Odometry, topics.ODOMETRY_TRUTH, bag_topics.ODOMETRY_TRUTH)
+        self._subscribe(PoseWithCovarianceStamped, relative(topics.POSE), topics.POSE)
+        self._subscribe(Odometry, relative(topics.ODOMETRY_TRUTH), topics.ODOMETRY_TRUTH)
         # No executor spins this node: waking up for every range would take CPU time from the mitigator.
         range_node = Node(
             f"_{self.get_name()}_ranges",
@@ -142,7 +143,7 @@ class Viewer(ManagedNode):
         """Subscribe to a topic of ranges; they are queued until `_read_queued_ranges`."""
         if self._range_node is not None and topic not in self._ranges:
             # Resolve with the remapping arguments of this node.
-            name = self.resolve_topic_name(topic)
+            name = self.resolve_topic_name(relative(topic))
             self._ranges[topic] = self._range_node.create_subscription(
                 kind, name, lambda _: None, _QOS, raw=True
             )
@@ -150,13 +151,13 @@ class Viewer(ManagedNode):
     def _read_queued_ranges(self) -> None:
         # A truth is published before its corrected range: reading truths last and adding them first misses none.
         corrected, truths, raw = (
-            list(topics.take_queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
+            list(endpoints.take_queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
             for topic in (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
         )
         for topic, queued in (
-            (bag_topics.RANGE_TRUTH, truths),
-            (bag_topics.RANGE_RAW, raw),
-            (bag_topics.RANGE_CORRECTED, corrected),
+            (topics.RANGE_TRUTH, truths),
+            (topics.RANGE_RAW, raw),
+            (topics.RANGE_CORRECTED, corrected),
         ):
             for data, _ in queued:
                 self._feed.add_encoded(topic, data)
@@ -171,16 +172,16 @@ class Viewer(ManagedNode):
         elif self._range_node is not None and topics.RANGE_RAW in self._ranges:
             self._range_node.destroy_subscription(self._ranges.pop(topics.RANGE_RAW))
         # The locator publishes every further tag on a separate topic; a remapping of the plain topic does not apply to it.
-        head, _, tail = self.resolve_topic_name(topics.POSE, only_expand=True).rpartition("/")
+        head, _, tail = self.resolve_topic_name(relative(topics.POSE), only_expand=True).rpartition("/")
         tag_topic = re.compile(rf"{re.escape(head)}/(tag_(?:\d+|0x[0-9a-f]+))/{re.escape(tail)}")
         for topic, _ in self.get_topic_names_and_types():
             if (match := tag_topic.fullmatch(topic)) and len(self._subscribed) < MAX_TAGS:
-                self._subscribe(PoseWithCovarianceStamped, topic, bag_topics.POSE, match[1])
+                self._subscribe(PoseWithCovarianceStamped, topic, topics.POSE, match[1])
 
     def _missing(self) -> MissingData:
         """Return the reasons for an empty page, such as a node that is not running."""
         raw, corrected, anchors, poses = (
-            self.resolve_topic_name(topic)
+            self.resolve_topic_name(relative(topic))
             for topic in (topics.RANGE_RAW, topics.RANGE_CORRECTED, topics.ANCHORS, topics.POSE)
         )
         if self.count_publishers(corrected):
@@ -196,8 +197,3 @@ class Viewer(ManagedNode):
             if self.count_publishers(poses)
             else f"No tag positions: {poses} has no publisher. Start the locator.",
         )
-
-
-def make_nodes(stop: threading.Event) -> list[Node]:
-    """Return the nodes of the process `viewer`."""
-    return [Viewer()]

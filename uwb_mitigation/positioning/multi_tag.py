@@ -1,4 +1,4 @@
-"""All tags of a site: a estimator and a fixed-lag smoother for each, and their diagnostics."""
+"""All tags of a site: an estimator and a fixed-lag smoother for each, and their diagnostics."""
 
 from __future__ import annotations
 

@@ -188,16 +188,16 @@ class ReplayFeed:
 
     def _wait_for_subscribers(self) -> None:
         """Wait until there are enough subscribers and the graph had time to connect, or until the timeout."""
-        wanted, started_s = self._value("wait_for_subscribers"), time.monotonic()
-        while (count := self._subscribers()) < wanted:
+        required, started_s = self._value("wait_for_subscribers"), time.monotonic()
+        while (count := self._subscribers()) < required:
             if time.monotonic() - started_s >= self._value("longest_wait"):
-                self._logger.warning(f"{count} of {wanted} subscribers connected; the replay starts")
+                self._logger.warning(f"{count} of {required} subscribers connected; the replay starts")
                 return
             if self._stopping.wait(TICK_S):
                 return
         delay_s = self._value("start_delay")
         if delay_s < 0.0:
-            delay_s = 0.0 if wanted > 1 else ANNOUNCEMENT_S
+            delay_s = 0.0 if required > 1 else ANNOUNCEMENT_S
         self._stopping.wait(delay_s)
 
     def _play(self) -> None:
@@ -205,8 +205,8 @@ class ReplayFeed:
         due_ns = 0
         while not self._stopping.is_set():
             from_ns = self._seeks.popleft() if self._seeks else 0
-            found, due_ns = self._play_from(from_ns, due_ns)
-            if not self._seeks and not (self._value("loop") and found):
+            has_records, due_ns = self._play_from(from_ns, due_ns)
+            if not self._seeks and not (self._value("loop") and has_records):
                 return
 
     def _play_from(self, from_ns: int, due_ns: int) -> tuple[bool, int]:

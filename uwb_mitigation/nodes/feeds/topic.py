@@ -13,7 +13,7 @@ from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
-from uwb_mitigation.nodes.support import diagnostics, topics
+from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.recordings.mapping.conversion import NO_CIR, Converter, kept_rows, measurement, samples_of
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Mapping
@@ -36,12 +36,12 @@ def message_type(name: str) -> type:
     if not (package.isidentifier() and kind.isidentifier()):
         raise ParameterError(f"type = {name!r:.60}", valid="PACKAGE/msg/NAME, such as sensor_msgs/msg/Range")
     try:
-        found: type = getattr(import_module(f"{package}.msg"), kind)
+        message_class: type = getattr(import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError) as error:
         raise MissingDependencyError(
             f"the message type {name} is not installed", valid=f"install {package}, and source its workspace"
         ) from error
-    return found
+    return message_class
 
 
 class TopicFeed:
@@ -86,15 +86,15 @@ class TopicFeed:
         self._meter = diagnostics.RateMonitor(now_ns)
         self._type = message_type(mapping.type)
         self._converter = Converter(mapping.values)
-        others = [*mapping.cir_columns, *(rule.column for rule in mapping.drop)]
-        self._rows = MessageRows(mapping, self._converter.columns | dict.fromkeys(others, False))
+        extra_columns = [*mapping.cir_columns, *(rule.column for rule in mapping.drop)]
+        self._rows = MessageRows(mapping, self._converter.columns | dict.fromkeys(extra_columns, False))
         self._subscriptions: list[Subscription] = []
 
     def start(self) -> None:
         """Subscribe to the topics."""
         for name in self._names:
             self._subscriptions.append(
-                topics.create_subscription(
+                endpoints.create_subscription(
                     self._node, self._type, name, self._callback(name), ReliabilityPolicy.BEST_EFFORT
                 )
             )
@@ -144,20 +144,22 @@ class TopicFeed:
         rows, now_ns = self._rows.rows(message), self._now_ns()
         count = len(rows[LIST_INDEX])
         rows |= {LOG_TIME: [now_ns] * count, TOPIC: [name] * count}
-        chunk = Chunk({each: _array(values) for each, values in rows.items()}, count, name, np.arange(count))
+        chunk = Chunk(
+            {column: _array(values) for column, values in rows.items()}, count, name, np.arange(count)
+        )
         chunk = chunk.take(kept_rows(self._mapping.drop, chunk, self.counts))
         if not chunk.count:
             return []
         values = self._converter.convert(chunk)
         # Radios without a synchronised clock send a zero stamp.
         values["stamp"][values["stamp"] <= 0] = now_ns
-        found = []
+        measurements = []
         for row in range(chunk.count):
             if np.isfinite(values["range"][row]):
-                found.append(measurement(values, row, self._cir(chunk, row), self._ranges + row))
+                measurements.append(measurement(values, row, self._cir(chunk, row), self._ranges + row))
             else:
                 self.counts["range is not a number"] += 1
-        return found
+        return measurements
 
     def _cir(self, chunk: Chunk, row: int) -> Cir:
         source = self._mapping.cir

@@ -27,7 +27,7 @@ MAX_LATENCIES = 20_000
 """Number of latencies that are kept."""
 
 
-def report(
+def diagnostic_array(
     node: Node, hardware_id: str, level: bytes, message: str, entries: Mapping[str, object]
 ) -> DiagnosticArray:
     """Return a message with one status, stamped on the node's clock and named after the node."""

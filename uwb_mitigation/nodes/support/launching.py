@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import json
 import os
-import re
 import shutil
 import sys
 import tempfile
@@ -30,11 +30,15 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _WILDCARDS = ("*", "**", "/*", "/**")
 """Sections of a parameter file that apply to every node."""
 
-_FLOAT = re.compile(r"[-+]?(\.\d+|\d+\.\d*|\d+(\.\d*)?[eE][-+]?\d+|\.\d+[eE][-+]?\d+)")
-"""Floats of YAML 1.2; PyYAML reads YAML 1.1, in which 1e-1 is a string."""
-
 _LAUNCH_FILES = (".launch.py", ".launch.xml", ".launch.yaml", ".launch.yml")
 _OWN_LAUNCH_FILES = ("uwb.launch.py", "boards.launch.py")
+
+_PARSERS: dict[type, Callable[[str], ParameterValue]] = {
+    bool: lambda text: {"true": True, "false": False}[text.lower()],
+    int: lambda text: int(text, 0),
+    float: float,
+    str: str,
+}
 
 
 def report_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
@@ -56,14 +60,14 @@ def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
     An argument has the name of its parameter and applies to every node with that parameter. If parameters of
     one name differ in their defaults, they are different parameters: the later node's argument is NODE_PARAMETER.
     """
-    found: dict[str, dict[str, Parameter]] = {}
+    rows_by_argument: dict[str, dict[str, Parameter]] = {}
     for node in nodes:
         for row in TABLES[node]:
-            group = found.setdefault(row.name, {})
-            if any(other.default != row.default for other in group.values()):
-                group = found.setdefault(f"{node}_{row.name}", {})
-            group[node] = row
-    return found
+            rows = rows_by_argument.setdefault(row.name, {})
+            if any(earlier_row.default != row.default for earlier_row in rows.values()):
+                rows = rows_by_argument.setdefault(f"{node}_{row.name}", {})
+            rows[node] = row
+    return rows_by_argument
 
 
 def description(rows: Mapping[str, Parameter]) -> str:
@@ -74,20 +78,20 @@ def description(rows: Mapping[str, Parameter]) -> str:
 
 
 def parameters(
-    texts: Mapping[str, str], nodes: Collection[str], known: Iterable[str]
+    texts: Mapping[str, str], nodes: Collection[str], argument_nodes: Iterable[str]
 ) -> dict[str, dict[str, Any]]:
     """Return the parameters that arguments set, {node: {parameter: value}}.
 
     Args:
         texts: {argument: text}; an empty text keeps the value of the files.
         nodes: the nodes that are started.
-        known: the nodes whose parameters are arguments.
+        argument_nodes: the nodes whose parameters are arguments.
 
     Raises:
         ParameterError: a value is invalid, or for a node that is not started.
     """
-    found: dict[str, dict[str, Any]] = {node: {} for node in nodes}
-    for name, rows in arguments(known).items():
+    values: dict[str, dict[str, Any]] = {node: {} for node in nodes}
+    for name, rows in arguments(argument_nodes).items():
         text = texts.get(name, "")
         if not text:
             continue
@@ -98,8 +102,13 @@ def parameters(
                 valid="locate:=true starts the locator, viewer:=true the viewer, source:=... the driver",
             )
         for node in started:
-            found[node][rows[node].name] = for_launch(value_of(rows[node], text))
-    return found
+            values[node][rows[node].name] = value_of(rows[node], text)
+    return values
+
+
+def quoted(values: Mapping[str, ParameterValue]) -> dict[str, ParameterValue]:
+    """Return parameters for launch_ros, which reads a text as YAML: a text such as 1234 needs quotes."""
+    return {name: json.dumps(value) if isinstance(value, str) else value for name, value in values.items()}
 
 
 def value_of(row: Parameter, text: str) -> ParameterValue:
@@ -108,39 +117,20 @@ def value_of(row: Parameter, text: str) -> ParameterValue:
     Raises:
         ParameterError: the text is not a valid value.
     """
-    value: Any = text
-    if row.or_number or not isinstance(row.default, str):
-        value = _read(text)
-    if row.or_number and not (isinstance(value, (int, float)) and abs(value) < 1 << 63):
-        # ROS integers are signed: an address of 64 bits stays a string. It may be in quotes, as on the command line.
-        value = value if isinstance(value, str) and text[0] in "'\"" else text
+    value: ParameterValue = text
+    kinds = (int, float) if row.or_number else (type(row.default),)
+    for kind in kinds:
+        with contextlib.suppress(ValueError, KeyError):
+            value = _PARSERS[kind](text)
+            break
+    if row.or_number and isinstance(value, int) and abs(value) >= 1 << 63:
+        # ROS integers are signed: an address of 64 bits stays a string.
+        value = text
+    if row.or_number and isinstance(value, str):
+        # In quotes, as on the command line.
+        value = value.strip("'\"")
     row.check(value)
-    return float(value) if isinstance(row.default, float) else value
-
-
-def for_launch(value: ParameterValue) -> ParameterValue:
-    """Return the value for launch_ros, which reads a text as YAML: a text such as 1234 needs quotes.
-
-    Raises:
-        ParameterError: a text such as 12e4, which ROS reads as a number although launch_ros does not quote it.
-    """
-    if not isinstance(value, str) or _read(value) == value:
-        return value
-    if _FLOAT.fullmatch(value) and yaml.safe_load(value) == value:
-        raise ParameterError(
-            f"ROS parses the text {value} as a number", valid="another notation, such as 0x12e4"
-        )
-    return json.dumps(value)
-
-
-def _read(text: str) -> Any:
-    """Return the value of a text in YAML, with the numbers of YAML 1.2 such as 1e-1; None if it is not YAML."""
-    if _FLOAT.fullmatch(text):
-        return float(text)
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        return None
+    return value
 
 
 def choice(name: str, text: str, choices: Sequence[str] = ("true", "false")) -> str:
@@ -151,12 +141,12 @@ def choice(name: str, text: str, choices: Sequence[str] = ("true", "false")) -> 
     return text.lower()
 
 
-def check_names(words: Sequence[str], known: Collection[str]) -> None:
+def check_names(words: Sequence[str], declared: Collection[str]) -> None:
     """Raise ParameterError for an argument of `ros2 launch` that the launch file does not declare.
 
     Args:
         words: the command-line arguments after the name of the launch file.
-        known: the declared arguments.
+        declared: the declared arguments.
     """
     # A launch file that includes this one may declare further arguments.
     if any(word.endswith(_LAUNCH_FILES) and Path(word).name not in _OWN_LAUNCH_FILES for word in sys.argv):
@@ -164,7 +154,7 @@ def check_names(words: Sequence[str], known: Collection[str]) -> None:
     for word in words:
         name, separator, _ = word.partition(":=")
         if separator:
-            check_name("argument", name, known, valid="--show-args lists them")
+            check_name("argument", name, declared, valid="--show-args lists them")
 
 
 def check_package(argument: str, package: str) -> None:
@@ -204,19 +194,19 @@ def check_driver(values: Mapping[str, Any]) -> None:
         raise ParameterError(f"source {source} without a {name}", valid=f"{name}:={example}")
 
 
-def from_files(node: str, own: str, shared: str = "") -> dict[str, Any]:
+def from_files(node: str, node_file: str, shared: str = "") -> dict[str, Any]:
     """Return the parameters that the files of a node set.
 
     Args:
         node: name of the node.
-        own: path of the file for this node.
+        node_file: path of the file for this node.
         shared: path of a file for all nodes, which overrides the other; may be empty.
 
     Raises:
         ParameterError: a file cannot be read, or a parameter in it is unknown or invalid.
     """
-    given = _parameters_in(Path(own), node, ())
-    return given | _parameters_in(Path(shared), node, conflicting_parameters(node)) if shared else given
+    values = _parameters_in(Path(node_file), node, ())
+    return values | _parameters_in(Path(shared), node, conflicting_parameters(node)) if shared else values
 
 
 def conflicting_parameters(node: str) -> dict[str, ParameterValue]:
@@ -227,8 +217,24 @@ def conflicting_parameters(node: str) -> dict[str, ParameterValue]:
     Returns:
         {parameter: default}
     """
-    found = [(name, rows[node]) for name, rows in arguments(TABLES).items() if node in rows]
-    return {row.name: row.default for name, row in found if row.name != name}
+    node_rows = [(name, rows[node]) for name, rows in arguments(TABLES).items() if node in rows]
+    return {row.name: row.default for name, row in node_rows if row.name != name}
+
+
+def separate_conflicts(
+    values: dict[str, dict[str, Any]], file_values: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Set the parameters of each node that a file for all nodes gives to an earlier node, in place.
+
+    Args:
+        values: {node: {parameter: value}} of the started nodes, from the arguments.
+        file_values: those of the files.
+    """
+    for node in values:
+        defaults = conflicting_parameters(node)
+        values[node] = {
+            name: file_values[node].get(name, default) for name, default in defaults.items()
+        } | values[node]
 
 
 def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str, Any]:
@@ -237,7 +243,7 @@ def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
         raise ParameterError(f"parameter file {path}: {reason}") from error
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     all_names = {row.name for table in TABLES.values() for row in table}
     rows = {row.name: row for row in TABLES[node]}
     for section, name, value in _entries(tree, ""):
@@ -252,10 +258,10 @@ def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str
             except ParameterError as error:
                 error.where = str(path)
                 raise
-            found[name] = value
+            values[name] = value
         elif name not in all_names and not name.startswith(STANDARD):
             check_name("parameter", name, all_names, str(path), "docs/reference/nodes.md lists them")
-    return found
+    return values
 
 
 def kept_parameters() -> dict[str, str]:

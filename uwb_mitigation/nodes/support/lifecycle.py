@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
-from lifecycle_msgs.msg import State
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -26,17 +25,18 @@ from uwb_mitigation.errors import (
     ParameterError,
     UwbMitigationError,
     check_name,
-    did_you_mean,
     missing_dependency,
 )
 from uwb_mitigation.files import write_atomically
-from uwb_mitigation.nodes.support import diagnostics, topics
-from uwb_mitigation.nodes.support.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
+from uwb_mitigation.nodes.support import diagnostics, endpoints
+from uwb_mitigation.nodes.support.parameter_tables import KEPT_PARAMETERS, STANDARD, TABLES, Parameter
+from uwb_mitigation.types.ros import topics
+from uwb_mitigation.types.ros.topics import relative
 
 DUPLICATE_NAME_DELAY_S = 40.0
 """A second node of the same name is reported after this time: a killed node stays in the graph for up to 20 s."""
 
-_QOS = "qos_overrides."
+_DECLARED_BY_RCLPY = ("use_sim_time", "start_type_description_service")
 
 Resource = TypeVar("Resource")
 
@@ -65,12 +65,15 @@ class ManagedNode(LifecycleNode):
 
     Attributes:
         error: the error of the latest transition; None after success.
+        given_parameters: {name: value} of all parameters given at start-up, also those of other nodes.
     """
 
     def __init__(self, name: str, table: Sequence[Parameter], other_parameters: Collection[str] = ()) -> None:
-        super().__init__(name)
-        declare(self, table, other_parameters)
+        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self.given_parameters: dict[str, Any] = self._take_given_parameters()
+        self._declare(table, other_parameters)
         self.error: UwbMitigationError | None = None
+        self._state = "unconfigured"
         self.now_ns = clock_reader(self.get_clock())
         self._last_unique_s = time.monotonic()
         self._reported: set[str] = set()
@@ -99,11 +102,11 @@ class ManagedNode(LifecycleNode):
         return resource
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile | None = None) -> Publisher:
-        """Return a lifecycle publisher until `close`, by default with the QoS of ranges."""
+        """Return a lifecycle publisher in the node's namespace until `close`, by default with the QoS of ranges."""
         if qos is None:
-            resource = topics.create_publisher(self, kind, topic)
+            resource = endpoints.create_publisher(self, kind, relative(topic))
         else:
-            resource = self.create_lifecycle_publisher(kind, topic, qos)
+            resource = self.create_lifecycle_publisher(kind, relative(topic), qos)
         return self.destroy_at_close(resource, self.destroy_lifecycle_publisher)
 
     def describe(self) -> diagnostics.Description:
@@ -129,32 +132,29 @@ class ManagedNode(LifecycleNode):
 
     @property
     def is_active(self) -> bool:
-        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+        return self._state == "active"
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        result = self._attempt(self.open, self.close)
-        if result == TransitionCallbackReturn.SUCCESS:
-            # QoS parameters are declared with the publishers and subscriptions.
-            _warn_of_unknown_qos(self)
-        return result
+        return self._attempt("inactive", self.open, self.close)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         # Activate publishers first: `begin` may start threads that publish.
         super().on_activate(state)
-        result = self._attempt(self.begin, self.end)
+        result = self._attempt("active", self.begin, self.end)
         if result != TransitionCallbackReturn.SUCCESS:
             super().on_deactivate(state)
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        result = self._attempt(self.end)
+        result = self._attempt("inactive", self.end)
         super().on_deactivate(state)
         return result
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._attempt(self._end_and_close)
+        return self._attempt("unconfigured", self._end_and_close)
 
-    on_shutdown = on_cleanup
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt("finalized", self._end_and_close)
 
     def destroy_node(self) -> None:
         self._end_and_close()
@@ -164,7 +164,10 @@ class ManagedNode(LifecycleNode):
         self.end()
         self.close()
 
-    def _attempt(self, step: Callable[[], None], on_failure: Callable[[], None] | None = None) -> Any:
+    def _attempt(
+        self, state: str, step: Callable[[], None], on_failure: Callable[[], None] | None = None
+    ) -> TransitionCallbackReturn:
+        """Run a step; after success the node is in `state`."""
         try:
             step()
         except UwbMitigationError as error:
@@ -177,7 +180,7 @@ class ManagedNode(LifecycleNode):
                     f"{type(error).__name__}: {error}", valid="this is a bug: see the log"
                 )
         else:
-            self.error = None
+            self.error, self._state = None, state
             return TransitionCallbackReturn.SUCCESS
         self.get_logger().error(str(self.error))
         if on_failure is not None:
@@ -185,13 +188,12 @@ class ManagedNode(LifecycleNode):
         return TransitionCallbackReturn.FAILURE
 
     def _publish_diagnostics(self) -> None:
-        label = self._state_machine.current_state[1]
         hardware, level, text, entries = self.describe()
         if self.error is not None:
-            level, text = diagnostics.ERROR, f"{label}: {self.error}"
+            level, text = diagnostics.ERROR, f"{self._state}: {self.error}"
         elif not self.is_active:
-            level, text = diagnostics.WARN, f"not active: {label}"
-        problems = topics.incompatible_publishers(self) + self._duplicate_name_warnings()
+            level, text = diagnostics.WARN, f"not active: {self._state}"
+        problems = endpoints.incompatible_publishers(self) + self._duplicate_name_warnings()
         for problem in problems:
             if problem not in self._reported:
                 self.get_logger().warning(problem)
@@ -199,47 +201,81 @@ class ManagedNode(LifecycleNode):
         if problems:
             text = "; ".join([*problems, text] if level > diagnostics.OK else problems)
             level = max(level, diagnostics.WARN)
-        self._diagnostics.publish(diagnostics.report(self, hardware, level, text, entries))
+        self._diagnostics.publish(diagnostics.diagnostic_array(self, hardware, level, text, entries))
 
     def _duplicate_name_warnings(self) -> list[str]:
         """Return a warning if another node has this name: parameter and transition calls are then ambiguous."""
-        own = (self.get_name(), self.get_namespace())
-        if self.get_node_names_and_namespaces().count(own) < 2:
+        full_name = (self.get_name(), self.get_namespace())
+        if self.get_node_names_and_namespaces().count(full_name) < 2:
             self._last_unique_s = time.monotonic()
         if time.monotonic() - self._last_unique_s < DUPLICATE_NAME_DELAY_S:
             return []
         remedy = "set a namespace (-r __ns:=/left) or a name (-r __node:=left)"
         return [f"another node has the name {self.get_fully_qualified_name()}: {remedy}"]
 
+    def _take_given_parameters(self) -> dict[str, Any]:
+        """Return the parameters given at start-up, and undeclare them, so that each is declared with its description."""
+        declared = self.get_parameters_by_prefix("")
+        names = [name for name in declared if name not in _DECLARED_BY_RCLPY]
+        for name in names:
+            self.undeclare_parameter(name)
+        return {name: declared[name].value for name in names}
 
-def declare(node: Node, table: Sequence[Parameter], other_parameters: Collection[str] = ()) -> None:
-    """Declare a table on a node, refuse unknown parameters, and check every later value.
+    def _declare(self, table: Sequence[Parameter], other_parameters: Collection[str]) -> None:
+        """Declare a table, refuse unknown parameters, and check every later value.
 
-    Args:
-        node: the node.
-        table: its parameters.
-        other_parameters: names of parameters of other nodes in this process.
+        Raises:
+            ParameterError: a parameter given at start-up is unknown, or its value has the wrong type or range.
+        """
+        rows = {row.name: row for row in table}
+        for row in table:
+            try:
+                self.declare_parameter(row.name, row.default, _descriptor(row))
+            except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+                raise ParameterError(f"parameter {row.name}: {error}", valid=row.valid) from error
+            row.check(self.value(row.name))
+        self._refuse_unknown({*rows, *other_parameters})
 
-    Raises:
-        ParameterError: a parameter given at start-up is unknown, or its value has the wrong type or range.
-    """
-    rows = {row.name: row for row in table}
-    save_live_parameters = _restore_live_parameters(node, {row.name for row in table if row.live})
-    for row in table:
-        try:
-            node.declare_parameter(row.name, row.default, _descriptor(row))
-        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise ParameterError(f"parameter {row.name}: {error}", valid=row.valid) from error
-        row.check(node.get_parameter(row.name).value)
-    _refuse_unknown(node, other_parameters)
-    if save_live_parameters is not None:
-        node.add_post_set_parameters_callback(save_live_parameters)
+        def check(values: Mapping[str, Any]) -> None:
+            for name in values.keys() & rows.keys():
+                rows[name].check(values[name])
 
-    def check(values: Mapping[str, Any]) -> None:
-        for name in values.keys() & rows.keys():
-            rows[name].check(values[name])
+        refuse_errors(self, check)
+        self._keep_live_parameters({row.name for row in table if row.live})
 
-    refuse_errors(node, check)
+    def _refuse_unknown(self, names: Collection[str]) -> None:
+        """Raise ParameterError for a parameter of no node; log the parameters of other nodes in one line."""
+        all_nodes = {row.name for table in TABLES.values() for row in table}
+        ignored = [
+            name
+            for name in sorted(self.given_parameters)
+            if name not in names and not name.startswith(STANDARD)
+        ]
+        for name in ignored:
+            if name not in all_nodes:
+                check_name("parameter", name, names, valid="--help lists them")
+        if ignored:
+            self.get_logger().info(f"ignored parameters of other nodes: {', '.join(ignored)}")
+
+    def _keep_live_parameters(self, live: Collection[str]) -> None:
+        """Restore the parameters that were set before a respawn, and save those that are set from now on."""
+        if not (folder := os.environ.get(KEPT_PARAMETERS)):
+            return
+        path = Path(folder, self.get_fully_qualified_name().strip("/").replace("/", "."))
+        saved: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        if saved:
+            self.set_parameters([RosParameter(name, value=value) for name, value in saved.items()])
+            values = ", ".join(f"{name} = {value!r}" for name, value in saved.items())
+            self.get_logger().info(f"restored parameters after a respawn: {values}")
+
+        def save(changes: list[Any]) -> None:
+            saved.update({change.name: change.value for change in changes if change.name in live})
+            try:
+                write_atomically(path, json.dumps(saved))
+            except UwbMitigationError as error:
+                self.get_logger().warning(f"parameters will be lost after a respawn: {error}")
+
+        self.add_post_set_parameters_callback(save)
 
 
 def refuse_errors(node: Node, check: Callable[[Mapping[str, Any]], None]) -> None:
@@ -271,57 +307,3 @@ def _descriptor(row: Parameter) -> ParameterDescriptor:
             bounds = IntegerRange(from_value=int(row.low), to_value=int(row.high), step=1)
             descriptor.integer_range = [bounds]
     return descriptor
-
-
-def _refuse_unknown(node: Node, other_parameters: Collection[str]) -> None:
-    """Raise ParameterError for an unknown parameter; log the parameters of other nodes in one line."""
-    all_nodes = {row.name for table in TABLES.values() for row in table}
-    given = [name for name in _undeclared(node) if not name.startswith(_QOS) and name not in other_parameters]
-    own = [*other_parameters, *(known for known in node._parameters if not known.startswith(_QOS))]
-    for name in given:
-        if name not in all_nodes:
-            check_name("parameter", name, own, valid="--help lists them")
-    if given:
-        node.get_logger().info(f"ignored parameters of other nodes: {', '.join(given)}")
-
-
-def _restore_live_parameters(node: Node, live: Collection[str]) -> Callable[[list[Any]], None] | None:
-    """Restore the parameters that were set before a respawn; return the callback that saves new values."""
-    folder = os.environ.get(KEPT_PARAMETERS)
-    if not folder:
-        return None
-    path = Path(folder, node.get_fully_qualified_name().strip("/").replace("/", "."))
-    saved: dict[str, Any] = {}
-    if path.is_file():
-        saved = json.loads(path.read_text(encoding="utf-8"))
-        # rclpy has no public access to the parameters given at start-up.
-        node._parameter_overrides.update(
-            {name: RosParameter(name, value=value) for name, value in saved.items()}
-        )
-        values = ", ".join(f"{name} = {value!r}" for name, value in saved.items())
-        node.get_logger().info(f"restored parameters after a respawn: {values}")
-
-    def save_live_parameters(changes: list[Any]) -> None:
-        saved.update({change.name: change.value for change in changes if change.name in live})
-        try:
-            write_atomically(path, json.dumps(saved))
-        except UwbMitigationError as error:
-            node.get_logger().warning(f"parameters will be lost after a respawn: {error}")
-
-    return save_live_parameters
-
-
-def _warn_of_unknown_qos(node: Node) -> None:
-    """Log every QoS override for a topic that the node does not have."""
-    known = [name for name in node._parameters if name.startswith(_QOS)]
-    for name in _undeclared(node):
-        if name.startswith(_QOS):
-            hint = did_you_mean(name, known)
-            node.get_logger().warning(
-                f"unknown parameter {name!r} has no effect" + (f"; {hint}" if hint else "")
-            )
-
-
-def _undeclared(node: Node) -> list[str]:
-    # rclpy has no public access to the parameters given at start-up.
-    return [name for name in sorted(node._parameter_overrides) if not node.has_parameter(name)]

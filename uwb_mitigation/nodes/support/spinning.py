@@ -14,7 +14,6 @@ import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -72,35 +71,41 @@ def load_node(name: str) -> Callable[[threading.Event], list[Node]]:
     if `anchors` is given: measurements go to the mitigator in memory, and `/uwb/range_raw` is published only while it
     has subscribers. Names, topics, parameters and diagnostics are the same as of separate nodes.
     """
-    parts = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
-    modules = [importlib.import_module(f"uwb_mitigation.nodes.{part}") for part in parts]
-    if len(modules) == 1:
-        make_nodes: Callable[[threading.Event], list[Node]] = modules[0].make_nodes
-        return make_nodes
-    driver, mitigator, locator = modules
+    if name == "pipeline":
+        return _load_pipeline()
+    node_class = _load_class(name)
+    # The end of a replay ends the process.
+    return lambda stop: [node_class(stop) if name == "driver" else node_class()]
+
+
+def _load_class(name: str) -> Any:
+    return getattr(importlib.import_module(f"uwb_mitigation.nodes.{name}"), name.capitalize())
+
+
+def _load_pipeline() -> Callable[[threading.Event], list[Node]]:
+    names = ("driver", "mitigator", "locator")
+    driver_class, mitigator_class, locator_class = map(_load_class, names)
     # Parameters on the command line reach all nodes.
-    other_parameters = {row.name for part in parts for row in TABLES[part]}
+    other_parameters = {row.name for name in names for row in TABLES[name]}
 
     def make_pipeline(stop: threading.Event) -> list[Node]:
-        made: list[Node] = []
+        nodes: list[Node] = []
         try:
-            consumer = mitigator.Mitigator(subscribe=False, other_parameters=other_parameters)
-            made.append(consumer)
-            made.insert(0, driver.Driver(stop, consumer, other_parameters=other_parameters))
-            # rclpy has no public access to the parameters given at start-up.
-            anchors = consumer._parameter_overrides.get("anchors")
-            if anchors is not None and anchors.value:
-                made.append(locator.Locator(other_parameters=other_parameters))
+            mitigator = mitigator_class(subscribe=False, other_parameters=other_parameters)
+            nodes.append(mitigator)
+            nodes.insert(0, driver_class(stop, mitigator, other_parameters=other_parameters))
+            if mitigator.given_parameters.get("anchors"):
+                nodes.append(locator_class(other_parameters=other_parameters))
         except BaseException:
-            for node in made:
+            for node in nodes:
                 node.destroy_node()
             raise
-        return made
+        return nodes
 
     return make_pipeline
 
 
-def main(name: str) -> None:
+def run_node(name: str) -> None:
     """Run an executable until a signal or until one of its nodes ends it; exit with its code."""
     sys.exit(_run(name))
 
@@ -119,7 +124,7 @@ def _run(name: str) -> int:
             make_nodes = load_node(name)
             stop = stop_event()
             nodes = make_nodes(stop)
-        except (rclpy_implementation.RCLError, NameValidationException) as error:
+        except (RuntimeError, NameValidationException) as error:  # rcl's errors are RuntimeErrors
             raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
         spin(nodes, stop)
     except ImportError as error:

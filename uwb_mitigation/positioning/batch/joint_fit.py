@@ -54,7 +54,7 @@ class Observations:
     Attributes:
         knot, anchor: int (n,), of each observation; knots of one segment are contiguous.
         ahead_s: float64 (n,), time of the observation after its knot.
-        range_m, share: float64 (n,); the share is the number of independent ranges in a observation.
+        range_m, share: float64 (n,); the share is the number of independent ranges in an observation.
         relative_height: float64 (n,), the height of the tag above the common one.
         rows: float64 (n, q), of the parameters.
         noise_group: int (n,), observations whose errors have the same standard deviation have the same number, from 0.

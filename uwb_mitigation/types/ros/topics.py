@@ -1,4 +1,4 @@
-"""Topics written by this package, and their types."""
+"""Topics of this package as recorded without a namespace, and their types."""
 
 RANGE_RAW = "/uwb/range_raw"
 RANGE_TRUTH = "/uwb/range_truth"
@@ -24,4 +24,11 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 RANGE_SENSOR_TYPE = "sensor_msgs/msg/Range"
 MARKERS_TYPE = "visualization_msgs/msg/MarkerArray"
 TF, TF_STATIC = "/tf", "/tf_static"
+DIAGNOSTICS, CLOCK = "/diagnostics", "/clock"
+PX4_ODOMETRY = "/fmu/in/vehicle_visual_odometry"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
+
+
+def relative(topic: str) -> str:
+    """Return the name that a node uses, so that the topic is in its namespace."""
+    return topic.removeprefix("/")

@@ -1,12 +1,12 @@
-"""Topic names, quality of service (REP-2003), publishers, subscriptions, and ranges as sensor_msgs/Range.
+"""Publishers and subscriptions with their quality of service (REP-2003), and ranges as sensor_msgs/Range.
 
-The names are relative: `/uwb/range_raw` without a namespace, `/board1/uwb/range_raw` in `board1`. History, depth and
-reliability can be overridden by the standard parameters `qos_overrides.TOPIC.publisher.POLICY` and
+History, depth and reliability can be overridden by the standard parameters `qos_overrides.TOPIC.publisher.POLICY` and
 `qos_overrides.TOPIC.subscription.POLICY`.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,20 +24,8 @@ from std_msgs.msg import Header
 
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.types.measurement import CorrectedRange
+from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, relative
 from uwb_mitigation.types.stamps import NS_PER_S
-
-RANGE_RAW = "uwb/range_raw"
-RANGE_CORRECTED = "uwb/range_corrected"
-RANGE_TRUTH = "uwb/range_truth"
-POSE = "uwb/pose"
-ODOMETRY = "uwb/odometry"
-POSE_SMOOTHED = "uwb/pose_smoothed"
-ANCHORS = "uwb/anchors"
-ODOMETRY_TRUTH = "uwb/odometry_truth"
-PX4_ODOMETRY = "/fmu/in/vehicle_visual_odometry"
-TF = "/tf"
-DIAGNOSTICS = "/diagnostics"
-CLOCK = "/clock"
 
 DEPTH = 1000
 """Queue depth: a subscriber that stalls for 1 s at 1 kHz loses no range."""
@@ -114,18 +102,26 @@ def create_raw_subscription(
     Raises:
         ParameterError: an overridden quality of service is invalid.
     """
-
-    def take(data: Any, info: Any = None) -> None:
-        # rclpy's events executor passes (data, info) as one tuple.
-        if info is None:
-            data, info = data
-        callback(data, info["publication_sequence_number"])
-
     events = SubscriptionEventCallbacks(message_lost=on_lost)
-    subscription = create_subscription(node, kind, topic, take, raw=True, event_callbacks=events)
-    # rclpy passes the info only to callbacks that require two arguments.
-    subscription._callback_type = Subscription.CallbackType.WithMessageInfo
-    return subscription
+    take = _RawCallback(callback)
+    return create_subscription(node, kind, topic, take, raw=True, event_callbacks=events)
+
+
+class _RawCallback:
+    """Passes the bytes of a message and the publisher's sequence number to a callback.
+
+    rclpy passes the info only to callbacks whose signature requires two arguments, but its events executor then passes
+    (data, info) as one tuple.
+    """
+
+    __signature__ = inspect.signature(lambda data, info: None)
+
+    def __init__(self, callback: Callable[[bytes, int], None]) -> None:
+        self._callback = callback
+
+    def __call__(self, *arguments: Any) -> None:
+        data, info = arguments if len(arguments) == 2 else arguments[0]
+        self._callback(data, info["publication_sequence_number"])
 
 
 def take_queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes, int]]:
@@ -183,7 +179,7 @@ class SensorRanges:
                 text = f"more than {MAX_SENSOR_TOPICS} anchors: no topic for anchor {format_id(anchor_id)}"
                 self._node.get_logger().warning(text, throttle_duration_sec=60.0)
                 return
-            topic = f"{RANGE_CORRECTED}/anchor_{format_id(anchor_id)}"
+            topic = f"{relative(RANGE_CORRECTED)}/anchor_{format_id(anchor_id)}"
             publisher = self._publishers[anchor_id] = create_publisher(self._node, self._kind, topic)
             publisher.on_activate(None)
         valid = math.isfinite(corrected.range_m) and math.isfinite(corrected.variance_m2)
