@@ -203,7 +203,7 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
     )
     for process in (locator, other):
         process.wait_for_output("locating")
-    transforms = ros.collect(TFMessage, "/tf")
+    transforms, left_transforms = ros.collect(TFMessage, "/tf"), ros.collect(TFMessage, "/left/tf")
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
     long_tag = "tag_0x1122334455667788"
     odometry = {
@@ -229,7 +229,9 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
     found = links()
     frames = {frame for frame, _ in found}
     # A frame has one parent: frames of the robot (odom, base_link) are not published.
-    assert {*odometry} <= frames <= {*odometry, f"left/{long_tag}"}
+    assert frames == {"uwb_tag", long_tag}
+    left_frames = {one.child_frame_id for array in left_transforms for one in array.transforms}
+    assert {"left/uwb_tag"} <= left_frames <= {"left/uwb_tag", f"left/{long_tag}"}
     assert {one.header.frame_id for one in found.values()} == {"map"}
     for frame, messages in odometry.items():
         assert {message.child_frame_id for message in messages} == {frame}
