@@ -1,9 +1,9 @@
 """Make the pictures of the README and of the documentation. Both use simulated ranges.
 
-`raw_and_corrected.png` is a map of a simulated drive with positions from raw and from corrected ranges.
-`viewer.png` and `viewer_narrow.png` are screenshots of the viewer in Chromium.
+`raw_and_corrected.png` is a map of a simulated drive: positions by least squares on raw ranges, by the locator on raw
+ranges, and by the locator on corrected ranges. `viewer.png` and `viewer_narrow.png` are screenshots in Chromium.
 
-    python docs/pictures.py
+    python docs/pictures.py [map]
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ def save(browser: Browser, name: str) -> None:
 
 
 def plot_raw_and_corrected() -> None:
-    """Plot a map of a simulated drive: positions from raw and from corrected ranges."""
+    """Plot a map of a simulated drive, with the same filter on raw and on corrected ranges."""
     command = [sys.executable, "-m", "uwb_mitigation.commands.cli"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -76,7 +77,9 @@ def plot_raw_and_corrected() -> None:
         subprocess.run([*command, "process", str(raw), "--offsets", "0.22", "-o", str(corrected)], check=True)
         anchors = load_anchors(folder / "drive.anchors.yaml")
         (recording,) = read_ranges(corrected, anchors).tags
-    tracks = track_tag(recording, EstimatorConfig(anchors, height=Height(0.0)))
+    config = EstimatorConfig(anchors, height=Height(0.0))
+    corrected_tracks = track_tag(recording, config)
+    raw_tracks = track_tag(replace(recording, ranges=recording.raw, corrected=False), config)
     figure, axes = plt.subplots(figsize=(9.0, 6.2), dpi=90)
     for wall in FLAT.walls:
         (x0, y0), (x1, y1) = wall.start, wall.end
@@ -92,11 +95,12 @@ def plot_raw_and_corrected() -> None:
     truth, begin_ns = recording.truth, recording.truth.stamp_ns[0]
     shown: list[tuple[Any, str, dict[str, Any]]] = [
         (
-            tracks.snapshot,
+            raw_tracks.snapshot,
             "raw ranges, least squares",
-            {"color": VERMILLION, "lw": 0.8, "marker": "+", "ms": 5},
+            {"color": VERMILLION, "lw": 0, "marker": "+", "ms": 4},
         ),
-        (tracks.live, "corrected ranges, locator", {"color": BLUE, "lw": 3.0}),
+        (raw_tracks.live, "raw ranges, locator", {"color": VERMILLION, "lw": 1.5}),
+        (corrected_tracks.live, "corrected ranges, locator", {"color": BLUE, "lw": 3.0}),
         (truth, "true path", {"color": NIGHT, "lw": 1.5, "ls": "--"}),
     ]
     for track, label, style in shown:
@@ -111,7 +115,8 @@ def plot_raw_and_corrected() -> None:
                 ],
                 axis=1,
             )
-            label += f"\nmean error {np.linalg.norm(position - true, axis=1).mean():.2f} m"
+            rmse_m = np.sqrt(np.mean(np.sum((position - true) ** 2, axis=1)))
+            label += f"\nRMSE {rmse_m:.2f} m"
         axes.plot(*position.T, label=label, **style)
     axes.plot(*anchors.position[:, :2].T, "^", color=NIGHT, ms=12, label="anchor")
     axes.plot([], [], color=GREY, lw=5, label="wall")
@@ -128,6 +133,8 @@ def plot_raw_and_corrected() -> None:
 def main() -> None:
     PICTURES.mkdir(exist_ok=True)
     plot_raw_and_corrected()
+    if "map" in sys.argv:
+        return
     processes.isolate()
     anchors = SimulatedSource(rate_hz=SIMULATED_HZ).anchors
     with socket.socket() as free:
