@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.recordings.mapping.conversion import NO_CIR, ColumnDict, read_csv
+from uwb_mitigation.recordings.mapping.conversion import ColumnDict, read_csv
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import (
     DEVICE_TICK_HZ,
@@ -57,6 +57,7 @@ _TOKEN = re.compile(
 )
 """All parts of a log that are used; the last group that matches determines the kind."""
 
+_NO_CIR = Cir(np.zeros(0, np.int16), radio=RadioType.DW1000, segment=Segment.IPATOV)
 _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 
@@ -175,7 +176,7 @@ class DecaRangingLog(Source):
                 # IEEE 802.15.4 with 64-bit addresses, then the function code
                 frame = bytes.fromhex(match["frame"].decode())
                 frame_kind, cir_owner = _CODES.get(frame[21]), None
-                tag, anchor = (int.from_bytes(frame[at : at + 8], "little") for at in (13, 5))
+                tag, anchor = (int.from_bytes(frame[i : i + 8], "little") for i in (13, 5))
             elif kind == "first":
                 cir_owner, frame_kind = frame_kind, None
                 time = (int(match["high"], 16) << 32 | int(match["low"], 16)) % DEVICE_TIME_WRAP
@@ -199,13 +200,7 @@ class DecaRangingLog(Source):
                     frames[cir_owner] = time, self._with_samples(cir, match["pairs"])
                 cir_owner = None
             elif kind == "range":
-                empty = Cir(
-                    NO_CIR.samples,
-                    channel=channel,
-                    prf_mhz=prf,
-                    radio=RadioType.DW1000,
-                    segment=Segment.IPATOV,
-                )
+                empty = replace(_NO_CIR, channel=channel, prf_mhz=prf)
                 time, cir = frames.get(self._cir_frame, (latest or 0, empty))
                 if len(cir) == 0:
                     self._count(Anomaly.NO_CIR)
@@ -222,8 +217,8 @@ class DecaRangingLog(Source):
 
     def _diagnostics(self, match: re.Match[bytes], channel: int, prf: int) -> Cir:
         power, first = (self._number(match[name], -1000.0, 1000.0) for name in ("power", "first"))
-        return Cir(
-            NO_CIR.samples,
+        return replace(
+            _NO_CIR,
             # fixed point: ten integer and six fractional bits
             first_path_index=self._number(match["path"], 0.0, 1024 - 2**-6),
             preamble_count=int(match["preamble"]),
@@ -232,8 +227,6 @@ class DecaRangingLog(Source):
             first_path_power_dbm=first,
             channel=channel,
             prf_mhz=prf,
-            radio=RadioType.DW1000,
-            segment=Segment.IPATOV,
         )
 
     def _with_samples(self, cir: Cir, pairs: bytes) -> Cir:
@@ -373,21 +366,20 @@ def find_survey(folder: Path) -> Survey | None:
         return None
 
     def table(name: str, *ids: str, axes: str = "", texts: tuple[str, ...] = ()) -> ColumnDict:
-        found = read_csv(folder / name, ids, dict.fromkeys(axes, (-1e6, 1e6)), texts)
-        first = np.unique(found[ids[0]], return_index=True)[1]
-        for row in sorted(set(range(len(found[ids[0]]))) - set(first.tolist()))[:1]:
-            what, where = f"{ids[0]} {found[ids[0]][row]} is repeated", f"{folder / name}: row {row + 1}"
-            raise RecordingError(what, where=where)
-        return found
+        columns = read_csv(folder / name, ids, dict.fromkeys(axes, (-1e6, 1e6)), texts)
+        keys = columns[ids[0]]
+        for row in sorted(set(range(len(keys))) - set(np.unique(keys, return_index=True)[1].tolist()))[:1]:
+            raise RecordingError(f"{ids[0]} {keys[row]} is repeated", where=f"{folder / name}: row {row + 1}")
+        return columns
 
     labels, surveyed = {}, {}
     if (folder / "labels.csv").is_file():
-        found = table("labels.csv", "file_id", texts=("label",))
-        labels = dict(zip(found["file_id"].tolist(), found["label"].tolist(), strict=True))
+        columns = table("labels.csv", "file_id", texts=("label",))
+        labels = dict(zip(columns["file_id"].tolist(), columns["label"].tolist(), strict=True))
     for kind in ("anchor", "tag"):
-        found = table(f"{kind}s.csv", "location", axes="xy")
-        places = zip(found["x"].tolist(), found["y"].tolist(), strict=True)
-        surveyed[kind] = dict(zip(found["location"].tolist(), places, strict=True))
+        columns = table(f"{kind}s.csv", "location", axes="xy")
+        positions = zip(columns["x"].tolist(), columns["y"].tolist(), strict=True)
+        surveyed[kind] = dict(zip(columns["location"].tolist(), positions, strict=True))
     pairs = table("pairs.csv", "file_number", "anchor_location", "tag_location")
     placements = {}
     for row, log in enumerate(pairs["file_number"].tolist()):
@@ -396,11 +388,10 @@ def find_survey(folder: Path) -> Survey | None:
             if location not in surveyed[kind]:
                 what = f"{kind} location {location} is unknown"
                 raise RecordingError(what, where=f"{folder / 'pairs.csv'}: row {row + 1}")
-        place = surveyed["tag"][tag]
-        truth = Truth(
-            math.dist(surveyed["anchor"][anchor], place), labels.get(log, ""), f"{folder.name}/{log}"
-        )
-        placements[log] = Placement(anchor, tag, (*place, 0.0), truth)
+        position = surveyed["tag"][tag]
+        true_m = math.dist(surveyed["anchor"][anchor], position)
+        truth = Truth(true_m, labels.get(log, ""), f"{folder.name}/{log}")
+        placements[log] = Placement(anchor, tag, (*position, 0.0), truth)
     anchors = [Anchor(key, (x, y, 0.0)) for key, (x, y) in surveyed["anchor"].items()]
     return placements, AnchorMap(anchors, str(folder / "anchors.csv"))
 

@@ -66,49 +66,21 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
     Raises:
         RecordingError: the bag cannot be read, or has no range of an anchor in the map.
     """
-    bag, offset_ns = BagReader(path), round(stamp_offset_s * 1e9)
-    raw, corrected = defaultdict[int, list[_Row]](list), defaultdict[int, list[_Row]](list)
-    unknown_anchors, skipped, checked = Counter[int](), Counter[str](), set[int]()
-    powers: dict[MeasurementKey, float] = {}
-
-    def add(
-        table: dict[int, list[_Row]], key: MeasurementKey, value: float, variance: float, power: float
-    ) -> bool:
-        row = anchors.index.get(key.anchor_id)
-        if row is None or not (math.isfinite(value) and value >= 0.0) or variance == math.inf:
-            return False
-        table[key.tag_id].append((key.stamp_ns + offset_ns, row, value, variance, power))
-        return True
-
+    bag = BagReader(path)
+    table = _RangeTable(anchors, round(stamp_offset_s * 1e9))
+    checked = set[int]()
     for message in bag.messages((RANGE_RAW, RANGE_CORRECTED)):
         is_raw = message.channel.topic == RANGE_RAW
         if id(message.channel) not in checked:
             check_channel(message.channel, RANGE_CIR_TYPE if is_raw else RANGE_CORRECTED_TYPE, path)
             checked.add(id(message.channel))
         try:
-            if is_raw:
-                measured = decode_range(message.data)
-                key = measurement_key(measured)
-                powers[key] = measured.cir.rx_power_dbm
-                row = (measured.range_m, math.nan, powers[key])
-            else:
-                key, corrected_range = decode_corrected(message.data)
-                row = (corrected_range.range_m, corrected_range.variance_m2, powers.get(key, math.nan))
-                if key not in powers:
-                    # A bag without raw ranges: corrected ranges contain the measured ones.
-                    add(raw, key, corrected_range.range_raw_m, math.nan, math.nan)
+            table.add_raw(message.data) if is_raw else table.add_corrected(message.data)
         except RecordingError as error:
-            skipped[error.what] += 1
-            continue
-        if not add(raw if is_raw else corrected, key, *row):
-            is_new = is_raw or not raw
-            if key.anchor_id not in anchors.index:
-                unknown_anchors[key.anchor_id] += is_new
-            else:
-                skipped["invalid range"] += is_new
-    if not raw and not corrected:
+            table.skipped[error.what] += 1
+    if not table.raw and not table.corrected:
         map_ids = ", ".join(map(str, sorted(anchors.index)))
-        recorded_ids = ", ".join(map(str, sorted(unknown_anchors))) or "none"
+        recorded_ids = ", ".join(map(str, sorted(table.unknown_anchors))) or "none"
         raise RecordingError(
             f"no range of the anchors {map_ids}",
             where=str(path),
@@ -117,11 +89,56 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
     truths = read_truth(path)
     no_truth = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
     tags = []
-    for tag in sorted(raw.keys() | corrected.keys()):
-        measured_ranges = _columns(tag, raw.get(tag, []))
-        usable = _columns(tag, corrected[tag]) if tag in corrected else measured_ranges
-        tags.append(TagRecording(tag, measured_ranges, usable, tag in corrected, truths.get(tag, no_truth)))
-    return RecordedRanges(tags, unknown_anchors, skipped + bag.warnings)
+    for tag in sorted(table.raw.keys() | table.corrected.keys()):
+        raw = _columns(tag, table.raw.get(tag, []))
+        is_corrected = tag in table.corrected
+        ranges = _columns(tag, table.corrected[tag]) if is_corrected else raw
+        tags.append(TagRecording(tag, raw, ranges, is_corrected, truths.get(tag, no_truth)))
+    return RecordedRanges(tags, table.unknown_anchors, table.skipped + bag.warnings)
+
+
+class _RangeTable:
+    """Rows of the raw and corrected ranges of a bag, by tag."""
+
+    def __init__(self, anchors: AnchorMap, offset_ns: int) -> None:
+        self._anchors, self._offset_ns = anchors, offset_ns
+        self._powers: dict[MeasurementKey, float] = {}
+        self.raw = defaultdict[int, list[_Row]](list)
+        self.corrected = defaultdict[int, list[_Row]](list)
+        self.unknown_anchors, self.skipped = Counter[int](), Counter[str]()
+
+    def add_raw(self, data: bytes) -> None:
+        measured = decode_range(data)
+        key, power = measurement_key(measured), measured.cir.rx_power_dbm
+        self._powers[key] = power
+        if not self._add(self.raw, key, measured.range_m, math.nan, power):
+            self._count(key)
+
+    def add_corrected(self, data: bytes) -> None:
+        key, corrected = decode_corrected(data)
+        power = self._powers.get(key, math.nan)
+        if key not in self._powers:
+            # A bag without raw ranges: corrected ranges contain the measured ones.
+            self._add(self.raw, key, corrected.range_raw_m, math.nan, math.nan)
+        is_valid = self._add(self.corrected, key, corrected.range_m, corrected.variance_m2, power)
+        # Otherwise, the raw range was counted.
+        if not is_valid and not self.raw:
+            self._count(key)
+
+    def _add(
+        self, rows: dict[int, list[_Row]], key: MeasurementKey, range_m: float, variance: float, power: float
+    ) -> bool:
+        anchor = self._anchors.index.get(key.anchor_id)
+        if anchor is None or not (math.isfinite(range_m) and range_m >= 0.0) or variance == math.inf:
+            return False
+        rows[key.tag_id].append((key.stamp_ns + self._offset_ns, anchor, range_m, variance, power))
+        return True
+
+    def _count(self, key: MeasurementKey) -> None:
+        if key.anchor_id in self._anchors.index:
+            self.skipped["invalid range"] += 1
+        else:
+            self.unknown_anchors[key.anchor_id] += 1
 
 
 def _columns(tag_id: int, rows: list[_Row]) -> Ranges:
