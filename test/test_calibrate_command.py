@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +16,8 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.training.site.live_position import LiveError
+from uwb_mitigation.training.site.selection import SiteErrors
 from uwb_mitigation.types.anchors import save_anchors
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.types.offsets import read_offsets
@@ -136,7 +137,7 @@ def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
         "drive.mcap",
         f"{bundle.model_id:08x}",
         "model:=site.onnx -p offsets:=site.offsets.yaml",
-        "Calibration reduces the range residual by at least",
+        "Live position error on held-out segments",
     ):
         assert text in page
     again = run("calibrate", "drive.mcap", *LEVEL, "-o", "site.onnx", folder=site)
@@ -160,8 +161,7 @@ def test_delayed_localisation_provides_the_truth(site):
     assert done.returncode == 0, done.stderr
     result = json.loads((site / "o.json").read_text())
     assert result["truth"] == "/odom"
-    raw, calibrated = result["position_error_m"]
-    assert calibrated < 0.6 * raw
+    assert result["live_position_change"] < -0.2
     assert result["localisation"]["time_offset_s"] == pytest.approx(0.3, abs=0.02)
     assert np.abs(np.array(result["localisation"]["lever_arm_m"]) - LEVER)[:2].max() < 0.05
     assert "with truth from /odom" in load_bundle(site / "odom.onnx").card.origin
@@ -171,7 +171,7 @@ def test_delayed_localisation_provides_the_truth(site):
 
 @pytest.mark.parametrize("truth", [None, "/odom"])
 def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, monkeypatch):
-    from uwb_mitigation.training.fit import selection
+    from uwb_mitigation.training.site import calibration
 
     seen = []
 
@@ -182,8 +182,8 @@ def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, m
         seen.append([without_offsets_of(rows[:0]), without_offsets_of(some), own])
         return choose(data, candidates, seed, without_offsets_of, on_share)
 
-    choose = selection.select_for_site
-    monkeypatch.setattr(selection, "select_for_site", look)
+    choose = calibration.held_out_site_errors
+    monkeypatch.setattr(calibration, "held_out_site_errors", look)
     options = ("--truth-topic", truth, "--estimate-lever-arm") if truth else ()
     done = run("calibrate", "drive.mcap", *LEVEL, "-o", "w.onnx", "--force", *options, folder=site)
     assert done.returncode == 0, done.stderr
@@ -230,10 +230,10 @@ def test_nine_gross_outliers_change_no_result(site):
 def test_heights_come_from_a_topic_and_stamps_are_shifted(site):
     late, _ = figures(site, "drive.mcap", "--height-topic", "/odom")
     # The localisation is delayed by 0.3 s and does not cover the first ranges.
-    assert late["left_out"] == {"no height at that time": 6}
+    assert late["skipped"] == {"no height at that time": 6}
     shifted, _ = figures(site, "drive.mcap", "--height-topic", "/odom", "--stamp-offset", 0.3)
     # Now it ends one range early.
-    assert shifted["left_out"] == {"no height at that time": 1}
+    assert shifted["skipped"] == {"no height at that time": 1}
     given, _ = figures(site, "drive.mcap", "--height", 1.0)
     for pair, value in given["offsets_m"].items():
         assert shifted["offsets_m"][pair] == pytest.approx(value, abs=0.02)
@@ -285,22 +285,16 @@ def test_refusal_is_reported_in_the_json_and_writes_no_model(site):
 
 
 def no_range_gain(fields):
-    chosen, n = fields["selection"].chosen, len(fields["data"])
-    return {
-        "selection": replace(fields["selection"], errors={chosen: np.tile(fields["raw_error_m"], 2)[: 2 * n]})
-    }
+    n = len(fields["data"])
+    return {"errors": SiteErrors({fields["chosen"]: fields["raw_error_m"][:n]}, {})}
 
 
-def worse_scatter(fields):
-    return {"solution": replace(fields["solution"], position_scatter_m=(0.2, 0.21))}
-
-
-def worse_position(fields):
-    return {"position_error_m": (0.2, 0.21)}
+def worse_live_position(fields):
+    return {"live": fields["live"] | {fields["chosen"]: LiveError(9.0, 9.0)}}
 
 
 @pytest.mark.parametrize(
-    ("change", "options"), [(no_range_gain, ()), (worse_scatter, ()), (worse_position, WITH_TRUTH)]
+    ("change", "options"), [(no_range_gain, ()), (worse_live_position, ()), (worse_live_position, WITH_TRUTH)]
 )
 def test_calibration_without_gain_is_written_only_with_force(site, monkeypatch, change, options):
     from uwb_mitigation.training.site import calibration as site_calibration
@@ -355,7 +349,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     from drives import HALL
 
-    from uwb_mitigation.training.site.anchor_check import validate_anchor_map
+    from uwb_mitigation.positioning.batch.anchor_errors import validate_anchor_map
 
     ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
     rng = np.random.default_rng(4)
@@ -367,8 +361,7 @@ def test_small_displacement_and_heavy_tail_accuse_no_anchor():
         (HALL, ranges.range_m + tail),
     ):
         moved = replace(ranges, range_m=value)
-        site = SimpleNamespace(anchors=anchors, ranges=moved, tag=np.zeros(len(moved), int))
-        validate_anchor_map(site, path.position, known)
+        validate_anchor_map(anchors, moved, np.zeros(len(moved), int), path.position, known)
 
 
 def test_tag_is_matched_with_its_own_frame_in_any_namespace():

@@ -109,9 +109,8 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             [np.zeros_like(heading), np.zeros_like(heading), np.sin(heading / 2), np.cos(heading / 2)], axis=1
         )
         path = PosePath(stamps + round(TIME_OFFSET_S * 1e9), frame + noise, quaternion)
-        solution = site_solution.solve_with_truth(
-            site, universal, [[path]], "/odom", time_offset_s=None, estimate_lever_arm=True
-        )
+        localisation = site_solution.Localisation("/odom", [[path]], estimate_lever_arm=True)
+        solution = site_solution.solve_with_truth(site, universal, localisation, height=height)
     else:
         solution = site_solution.solve_without_truth(site, universal, height=height, area=None)
     found = site_calibration.calibrate_site(site, universal, solution, seed=0)
@@ -132,7 +131,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             "anchors": anchors,
             "size_m": list(drive.plan.size),
             "walls": len(drive.plan.walls),
-            "chosen": found.selection.chosen,
+            "chosen": found.chosen,
             "level": found.solution.offset_level,
             "seconds": took,
             "raw_mae": error_of(test, None, NO_OFFSETS),
@@ -183,7 +182,7 @@ def speed(minutes: float) -> dict[str, object]:
         "seconds": time.perf_counter() - began,
         "cpu_seconds": time.process_time() - cpu,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "chosen": found.selection.chosen,
+        "chosen": found.chosen,
     }
 
 

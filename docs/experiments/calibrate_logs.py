@@ -57,7 +57,7 @@ def show(found: SiteCalibration) -> None:
     print(
         {f"{tag}-{anchor}": f"{v:.3f}+-{sd:.3f}" for (tag, anchor), (v, sd) in found.solution.pairs.items()}
     )
-    print(found.selection.model.linear_bias, found.notes)
+    print(found.model.linear_bias, found.notes)
 
 
 def hanyang(folder: Path, name: str) -> None:
@@ -72,7 +72,7 @@ def hanyang(folder: Path, name: str) -> None:
         ids = np.array([anchor.id for anchor in anchors.anchors], np.uint64)
         off = found.offsets.of(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
         first = np.array([record.measurement.cir.first_path_power_dbm for record in test])
-        line = found.selection.model.linear_bias.predict_m(ranges.rx_power_dbm, first).astype(float)
+        line = found.model.linear_bias.predict_m(ranges.rx_power_dbm, first).astype(float)
         less = off + np.where(np.isfinite(line), line, 0.0)
         for kind, value in (("raw", ranges.range_m), ("calibrated", np.maximum(ranges.range_m - less, 0.0))):
             shifted = Ranges(ranges.stamp_ns, ranges.anchor, value, ranges.variance_m2, ranges.rx_power_dbm)

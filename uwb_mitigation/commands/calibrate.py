@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,16 +24,14 @@ from uwb_mitigation.commands.support.console import JsonOption, print_line, show
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from uwb_mitigation.mitigation.model.bundle import Bundle
     from uwb_mitigation.training.site.calibration import SiteCalibration
     from uwb_mitigation.training.site.data import SiteData
+    from uwb_mitigation.training.site.solution import LivePrior, Localisation, SiteSolution
     from uwb_mitigation.types.anchors import AnchorMap
-    from uwb_mitigation.types.tracks import PosePath
 
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
+MAX_STAMP_OFFSET_S = 3600.0
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
 
@@ -119,73 +118,108 @@ def calibrate(
     """
     from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
-    from uwb_mitigation.training.site import calibration as site_calibration
-    from uwb_mitigation.training.site import solution as site_solution
+    from uwb_mitigation.training.site.calibration import calibrate_site
+    from uwb_mitigation.training.site.solution import LivePrior
     from uwb_mitigation.types.anchors import anchors_path, load_anchors
 
-    check_output(output)
-    for file in (output, site_calibration.offsets_file(output), *([report] if report else [])):
-        if file.exists() and not force:
-            raise ParameterError("the file exists", where=str(file), valid="--force replaces it")
-    pose_options = (frames, time_offset, lever_arm, estimate_lever_arm or None)
-    if truth_topic is None and any(option is not None for option in pose_options):
-        raise ParameterError(
-            "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
-            valid="with --truth-topic",
-        )
+    _check_files(output, report, force)
+    pose_options = _PoseOptions(
+        truth_topic, frames, time_offset, parse_lever_arm(lever_arm), estimate_lever_arm
+    )
+    pose_options.check()
     if height is not None and height_topic is not None:
         raise ParameterError("--height and --height-topic", valid="either of them")
-    for option, seconds in (("stamp offset", stamp_offset), ("time offset", time_offset)):
-        if seconds is not None and not abs(seconds) <= 3600.0:
-            raise ParameterError(f"{option} {seconds}", valid="-3600 to 3600 s")
-    height_prior = None if height is None else Height(height, height_sd)
-    area_bounds, lever_arm_m = Area.parse(area), parse_lever_arm(lever_arm)
+    if not abs(stamp_offset) <= MAX_STAMP_OFFSET_S:
+        raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
+    prior = LivePrior(None if height is None else Height(height, height_sd), Area.parse(area), height_sd)
     anchor_map = load_anchors(anchors or anchors_path(bags[0]))
     source = bundle_for(None, bags[0])
     try:
         site = _gather(bags, anchor_map, source, stamp_offset, height_topic, height_sd)
-        if height_topic is not None and len(site.tags) > 1:
-            raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
-        for reason, count in site.skipped.items():
-            warn(f"skipped: {count} x {reason}")
         with console.stage_bars() as on_progress:
-            if truth_topic is None:
-                solution = site_solution.solve_without_truth(
-                    site,
-                    source,
-                    height=height_prior,
-                    area=area_bounds,
-                    height_sd_m=height_sd,
-                    on_progress=on_progress,
-                )
-            else:
-                paths, lever_arms_m = _poses(bags, site, truth_topic, frames, lever_arm_m)
-                solution = site_solution.solve_with_truth(
-                    site,
-                    source,
-                    paths,
-                    truth_topic,
-                    time_offset_s=time_offset,
-                    lever_arms_m=lever_arms_m,
-                    estimate_lever_arm=estimate_lever_arm,
-                    on_progress=on_progress,
-                )
-            calibration = site_calibration.calibrate_site(
-                site, source, solution, seed=seed, on_progress=on_progress
-            )
+            solution = _solve(bags, site, source, prior, pose_options, on_progress)
+            calibration = calibrate_site(site, source, solution, seed=seed, on_progress=on_progress)
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
-        refused: dict[str, object] = {"offsets_m": {}, "raw_mae_m": None, "calibrated_mae_m": None}
-        console.write_json(json, refused | {"truth": truth_topic or "none", "refused": str(error)})
+        refused: dict[str, object] = {
+            "offsets_m": {},
+            "raw_mae_m": None,
+            "calibrated_mae_m": None,
+            "live_position_change": None,
+        }
+        console.write_json(json, refused, {"truth": truth_topic or "none", "refused": error})
         raise
     _show(calibration)
-    if calibration.lacks_gain and not force:
+    if calibration.refusal and not force:
         no_gain = DatasetError(
             f"not written: {calibration.summary()}" + "".join(f" {note}." for note in calibration.notes[:1]),
             valid="a longer drive, or --force to write it anyway",
         )
-        console.write_json(json, calibration.as_json() | {"refused": str(no_gain)})
+        console.write_json(json, calibration, {"refused": no_gain})
         raise no_gain
+    console.write_json(json, calibration, _write(calibration, bags, source, output, report))
+
+
+@dataclass(frozen=True)
+class _PoseOptions:
+    """Options of a localisation that is used as ground truth."""
+
+    topic: str | None
+    frames: tuple[str, str] | None
+    time_offset_s: float | None
+    lever_arm_m: tuple[float, float, float] | None
+    estimate_lever_arm: bool
+
+    def check(self) -> None:
+        """Raise a ParameterError if the options contradict each other."""
+        options = (self.frames, self.time_offset_s, self.lever_arm_m, self.estimate_lever_arm or None)
+        if self.topic is None and any(option is not None for option in options):
+            raise ParameterError(
+                "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
+                valid="with --truth-topic",
+            )
+        if self.time_offset_s is not None and not abs(self.time_offset_s) <= MAX_STAMP_OFFSET_S:
+            raise ParameterError(f"time offset {self.time_offset_s}", valid="-3600 to 3600 s")
+
+
+def _check_files(output: Path, report: Path | None, force: bool) -> None:
+    from uwb_mitigation.training.site.calibration import offsets_file
+
+    check_output(output)
+    for file in (output, offsets_file(output), *([report] if report else [])):
+        if file.exists() and not force:
+            raise ParameterError("the file exists", where=str(file), valid="--force replaces it")
+
+
+def _solve(
+    bags: list[Path],
+    site: SiteData,
+    source: Bundle,
+    prior: LivePrior,
+    pose_options: _PoseOptions,
+    on_progress: Callable[[str, float], None],
+) -> SiteSolution:
+    from uwb_mitigation.training.site import solution
+
+    if pose_options.topic is not None:
+        localisation = _localisation(bags, site, pose_options.topic, pose_options)
+        return solution.solve_with_truth(
+            site, source, localisation, height=prior.height, on_progress=on_progress
+        )
+    return solution.solve_without_truth(
+        site,
+        source,
+        height=prior.height,
+        area=prior.area,
+        height_sd_m=prior.height_sd_m,
+        on_progress=on_progress,
+    )
+
+
+def _write(
+    calibration: SiteCalibration, bags: list[Path], source: Bundle, output: Path, report: Path | None
+) -> dict[str, object]:
+    """Write bundle, offsets and page; return their entries in the result."""
     name = ", ".join(bag.resolve().name for bag in bags)
     bundle, offsets_path = calibration.write(output, source, name)
     print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
@@ -195,9 +229,7 @@ def calibrate(
 
         write_atomically(report, site_page(calibration, name, bundle, (str(output), str(offsets_path))))
         print_line(f"Wrote {report}.")
-    console.write_json(
-        json, calibration.as_json() | {"model_id": bundle.model_id, "offsets_file": str(offsets_path)}
-    )
+    return {"model_id": bundle.model_id, "offsets_file": offsets_path}
 
 
 def _gather(
@@ -216,7 +248,7 @@ def _gather(
 
     heights = None if height_topic is None else [read_heights(bag, height_topic, height_sd) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
-        return read_site(
+        site = read_site(
             [stack.enter_context(open_recording(bag)) for bag in bags],
             anchors,
             source.card,
@@ -224,27 +256,29 @@ def _gather(
             stamp_offset_s=stamp_offset,
             heights=heights,
         )
+    if heights is not None and len(site.tags) > 1:
+        raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
+    for reason, count in site.skipped.items():
+        warn(f"skipped: {count} x {reason}")
+    return site
 
 
-def _poses(
-    bags: list[Path],
-    site: SiteData,
-    topic: str,
-    frames: tuple[str, str] | None,
-    lever_arm_m: tuple[float, float, float] | None,
-) -> tuple[list[list[PosePath]], NDArray[np.float64]]:
-    """Return, for each tag, the poses of its body in each bag; and the lever arms, (T, 3)."""
+def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOptions) -> Localisation:
+    """Read for each tag the poses of its body in each bag, and its lever arm."""
     import numpy as np
 
     from uwb_mitigation.recordings.bag.pose_paths import read_bodies
+    from uwb_mitigation.training.site.solution import Localisation
     from uwb_mitigation.types.ros.poses import UWB_TAG, tag_of_frame
+
+    lever_arm_m = options.lever_arm_m
 
     if lever_arm_m is not None and len(site.tags) > 1:
         raise ParameterError(
             f"one --lever-arm for {len(site.tags)} tags",
             valid="transforms to the frames of the tags in the bag",
         )
-    bodies = [read_bodies(bag, topic, frames) for bag in bags]
+    bodies = [read_bodies(bag, topic, options.frames) for bag in bags]
     paths, lever_arms_m = [], np.zeros((len(site.tags), 3))
     for number, tag in enumerate(site.tags):
         names = [
@@ -262,7 +296,7 @@ def _poses(
                     f"tag {format_id(tag.tag_id)}: the bag contains no transform from {names[0] or BASE_FRAME} to the "
                     "antenna; the lever arm is 0. Set --lever-arm"
                 )
-    return paths, lever_arms_m
+    return Localisation(topic, paths, options.time_offset_s, lever_arms_m, options.estimate_lever_arm)
 
 
 def _body_of_tag(tag_id: int, bodies: Iterable[str], where: str) -> str:
@@ -292,18 +326,20 @@ def _lever_arm_in(
         for bag, body in zip(bags, bodies, strict=True)
         for frame in frames
     ]
-    known = [(bag, arm) for bag, arm in arms if arm is not None]
-    for bag, arm in known[1:]:
-        if math.dist(arm, known[0][1]) > MAX_LEVER_ARM_DIFFERENCE_M:
+    transforms = [(bag, arm) for bag, arm in arms if arm is not None]
+    for bag, arm in transforms[1:]:
+        if math.dist(arm, transforms[0][1]) > MAX_LEVER_ARM_DIFFERENCE_M:
             raise RecordingError(
-                f"the lever arm differs from that in {known[0][0]}",
+                f"the lever arm differs from that in {transforms[0][0]}",
                 where=str(bag),
                 valid="--lever-arm, or bags with the antenna at one position",
             )
-    return known[0][1] if known else None
+    return transforms[0][1] if transforms else None
 
 
 def _show(calibration: SiteCalibration) -> None:
+    from uwb_mitigation.training.site.live_position import RAW
+
     solution = calibration.solution
     if solution.alignment is not None:
         alignment = solution.alignment
@@ -317,15 +353,16 @@ def _show(calibration: SiteCalibration) -> None:
             )
             print_line(f"tag {format_id(ranges.tag_id)}: lever arm {values} m")
     rows = [(format_id(tag), format_id(anchor), *values) for (tag, anchor), values in solution.pairs.items()]
-    columns = ("tag", "anchor", "offset m", "standard deviation m")
-    show_table("Offsets", columns, rows)
-    chosen = calibration.selection.chosen
-    errors = {"raw": calibration.raw_mae_m, **calibration.selection.mae()}
+    show_table("Offsets", ("tag", "anchor", "offset, m", "standard deviation, m"), rows, left=2)
+    mae_m = {RAW: calibration.raw_mae_m, **calibration.errors.mae()}
     show_table(
-        "On held-out segments and anchors",
-        ("model", "MAE m", ""),
-        [(name, mae, "<-" if name == chosen else "") for name, mae in errors.items()],
-        chosen,
+        "On held-out segments",
+        ("ranges", "live position RMSE, m", "range MAE, m", "chosen"),
+        [
+            (name, calibration.live[name].locator_m, mae, "<-" if name == calibration.chosen else "")
+            for name, mae in mae_m.items()
+        ],
+        calibration.chosen,
     )
     for note in calibration.notes:
         warn(note)

@@ -8,11 +8,13 @@ their likelihoods.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.joint_fit import (
@@ -24,9 +26,10 @@ from uwb_mitigation.positioning.batch.joint_fit import (
 )
 from uwb_mitigation.positioning.batch.motion_segments import Segments
 from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank, unit_vectors
-from uwb_mitigation.positioning.noise_model import Regressors
+from uwb_mitigation.positioning.noise_model import MAD_TO_SD, Regressors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.tracks import Ranges
 
 MISPLACED_M = 0.4
 """A smaller displacement looks like reflections."""
@@ -53,6 +56,15 @@ MIRRORED = 4.5
 
 MAX_REFITS = 8
 MAX_GROUPS = 5
+
+INDEPENDENT_S = 2.0
+"""Range errors of an anchor within this time count as one independent error."""
+
+MIN_GROUPS = 8
+"""An anchor with fewer independent errors is not examined."""
+
+MIN_SD_M = 0.1
+MAX_ANCHOR_RANGES = 2000
 
 _DISPLACEMENT_SD_M = 2.0
 _STEPS = 6
@@ -318,3 +330,125 @@ def _gap_s(observations: Observations, received: NDArray[np.bool_]) -> NDArray[n
         np.abs(time - there[after]), np.abs(time - there[np.maximum(after - 1, 0)])
     )
     return nearest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchorRanges:
+    """The ranges of one anchor.
+
+    Attributes:
+        antenna: (n, 3), position of the tag, m. range_m: (n,). tag: int (n,).
+        weight: the number of independent errors, divided by n.
+    """
+
+    antenna: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+    tag: NDArray[np.intp]
+    weight: float
+
+    def residual_m(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the error of each range to an anchor at `position` minus the median of its tag."""
+        error: NDArray[np.float64] = self.range_m - np.linalg.norm(self.antenna - position, axis=1)
+        for tag in np.unique(self.tag):
+            error[self.tag == tag] -= np.median(error[self.tag == tag])
+        return error
+
+    def loss(self, position: NDArray[np.float64], sd_m: float) -> float:
+        """Return the negative log likelihood (Cauchy) for an anchor at `position`, with per-tag offsets."""
+        return float(self.weight * np.log1p((self.residual_m(position) / sd_m) ** 2).sum())
+
+    def best_displacement(self, position: NDArray[np.float64], sd_m: float) -> NDArray[np.float64]:
+        """Return the horizontal displacement from `position` that fits the ranges best, m, shape (3,)."""
+        solution = least_squares(
+            lambda shift: self.residual_m(position + np.append(shift, 0.0)),
+            np.zeros(2),
+            loss="cauchy",
+            f_scale=sd_m,
+        )
+        return np.append(solution.x, 0.0)
+
+
+def validate_anchor_map(
+    anchors: AnchorMap,
+    all_ranges: Ranges,
+    tag: NDArray[np.intp],
+    antenna: NDArray[np.float64],
+    is_used: NDArray[np.bool_],
+) -> None:
+    """Raise an error if other anchor positions fit the ranges much better.
+
+    Args:
+        anchors: anchors of the file.
+        all_ranges: r ranges.
+        tag: int (r,), tag of each range.
+        antenna: (r, 3), position of the tag's antenna at each range, m.
+        is_used: bool (r,), whether the position is known and the range is not an outlier.
+
+    Raises:
+        DatasetError: names the anchors.
+    """
+    ranges = _by_anchor(all_ranges, tag, antenna, is_used)
+    if not ranges:
+        return
+    spread = np.concatenate(
+        [anchor_ranges.residual_m(anchors.position[row]) for row, anchor_ranges in ranges.items()]
+    )
+    sd_m = max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(spread))))
+    current_loss = {
+        row: anchor_ranges.loss(anchors.position[row], sd_m) for row, anchor_ranges in ranges.items()
+    }
+    shift = {
+        row: anchor_ranges.best_displacement(anchors.position[row], sd_m)
+        for row, anchor_ranges in ranges.items()
+    }
+    gain = {
+        row: current_loss[row] - anchor_ranges.loss(anchors.position[row] + shift[row], sd_m)
+        for row, anchor_ranges in ranges.items()
+    }
+    suspects = [
+        row
+        for row in ranges
+        if np.linalg.norm(shift[row]) > MISPLACED_M and _is_better(gain[row], current_loss[row])
+    ]
+    fix = "the true positions in the anchors file (`uwb-mitigation survey` finds them)"
+    best_swap: tuple[float, int, int] | None = None
+    for a, b in itertools.combinations(suspects, 2):
+        swapped = ranges[a].loss(anchors.position[b], sd_m) + ranges[b].loss(anchors.position[a], sd_m)
+        swap_gain = current_loss[a] + current_loss[b] - swapped
+        # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
+        is_swap = swap_gain > (1.0 - LARGER) * (gain[a] + gain[b])
+        if is_swap and (best_swap is None or swap_gain > best_swap[0]):
+            best_swap = swap_gain, a, b
+    if best_swap is not None:
+        first, second = (anchors.anchors[row] for row in best_swap[1:])
+        raise DatasetError(
+            f"anchors {first} and {second} contradict the localisation: the ranges fit if these anchors are swapped",
+            valid=fix,
+        )
+    if suspects:
+        row = max(suspects, key=gain.__getitem__)
+        raise DatasetError(
+            f"anchor {anchors.anchors[row]} contradicts the localisation: the ranges fit a position "
+            f"{float(np.linalg.norm(shift[row])):.1f} m from that in the anchors file",
+            valid=fix,
+        )
+
+
+def _is_better(gain: float, loss: float) -> bool:
+    return gain > max(MIN_LOSS_GAIN, LARGER * loss)
+
+
+def _by_anchor(
+    ranges: Ranges, tag: NDArray[np.intp], antenna: NDArray[np.float64], is_used: NDArray[np.bool_]
+) -> dict[int, AnchorRanges]:
+    by_anchor = {}
+    for row in np.unique(ranges.anchor).tolist():
+        rows = np.flatnonzero(is_used & (ranges.anchor == row))
+        group = ranges.stamp_ns[rows] // round(INDEPENDENT_S * 1e9)
+        independent = len(np.unique(np.stack([group, tag[rows]]), axis=1).T) if len(rows) else 0
+        if independent < MIN_GROUPS:
+            continue
+        rows = rows[:: math.ceil(len(rows) / MAX_ANCHOR_RANGES)]
+        weight = min(1.0, independent / len(rows))
+        by_anchor[row] = AnchorRanges(antenna[rows], ranges.range_m[rows], tag[rows], weight)
+    return by_anchor

@@ -188,6 +188,16 @@ class JointFit:
             found[:, 2, 2] = height.sd**2
         return found
 
+    def antenna_position(self) -> NDArray[np.float64]:
+        """Return the position of the tag's antenna at each observation, float64 (n, 3), m."""
+        observations = self.observations
+        position: NDArray[np.float64] = (
+            self.position[observations.knot]
+            + observations.ahead_s[:, None] * self.velocity[observations.knot]
+        )
+        position[:, 2] += observations.relative_height
+        return position
+
     def without(self, left_out: NDArray[np.bool_]) -> JointFit:
         """Fit again without those observations, bool (n,), starting here."""
         observations, start = self.observations.without(left_out), self.position

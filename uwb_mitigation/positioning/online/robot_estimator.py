@@ -26,7 +26,7 @@ from uwb_mitigation.positioning.online.tag_estimator import (
     TagEstimator,
     is_valid,
 )
-from uwb_mitigation.types.tracks import Estimate, rows_of
+from uwb_mitigation.types.tracks import Estimate, Ranges, Track, rows_of
 
 NUM_YAWS = 8
 """Number of initial yaws."""
@@ -47,6 +47,11 @@ YAW_CONCENTRATION = 2.0
 def make_estimator(config: EstimatorConfig) -> TagEstimator:
     """Return the estimator for a configuration: with odometry if it contains the motion of a robot."""
     return TagEstimator(config) if config.robot is None else RobotEstimator(config)
+
+
+def live_track(config: EstimatorConfig, ranges: Ranges) -> Track:
+    """Run the estimator over recorded ranges; return an estimate for each range with a position."""
+    return make_estimator(config).run(ranges)
 
 
 @dataclass(slots=True)

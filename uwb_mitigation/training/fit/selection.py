@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.splits import Split
@@ -23,9 +22,6 @@ COLD_START_MIN_GAIN = 0.10
 
 NESTED = "selection (nested)"
 """Name of the errors of the selection procedure, on configurations that neither a fit nor the selection used."""
-
-SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
-"""Number of folds of site data over segments of the track and over anchors."""
 
 _NO_CALLBACK: Callable[[], None] = lambda: None  # noqa: E731
 
@@ -42,8 +38,7 @@ class Selection:
 
     Attributes:
         chosen: name of the candidate.
-        errors: {candidate, `raw` or NESTED: held-out errors}, m. For a site, errors on held-out segments, shape (n,), are
-            followed by errors on held-out anchors.
+        errors: {candidate, `raw` or NESTED: held-out errors}, m.
         model: the chosen candidate, fitted to all of the data.
         folds, seed: parameters of the splits. configurations: number of configurations in the data.
     """
@@ -140,52 +135,3 @@ def select_nested(
 def min_configurations(folds: int) -> int:
     """Return the minimum number of configurations for `select_nested`, so that no inner fold is empty."""
     return 4 if folds == 2 else 3
-
-
-def select_for_site(
-    data: Dataset,
-    candidates: Sequence[Candidate],
-    seed: int,
-    without_offsets_of: Callable[[NDArray[np.intp]], NDArray[np.float64]],
-    on_share: Callable[[float], None] = lambda share: None,
-) -> Selection:
-    """Select a model by errors on held-out segments of the track and on held-out anchors.
-
-    Args:
-        data: from `SiteData.to_dataset`, with the offsets subtracted.
-        candidates: models in order of complexity.
-        seed: seed of the splits and of the fits.
-        without_offsets_of: returns for held-out rows the change of each range's offset, shape (n,), m, if the offsets
-            are estimated without these rows. Offsets are re-estimated for held-out segments, but not for held-out
-            anchors, whose offsets can only be estimated from their own ranges.
-        on_share: called with the finished share, 0 to 1.
-
-    Raises:
-        DatasetError: one segment cannot be divided.
-    """
-    assert data.anchors is not None
-    segments = _folds(np.array([name.split("/")[0] for name in data.configurations]), SEGMENT_FOLDS, seed)
-    anchors = _folds(data.anchors.astype(str), ANCHOR_FOLDS, seed)
-    if not segments:
-        raise DatasetError(
-            "only one segment of ranges, so that no segment can be held out",
-            valid="a longer drive, or more positions",
-        )
-    on_fit = step_counter((len(segments) + len(anchors)) * len(candidates) + 1, on_share)
-
-    def prepare(fold: Split) -> Dataset:
-        return data.shifted(without_offsets_of(fold.test))
-
-    errors = held_out_errors(data, candidates, segments, seed, on_fit, prepare=prepare)
-    if anchors:
-        anchor_errors = held_out_errors(data, candidates, anchors, seed, on_fit)
-        errors = {name: np.concatenate([error, anchor_errors[name]]) for name, error in errors.items()}
-    chosen = select_simplest(errors)
-    (candidate,) = (item for item in candidates if item.name == chosen)
-    return Selection(chosen, errors, candidate.fit(data, seed), folds=len(segments), seed=seed)
-
-
-def _folds(groups: NDArray[np.str_], folds: int, seed: int) -> list[Split]:
-    """Return at most `folds` folds over groups, shape (n,); empty for a single group."""
-    count = min(folds, len(np.unique(groups)))
-    return splits.by_configuration(groups, count, seed) if count >= 2 else []

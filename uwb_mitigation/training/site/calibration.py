@@ -1,4 +1,4 @@
-"""Calibrate a site from a drive: select a model for the true ranges and offsets of `site_solution`, and write it."""
+"""Calibrate a site from a drive: select a model for the true ranges and offsets of a `SiteSolution`, and write it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.fit import candidates as models
-from uwb_mitigation.training.fit import selection as selections
+from uwb_mitigation.training.evaluation.intervals import fit_intervals
+from uwb_mitigation.training.fit.candidates import FittedModel, site_models
 from uwb_mitigation.training.fit.cards import card_of, ood_bands_of
-from uwb_mitigation.training.fit.selection import MIN_GAIN, Selection
+from uwb_mitigation.training.fit.selection import MIN_GAIN
 from uwb_mitigation.training.site.data import SiteData
+from uwb_mitigation.training.site.live_position import RAW, LiveError, live_errors
+from uwb_mitigation.training.site.selection import SiteErrors, held_out_site_errors
 from uwb_mitigation.training.site.solution import Pairs, Progress, SiteSolution, usable_ranges
 from uwb_mitigation.types.offsets import Offsets, dump_offsets
 
@@ -27,8 +29,8 @@ MIN_LABELLED = 40
 MAX_OFFSET_M = 1.0
 """Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
 
-WINDOW_S = 1.0
-"""Duration of the ranges from which one position error is computed."""
+MIN_VARIANCE_SHARE = 0.25
+"""Without ground truth, residuals contain the error of the estimated true range; at least this share is that of the range."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -38,17 +40,20 @@ class SiteCalibration:
     Attributes:
         site: recorded data. solution: true ranges and offsets.
         data: the ranges of `solution.rows`, with the offsets subtracted. raw_error_m: their errors as measured, (n,).
-        selection: the selected model. notes: all notes.
-        position_error_m: RMSE of the horizontal position due to held-out errors, raw and with the chosen model.
+        errors: held-out errors of each candidate. chosen: name of the selected candidate, `model`: fitted to all ranges.
+        live: {`raw` or candidate: error of the live position on held-out segments}.
+        notes: all notes.
     """
 
     site: SiteData
     solution: SiteSolution
     data: Dataset
     raw_error_m: NDArray[np.float64]
-    selection: Selection
+    errors: SiteErrors
+    chosen: str
+    model: FittedModel
+    live: dict[str, LiveError]
     notes: tuple[str, ...]
-    position_error_m: tuple[float, float]
 
     @property
     def offsets(self) -> Offsets:
@@ -58,7 +63,7 @@ class SiteCalibration:
     @property
     def held_out_error_m(self) -> NDArray[np.float64]:
         """Return the errors of the chosen model on held-out segments, shape (n,), m."""
-        return self.selection.errors[self.selection.chosen][: len(self.data)]
+        return self.errors.by_segment[self.chosen]
 
     @property
     def raw_mae_m(self) -> float:
@@ -68,84 +73,78 @@ class SiteCalibration:
     @property
     def calibrated_mae_m(self) -> float:
         """Return the MAE of the chosen model on held-out segments and anchors."""
-        return self.selection.mae()[self.selection.chosen]
+        return self.errors.mae()[self.chosen]
+
+    @property
+    def live_position_change(self) -> float:
+        """Return the change of the live position error (share); negative: it decreases; NaN: unknown."""
+        return self.live[self.chosen].change_from(self.live[RAW])
+
+    @property
+    def refusal(self) -> str:
+        """Return why the calibration does not help; empty: it does."""
+        if self.live[self.chosen].is_worse_than(self.live[RAW]):
+            return "the live position becomes worse"
+        if self.calibrated_mae_m > (1.0 - MIN_GAIN) * self.raw_mae_m:
+            return "the ranges do not improve"
+        raw_m, calibrated_m = self.solution.position_scatter_m
+        if calibrated_m > raw_m:
+            return "the anchors agree less about the positions"
+        return ""
 
     @property
     def lacks_gain(self) -> bool:
-        """Whether held-out ranges improve by less than `MIN_GAIN`, or positions become worse."""
-        raw, calibrated = self.solution.position_scatter_m
-        scatters = calibrated > raw
-        if self.solution.truth is not None:
-            raw, calibrated = self.position_error_m
-            scatters = calibrated > (1.0 + MIN_GAIN) * raw
-        return self.calibrated_mae_m > (1.0 - MIN_GAIN) * self.raw_mae_m or scatters
-
-    @property
-    def gain_lower_bound(self) -> float:
-        """Return the reduction of the held-out error (share) if the mean offset is wrong by two standard deviations.
-
-        Without ground truth the held-out ranges are compared with a track that contains the error of the mean offset.
-        """
-        wrong = 2.0 * self.solution.common_sd_m
-        raw, residual = self.raw_error_m, self.held_out_error_m
-        return min(
-            1.0 - float(np.abs(residual + by).mean() / max(np.abs(raw + by).mean(), 1e-9))
-            for by in (-wrong, 0.0, wrong)
-        )
+        """Whether the calibration does not help."""
+        return bool(self.refusal)
 
     def summary(self) -> str:
-        """Return the result in one sentence."""
-        truth, chosen = self.solution.truth, self.selection.chosen
-        kind = "residual" if truth is None else "error"
-        against = (
-            "against the other anchors, not against ground truth" if truth is None else f"against {truth}"
+        """Return the result in a few sentences, live position first."""
+        truth = self.solution.truth
+        raw, calibrated = self.live[RAW], self.live[self.chosen]
+        text = ""
+        if not math.isnan(raw.locator_m):
+            against = (
+                "an estimate: the reference is the smoothed track" if truth is None else f"against {truth}"
+            )
+            text = (
+                f"Live position error on held-out segments ({against}): {raw.locator_m:.3f} m raw, "
+                f"{calibrated.locator_m:.3f} m calibrated ({self.live_position_change:+.0%}). "
+            )
+        kind = "residual against the other anchors" if truth is None else f"error against {truth}"
+        text += (
+            f"Mean absolute range {kind}: {self.raw_mae_m:.3f} m raw, {self.calibrated_mae_m:.3f} m calibrated "
+            f"({self.chosen})."
         )
-        text = (
-            f"Mean absolute range {kind} on held-out segments, {against}: {self.raw_mae_m:.3f} m raw, "
-            f"{self.calibrated_mae_m:.3f} m calibrated ({chosen})"
-        )
-        for what, (raw, calibrated) in (
-            ("positions without one anchor scatter by", self.solution.position_scatter_m),
-            ("position error on held-out segments", self.position_error_m),
-        ):
-            if not math.isnan(raw):
-                text += f"; {what} {raw:.3f} m raw, {calibrated:.3f} m calibrated"
-        if self.lacks_gain:
-            return f"{text}. Calibration does not improve both ranges and positions."
-        if (gain := self.gain_lower_bound) <= 0.0:
-            return f"{text}. The reduction of the range {kind} is smaller than its uncertainty."
-        return f"{text}. Calibration reduces the range {kind} by at least {gain:.0%}."
+        if self.refusal:
+            text += f" Calibration does not help: {self.refusal}."
+        return text
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation calibrate`."""
-        solution, model = self.solution, self.selection.model
+        solution, model = self.solution, self.model
         factor = 0.0 if model.network is None else 1.0 if model.factor is None else model.factor
-        linear_bias = model.linear_bias
         return {
-            "offsets_m": {f"{tag}-{anchor}": value for (tag, anchor), (value, _) in solution.pairs.items()},
-            "offset_sd_m": {f"{tag}-{anchor}": sd for (tag, anchor), (_, sd) in solution.pairs.items()},
+            "offsets_m": {pair: value for pair, (value, _) in solution.pairs.items()},
+            "offset_sd_m": {pair: sd for pair, (_, sd) in solution.pairs.items()},
             "offsets_of": solution.offset_level,
+            "live_position_change": self.live_position_change,
+            "live_position_m": self.live,
             "raw_mae_m": self.raw_mae_m,
             "calibrated_mae_m": self.calibrated_mae_m,
             "truth": solution.truth or "none",
             "refused": None,
-            "chosen": self.selection.chosen,
-            "candidates": self.selection.mae(),
+            "chosen": self.chosen,
+            "candidates": self.errors.mae(),
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(self.data),
             "outliers": solution.outliers,
-            "position_scatter_m": _json_pair(solution.position_scatter_m),
-            "position_error_m": _json_pair(self.position_error_m),
+            "position_scatter_m": solution.position_scatter_m,
             "network_factor": [factor, solution.network_sd],
-            "line": {
-                "offset_m": linear_bias.offset_m,
-                "per_rx_power": linear_bias.per_rx_power,
-                "per_power_gap": linear_bias.per_power_gap,
-            },
-            "places": {name: list(position) for name, position in solution.stationary_positions.items()},
-            "notes": list(self.notes),
-            "left_out": dict(self.site.skipped),
-            "localisation": None if solution.alignment is None else solution.alignment.as_json(),
+            "line": model.linear_bias,
+            "positions": solution.stationary_positions,
+            "notes": self.notes,
+            "skipped": self.site.skipped,
+            "localisation": solution.alignment,
         }
 
     def write(self, output: Path, universal: Bundle, name: str) -> tuple[Bundle, Path]:
@@ -159,14 +158,14 @@ class SiteCalibration:
         Raises:
             ModelError: they cannot be written.
         """
-        truth, model, n = self.solution.truth, self.selection.model, len(self.data)
+        truth, model = self.solution.truth, self.model
         method = "without truth" if truth is None else f"with truth from {truth}"
-        metrics = {"raw": self.raw_mae_m, **self.selection.mae()}
+        metrics = {"raw": self.raw_mae_m, **self.errors.mae()}
         training = {
             "data": f"{name}, calibrated {method}",
             "calibrated": method,
-            "chosen": self.selection.chosen,
-            "measurements": n,
+            "chosen": self.chosen,
+            "measurements": len(self.data),
             "configurations": len(self.data.names),
             "split": "held out: segments of the track, and anchors",
             "started_from": f"{universal.model_id:08x}",
@@ -176,8 +175,9 @@ class SiteCalibration:
         has_network = model.network is not None
         network = scaled(float_network(universal), 0.0) if model.network is None else model.network
         ood_bands = ood_bands_of(self.data) if has_network else None
+        residual_m = range_residuals(self.held_out_error_m, self.solution.truth_sd_m)
         fitted = output.stem, universal.architecture, self.data, model.linear_bias
-        card = card_of(*fitted, self.data, self.held_out_error_m, training, ood_bands)
+        card = card_of(*fitted, self.data, residual_m, training, ood_bands)
         if has_network:
             # The drive does not cover the whole site, so the limits include those of the universal model.
             (low, high), (lowest, highest) = universal.card.correction_limits_m, card.correction_limits_m
@@ -213,10 +213,13 @@ def calibrate_site(
 ) -> SiteCalibration:
     """Select a model for the ranges and offsets of a solution.
 
+    The simplest model is selected that no more complex one improves significantly: by the held-out range errors, among the
+    models that do not increase the error of the live position. If offsets of pairs increase it, all pairs share one offset.
+
     Args:
         site: recorded ranges.
         universal: bundle that the candidates start from.
-        solution: true ranges and offsets, from `site_solution`.
+        solution: true ranges and offsets.
         seed: seed of the splits and of the training.
         on_progress: called with the stage and the finished share of it, 0 to 1.
 
@@ -229,67 +232,66 @@ def calibrate_site(
             valid=f"at least {MIN_LABELLED}",
         )
     _check_offsets(solution.pairs)
+    calibration = _select_model(site, universal, solution, seed, on_progress)
+    if calibration.refusal and solution.offset_level != "one":
+        common = _select_model(site, universal, solution.with_common_offset(), seed, on_progress)
+        if not common.refusal:
+            return common
+    return calibration
+
+
+def _select_model(
+    site: SiteData, universal: Bundle, solution: SiteSolution, seed: int, on_progress: Progress
+) -> SiteCalibration:
     raw = site.to_dataset(
         solution.rows, solution.true_m, solution.segment, solution.stationary[solution.segment]
     )
     assert raw.tags is not None
     assert raw.anchors is not None
-    pair_of = list(zip(raw.tags.tolist(), raw.anchors.tolist(), strict=True))
     data = raw.shifted(-solution.offsets.of(raw.tags, raw.anchors).astype(np.float64))
+    data, candidates, notes = site_models(data, site.has_cirs, universal)
+    if without_cir := int((~usable_ranges(site)).sum()):
+        notes = [f"{without_cir} ranges without a usable CIR are only used for track and offsets", *notes]
+    pairs = list(zip(raw.tags.tolist(), raw.anchors.tolist(), strict=True))
 
     def offset_change(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
-        of_pair = solution.offset_changes_without(held_out)
-        return np.array([-of_pair.get(pair, 0.0) for pair in pair_of])
+        changes = solution.offset_changes_without(held_out)
+        return np.array([-changes.get(pair, 0.0) for pair in pairs])
 
-    with_network, candidates, missing = models.site_models(data, site.has_cirs, universal)
-    selection = selections.select_for_site(
-        with_network, candidates, seed, offset_change, lambda share: on_progress("selecting the model", share)
+    errors = held_out_site_errors(
+        data, candidates, seed, offset_change, lambda share: on_progress("selecting the model", share)
     )
-    without_cir = int((~usable_ranges(site)).sum())
-    notes = (
-        [f"{without_cir} ranges without a usable CIR are only used for track and offsets"]
-        if without_cir
-        else []
-    )
-    residual = selection.errors[selection.chosen][: len(data)]
-    raw_error, error = (position_error_m(site, solution, error_m) for error_m in (raw.error_m, residual))
+    live = live_errors(site, solution, errors.by_segment, _variances(raw, errors, solution.truth_sd_m))
+    chosen = errors.select(live)
+    (candidate,) = (item for item in candidates if item.name == chosen)
     return SiteCalibration(
         site=site,
         solution=solution,
         data=data,
         raw_error_m=raw.error_m,
-        selection=selection,
-        notes=(*solution.notes, *notes, *missing),
-        position_error_m=(raw_error, error),
+        errors=errors,
+        chosen=chosen,
+        model=candidate.fit(data, seed),
+        live=live,
+        notes=(*solution.notes, *notes),
     )
 
 
-def position_error_m(site: SiteData, solution: SiteSolution, error_m: NDArray[np.float64]) -> float:
-    """Return the RMSE of the horizontal position due to range errors, m: least squares on the ranges of each second.
+def range_residuals(residual_m: NDArray[np.float64], truth_sd_m: float) -> NDArray[np.float64]:
+    """Return residuals (n,) without the part that is due to the error of the estimated true range."""
+    mean_square = float(np.mean(residual_m**2))
+    share = 1.0 - truth_sd_m**2 / mean_square if mean_square > 0.0 else 1.0
+    return residual_m * math.sqrt(max(share, MIN_VARIANCE_SHARE))
 
-    Args:
-        site: recorded ranges.
-        solution: positions of the tags.
-        error_m: (n,), errors of the ranges of `solution.rows`.
 
-    Returns:
-        NaN if no second has ranges to three anchors that determine a position.
-    """
-    ranges = site.ranges.take(solution.rows)
-    stamp, row = ranges.stamp_ns, ranges.anchor
-    difference = solution.antenna_position - site.anchors.position[row]
-    unit = difference[:, :2] / np.maximum(np.linalg.norm(difference, axis=1), 0.05)[:, None]
-    window = (stamp - stamp.min()) // round(WINDOW_S * 1e9)
-    squared = []
-    _, index = np.unique(np.stack([solution.segment, window]), axis=1, return_inverse=True)
-    index = index.reshape(-1)
-    order = np.argsort(index, kind="stable")
-    for part in np.split(order, np.flatnonzero(np.diff(index[order])) + 1):
-        # Check that the position is observable: singular values of unit vectors grow with the square root of their number.
-        if len(np.unique(row[part])) >= 3 and np.linalg.svd(unit[part])[1][1] > 0.3 * math.sqrt(len(part)):
-            position_error = np.linalg.lstsq(unit[part], error_m[part], rcond=None)[0]
-            squared.append(float(position_error @ position_error))
-    return math.sqrt(float(np.mean(squared))) if squared else math.nan
+def _variances(raw: Dataset, errors: SiteErrors, truth_sd_m: float) -> dict[str, NDArray[np.float64]]:
+    """Return the variances (n,) that a bundle with each model publishes, m^2."""
+    variances = {}
+    for name, error_m in errors.by_segment.items():
+        predicted_m = raw.error_m - error_m
+        intervals = fit_intervals(range_residuals(error_m, truth_sd_m), predicted_m, raw.configurations)
+        variances[name] = intervals.variance_m2 + intervals.variance_per_m2 * predicted_m**2
+    return variances
 
 
 def _check_offsets(pairs: Pairs) -> None:

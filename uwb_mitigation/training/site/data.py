@@ -17,7 +17,7 @@ from uwb_mitigation.mitigation.model.bundle import ModelCard
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.training.data.dataset import CirSources, Dataset
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.measurement import RangeMeasurement, Record
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Heights, Ranges
 
@@ -99,7 +99,7 @@ class SiteData:
                 held out as a whole: "segment 3.1/".
         """
         ranges = self.ranges.take(rows)
-        tag = np.array([one.tag_id for one in self.tags], np.uint64)[self.tag[rows]]
+        tag = np.array([tag.tag_id for tag in self.tags], np.uint64)[self.tag[rows]]
         segment_start_ns = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
         np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
         elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / NS_PER_S
@@ -148,84 +148,104 @@ def read_site(
     Raises:
         DatasetError: no range belongs to an anchor in the map.
     """
-    skipped: Counter[str] = Counter()
-    unknown: Counter[int] = Counter()
-    rows: list[tuple[int, int, int, float, float, float, float, bool]] = []
-    windows: list[NDArray[np.float32]] = []
-    sources = CirSources()
-    frame_ids: dict[int, dict[str, None]] = {}
+    table = _RangeTable(anchors, card, has_heights=heights is not None)
     shifts: list[int] = []
-    last_stamp_ns: int | None = None
     for number, recording in enumerate(recordings):
-        shift: int | None = None
-        end_of_previous = last_stamp_ns
+        shift_ns: int | None = None
+        end_of_previous = table.last_stamp_ns
+        heights_of_recording = None if heights is None else heights[number]
         for record in recording:
             on_record()
-            measured = record.measurement
-            stamp_ns = measured.stamp_ns + round(stamp_offset_s * NS_PER_S)
-            if shift is None:
-                is_later = end_of_previous is None or stamp_ns > end_of_previous
-                shift = 0 if is_later else end_of_previous - stamp_ns + RECORDING_GAP_NS  # type: ignore[operator]
-            row = anchors.index.get(measured.anchor_id)
-            height = math.nan if heights is None else float(heights[number].at(np.array([stamp_ns]))[0][0])
-            if row is None:
-                unknown[measured.anchor_id] += 1
-            elif not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
-                skipped["no valid range"] += 1
-            elif heights is not None and math.isnan(height):
-                skipped["no height at that time"] += 1
-            else:
-                frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
-                (fault,), (window,) = card.preprocessing.windows_of([measured])
-                stamp_ns += shift
-                last_stamp_ns = stamp_ns if last_stamp_ns is None else max(last_stamp_ns, stamp_ns)
-                cir = measured.cir
-                powers = cir.rx_power_dbm, cir.first_path_power_dbm
-                usable = fault == 0 and card.fits(cir.radio, cir.segment, len(cir) > 0)
-                rows.append((measured.tag_id, stamp_ns, row, measured.range_m, *powers, height, usable))
-                windows.append(window)
-                sources.add(cir)
-        shifts.append(shift or 0)
-    for anchor_id, count in unknown.items():
-        skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
-    if not rows:
-        received_ids = ", ".join(map(format_id, sorted(unknown))) or "none"
-        raise DatasetError(
-            f"no ranges of the anchors {', '.join(map(format_id, sorted(anchors.index)))}",
-            valid=f"anchors of the recording: {received_ids}",
+            stamp_ns = record.measurement.stamp_ns + round(stamp_offset_s * NS_PER_S)
+            if shift_ns is None:
+                shift_ns = 0
+                if end_of_previous is not None and stamp_ns <= end_of_previous:
+                    shift_ns = end_of_previous - stamp_ns + RECORDING_GAP_NS
+            height_m = math.nan
+            if heights_of_recording is not None:
+                height_m = float(heights_of_recording.at(np.array([stamp_ns]))[0][0])
+            table.add(record.measurement, stamp_ns + shift_ns, height_m)
+        shifts.append(shift_ns or 0)
+    return table.to_site(tuple(shifts))
+
+
+class _RangeTable:
+    """Collects ranges row by row.
+
+    Attributes:
+        last_stamp_ns: latest stamp; None: no range yet.
+    """
+
+    def __init__(self, anchors: AnchorMap, card: ModelCard, *, has_heights: bool) -> None:
+        self.last_stamp_ns: int | None = None
+        self._anchors, self._card, self._has_heights = anchors, card, has_heights
+        self._skipped, self._unknown_anchors = Counter[str](), Counter[int]()
+        self._rows: list[tuple[int, int, int, float, float, float, float, bool]] = []
+        self._windows: list[NDArray[np.float32]] = []
+        self._sources = CirSources()
+        self._frame_ids: dict[int, dict[str, None]] = {}
+
+    def add(self, measured: RangeMeasurement, stamp_ns: int, height_m: float) -> None:
+        """Add a range, or count why it is skipped."""
+        row = self._anchors.index.get(measured.anchor_id)
+        if row is None:
+            self._unknown_anchors[measured.anchor_id] += 1
+        elif not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
+            self._skipped["no valid range"] += 1
+        elif self._has_heights and math.isnan(height_m):
+            self._skipped["no height at that time"] += 1
+        else:
+            self._frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
+            (fault,), (window,) = self._card.preprocessing.windows_of([measured])
+            self.last_stamp_ns = max(stamp_ns, self.last_stamp_ns or stamp_ns)
+            cir = measured.cir
+            powers = cir.rx_power_dbm, cir.first_path_power_dbm
+            is_usable = fault == 0 and self._card.fits(cir.radio, cir.segment, len(cir) > 0)
+            self._rows.append(
+                (measured.tag_id, stamp_ns, row, measured.range_m, *powers, height_m, is_usable)
+            )
+            self._windows.append(window)
+            self._sources.add(cir)
+
+    def to_site(self, shift_ns: tuple[int, ...]) -> SiteData:
+        """Return the ranges by tag and time.
+
+        Raises:
+            DatasetError: no range belongs to an anchor in the map.
+        """
+        for anchor_id, count in self._unknown_anchors.items():
+            self._skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
+        if not self._rows:
+            received_ids = ", ".join(map(format_id, sorted(self._unknown_anchors))) or "none"
+            raise DatasetError(
+                f"no ranges of the anchors {', '.join(map(format_id, sorted(self._anchors.index)))}",
+                valid=f"anchors of the recording: {received_ids}",
+            )
+        types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
+        columns: list[NDArray[Any]] = [
+            np.array(column, kind) for column, kind in zip(zip(*self._rows, strict=True), types, strict=True)
+        ]
+        order = np.lexsort((columns[1], columns[0]))
+        tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir = (
+            column[order] for column in columns
         )
-    types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
-    columns: list[NDArray[Any]] = [
-        np.array(column, kind) for column, kind in zip(zip(*rows, strict=True), types, strict=True)
-    ]
-    order = np.lexsort((columns[1], columns[0]))
-    tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir = (
-        column[order] for column in columns
-    )
-    rx, first_path = (np.where(np.isfinite(powers), powers, np.nan) for powers in (rx, first_path))
-    tags = tuple(
-        Ranges(
-            stamp[tag_rows],
-            anchor[tag_rows],
-            range_m[tag_rows],
-            np.full(len(tag_rows), np.nan),
-            rx[tag_rows],
-            int(tag[tag_rows[0]]),
+        rx, first_path = (np.where(np.isfinite(powers), powers, np.nan) for powers in (rx, first_path))
+        tags = tuple(
+            Ranges(stamp[i], anchor[i], range_m[i], np.full(len(i), np.nan), rx[i], int(tag[i[0]]))
+            for i in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
         )
-        for tag_rows in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
-    )
-    return SiteData(
-        anchors=anchors,
-        tags=tags,
-        preprocessing=card.preprocessing,
-        inputs=np.stack([windows[index] for index in order]),
-        rx_power_dbm=rx.astype(np.float32),
-        first_path_power_dbm=first_path.astype(np.float32),
-        has_cirs=bool(has_usable_cir.mean() >= MIN_CIR_SHARE),
-        has_usable_cir=has_usable_cir,
-        height_m=None if heights is None else height_m,
-        frame_ids={tag_id: tuple(names) for tag_id, names in frame_ids.items()},
-        skipped=skipped,
-        shift_ns=tuple(shifts),
-        sources=sources,
-    )
+        return SiteData(
+            anchors=self._anchors,
+            tags=tags,
+            preprocessing=self._card.preprocessing,
+            inputs=np.stack([self._windows[index] for index in order]),
+            rx_power_dbm=rx.astype(np.float32),
+            first_path_power_dbm=first_path.astype(np.float32),
+            has_cirs=bool(has_usable_cir.mean() >= MIN_CIR_SHARE),
+            has_usable_cir=has_usable_cir,
+            height_m=height_m if self._has_heights else None,
+            frame_ids={tag_id: tuple(names) for tag_id, names in self._frame_ids.items()},
+            skipped=self._skipped,
+            shift_ns=shift_ns,
+            sources=self._sources,
+        )

@@ -49,8 +49,8 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         details.append(
             f"Localisation {solution.truth}: time offset {solution.alignment.time_offset_s:.3f} s, lever arm {arms} m."
         )
-    if calibration.selection.model.factor is not None and solution.network_sd:
-        factor = f"{calibration.selection.model.factor:.2f} +- {solution.network_sd:.2f}"
+    if calibration.model.factor is not None and solution.network_sd:
+        factor = f"{calibration.model.factor:.2f} +- {solution.network_sd:.2f}"
         details.append(f"Factor of the universal network's predictions: {factor}.")
     if solution.line[1]:
         slope, sd = (100.0 * value for value in solution.line)
@@ -72,8 +72,8 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         files=files,
         colours={"raw": "#d55e00", "calibrated": "#0072b2"},
         offsets=offsets,
-        candidates={"raw": calibration.raw_mae_m, **calibration.selection.mae()},
-        chosen=calibration.selection.chosen,
+        candidates={"raw": calibration.raw_mae_m, **calibration.errors.mae()},
+        chosen=calibration.chosen,
         width=WIDTH,
         height=HEIGHT,
         plan=_plan(calibration),
@@ -102,7 +102,7 @@ def _residuals(boxes: list[tuple[str, list[list[float]]]]) -> dict[str, object]:
 def _plan(calibration: SiteCalibration) -> dict[str, object]:
     """Return anchors, tracks and stationary positions in pixels, and the number of pixels per metre."""
     solution = calibration.solution
-    tracks = [solution.track[solution.track_of == one][:, :2] for one in np.unique(solution.track_of)]
+    tracks = [solution.track[solution.track_of == number][:, :2] for number in np.unique(solution.track_of)]
     anchors = calibration.site.anchors.position[:, :2]
     all_points = np.concatenate([anchors, *tracks])
     all_points = all_points[np.isfinite(all_points).all(axis=1)]

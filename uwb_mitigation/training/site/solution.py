@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.floating import float_network
+from uwb_mitigation.positioning.batch.anchor_errors import validate_anchor_map
 from uwb_mitigation.positioning.batch.pose_alignment import PoseAlignment, align_poses
-from uwb_mitigation.positioning.batch.self_calibration import SelfCalibration
-from uwb_mitigation.positioning.batch.self_calibration import self_calibrate as self_calibrate
+from uwb_mitigation.positioning.batch.self_calibration import SelfCalibration, self_calibrate
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import MAD_TO_SD, NETWORK_SD, SLOPE_SD, Regressors
 from uwb_mitigation.training.fit.candidates import network_m
-from uwb_mitigation.training.site.anchor_check import validate_anchor_map
 from uwb_mitigation.training.site.data import SiteData
 from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.tracks import PosePath
@@ -34,11 +33,23 @@ NETWORK_GROUPS = 8
 
 NETWORK, LEVEL = "network", "level"
 
+LEVEL_M = 0.3
+"""A tag whose height changes by less drives on a level floor: the locator gets its height."""
+
 Pairs = Mapping[tuple[int, int], tuple[float, float]]
 """{(tag id, anchor id): (offset, standard deviation)}, m."""
 
 Progress = Callable[[str, float], None]
 """Called with the current stage and the finished share of it, 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LivePrior:
+    """Prior knowledge of the locator: constant height, area, and standard deviation of measured heights, m."""
+
+    height: Height | None = None
+    area: Area | None = None
+    height_sd_m: float = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -54,6 +65,8 @@ class SiteSolution:
         notes: unobservable quantities and excluded data.
         offset_changes_without: returns for held-out rows of `rows` the change of the pair offsets, m, if they are estimated
             without these rows.
+        prior: prior knowledge with which the locator runs at this site.
+        truth_sd_m: standard deviation of `true_m` (RMS) without ground truth; 0 with it.
         truth: topic of the localisation; None: only ranges were used. alignment: its time offset and lever arms.
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
         stationary_positions: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several
@@ -75,6 +88,8 @@ class SiteSolution:
     outliers: int
     notes: tuple[str, ...]
     offset_changes_without: Callable[[NDArray[np.intp]], Mapping[tuple[int, int], float]]
+    prior: LivePrior
+    truth_sd_m: float = 0.0
     truth: str | None = None
     alignment: PoseAlignment | None = None
     track: NDArray[np.float64]
@@ -84,6 +99,40 @@ class SiteSolution:
     line: tuple[float, float] = (0.0, 0.0)
     common_sd_m: float = 0.0
     position_scatter_m: tuple[float, float] = (math.nan, math.nan)
+
+    def with_common_offset(self) -> SiteSolution:
+        """Return the solution with the common offset for all pairs."""
+        common_m = self.offsets.default
+
+        def changes(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
+            by_pair = self.offset_changes_without(held_out)
+            return dict.fromkeys(by_pair, float(np.mean(list(by_pair.values() or [0.0]))))
+
+        return replace(
+            self,
+            pairs={pair: (common_m, sd) for pair, (_, sd) in self.pairs.items()},
+            offsets=Offsets(common_m),
+            offset_level="one",
+            offset_changes_without=changes,
+            notes=(*self.notes, "own offsets do not improve the live position, so that all pairs share one"),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localisation:
+    """Poses of the robot, used as ground truth.
+
+    Attributes:
+        topic: topic of the poses, for reports.
+        paths: for each tag, the poses of the robot that carries it, for each recording.
+        time_offset_s, lever_arms_m, estimate_lever_arm: see `align_poses`.
+    """
+
+    topic: str
+    paths: Sequence[Sequence[PosePath]]
+    time_offset_s: float | None = None
+    lever_arms_m: NDArray[np.float64] | None = None
+    estimate_lever_arm: bool = False
 
 
 def solve_without_truth(
@@ -109,82 +158,102 @@ def solve_without_truth(
         DatasetError: the solution is not observable, an anchor position in the file is wrong, or an offset is
             implausible.
     """
-    on_progress("estimating track and offsets", 0.1)
-    extra_regressors = regressors(site, universal)
+    stage = "estimating track and offsets"
+    on_progress(stage, 0.1)
     calibration = self_calibrate(
         site.anchors,
         site.tags,
-        extra_regressors,
+        regressors(site, universal),
         height=height,
         area=area,
         heights_m=site.height_m,
         height_sd_m=height_sd_m,
     )
-    on_progress("estimating track and offsets", 1.0)
-    track, ids = calibration.segments, [anchor.id for anchor in site.anchors.anchors]
-    site_rows = site.first_rows[track.tag] + track.row
-    is_known = np.isfinite(calibration.pseudo_m) & (calibration.pseudo_sd_m <= MAX_TRUTH_SD_M)
-    is_known, outliers = _without_outliers(track.ranges.range_m - calibration.pseudo_m, is_known)
-    notes = list(calibration.notes)
-    if (unknown := int((~is_known).sum()) - outliers) > 0:
-        notes.append(
-            f"{unknown} of {len(is_known)} ranges are not used for the fit: the other anchors do not determine the tag position"
-        )
-    used = np.flatnonzero(is_known & usable_ranges(site)[site_rows])
-    pairs = {
-        (calibration.tag_ids[tag], ids[row]): calibration.applied(tag, row)
-        for tag, row in calibration.pairs()
-    }
-    common = calibration.mean()[0] if calibration.mean_is_significant else 0.0
-    offsets = Offsets(common)
-    if calibration.level == "pair":
-        offsets = _pair_offsets(common, pairs)
-    elif calibration.level == "anchor":
-        anchor_offsets = {ids[row]: calibration.applied(tag, row)[0] for tag, row in calibration.pairs()}
-        offsets = Offsets(common, anchors=anchor_offsets)
+    on_progress(stage, 1.0)
+    return _RangesOnly(site, calibration).solution(LivePrior(height, area, height_sd_m))
 
-    def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
-        recalibrated = calibration.raw_only(_whole_segments(used[held_out], used, track.of))
+
+class _RangesOnly:
+    """The result of `self_calibrate` as a `SiteSolution`."""
+
+    def __init__(self, site: SiteData, calibration: SelfCalibration) -> None:
+        self._calibration = calibration
+        self._anchor_ids = [anchor.id for anchor in site.anchors.anchors]
+        segments = calibration.segments
+        site_rows = site.first_rows[segments.tag] + segments.row
+        has_truth = np.isfinite(calibration.pseudo_m) & (calibration.pseudo_sd_m <= MAX_TRUTH_SD_M)
+        has_truth, self._outliers = _without_outliers(
+            segments.ranges.range_m - calibration.pseudo_m, has_truth
+        )
+        self._num_unknown = int((~has_truth).sum()) - self._outliers
+        self._labelled = np.flatnonzero(has_truth & usable_ranges(site)[site_rows])
+        self._rows = site_rows[self._labelled]
+
+    def solution(self, prior: LivePrior) -> SiteSolution:
+        """Return true ranges and offsets."""
+        calibration, labelled = self._calibration, self._labelled
+        segments, observations = calibration.segments, calibration.fit.observations
+        notes = list(calibration.notes)
+        if self._num_unknown:
+            notes.append(
+                f"{self._num_unknown} of {len(segments.ranges)} ranges are not used for the fit: the other anchors do not "
+                "determine the tag position"
+            )
+        pairs = {self._ids(tag, row): calibration.applied(tag, row) for tag, row in calibration.pairs()}
+        return SiteSolution(
+            rows=self._rows,
+            true_m=calibration.pseudo_m[labelled],
+            antenna_position=calibration.fit.antenna_position()[observations.of][labelled],
+            segment=segments.of[labelled],
+            stationary=segments.is_stationary,
+            pairs=pairs,
+            offsets=self._offsets(pairs),
+            offset_level=calibration.level,
+            outliers=self._outliers,
+            notes=tuple(notes),
+            offset_changes_without=self.offset_changes_without,
+            prior=prior,
+            truth_sd_m=float(np.sqrt(np.mean(calibration.pseudo_sd_m[labelled] ** 2)))
+            if len(labelled)
+            else 0.0,
+            track=calibration.fit.position,
+            track_of=observations.knot_segment,
+            stationary_positions=_stationary_positions(calibration),
+            network_sd=calibration.value(NETWORK)[1],
+            line=calibration.value(LEVEL),
+            common_sd_m=calibration.mean()[1],
+            position_scatter_m=calibration.position_scatter_m,
+        )
+
+    def _ids(self, tag: int, row: int) -> tuple[int, int]:
+        return self._calibration.tag_ids[tag], self._anchor_ids[row]
+
+    def _offsets(self, pairs: Pairs) -> Offsets:
+        calibration = self._calibration
+        common = calibration.mean()[0] if calibration.mean_is_significant else 0.0
+        if calibration.level == "pair":
+            return _pair_offsets(common, pairs)
+        if calibration.level == "anchor":
+            return Offsets(common, anchors={anchor_id: value for (_, anchor_id), (value, _) in pairs.items()})
+        return Offsets(common)
+
+    def offset_changes_without(self, held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
+        """See `SiteSolution`."""
+        calibration, labelled = self._calibration, self._labelled
+        refit = calibration.raw_only(_whole_segments(labelled[held_out], labelled, calibration.segments.of))
         return {
-            (calibration.tag_ids[tag], ids[row]): recalibrated.pair(tag, row)[0]
-            - calibration.pair(tag, row)[0]
+            self._ids(tag, row): refit.pair(tag, row)[0] - calibration.pair(tag, row)[0]
             for tag, row in calibration.pairs()
             if calibration.applied(tag, row)[0] != 0.0
         }
-
-    return SiteSolution(
-        rows=site_rows[used],
-        true_m=calibration.pseudo_m[used],
-        antenna_position=calibration.fit.position[
-            calibration.fit.observations.knot[calibration.fit.observations.of]
-        ][used],
-        segment=track.of[used],
-        stationary=track.is_stationary,
-        pairs=pairs,
-        offsets=offsets,
-        offset_level=calibration.level,
-        outliers=outliers,
-        notes=tuple(notes),
-        offset_changes_without=offset_changes_without,
-        track=calibration.fit.position,
-        track_of=calibration.fit.observations.knot_segment,
-        stationary_positions=_stationary_positions(calibration),
-        network_sd=calibration.value(NETWORK)[1],
-        line=calibration.value(LEVEL),
-        common_sd_m=calibration.mean()[1],
-        position_scatter_m=calibration.position_scatter_m,
-    )
 
 
 def solve_with_truth(
     site: SiteData,
     universal: Bundle,
-    paths: Sequence[Sequence[PosePath]],
-    topic: str,
+    localisation: Localisation,
     *,
-    time_offset_s: float | None,
-    lever_arms_m: NDArray[np.float64] | None = None,
-    estimate_lever_arm: bool = False,
+    height: Height | None = None,
     on_progress: Progress = lambda stage, share: None,
 ) -> SiteSolution:
     """Solve for true ranges and offsets with the poses of a localisation.
@@ -192,86 +261,117 @@ def solve_with_truth(
     Args:
         site: recorded ranges.
         universal: bundle whose corrections are a regressor.
-        paths: for each tag, the poses of the robot that carries it, for each recording.
-        topic: topic of the poses, for reports.
-        time_offset_s: see `align_poses`.
-        lever_arms_m: see `align_poses`.
-        estimate_lever_arm: see `align_poses`.
+        localisation: poses of the robot.
+        height: height of the tags, if constant, with which the locator will run.
         on_progress: see `Progress`.
 
     Raises:
         DatasetError: as for `solve_without_truth`; or too few ranges within the times of the localisation.
     """
-    on_progress("estimating time offset and lever arm", 0.1)
-    joined = [
-        PosePath.joined([path.shifted(by) for path, by in zip(tag_paths, site.shift_ns, strict=True)])
-        for tag_paths in paths
-    ]
-    extra_regressors = regressors(site, universal)
-    alignment = align_poses(
-        site.anchors,
-        site.tags,
-        joined,
-        extra_regressors,
-        time_offset_s=time_offset_s,
-        lever_arms_m=lever_arms_m,
-        estimate_lever_arm=estimate_lever_arm,
-    )
-    on_progress("estimating time offset and lever arm", 1.0)
-    error = site.ranges.range_m - alignment.distance_m
-    is_used, outliers = _without_outliers(error, np.isfinite(error))
-    rows = np.flatnonzero(is_used & usable_ranges(site))
-    validate_anchor_map(site, alignment.position, is_used)
-    ids = [anchor.id for anchor in site.anchors.anchors]
-    pairs = {
-        (site.tags[tag].tag_id, ids[row]): alignment.pair(tag, row, float(site.anchors.sd[row]))
-        for tag, row in alignment.pairs
-    }
-    common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
-    scatter_m = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
-    # With few ranges, the other pairs determine the offset of a pair better than its own ranges.
-    typical_offset = common, math.hypot(MAX_TRUTH_SD_M, scatter_m)
-    pairs = {pair: typical_offset if value[1] > MAX_TRUTH_SD_M else value for pair, value in pairs.items()}
-    tag = site.tag
+    stage = "estimating time offset and lever arm"
+    on_progress(stage, 0.1)
+    solver = _WithLocalisation(site, regressors(site, universal), localisation)
+    on_progress(stage, 1.0)
+    return solver.solution(height)
 
-    def offset_changes_without(held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
-        remaining = np.setdiff1d(rows, rows[held_out])
-        rows_of_tags = [remaining[tag[remaining] == number] for number in range(len(site.tags))]
-        realigned = align_poses(
+
+class _WithLocalisation:
+    """Ranges aligned with the poses of a localisation, as a `SiteSolution`."""
+
+    def __init__(self, site: SiteData, extra: Regressors, localisation: Localisation) -> None:
+        self._site, self._extra, self._localisation = site, extra, localisation
+        self._paths = [
+            PosePath.joined([path.shifted(by_ns) for path, by_ns in zip(paths, site.shift_ns, strict=True)])
+            for paths in localisation.paths
+        ]
+        self._alignment = align_poses(
+            site.anchors,
+            site.tags,
+            self._paths,
+            extra,
+            time_offset_s=localisation.time_offset_s,
+            lever_arms_m=localisation.lever_arms_m,
+            estimate_lever_arm=localisation.estimate_lever_arm,
+        )
+        error_m = site.ranges.range_m - self._alignment.distance_m
+        self._is_used, self._outliers = _without_outliers(error_m, np.isfinite(error_m))
+        self._rows = np.flatnonzero(self._is_used & usable_ranges(site))
+
+    def solution(self, height: Height | None) -> SiteSolution:
+        """Return true ranges and offsets.
+
+        Raises:
+            DatasetError: another lever arm, or other anchor positions, explain the ranges much better.
+        """
+        site, alignment, rows = self._site, self._alignment, self._rows
+        validate_anchor_map(site.anchors, site.ranges, site.tag, alignment.position, self._is_used)
+        common, pairs = self._pairs()
+        segment = site.tag[rows]
+        return SiteSolution(
+            rows=rows,
+            true_m=alignment.distance_m[rows],
+            antenna_position=alignment.position[rows],
+            segment=segment,
+            stationary=np.zeros(len(site.tags), np.bool_),
+            pairs=pairs,
+            offsets=_pair_offsets(common, pairs),
+            offset_level="pair",
+            outliers=self._outliers,
+            notes=(),
+            offset_changes_without=self.offset_changes_without,
+            prior=LivePrior(height or _level_height(alignment.position[rows])),
+            truth=self._localisation.topic,
+            alignment=alignment,
+            track=alignment.position[rows],
+            track_of=segment,
+            stationary_positions={},
+        )
+
+    def _ids(self, tag: int, row: int) -> tuple[int, int]:
+        return self._site.tags[tag].tag_id, self._site.anchors.anchors[row].id
+
+    def _pairs(self) -> tuple[float, Pairs]:
+        """Return the common offset, m, and the offset of each pair."""
+        alignment, anchor_sd = self._alignment, self._site.anchors.sd
+        pairs = {
+            self._ids(tag, row): alignment.pair(tag, row, float(anchor_sd[row]))
+            for tag, row in alignment.pairs
+        }
+        common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
+        scatter_m = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
+        # With few ranges, the other pairs determine the offset of a pair better than its own ranges.
+        typical_offset = common, math.hypot(MAX_TRUTH_SD_M, scatter_m)
+        return common, {
+            pair: typical_offset if value[1] > MAX_TRUTH_SD_M else value for pair, value in pairs.items()
+        }
+
+    def offset_changes_without(self, held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
+        """See `SiteSolution`."""
+        site, alignment = self._site, self._alignment
+        remaining = np.setdiff1d(self._rows, self._rows[held_out])
+        tag = site.tag[remaining]
+        refit = align_poses(
             site.anchors,
             [
-                ranges.take(rows_of_tag - begin)
-                for ranges, rows_of_tag, begin in zip(site.tags, rows_of_tags, site.first_rows, strict=True)
+                ranges.take(remaining[tag == number] - first_row)
+                for number, (ranges, first_row) in enumerate(zip(site.tags, site.first_rows, strict=True))
             ],
-            joined,
-            extra_regressors.take(remaining),
+            self._paths,
+            self._extra.take(remaining),
             time_offset_s=alignment.time_offset_s,
             lever_arms_m=alignment.lever_arm_m,
         )
         return {
-            (site.tags[number].tag_id, ids[row]): realigned.pair(number, row, 0.0)[0]
-            - alignment.pair(number, row, 0.0)[0]
-            for number, row in realigned.pairs
+            self._ids(tag, row): refit.pair(tag, row, 0.0)[0] - alignment.pair(tag, row, 0.0)[0]
+            for tag, row in refit.pairs
         }
 
-    return SiteSolution(
-        rows=rows,
-        true_m=alignment.distance_m[rows],
-        antenna_position=alignment.position[rows],
-        segment=tag[rows],
-        stationary=np.zeros(len(site.tags), np.bool_),
-        pairs=pairs,
-        offsets=_pair_offsets(common, pairs),
-        offset_level="pair",
-        outliers=outliers,
-        notes=(),
-        offset_changes_without=offset_changes_without,
-        truth=topic,
-        alignment=alignment,
-        track=alignment.position[rows],
-        track_of=tag[rows],
-        stationary_positions={},
-    )
+
+def _level_height(position: NDArray[np.float64]) -> Height | None:
+    """Return the height of antennas at (n, 3) if it is constant."""
+    if not len(position) or float(np.ptp(position[:, 2])) > LEVEL_M:
+        return None
+    return Height(float(np.median(position[:, 2])), 0.1)
 
 
 def regressors(site: SiteData, universal: Bundle) -> Regressors:
@@ -286,21 +386,23 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
         group = np.where(site.has_usable_cir, np.searchsorted(edges, size), NETWORK_GROUPS)
         return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), group)
     power = site.rx_power_dbm.astype(np.float64)
-    known = np.isfinite(power)
-    if known.mean() < 0.5 or np.ptp(power[known]) < 1.0:
+    has_power = np.isfinite(power)
+    if has_power.mean() < 0.5 or np.ptp(power[has_power]) < 1.0:
         return Regressors.none(len(power))
-    return Regressors.one(LEVEL, np.where(known, power - np.median(power[known]), 0.0), 0.0, SLOPE_SD)
+    return Regressors.one(LEVEL, np.where(has_power, power - np.median(power[has_power]), 0.0), 0.0, SLOPE_SD)
 
 
 def _stationary_positions(calibration: SelfCalibration) -> dict[str, tuple[float, float, float]]:
     """Return the positions of stationary tags, see `SiteSolution.stationary_positions`."""
     stationary = np.flatnonzero(calibration.fit.observations.is_stationary).tolist()
-    tag_of = dict(zip(calibration.segments.of.tolist(), calibration.segments.tag.tolist(), strict=True))
-    positions = Counter(tag_of[segment] for segment in stationary)
+    tag_of_segment = dict(
+        zip(calibration.segments.of.tolist(), calibration.segments.tag.tolist(), strict=True)
+    )
+    positions = Counter(tag_of_segment[segment] for segment in stationary)
     number: Counter[int] = Counter()
     named = {}
     for segment in stationary:
-        tag = tag_of[segment]
+        tag = tag_of_segment[segment]
         number[tag] += 1
         suffix = f" #{number[tag]}" if positions[tag] > 1 else ""
         x, y, z = calibration.fit.position[calibration.fit.observations.knot_segment == segment][0].tolist()
@@ -314,15 +416,15 @@ def _pair_offsets(common: float, pairs: Pairs) -> Offsets:
 
 
 def _without_outliers(
-    error_m: NDArray[np.float64], known: NDArray[np.bool_]
+    error_m: NDArray[np.float64], is_known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], int]:
-    """Return the mask of `known` errors that are not outliers, bool (n,), and the number of outliers."""
-    if not known.any():
-        return known, 0
-    distance_m = np.abs(error_m - np.median(error_m[known]))
-    limit = max(OUTLIER_M, OUTLIER_SDS * MAD_TO_SD * float(np.median(distance_m[known])))
-    is_used = known & (distance_m <= limit)
-    return is_used, int(known.sum() - is_used.sum())
+    """Return the mask of known errors that are not outliers, bool (n,), and the number of outliers."""
+    if not is_known.any():
+        return is_known, 0
+    distance_m = np.abs(error_m - np.median(error_m[is_known]))
+    limit = max(OUTLIER_M, OUTLIER_SDS * MAD_TO_SD * float(np.median(distance_m[is_known])))
+    is_used = is_known & (distance_m <= limit)
+    return is_used, int(is_known.sum() - is_used.sum())
 
 
 def _whole_segments(
