@@ -11,8 +11,9 @@ from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from uwb_mitigation.mitigation.correction import Mitigation
-from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes import mitigator
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
 pytestmark = pytest.mark.ros
@@ -58,3 +59,14 @@ def test_several_pipelines_do_not_interfere(ros: Ros):
     ros.spin_until(lambda: all(len(messages) == 200 for messages in received.values()))
     for messages in received.values():
         assert [m.sequence for m in messages] == list(range(200))
+
+
+@pytest.mark.parametrize("model", ["universal", "universal_amplitude", "evk1000_apartment", "dw3000_sts"])
+def test_network_runs_before_the_mitigator_is_active(model: str, monkeypatch: pytest.MonkeyPatch):
+    batches: list[int] = []
+    predict_m = Session.predict_m
+    monkeypatch.setattr(
+        Session, "predict_m", lambda self, windows: batches.append(len(windows)) or predict_m(self, windows)
+    )
+    mitigator.load_corrector(model)
+    assert {1, mitigator.BATCH} <= set(batches)

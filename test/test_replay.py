@@ -327,3 +327,17 @@ def test_parameters_pause_seek_and_speed_up_a_running_replay(ros: Ros, bag: Path
     assert driver.wait() == 0, driver.output
     ros.spin_until(lambda: len(received) == COUNT // 4)
     assert [m.sequence for m in received] == list(range(300, COUNT))
+
+
+def test_time_to_open_a_source_does_not_make_its_first_records_late():
+    opened_ns: list[int] = []
+
+    class SlowSource(ListSource):
+        def __iter__(self) -> Iterator[Record]:
+            time.sleep(0.3)
+            opened_ns.append(time.monotonic_ns())
+            yield from super().__iter__()
+
+    player = Player(SlowSource([0, 10 * MS, 20 * MS])).play()
+    assert player.stamps[0] >= opened_ns[0]
+    assert np.diff(player.stamps).tolist() == [10 * MS] * 2

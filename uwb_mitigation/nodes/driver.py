@@ -46,7 +46,7 @@ from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, R
 from uwb_mitigation.types.offsets import NO_OFFSETS, read_offsets
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import encode_corrected, encode_range, encode_truth
-from uwb_mitigation.types.ros.poses import encode_true_position
+from uwb_mitigation.types.ros.poses import encode_true_position, prepare_encoders
 from uwb_mitigation.types.ros.topics import RANGE_RAW
 from uwb_mitigation.types.source import Source
 
@@ -219,6 +219,7 @@ class Driver(ManagedNode):
 
     def _prepare_replay(self) -> Callable[[], SourceHandle]:
         source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
+        prepare_encoders()
         self._truths = self.publisher(RangeTruth, topics.RANGE_TRUTH)
         self._places = self.publisher(Odometry, topics.ODOMETRY_TRUTH)
         own_clock = self.value("publish_clock")

@@ -43,8 +43,14 @@ from uwb_mitigation.types.ros.codec import (
     decode_range,
     measurement_key,
 )
-from uwb_mitigation.types.ros.poses import BodyTwist, encode_odometry, encode_pose, tag_frame, tag_of_frame
-from uwb_mitigation.types.ros.schemas import typestore
+from uwb_mitigation.types.ros.poses import (
+    BodyTwist,
+    encode_odometry,
+    encode_pose,
+    prepare_encoders,
+    tag_frame,
+    tag_of_frame,
+)
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heading
 
@@ -116,8 +122,7 @@ class Locator(ManagedNode):
             self.autostart()
 
     def open(self) -> None:
-        # Loading takes 0.1 s, which the first pose must not wait for.
-        typestore()
+        prepare_encoders()
         path = self.value("anchors")
         if not path:
             raise ParameterError(

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
+import numpy as np
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message, serialize_message
@@ -21,13 +22,14 @@ from uwb_mitigation.mitigation.correction import Corrector, Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import model_path
-from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Scaling
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.support.parameter_tables import MITIGATOR
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
+    Cir,
     Encoding,
     RadioType,
     RangeMeasurement,
@@ -60,8 +62,23 @@ def load_corrector(model: str, backend: str = "onnxruntime") -> Corrector:
         # Import on demand: it compiles C code.
         from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
 
-        return FirmwareMitigation(bundle)
-    return Mitigation(bundle)
+        corrector: Corrector = FirmwareMitigation(bundle)
+    else:
+        corrector = Mitigation(bundle)
+    _warm_up(corrector)
+    return corrector
+
+
+def _warm_up(corrector: Corrector) -> None:
+    """Correct single ranges and a batch, because the first calls of ONNX Runtime and NumPy are slow."""
+    card = corrector.bundle.card
+    samples = np.zeros(2 * 2 * card.preprocessing.samples, np.int16)
+    samples[2 * WINDOW_LEAD] = 10_000
+    cir = Cir(samples, first_path_index=WINDOW_LEAD, preamble_count=128, rx_power_dbm=-80.0,
+              first_path_power_dbm=-81.0, radio=card.radios[0], segment=card.segments[0])  # fmt: skip
+    measurement = RangeMeasurement(0, 1, 1, 0, 0, 5.0, cir)
+    for count in (1, 1, BATCH):
+        corrector.correct([measurement] * count)
 
 
 class Mitigator(ManagedNode):

@@ -230,6 +230,8 @@ class ReplayFeed:
                 if last_ns is not None:
                     pause_ns = min(recorded_ns - last_ns, longest_ns)
                     due_ns += pause_ns
+                else:
+                    self._start_clock(due_ns)
                 last_ns = recorded_ns
                 late_ns = self._wait_until(due_ns, recorded_ns)
                 if late_ns is None:
@@ -246,6 +248,12 @@ class ReplayFeed:
             self._flush()
         # The next round begins when the next record would be due.
         return first_ns is not None, due_ns + max(pause_ns, 1)
+
+    def _start_clock(self, due_ns: int) -> None:
+        """Let a record be due not before now: opening a source and skipping records takes time."""
+        now_ns = self._clock.now_ns()
+        if self._clock_ns(due_ns) < now_ns:
+            self._reference_ns, self._reference_clock_ns = due_ns, now_ns
 
     def _flush(self) -> None:
         if self._late:
