@@ -70,8 +70,7 @@ def test_saved_bundle_is_loaded_unchanged(saved):
     assert loaded.model == saved.path.read_bytes()
 
 
-def test_radios_of_a_card_read_back_and_the_default_is_not_stored(saved, tmp_path):
-    assert b"radios" not in saved.model
+def test_radios_of_a_card_read_back(tmp_path):
     sources = {"radios": (RadioType.DW3000, RadioType.QM35), "segments": (Segment.STS,)}
     weights = random_weights(SHAPE)
     other = replace(card(SHAPE, quantised=False), **sources)
@@ -136,14 +135,16 @@ def test_graph_that_onnx_runtime_cannot_run_is_refused(saved):
     "change",
     [
         lambda m: m.update(format=2),
-        lambda m: m.pop("prior"),
+        lambda m: m.pop("linear_bias"),
+        lambda m: m.update(linear_bias=None),
+        lambda m: m.pop("radios"),
         lambda m: m["preprocessing"].update(scaling="log"),
         lambda m: m["preprocessing"].update(samples=32),
         lambda m: m["architecture"].update(samples="16"),
         lambda m: m["architecture"].update(samples=10**9),
         lambda m: m["architecture"].update(depth=1),
-        lambda m: m["prior"].update(offset_m=0.1),
-        lambda m: m["prior"].update(offset_m=1e400),
+        lambda m: m["linear_bias"].update(offset_m=0.1),
+        lambda m: m["linear_bias"].update(offset_m=1e400),
         lambda m: m.update(variance_m2=-1),
         lambda m: m.update(correction_limits_m=[1, 0]),
         lambda m: m.update(correction_limits_m=[1]),
@@ -154,13 +155,6 @@ def test_graph_that_onnx_runtime_cannot_run_is_refused(saved):
 )
 def test_inconsistent_metadata_is_refused(saved, change):
     assert refused(with_metadata(saved.model, change))
-
-
-def test_without_a_linear_bias_model_only_the_network_predicts(saved):
-    data = with_metadata(saved.model, lambda metadata: metadata.update(prior=None))
-    loaded = parse_bundle(data, Path("some.onnx"))
-    assert loaded.linear_bias == LinearBiasModel(0.0)
-    assert not loaded.linear_bias.needs_power
 
 
 def test_card_that_contradicts_its_graph_is_not_written(tmp_path):

@@ -87,7 +87,7 @@ class ModelCard:
     @property
     def source(self) -> str:
         """Radios and segments of the training data, human-readable."""
-        return " ".join("/".join(each.name for each in names) for names in (self.radios, self.segments))
+        return " ".join("/".join(kind.name for kind in kinds) for kinds in (self.radios, self.segments))
 
     def mismatch(self, other: str) -> str:
         """Return why ranges of another radio or segment are not corrected."""
@@ -108,9 +108,9 @@ class ModelCard:
                 f"the preprocessing returns {self.preprocessing.samples}"
             )
         numbers = {
-            "prior.offset_m": self.linear_bias.offset_m,
-            "prior.per_rx_power": self.linear_bias.per_rx_power,
-            "prior.per_power_gap": self.linear_bias.per_power_gap,
+            "linear_bias.offset_m": self.linear_bias.offset_m,
+            "linear_bias.per_rx_power": self.linear_bias.per_rx_power,
+            "linear_bias.per_power_gap": self.linear_bias.per_power_gap,
             "correction_limits_m[0]": self.correction_limits_m[0],
             "correction_limits_m[1]": self.correction_limits_m[1],
             "variance_m2": self.variance_m2,
@@ -298,23 +298,15 @@ def assemble_bundle(graph: bytes, card: ModelCard) -> bytes:
     """Return the bytes of a bundle."""
     import onnx
 
-    fields = asdict(card)
-    # Keys of the file format, which are older than the names in the code.
-    fields["prior"], fields["familiarity"] = fields.pop("linear_bias"), fields.pop("ood_bands")
-    if card.needs_cir:
-        # Older bundles do not have this field.
-        del fields["needs_cir"]
-    for name in ("radios", "segments"):
-        fields[name] = [each.name for each in getattr(card, name)]
-        if fields[name] in (["DW1000"], ["IPATOV"]):
-            # Older bundles do not have these fields.
-            del fields[name]
-    if card.ood_bands is not None and card.ood_bands.lead_level_db is None:
-        del fields["familiarity"]["lead_level_db"]
-    metadata = fields | {
+    metadata = asdict(card)
+    metadata["ood"] = metadata.pop("ood_bands")
+    metadata |= {
         "format": FORMAT,
         "model_id": _BLANK.decode(),
-        "architecture": _architecture_metadata(card.architecture),
+        "radios": [radio.name for radio in card.radios],
+        "segments": [segment.name for segment in card.segments],
+        "architecture": asdict(card.architecture)
+        | {"kind": "mlp" if isinstance(card.architecture, Mlp) else "remnet"},
         "preprocessing": {
             "samples": card.preprocessing.samples,
             "scaling": card.preprocessing.scaling.value,
@@ -342,7 +334,6 @@ def _checksum(data: bytes, digits: int) -> int:
 def _card(metadata: dict[str, Any]) -> ModelCard:
     if metadata["format"] != FORMAT:
         raise ModelError(f"metadata format {metadata['format']!r}", valid=f"{FORMAT}")
-    linear_bias = metadata["prior"]
     low, high = metadata["correction_limits_m"]
     return ModelCard(
         name=str(metadata["name"]),
@@ -352,20 +343,19 @@ def _card(metadata: dict[str, Any]) -> ModelCard:
             Scaling(metadata["preprocessing"]["scaling"]),
         ),
         linear_bias=LinearBiasModel(
-            **{key: float(value) for key, value in (linear_bias or {"offset_m": 0}).items()}
+            **{key: float(value) for key, value in dict(metadata["linear_bias"]).items()}
         ),
         quantised=metadata["quantised"] is True,
         variance_m2=float(metadata["variance_m2"]),
         variance_uncorrected_m2=float(metadata["variance_uncorrected_m2"]),
         correction_limits_m=(float(low), float(high)),
         training=dict(metadata["training"]),
-        # Older bundles do not contain these fields.
-        variance_per_m2=float(metadata.get("variance_per_m2", 0.0)),
-        interval95_sigmas=float(metadata.get("interval95_sigmas", 1.96)),
-        ood_bands=_ood_bands(metadata.get("familiarity")),
-        needs_cir=metadata.get("needs_cir", True) is not False,
-        radios=tuple(RadioType[str(name)] for name in metadata.get("radios", ("DW1000",))),
-        segments=tuple(Segment[str(name)] for name in metadata.get("segments", ("IPATOV",))),
+        variance_per_m2=float(metadata["variance_per_m2"]),
+        interval95_sigmas=float(metadata["interval95_sigmas"]),
+        ood_bands=_ood_bands(metadata["ood"]),
+        needs_cir=metadata["needs_cir"] is True,
+        radios=tuple(RadioType[str(name)] for name in metadata["radios"]),
+        segments=tuple(Segment[str(name)] for name in metadata["segments"]),
     )
 
 
@@ -377,14 +367,9 @@ def _ood_bands(metadata: dict[str, Any] | None) -> OodBands | None:
     return OodBands(offset, **{name: Band(**band) if band else None for name, band in bands.items()})
 
 
-def _architecture_metadata(architecture: Architecture) -> dict[str, Any]:
-    """Return the metadata of the architecture; REMNet has no type, because older bundles contain no other network."""
-    return asdict(architecture) | ({"kind": "mlp"} if isinstance(architecture, Mlp) else {})
-
-
 def _architecture(metadata: dict[str, Any]) -> Architecture:
     shape = dict(metadata)
-    kind = shape.pop("kind", "remnet")
+    kind = shape.pop("kind")
     if kind == "mlp":
         hidden = tuple(_integer(size) for size in shape.pop("hidden"))
         return Mlp(hidden=hidden, **{key: _integer(value) for key, value in shape.items()})
