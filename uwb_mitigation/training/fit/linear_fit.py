@@ -117,28 +117,25 @@ def least_absolute_deviations(
 ) -> NDArray[np.floating]:
     """Return coefficients (p,) that minimise `sum(abs(target - design @ coefficients))`; design (n, p), target (n,).
 
-    Iteratively reweighted least squares with a decreasing floor on the residuals (Schlossmacher,
-    "An iterative technique for absolute deviations curve fitting", JASA 1973), then a step to the
-    vertex, because an optimum passes through p of the points.
+    The coefficients are the multipliers of the dual linear programme, which has n bounded variables and p constraints
+    (Barrodale and Roberts, "An improved algorithm for discrete l1 linear approximation", SIAM J. Numer. Anal. 1973).
+
+    Raises:
+        DatasetError: the solver fails.
     """
-    points, unknowns = design.shape
-    # Scale the columns: powers are much larger than the ones of the intercept.
+    # SciPy takes 0.3 s to import.
+    from scipy.optimize import linprog
+
+    # Powers are much larger than the ones of the intercept.
     column_scale = np.abs(design).max(axis=0)
-    scaled = design / np.where(column_scale > 0, column_scale, 1)
-    weight = np.ones(points)
-    floor = max(float(np.abs(target).max()), 1e-9)
-    coefficients = np.zeros(unknowns)
-    for _ in range(200):
-        root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(scaled * root[:, None], target * root, rcond=None)[0]
-        residual = np.abs(target - scaled @ coefficients)
-        floor = max(0.9 * floor, 1e-9)
-        weight = 1 / np.maximum(residual, floor)
-    nearest = np.argsort(np.abs(target - scaled @ coefficients), kind="stable")[:unknowns]
-    vertex = np.linalg.lstsq(scaled[nearest], target[nearest], rcond=None)[0]
-    if np.abs(target - scaled @ vertex).sum() < np.abs(target - scaled @ coefficients).sum():
-        coefficients = vertex
-    return coefficients / np.where(column_scale > 0, column_scale, 1)
+    column_scale = np.where(column_scale > 0, column_scale, 1)
+    solution = linprog(
+        -target, A_eq=(design / column_scale).T, b_eq=np.zeros(design.shape[1]), bounds=(-1, 1)
+    )
+    if not solution.success:
+        raise DatasetError(f"the linear bias model cannot be fitted: {solution.message}")
+    coefficients: NDArray[np.floating] = -solution.eqlin.marginals / column_scale
+    return coefficients
 
 
 def fit_constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinearBiasModel:
