@@ -230,7 +230,7 @@ def test_variances_of_the_protocol_are_from_held_out_configurations(data, watch,
 
 
 def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    monkeypatch.setattr(recordings, "load", lambda *_, **__: ("made up", True, data))
+    monkeypatch.setattr(recordings, "load_dataset", lambda *_, **__: ("made up", True, data))
     result = CliRunner().invoke(app, [str(word) for word in words])
     if result.exception is not None:
         raise result.exception

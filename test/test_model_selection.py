@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from uwb_mitigation.types.measurement import Record, Truth
 pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.mitigation.model.floating import float_network
 from uwb_mitigation.training.data import recordings
+from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.fit import candidates, selection
 from uwb_mitigation.training.fit.candidates import Candidate, FittedModel, Recipe, network_m
 from uwb_mitigation.training.fit.options import FitOptions
@@ -31,10 +32,21 @@ from uwb_mitigation.training.fit.selection import NESTED
 
 SHAPE = Remnet(samples=8)
 RECIPE = Recipe(SHAPE, FitOptions(epochs=1))
-CONSTANTS = [
-    Candidate(name, lambda data, seed, offset=offset: FittedModel(LinearBiasModel(offset)))
-    for name, offset in (("none", 0.0), ("half", 0.5), ("quarter", 0.25))
-]
+
+
+@dataclass(frozen=True, eq=False)
+class FixedOffset(Candidate):
+    offset_m: float
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        return FittedModel(LinearBiasModel(self.offset_m))
+
+
+class TrainedOffset(FixedOffset):
+    trains = True
+
+
+CONSTANTS = [FixedOffset("none", 0.0), FixedOffset("half", 0.5), FixedOffset("quarter", 0.25)]
 
 
 def numbered(error_of):
@@ -74,7 +86,7 @@ def test_nested_error_is_from_configurations_outside_the_selection():
 
 def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
     data = numbered(lambda number: 0.3)
-    offered = [replace(item, trains=item.name == "quarter") for item in CONSTANTS]
+    offered = [*CONSTANTS[:2], TrainedOffset("quarter", 0.25)]
     assert selection.select_nested(data, offered, 3, 0).chosen == "quarter"
     prefer = selection.select_simplest
 
@@ -209,7 +221,7 @@ def eight_places(monkeypatch) -> Recorded:
 
 
 def loads(monkeypatch, data) -> None:
-    monkeypatch.setattr(recordings, "load", lambda *_: ("made up", data))
+    monkeypatch.setattr(recordings, "load_dataset", lambda *_: ("made up", data))
 
 
 def test_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
@@ -229,7 +241,7 @@ def test_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
 
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):
     loads(monkeypatch, dataset(6, 3, samples=157))
-    far_off = Candidate("far off", lambda data, seed: FittedModel(LinearBiasModel(9.0)))
+    far_off = FixedOffset("far off", 9.0)
     monkeypatch.setattr(candidates, "new_models", lambda recipe: [far_off])
     output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
     printed = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)

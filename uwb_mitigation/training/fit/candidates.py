@@ -8,14 +8,16 @@ Only candidates that train a network need torch.
 from __future__ import annotations
 
 import importlib.util
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.model import graph
-from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model.architecture import Architecture, Remnet
 from uwb_mitigation.mitigation.model.bundle import Bundle, session_options
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
@@ -23,6 +25,7 @@ from uwb_mitigation.mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.fit import linear_fit
+from uwb_mitigation.training.fit.linear_fit import fit_constant
 from uwb_mitigation.training.fit.options import FitOptions
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB
 
@@ -70,19 +73,21 @@ class FittedModel:
         return np.where(np.isfinite(predicted), predicted, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """One candidate model.
+@dataclass(frozen=True, eq=False)
+class Candidate(ABC):
+    """A candidate model.
 
     Attributes:
         name: Name in tables.
-        fit: called with a dataset and a seed.
         trains: whether it trains a network. Such a model is kept only if the nested error shows a gain.
     """
 
     name: str
-    fit: Callable[[Dataset, int], FittedModel]
-    trains: bool = False
+    trains: ClassVar[bool] = False
+
+    @abstractmethod
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """Fit the model to a dataset."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,39 +153,44 @@ def fit_new_model(
     if recipe.line:
         linear_bias = fit_line(data)
     elif not recipe.network:
-        linear_bias = fit_constant(data)
+        linear_bias = _constant(data)
     if not recipe.network:
         with fitting.single_thread(seed):
             return FittedModel(linear_bias, networks.weights_of(networks.build(recipe.architecture, 0)))
     options = replace(recipe.fit, seed=seed)
-    start = recipe.architecture, options, on_epoch
-    return FittedModel(linear_bias, _fit_residuals(data, linear_bias, recipe.per_configuration, *start))
+    network = _fit_residuals(
+        data, linear_bias, recipe.per_configuration, options, recipe.architecture, on_epoch=on_epoch
+    )
+    return FittedModel(linear_bias, network)
 
 
 def _fit_residuals(
     data: Dataset,
     linear_bias: LinearBiasModel,
     per_configuration: int,
-    architecture: Remnet,
     options: FitOptions,
-    on_epoch: Callable[[], None] = lambda: None,
+    architecture: Architecture | None = None,
     start: FloatWeights | None = None,
+    on_epoch: Callable[[], None] = lambda: None,
 ) -> FloatWeights:
-    """Fit a network to the residuals of a linear bias model."""
+    """Fit a network, either of `architecture` or from `start`, to the residuals of a linear bias model."""
     from uwb_mitigation.training.fit import fitting
 
+    if start is not None:
+        architecture = start.architecture
+    assert architecture is not None
     subset = data.rows(splits.subsample(data.configurations, per_configuration, options.seed))
     residual = subset.error_m - linear_bias_m(linear_bias, subset)
     # If the linear bias model needs a power that is unknown, the range is passed through.
-    known = np.isfinite(residual)
-    return fitting.fit(architecture, subset.inputs[known], residual[known], options, on_epoch, start=start)
+    rows = np.isfinite(residual)
+    return fitting.fit(architecture, subset.inputs[rows], residual[rows], options, on_epoch, start=start)
 
 
-def fit_constant(data: Dataset) -> LinearBiasModel:
+def _constant(data: Dataset) -> LinearBiasModel:
     """Fit a constant: to configurations, or without CIRs to single ranges."""
     # Each range counts as a configuration.
     configurations = data.configurations if data.has_cirs else np.arange(len(data)).astype(str)
-    return linear_fit.fit_constant(configurations, data.error_m)
+    return fit_constant(configurations, data.error_m)
 
 
 def fit_line(data: Dataset) -> LinearBiasModel:
@@ -192,8 +202,8 @@ def fit_line(data: Dataset) -> LinearBiasModel:
         assert data.anchors is not None
         cells = np.array(
             [
-                "/".join(map(str, each))
-                for each in zip(data.configurations, true_m, data.tags, data.anchors, strict=True)
+                "/".join(map(str, cell))
+                for cell in zip(data.configurations, true_m, data.tags, data.anchors, strict=True)
             ]
         )
         rows = data.rows(splits.subsample(cells, PER_CONFIGURATION, 0))
@@ -207,92 +217,145 @@ def fit_line(data: Dataset) -> LinearBiasModel:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Constant(Candidate):
+    """One offset for all ranges."""
+
+    name: str = CONSTANT
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        return FittedModel(_constant(data))
+
+
+@dataclass(frozen=True, eq=False)
+class SiteOffset(Candidate):
+    """One offset for all ranges in addition to those of the radios."""
+
+    name: str = SITE_OFFSETS
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        return FittedModel(fit_constant(data.configurations, data.error_m))
+
+
+@dataclass(frozen=True, eq=False)
+class Line(Candidate):
+    """A line in both powers."""
+
+    name: str = LINE
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        return FittedModel(fit_line(data))
+
+
+@dataclass(frozen=True, eq=False)
+class NewNetwork(Candidate):
+    """A network with random initial weights, with a line (LINE_NETWORK) or without (NETWORK)."""
+
+    recipe: Recipe
+    trains: ClassVar[bool] = True
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        return fit_new_model(data, self.recipe.for_candidate(self.name), seed)
+
+
+@dataclass(frozen=True, eq=False)
+class Unchanged(Candidate):
+    """The model of a bundle."""
+
+    linear_bias: LinearBiasModel
+    network: FloatWeights
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        return FittedModel(self.linear_bias, self.network)
+
+
+@dataclass(frozen=True, eq=False)
+class NewOffset(Unchanged):
+    """The model of a bundle with an offset of the data."""
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        residual = data.error_m - linear_bias_m(self.linear_bias, data) - network_m(self.network, data.inputs)
+        is_finite = np.isfinite(residual)
+        shift = 0.0
+        if is_finite.any():
+            shift = fit_constant(data.configurations[is_finite], residual[is_finite]).offset_m
+        offset_m = float(np.float32(self.linear_bias.offset_m + shift))
+        return FittedModel(replace(self.linear_bias, offset_m=offset_m), self.network)
+
+
+@dataclass(frozen=True, eq=False)
+class FineTuned(Unchanged):
+    """The network of a bundle, trained further on the residuals of a line if the bundle has one, otherwise of an offset."""
+
+    options: FitOptions
+    trains: ClassVar[bool] = True
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        linear_bias = fit_line(data) if self.linear_bias.needs_power else _offset(data, self.network)
+        options = replace(self.options, seed=seed)
+        network = _fit_residuals(data, linear_bias, PER_CONFIGURATION, options, start=self.network)
+        return FittedModel(linear_bias, network)
+
+
+@dataclass(frozen=True, eq=False)
+class ColdStartMean(Candidate):
+    """The mean of line and cold start: it reduces both the scatter of the line and the network's errors at a site."""
+
+    network: FloatWeights
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        line, offset = fit_line(data), _offset(data, self.network).offset_m
+        total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
+        linear_bias = LinearBiasModel(*(float(np.float32(value / 2)) for value in total))
+        return FittedModel(linear_bias, scaled(self.network, 0.5))
+
+
 def new_models(recipe: Recipe) -> list[Candidate]:
     """Return a constant, a line, a network on the residuals of the line, and a network without a line."""
-
-    def new_model(name: str) -> Callable[[Dataset, int], FittedModel]:
-        return lambda data, seed: fit_new_model(data, recipe.for_candidate(name), seed)
-
-    return [
-        _constant(),
-        _line(),
-        Candidate(LINE_NETWORK, new_model(LINE_NETWORK), trains=True),
-        Candidate(NETWORK, new_model(NETWORK), trains=True),
-    ]
-
-
-def _constant() -> Candidate:
-    return Candidate(CONSTANT, lambda data, seed: FittedModel(fit_constant(data)))
-
-
-def _line() -> Candidate:
-    return Candidate(LINE, lambda data, seed: FittedModel(fit_line(data)))
+    return [Constant(), Line(), NewNetwork(LINE_NETWORK, recipe), NewNetwork(NETWORK, recipe)]
 
 
 def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
     """Return the unchanged model of a bundle, the same with another offset, a constant, a line, and a fine-tuned network.
 
-    The fine-tuned network is trained on the residuals of a new linear bias model: a line if the bundle has one, otherwise an offset.
-
     Raises:
         ModelError: the network is not a REMNet.
     """
-    network = float_network(source)
-
-    def with_new_offset(data: Dataset, seed: int) -> FittedModel:
-        residual = data.error_m - linear_bias_m(source.linear_bias, data) - network_m(network, data.inputs)
-        known = np.isfinite(residual)
-        shift = (
-            linear_fit.fit_constant(data.configurations[known], residual[known]).offset_m
-            if known.any()
-            else 0.0
-        )
-        linear_bias = replace(
-            source.linear_bias, offset_m=float(np.float32(source.linear_bias.offset_m + shift))
-        )
-        return FittedModel(linear_bias, network)
-
-    def fine_tuned(data: Dataset, seed: int) -> FittedModel:
-        linear_bias = fit_line(data) if source.linear_bias.needs_power else _offset(data, network)
-        assert isinstance(source.architecture, Remnet)
-        start = source.architecture, replace(options, seed=seed)
-        return FittedModel(
-            linear_bias, _fit_residuals(data, linear_bias, PER_CONFIGURATION, *start, start=network)
-        )
-
+    model = source.linear_bias, float_network(source)
     return [
-        Candidate(AS_SHIPPED, lambda data, seed: FittedModel(source.linear_bias, network)),
-        Candidate(NEW_OFFSET, with_new_offset),
-        _constant(),
-        _line(),
-        Candidate(FINE_TUNED, fine_tuned, trains=True),
+        Unchanged(AS_SHIPPED, *model),
+        NewOffset(NEW_OFFSET, *model),
+        Constant(),
+        Line(),
+        FineTuned(FINE_TUNED, *model, options),
     ]
 
 
 def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: Bundle) -> list[Candidate]:
     """Add the universal network with an offset of the data, if the data is preprocessed for it.
 
-    With few configurations it is the first candidate, so that it is preferred. With `MIN_CONFIGURATIONS_FOR_MEAN` or more it follows
-    the constant, and its mean with the line follows the line. The mean reduces both the scatter of the line and the
-    site-specific errors of the network.
+    With few configurations it is the first candidate, so that it is preferred. With `MIN_CONFIGURATIONS_FOR_MEAN` or
+    more it follows the constant, and its mean with the line follows the line.
     """
     if data.preprocessing != universal.preprocessing:
         return list(candidates)
     network = float_network(universal)
-    start = Candidate(COLD_START, lambda data, seed: FittedModel(_offset(data, network), network))
+    start = NewOffset(COLD_START, LinearBiasModel(0.0), network)
     if has_few_configurations(data):
         return [start, *candidates]
-    half = scaled(network, 0.5)
-    known = np.isfinite(data.rx_power_dbm - data.first_path_power_dbm)
-    has_line = len(data.rows(known).names) >= MIN_CONFIGURATIONS_FOR_MEAN
-
-    def mean(data: Dataset, seed: int) -> FittedModel:
-        line, offset = fit_line(data), _offset(data, network).offset_m
-        total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
-        return FittedModel(LinearBiasModel(*(float(np.float32(value / 2)) for value in total)), half)
-
-    inserted = {CONSTANT: [start], LINE: [Candidate(COLD_START_MEAN, mean)] if has_line else []}
-    return [item for one in candidates for item in (one, *inserted.get(one.name, ()))]
+    has_powers = np.isfinite(data.rx_power_dbm - data.first_path_power_dbm)
+    has_line = len(data.rows(has_powers).names) >= MIN_CONFIGURATIONS_FOR_MEAN
+    mean = [ColdStartMean(COLD_START_MEAN, network)] if has_line else []
+    inserted: dict[str, list[Candidate]] = {CONSTANT: [start], LINE: [*mean]}
+    return [item for old in candidates for item in (old, *inserted.get(old.name, ()))]
 
 
 def has_few_configurations(data: Dataset) -> bool:
@@ -301,7 +364,57 @@ def has_few_configurations(data: Dataset) -> bool:
 
 
 def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
-    return linear_fit.fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
+    return fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
+
+
+@dataclass(frozen=True, eq=False)
+class SiteLine(Candidate):
+    """A line in the powers that the radios report."""
+
+    name: str = SITE_LINE
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        return FittedModel(_site_line(data, data.error_m))
+
+
+@dataclass(frozen=True, eq=False)
+class SiteUniversal(Candidate):
+    """The universal network, multiplied by a factor, with an offset or a line."""
+
+    network: FloatWeights
+    has_line: bool
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        factor = _factor(data)
+        residual = data.error_m - factor * _universal_m(data)
+        # A bundle with a network passes a range through if its first-path power is unknown.
+        if self.has_line and _has_both_powers(data):
+            linear_bias = _site_line(data, residual)
+        else:
+            linear_bias = fit_constant(data.configurations, residual)
+        return FittedModel(linear_bias, scaled(self.network, factor), factor)
+
+
+@dataclass(frozen=True, eq=False)
+class SiteFineTuned(Candidate):
+    """The universal network, trained further on the data."""
+
+    network: FloatWeights
+
+    def fit(self, data: Dataset, seed: int) -> FittedModel:
+        """See `Candidate`."""
+        from uwb_mitigation.training.fit import fitting
+
+        shift = fit_constant(data.configurations, data.error_m - _universal_m(data))
+        subset = data.rows(splits.subsample(data.configurations, FINE_TUNING_PER_CONFIGURATION, seed))
+        if len(subset) > MAX_FINE_TUNING_INPUTS:
+            chosen = np.random.default_rng(seed).choice(len(subset), MAX_FINE_TUNING_INPUTS, replace=False)
+            subset = subset.rows(np.sort(chosen))
+        options, targets = replace(FINE_TUNING, seed=seed), subset.error_m - shift.offset_m
+        network, architecture = self.network, self.network.architecture
+        return FittedModel(shift, fitting.fit(architecture, subset.inputs, targets, options, start=network))
 
 
 def site_models(
@@ -313,57 +426,20 @@ def site_models(
         The data with the predictions of the universal network, so that they are computed only once; the candidates;
         notes about missing candidates.
     """
-    offsets = Candidate(
-        SITE_OFFSETS,
-        lambda data, seed: FittedModel(linear_fit.fit_constant(data.configurations, data.error_m)),
-    )
+    offsets = SiteOffset()
     if not has_cirs:
-        line = Candidate(SITE_LINE, lambda data, seed: FittedModel(_site_line(data, data.error_m)))
-        return (
-            data,
-            [offsets, line],
-            ["no networks: the recording has no CIRs that the universal model was trained for"],
-        )
-    start = float_network(universal)
-    data = replace(data, headers=network_m(start, data.inputs)[:, None].astype(np.float32))
-
-    def with_network(line: bool) -> Callable[[Dataset, int], FittedModel]:
-        def fit(data: Dataset, seed: int) -> FittedModel:
-            factor = _factor(data)
-            residual = data.error_m - factor * _universal_m(data)
-            # A bundle with a network passes a range through if its first-path power is unknown.
-            has_line = line and _has_both_powers(data)
-            linear_bias = (
-                _site_line(data, residual)
-                if has_line
-                else linear_fit.fit_constant(data.configurations, residual)
-            )
-            return FittedModel(linear_bias, scaled(start, factor), factor)
-
-        return fit
-
-    candidates = [
+        missing = "no networks: the recording has no CIRs that the universal model was trained for"
+        return data, [offsets, SiteLine()], [missing]
+    network = float_network(universal)
+    data = replace(data, headers=network_m(network, data.inputs)[:, None].astype(np.float32))
+    candidates: list[Candidate] = [
         offsets,
-        Candidate(SITE_UNIVERSAL, with_network(line=False)),
-        Candidate(SITE_UNIVERSAL_LINE, with_network(line=True)),
+        SiteUniversal(SITE_UNIVERSAL, network, has_line=False),
+        SiteUniversal(SITE_UNIVERSAL_LINE, network, has_line=True),
     ]
     if importlib.util.find_spec("torch") is None:
         return data, candidates, ["no fine-tuned network: torch is not installed (`make setup-training`)"]
-
-    def fine_tuned(data: Dataset, seed: int) -> FittedModel:
-        from uwb_mitigation.training.fit import fitting
-
-        shift = linear_fit.fit_constant(data.configurations, data.error_m - _universal_m(data))
-        subset = data.rows(splits.subsample(data.configurations, FINE_TUNING_PER_CONFIGURATION, seed))
-        if len(subset) > MAX_FINE_TUNING_INPUTS:
-            chosen = np.random.default_rng(seed).choice(len(subset), MAX_FINE_TUNING_INPUTS, replace=False)
-            subset = subset.rows(np.sort(chosen))
-        options, targets = replace(FINE_TUNING, seed=seed), subset.error_m - shift.offset_m
-        return FittedModel(
-            shift, fitting.fit(universal.architecture, subset.inputs, targets, options, start=start)
-        )
-
-    return data, [*candidates, Candidate(SITE_FINE_TUNED, fine_tuned)], []
+    return data, [*candidates, SiteFineTuned(SITE_FINE_TUNED, network)], []
 
 
 def _universal_m(data: Dataset) -> NDArray[np.float64]:
