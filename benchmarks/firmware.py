@@ -18,7 +18,7 @@ from benchmarks.equipment import emulator
 from benchmarks.equipment.random_networks import mlp, remnet, rounding_windows
 from uwb_mitigation.mitigation.embedded.export import Golden, golden_windows, write_header
 from uwb_mitigation.mitigation.embedded.packing import PackedNetwork, pack
-from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target, build_image
+from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target, compile_image
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import Mlp
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, session_options
@@ -157,7 +157,7 @@ def measure(
             folder, packed, network.card, network.model_id, Golden(examples, network.expect(examples))
         )
         optimisation = "-O3" if kernels is Kernels.PORTABLE else "-Os"
-        image = build_image(folder, folder, Target.QEMU_MPS2, kernels, optimisation)
+        image = compile_image(folder, folder, Target.QEMU_MPS2, kernels, optimisation)
         result = emulator.run_windows(image, windows)
         cycles = emulator.estimate_cycles(image, emulator.count_executed(image, windows[len(windows) // 2]))
         flash = emulator.measure_size(folder, folder, kernels, optimisation).flash_bytes

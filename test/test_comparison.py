@@ -77,7 +77,7 @@ def run(*arguments: object):
 
 def test_command_writes_the_documented_keys(tmp_path, monkeypatch, found):
     monkeypatch.setattr(recordings, "load_dataset", lambda *_: ("made up", dataset(12, 6, samples=8)))
-    monkeypatch.setattr(comparison, "run", lambda *_: found)
+    monkeypatch.setattr(comparison, "compare_models", lambda *_: found)
     result = run(
         "evaluate", "--data", tmp_path, "--cross-validate", "configuration", "--json", tmp_path / "c.json"
     )

@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.recordings import formats
-from uwb_mitigation.training.evaluation.accuracy import evaluate
+from uwb_mitigation.training.evaluation.accuracy import evaluate_accuracy
 from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
 
 
@@ -54,7 +54,7 @@ def test_statistics_without_data_are_refused(errors):
 
 def test_evaluation_equals_live_correction(tmp_path, recording):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
-    outcome = evaluate(mitigation, recording)
+    outcome = evaluate_accuracy(mitigation, recording)
     left = [mitigation.correct([item.measurement])[0].range_m - item.truth.range_m for item in recording]
     assert outcome.n == 48
     assert outcome.raw.mae == 0.25
@@ -64,7 +64,7 @@ def test_evaluation_equals_live_correction(tmp_path, recording):
 
 def test_passed_through_range_counts_unchanged(tmp_path):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
-    outcome = evaluate(mitigation, [record(preamble_count=0)])
+    outcome = evaluate_accuracy(mitigation, [record(preamble_count=0)])
     assert outcome.corrected.mae == 0.25
     assert outcome.statuses == {"BAD_CIR": 1}
 
@@ -74,16 +74,16 @@ def test_intervals_are_those_of_the_bundle(tmp_path, sigmas, covered):
     # Every range passes through with an error of 0.25 m: 2.8 standard deviations.
     promised = {"interval95_sigmas": sigmas, "variance_uncorrected_m2": 1 / 128}
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157), **promised))
-    outcome = evaluate(mitigation, [record(preamble_count=0)])
+    outcome = evaluate_accuracy(mitigation, [record(preamble_count=0)])
     assert (outcome.coverage68, outcome.coverage95) == (0.0, covered)
 
 
 def test_records_without_truth_or_range_are_skipped(tmp_path):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
     without_range = replace(record(), measurement=replace(record().measurement, range_m=np.nan))
-    assert evaluate(mitigation, [record(), replace(record(), truth=None), without_range]).n == 1
+    assert evaluate_accuracy(mitigation, [record(), replace(record(), truth=None), without_range]).n == 1
     with pytest.raises(DatasetError, match="none of 1 measurements"):
-        evaluate(mitigation, [replace(record(), truth=None)])
+        evaluate_accuracy(mitigation, [replace(record(), truth=None)])
 
 
 def test_evaluate_writes_the_documented_keys(tmp_path, recording):

@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.training.data.dataset import build_dataset
 from uwb_mitigation.training.evaluation import zero_shot
-from uwb_mitigation.training.evaluation.accuracy import Accuracy, evaluate
+from uwb_mitigation.training.evaluation.accuracy import Accuracy, evaluate_accuracy
 from uwb_mitigation.training.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.types.measurement import Cir, Record
 
@@ -75,7 +75,7 @@ PERTURBED = {
 
 def changed(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
     """Return the accuracy on records with changed CIRs."""
-    return evaluate(
+    return evaluate_accuracy(
         mitigation,
         [
             replace(record, measurement=replace(record.measurement, cir=change(record.measurement.cir)))
@@ -103,13 +103,13 @@ def test_inputs_that_cannot_be_in_distribution_are_reported(mitigation, records)
 
 
 def test_training_logs_are_in_distribution(mitigation, records):
-    outcome = evaluate(mitigation, records)
+    outcome = evaluate_accuracy(mitigation, records)
     assert set(outcome.statuses) == {"OK"}
     assert outcome.corrected.mae < 0.4 * outcome.raw.mae
 
 
 def test_model_still_improves_the_simulated_flat(mitigation):
-    outcome = evaluate(mitigation, SimulatedSource(seed=1, count=600, rate_hz=40.0))
+    outcome = evaluate_accuracy(mitigation, SimulatedSource(seed=1, count=600, rate_hz=40.0))
     assert outcome.corrected.mae < 0.75 * outcome.raw.mae
     assert set(outcome.statuses) == {"OK"}
 
@@ -154,7 +154,7 @@ def test_universal_model_does_not_harm_at_any_level(decibels, universal, calibra
 
 
 def test_universal_model_improves_unseen_sites(universal, calibrated):
-    outcome = evaluate(universal, calibrated)
+    outcome = evaluate_accuracy(universal, calibrated)
     assert outcome.corrected.mae < 0.6 * outcome.raw.mae
     before, after = outcome.by_label["LOS"][1:]
     assert after <= before + 0.02
@@ -172,7 +172,7 @@ def test_universal_model_reaches_the_error_of_its_card_on_the_real_logs(apartmen
 
 def test_universal_model_helps_in_simulated_rooms_by_amplitude():
     mitigation = Mitigation(load_bundle(default_model_path(Scaling.MAX)))
-    outcome = evaluate(mitigation, SimulatedDeepUwb(seed=1, ranges=2000, exchanges=1))
+    outcome = evaluate_accuracy(mitigation, SimulatedDeepUwb(seed=1, ranges=2000, exchanges=1))
     errors = [
         record.measurement.range_m - record.truth.range_m
         for record in SimulatedDeepUwb(seed=1, ranges=2000, exchanges=1)

@@ -101,8 +101,8 @@ def test_features_are_finite_if_header_fields_are_missing():
     data = dataset(3, 4, samples=64)
     data.rx_power_dbm[:] = np.nan
     data.inputs[0] = 0
-    assert baselines.features(data, header=True).shape == (12, 15)
-    assert np.isfinite(baselines.features(data, header=True)).all()
+    assert baselines.baseline_features(data, header=True).shape == (12, 15)
+    assert np.isfinite(baselines.baseline_features(data, header=True)).all()
 
 
 def test_regressions_use_the_header(monkeypatch):

@@ -54,7 +54,7 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture(scope="module")
 def image(exported: Exported) -> toolchain.Image:
-    return toolchain.build_image(exported.folder, exported.folder, Target.QEMU_MPS2)
+    return toolchain.compile_image(exported.folder, exported.folder, Target.QEMU_MPS2)
 
 
 def check_windows(exported: Exported, image: toolchain.Image, windows: np.ndarray) -> emulator.Emulation:
@@ -91,7 +91,7 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
     weights = random_networks.remnet(samples, 3, modules)
     firmware_models.write_model(tmp_path, weights)
     windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], 200)
-    image = toolchain.build_image(tmp_path, tmp_path, Target.QEMU_MPS2)
+    image = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2)
     result = emulator.run_windows(image, windows)
     assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
 
@@ -100,8 +100,8 @@ def test_trace_and_counter_agree_and_portable_c_takes_four_times_the_instruction
     weights = random_networks.remnet(8, 3)
     firmware_models.write_model(tmp_path, weights)
     windows = random_networks.rounding_windows(8, weights.activation_scale["input"], 200)
-    kernels = toolchain.build_image(tmp_path, tmp_path, Target.QEMU_MPS2)
-    portable = toolchain.build_image(tmp_path, tmp_path, Target.QEMU_MPS2, Kernels.PORTABLE, "-O3")
+    kernels = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2)
+    portable = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2, Kernels.PORTABLE, "-O3")
     results = [emulator.run_windows(image, windows) for image in (kernels, portable)]
     for result in results:
         assert np.array_equal(
@@ -118,7 +118,7 @@ def check_corrections(
 ) -> set[int]:
     """Compare the corrections of the board with those of the mitigator; return the statuses."""
     export_bundle(bundle, folder)
-    image = toolchain.build_image(folder, folder, Target.QEMU_MPS2)
+    image = toolchain.compile_image(folder, folder, Target.QEMU_MPS2)
     result = emulator.run_measurements(image, measurements, bundle.architecture.samples, offset_m=offset_m)
     assert result.model_id == bundle.model_id
     mitigation = Mitigation(bundle, Offsets(offset_m))

@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.mitigation.embedded.export import export_bundle, number
+from uwb_mitigation.mitigation.embedded.export import export_bundle, format_number
 from uwb_mitigation.mitigation.embedded.packing import pack
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import Remnet
@@ -25,7 +25,7 @@ def test_floats_read_back_to_the_same_bits():
     random = np.random.default_rng(0)
     patterns = random.integers(0, 2**32, 20_000, np.uint32).view(np.float32)
     for value in [*patterns[np.isfinite(patterns)], np.float32(0), np.float32(-0.0), np.float32(1e-45)]:
-        text = number(value)
+        text = format_number(value)
         assert re.fullmatch(r"-?\d+(\.\d+)?(e[+-]\d+)?f", text)
         assert re.search(r"[.e]", text), "an integer with the suffix f is no C"
         assert np.float32(text[:-1]).view(np.uint32) == value.view(np.uint32)
@@ -34,14 +34,14 @@ def test_floats_read_back_to_the_same_bits():
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.1, 1e300])
 def test_value_that_is_not_a_finite_float32_is_refused(value: float):
     with pytest.raises(ModelError, match="float32"):
-        number(value)
+        format_number(value)
 
 
 def test_shipped_model_is_exported_with_its_identity(tmp_path: Path):
     bundle = load_bundle(default_model_path())
     text = export_bundle(bundle, tmp_path / "new" / "folder").read_text()
     assert f"0x{bundle.model_id:08x}u" in text
-    assert number(bundle.linear_bias.per_rx_power) in text
+    assert format_number(bundle.linear_bias.per_rx_power) in text
 
 
 def test_float_bundle_is_refused_with_the_remedy(tmp_path: Path):

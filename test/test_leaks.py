@@ -29,7 +29,7 @@ from uwb_mitigation.training.fit import linear_fit
 pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
 from uwb_mitigation.training import comparison, train
-from uwb_mitigation.training.fit import candidates, cards, fitting, selection
+from uwb_mitigation.training.fit import candidates, fitting, model_card, selection
 from uwb_mitigation.training.fit.candidates import Recipe
 from uwb_mitigation.training.fit.options import FitOptions
 from uwb_mitigation.training.paper import data as recordings
@@ -43,23 +43,23 @@ RECIPE = Recipe(Remnet(SAMPLES, modules=1, filters=4), QUICK, QUICK)
 LEARNERS = {
     (comparison, "fit"),
     (comparison, "calibration_inputs"),
-    (comparison, "quantize"),
+    (comparison, "quantize_network"),
     (fitting, "fit"),
     (candidates, "fit_new_model"),
     (train, "fit_new_model"),
     (train, "fit_with_card"),
     (train, "calibration_inputs"),
-    (train, "quantize"),
-    (train, "make_card"),
+    (train, "quantize_network"),
+    (train, "site_card"),
     (linear_fit, "fit_linear_bias"),
     (linear_fit, "fit_constant"),
     (baselines, "los_median"),
     (baselines, "overall_median"),
     (baselines, "ridge"),
     (baselines, "gradient_boosting"),
-    (cards, "calibrate"),
-    (experiment, "calibrate"),
-    (experiment, "quantize"),
+    (model_card, "fit_intervals"),
+    (experiment, "calibrate_quantization"),
+    (experiment, "quantize_network"),
 }
 
 
@@ -157,14 +157,19 @@ def test_no_row_of_the_comparison_was_fitted_on_its_test_data(data, watch):
     comparison.compare_models(data, RECIPE, GroupKey.CONFIGURATION, folds=2, seeds=1)
     watch.called("baselines.los_median", "baselines.overall_median", "baselines.ridge")
     watch.called(
-        "baselines.gradient_boosting", "train.fit_with_card", "linear_fit.fit_linear_bias", "cards.calibrate"
+        "baselines.gradient_boosting",
+        "train.fit_with_card",
+        "linear_fit.fit_linear_bias",
+        "model_card.fit_intervals",
     )
-    watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantize")
+    watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantize_network")
 
 
 def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
     found = train.cross_validate(data, RECIPE, 3, 0)
-    watch.called("fitting.fit", "train.calibration_inputs", "train.quantize", "linear_fit.fit_linear_bias")
+    watch.called(
+        "fitting.fit", "train.calibration_inputs", "train.quantize_network", "linear_fit.fit_linear_bias"
+    )
     for split in splits.by_configuration(data.configurations, 3, 0):
         expected = data.error_m[split.test] - np.median(data.error_m[split.train])
         assert np.allclose(found.errors["overall_median"][split.test], expected)
@@ -197,26 +202,26 @@ def test_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path
     wanted = experiment.list_tasks(["remnet", "mlp"], [SAMPLES], seeds=1)
     with watch.without(parts(data).test.names):
         experiment.run_experiment(parts(data), tmp_path, wanted, QUICK)
-    watch.called("experiment.calibrate", "fitting.fit")
+    watch.called("experiment.calibrate_quantization", "fitting.fit")
     watch.called("baselines.los_median", "baselines.overall_median", "linear_fit.fit_linear_bias")
 
 
 @pytest.fixture
 def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
-    """Record the configurations of each call of `cards.calibrate_quantization`."""
+    """Record the configurations of each call of `model_card.fit_intervals`."""
     calls: list[set[str]] = []
-    calibrate = cards.calibrate
+    calibrate = model_card.fit_intervals
 
     def recorded(left: Any, predicted: Any, names: NDArray[np.str_]) -> Any:
         calls.append(set(names.tolist()))
         return calibrate(left, predicted, names)
 
-    monkeypatch.setattr(cards, "calibrate", recorded)
+    monkeypatch.setattr(model_card, "fit_intervals", recorded)
     return calls
 
 
 def test_variances_of_the_protocol_are_from_held_out_configurations(data, watch, calibrated):
-    card = experiment.make_card("made up", RECIPE.architecture, parts(data), QUICK)
+    card = experiment.paper_card("made up", RECIPE.architecture, parts(data), QUICK)
     fitted, (corrected, raw) = watch.seen["fitting.fit"], calibrated
     assert fitted
     assert corrected
@@ -224,13 +229,13 @@ def test_variances_of_the_protocol_are_from_held_out_configurations(data, watch,
     assert fitted | corrected == raw == set(parts(data).train.names)
     far_off = replace(parts(data).test, error_m=parts(data).test.error_m + 7)
     assert (
-        experiment.make_card("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK)
+        experiment.paper_card("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK)
         == card
     )
 
 
 def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    monkeypatch.setattr(recordings, "load_dataset", lambda *_, **__: ("made up", True, data))
+    monkeypatch.setattr(recordings, "load_paper_data", lambda *_, **__: ("made up", True, data))
     result = CliRunner().invoke(app, [str(word) for word in words])
     if result.exception is not None:
         raise result.exception
@@ -240,4 +245,4 @@ def test_command_trains_on_the_training_part(data, watch, monkeypatch, tmp_path)
     quick = ("--networks", "remnet", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
     with watch.without(data.rows(in_room_2(data)).names):
         typed(data, monkeypatch, "paper", "protocol", "--data", "x", "-o", tmp_path, *quick)
-    watch.called("experiment.calibrate")
+    watch.called("experiment.calibrate_quantization")

@@ -233,7 +233,7 @@ def test_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
         "--epochs", 1, "--folds", 2, "--json", result,
     )  # fmt: skip
     found = json.loads(result.read_text())
-    assert found["helped"]
+    assert found["improved"]
     assert candidates.COLD_START not in [row["name"] for row in found["choice"]["rows"]]
     assert found["choice"]["chosen"] in ("new offset", "constant")
     assert load_bundle(output).card.training["started_from"] == f"{started.model_id:08x}"
@@ -251,8 +251,8 @@ def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypat
     # The mark is in the line of the chosen candidate, also with 80 columns.
     assert [line for line in printed.splitlines() if "<-" in line and candidates.COLD_START in line]
     mae = {row["name"]: row["mae"] for row in found["choice"]["rows"]}
-    assert found["helped"] == (mae[NESTED] < mae["raw"])
-    assert set(found) == {"model_id", "n", "refused", "rows", "helped", "by_configuration", "choice"}
+    assert found["improved"] == (mae[NESTED] < mae["raw"])
+    assert set(found) == {"model_id", "n", "skipped", "rows", "improved", "by_configuration", "choice"}
     inputs = windows(5, 157)
     expected = network_m(float_network(start), inputs)
     assert network_m(float_network(made), inputs) == pytest.approx(expected, abs=1e-6)
@@ -265,7 +265,7 @@ def test_harmful_model_is_reported(tmp_path, monkeypatch):
     output, result = tmp_path / "x.onnx", tmp_path / "x.json"
     words = ("--recipe", "constant", "--samples", 8, "-o", output, "--json", result)
     assert "no improvement" in run_or_raise("train", "--data", tmp_path, *words)
-    assert json.loads(result.read_text())["helped"] is False
+    assert json.loads(result.read_text())["improved"] is False
     assert load_bundle(output).card.training["recipe"] == {"line": False, "network": False}
 
 

@@ -13,11 +13,11 @@ from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, save_bundle, session_options
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.weights import FloatWeights
-from uwb_mitigation.training.fit.quantization import quantize
+from uwb_mitigation.training.fit.quantization import quantize_network
 
 torch = pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
-from uwb_mitigation.training.fit.networks import MlpModule, RemnetModule, build, weights_of  # noqa: E402
+from uwb_mitigation.training.fit.networks import MlpModule, RemnetModule, build_network, weights_of  # noqa: E402
 
 
 def mlp_weights(shape: Mlp, seed: int = 0) -> FloatWeights:
@@ -70,14 +70,14 @@ def test_torch_and_numpy_compute_the_same(shape):
     weights = random_weights(shape) if isinstance(shape, Remnet) else mlp_weights(shape)
     inputs = windows(20, shape.samples)
     with torch.no_grad():
-        computed = build(shape, 0.5, weights).eval()(torch.from_numpy(inputs)).numpy()
+        computed = build_network(shape, 0.5, weights).eval()(torch.from_numpy(inputs)).numpy()
     assert np.allclose(floating.predict_m(weights, inputs), computed, atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [Remnet(20, first_kernel=5, filters=6, modules=2), Mlp(16, (8, 4))])
 def test_weights_go_in_and_out_unchanged(shape):
     weights = random_weights(shape) if isinstance(shape, Remnet) else mlp_weights(shape)
-    again = weights_of(build(shape, 0.5, weights))
+    again = weights_of(build_network(shape, 0.5, weights))
     for name in weights.weight:
         assert np.array_equal(weights.weight[name], again.weight[name])
         assert np.array_equal(weights.bias[name], again.bias[name])
@@ -85,7 +85,7 @@ def test_weights_go_in_and_out_unchanged(shape):
 
 @pytest.mark.parametrize("shape", [Mlp(157), Mlp(8, (5,)), Mlp(33, (64, 7, 9))])
 def test_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
-    weights = quantize(mlp_weights(shape), windows(100, shape.samples), exact=False)
+    weights = quantize_network(mlp_weights(shape), windows(100, shape.samples), exact=False)
     session = onnxruntime.InferenceSession(
         graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
     )
@@ -99,7 +99,7 @@ def test_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
 def test_mlp_bundle_loads_and_runs(tmp_path, quantised):
     shape = Mlp(16, (12, 8))
     weights = mlp_weights(shape)
-    integers = quantize(weights, windows(50, 16), exact=False)
+    integers = quantize_network(weights, windows(50, 16), exact=False)
     model = graph.int8_model(integers) if quantised else graph.float_model(weights)
     save_bundle(tmp_path / "mlp.onnx", model, card(shape, quantised=quantised))
     bundle = load_bundle(tmp_path / "mlp.onnx")

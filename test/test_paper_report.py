@@ -16,7 +16,7 @@ from model_material import dataset
 
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.training.paper import report, tables
-from uwb_mitigation.training.paper.report import Report, Study, build
+from uwb_mitigation.training.paper.report import Report, Study, build_report
 from uwb_mitigation.training.paper.results import ExperimentResults, FirmwareRow
 
 PARTS = ["data", "table1", "table2", "table3", "fig3", "fig4a", "fig4b", "fig5"]
@@ -118,7 +118,7 @@ def row_of(made: Report, table: str, *heads: str) -> tuple[tables.Cell, ...]:
 @pytest.fixture(scope="module")
 def full() -> Report:
     """Return the report of one network and one firmware measurement."""
-    return build(study(simulated=True), results(trained()), [firmware_row()])
+    return build_report(study(simulated=True), results(trained()), [firmware_row()])
 
 
 @pytest.fixture
@@ -152,9 +152,9 @@ def test_page_contains_all_tables_and_figures_and_no_external_references(full):
 
 
 def test_same_data_gives_the_same_page_and_radio_data_is_not_called_simulated():
-    plain = build(study()).html().split("</style>")[1]
+    plain = build_report(study()).html().split("</style>")[1]
     assert "simulated" not in plain.lower()
-    assert build(study()).html().split("</style>")[1] == plain
+    assert build_report(study()).html().split("</style>")[1] == plain
 
 
 def test_missing_measurements_and_estimates_are_marked(full):
@@ -175,7 +175,7 @@ def test_published_numbers_are_in_their_own_columns(full):
 
 
 def test_measured_numbers_are_means_over_seeds(no_cloud):
-    made = build(study(), results(*(trained(seed=seed) for seed in range(3))))
+    made = build_report(study(), results(*(trained(seed=seed) for seed in range(3))))
     cell = row_of(made, "table1", "REMNet", "157")[7]
     assert (cell.kind, cell.n, cell.text) == ("measured", 3, "0.0645 ± 0.0020")
     assert (cell.value, cell.std) == (pytest.approx(0.0645), pytest.approx(0.002))
@@ -197,7 +197,7 @@ def test_baselines_are_below_the_networks(no_cloud):
         {"name": "overall_median", "errors": dict.fromkeys(("all", "los", "nlos"), part)},
         {"name": "line", "errors": None, "reason": "the data has no received power"},
     ]
-    made = build(study(), results(trained(), baselines=baselines))
+    made = build_report(study(), results(trained(), baselines=baselines))
     assert row_of(made, "table1", "Median error")[7].value == 0.15
     assert row_of(made, "table1", "No correction")[7].value == 0.2
     assert row_of(made, "table1", "Median error in LOS")[7].kind == "missing"
@@ -206,7 +206,7 @@ def test_baselines_are_below_the_networks(no_cloud):
 
 def test_hostile_names_are_only_text():
     made = study(HOSTILE, HOSTILE, HOSTILE)
-    page = build(made, results(trained(network=HOSTILE), data=HOSTILE, split=HOSTILE)).html()
+    page = build_report(made, results(trained(network=HOSTILE), data=HOSTILE, split=HOSTILE)).html()
     assert not Page(page).all("script")
     assert "<script" not in page
 

@@ -129,7 +129,7 @@ def test_card_contains_the_errors_on_held_out_configurations():
     data = dataset(12, 20)
     recipe = Recipe(SHAPE, FitOptions(epochs=1))
     validation = train.cross_validate(data, recipe, folds=4, seed=0)
-    card = train.make_card("name", recipe, LinearBiasModel(0.5), validation, "data")
+    card = train.site_card("name", recipe, LinearBiasModel(0.5), validation, "data")
     left = validation.errors["float"]
     deviation = np.sqrt(card.variance_m2 + card.variance_per_m2 * (data.error_m - left) ** 2)
     # 0.68 x 13 of 12 configurations: the unseen one counts, too.

@@ -13,7 +13,7 @@ from model_material import bundle, measurement
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.mitigation.model.ood import Band, OodBands, OodDetector, features
+from uwb_mitigation.mitigation.model.ood import Band, OodBands, OodDetector, ood_features
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.types.measurement import Status
 
@@ -53,7 +53,7 @@ def test_energy_before_the_first_path_needs_no_level(scaling):
     amplitude[0, :3], amplitude[0, 6:9] = 0.125, 0.25
     window = np.sqrt(amplitude) if scaling is Scaling.PREAMBLE else amplitude
     unknown = np.float32([math.nan])
-    found = features(window, scaling, np.float32([3.0]), unknown, unknown)
+    found = ood_features(window, scaling, np.float32([3.0]), unknown, unknown)
     assert found[0, 5] == pytest.approx(10 * math.log10(0.2), abs=0.06)
     only = OodBands(0.0, None, lead_level_db=Band(-50.0, -10.0, 6.0))
     assert OodDetector(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
@@ -121,7 +121,7 @@ def test_bands_contain_the_measurements_they_are_computed_from():
     power = np.linspace(-95, -80, 50, dtype=np.float32)
     range_m = np.linspace(1, 6, 50, dtype=np.float32)
     windows[:, :3] /= 16
-    values = features(windows, Scaling.PREAMBLE, range_m, power, power - np.float32(5))
+    values = ood_features(windows, Scaling.PREAMBLE, range_m, power, power - np.float32(5))
     found = OodBands.of(0.3, values)
     assert (OodDetector(found.bands).score(values) <= 0).all()
     assert replace(found, known_offset_m=0.0).bands == found.bands

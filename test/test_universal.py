@@ -24,11 +24,11 @@ SMALL = TrainingPlan(seed=3, samples=32, blocks=2, held_out_blocks=1, fit=FitOpt
 
 @pytest.fixture(scope="module")
 def small() -> UniversalModel:
-    return universal.train(SMALL, "small", workers=1)
+    return universal.train_universal_model(SMALL, "small", workers=1)
 
 
 def test_result_does_not_depend_on_the_number_of_workers(small: UniversalModel) -> None:
-    again = universal.train(SMALL, "small", workers=2)
+    again = universal.train_universal_model(SMALL, "small", workers=2)
     assert again.card == small.card
     for name, weight in small.network.weight.items():
         assert again.network.weight[name].tobytes() == weight.tobytes()

@@ -105,7 +105,7 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
     trained = json.loads((tmp_path / "train.json").read_text())
     assert trained["choice"]["chosen"] == "line"
     assert {row["name"] for row in trained["rows"]} == {"raw", "overall_median", "l1_line", "float"}
-    assert trained["helped"]
+    assert trained["improved"]
     assert not load_bundle(tmp_path / "line.onnx").card.needs_cir
 
     done = run("evaluate", "--data", "bare.mcap", "--model", "line.onnx", "--json", "e.json", folder=tmp_path)

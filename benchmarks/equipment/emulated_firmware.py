@@ -19,7 +19,7 @@ from pathlib import Path
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.embedded.export import export_bundle
-from uwb_mitigation.mitigation.embedded.toolchain import Target, build_image, require_tools
+from uwb_mitigation.mitigation.embedded.toolchain import Target, compile_image, require_tools
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.radios.wire import messages
@@ -67,7 +67,7 @@ class EmulatedFirmware:
         try:
             folder = Path(self._folder.name)
             export_bundle(bundle, folder)
-            self._start(build_image(folder, folder, Target.QEMU_MPS2_LINK).elf, folder / "radio")
+            self._start(compile_image(folder, folder, Target.QEMU_MPS2_LINK).elf, folder / "radio")
         except BaseException:
             self.close()
             raise

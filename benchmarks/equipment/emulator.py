@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.mitigation.embedded.compiling import run_tool
-from uwb_mitigation.mitigation.embedded.toolchain import Image, Kernels, Target, build_image, require_tools
+from uwb_mitigation.mitigation.embedded.toolchain import Image, Kernels, Target, compile_image, require_tools
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 _MACHINE = ("qemu-system-arm", "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "none")
@@ -242,7 +242,7 @@ def measure_size(
     """Measure the size of a program that only corrects a range: vectors, start-up, library, model."""
     stub = build / "size.c"
     stub.write_text(_SIZE_STUB, encoding="utf-8")
-    return build_image(export, build, Target.DWM1001_DEV, kernels, optimisation, stub)
+    return compile_image(export, build, Target.DWM1001_DEV, kernels, optimisation, stub)
 
 
 def estimate_cycles(image: Image, executed: Counter[tuple[int, bool]]) -> int:

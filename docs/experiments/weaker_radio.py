@@ -18,7 +18,7 @@ from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import model_path
 from uwb_mitigation.recordings.formats import open_recording
-from uwb_mitigation.training.evaluation.accuracy import evaluate
+from uwb_mitigation.training.evaluation.accuracy import evaluate_accuracy
 
 with open_recording(Path(sys.argv[1])) as source:
     records = list(source)[:: int(sys.argv[2])]
@@ -47,5 +47,5 @@ for name in sys.argv[3:]:
     subtracted_m = offset_m if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else 0.0
     print(name)
     for level in (-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20):
-        found = evaluate(mitigation, (with_level(record, level, subtracted_m) for record in records))
+        found = evaluate_accuracy(mitigation, (with_level(record, level, subtracted_m) for record in records))
         print(f"{level:5} {found.corrected.mae / found.raw.mae:.3f}", found.statuses)

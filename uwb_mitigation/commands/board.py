@@ -84,7 +84,7 @@ def build_image(
     bundle = load_bundle(model_path(model))
     with tempfile.TemporaryDirectory() as folder:
         export_bundle(bundle, Path(folder))
-        image = toolchain.build_image(Path(folder), Path(folder), toolchain.Target.DWM1001_DEV)
+        image = toolchain.compile_image(Path(folder), Path(folder), toolchain.Target.DWM1001_DEV)
         toolchain.write_hex(image, output)
     print_line(
         f"{output}: {image.flash_bytes:,} of {image.available_flash_bytes:,} bytes of flash, {image.static_bytes:,} of "

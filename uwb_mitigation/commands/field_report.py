@@ -106,7 +106,7 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
     """Write the page, the values and the ranges."""
     from uwb_mitigation.commands.field.test import SOURCES
     from uwb_mitigation.recordings.bag.writer import BagWriter
-    from uwb_mitigation.training.page import render_page
+    from uwb_mitigation.training.html import render_page
     from uwb_mitigation.types.measurement import Record, Truth
 
     system = {

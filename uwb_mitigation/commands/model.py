@@ -1,4 +1,4 @@
-"""`uwb-mitigation train`, `quantize` and `evaluate`: create and evaluate models."""
+"""`uwb-mitigation train`, `quantize_network` and `evaluate_accuracy`: create and evaluate models."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
 ]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
-# Options for one mode of `train` or `evaluate`; they are errors in the other mode.
+# Options for one mode of `train` or `evaluate_accuracy`; they are errors in the other mode.
 _DATA_OPTIONS = {
     "recipe_name": "--recipe",
     "samples": "--samples",
@@ -227,7 +227,7 @@ def evaluate(
 
     mitigation = Mitigation(bundle_for(model, data), read_offsets(offsets or ""))
     with open_recording(data) as source, console.reading() as on_record:
-        result = accuracy.evaluate(mitigation, source, on_record)
+        result = accuracy.evaluate_accuracy(mitigation, source, on_record)
     model_tables.show_accuracy(result)
     console.write_json(json, result.as_json())
 

@@ -69,8 +69,8 @@ def fetch(
     console.write_json(json, {"output": str(output), "bytes": size, "checksum": checksum})
 
 
-@app.command()
-def simulate(
+@app.command("simulate")
+def simulate_deepuwb(
     output: Annotated[
         Path,
         typer.Option(
@@ -167,7 +167,7 @@ def report(
     with console.reading() as on_record:
         longest = Preprocessing(max(published.WINDOWS), Scaling.MAX)
         study = reports.Study(data, *load_paper_data(data, longest, on_record), _command())
-    result = reports.build(study, trainings, bench)
+    result = reports.build_report(study, trainings, bench)
     page = output / "report.html"
     write_atomically(page, result.html())
     console.write_json(json, result.as_json())

@@ -76,7 +76,7 @@ def train_universal(
         plan = replace(plan, blocks=blocks)
     with console.progress() as bar:
         task = bar.add_task("simulating", total=1.0)
-        trained = universal.train(
+        trained = universal.train_universal_model(
             plan,
             output.stem,
             workers or os.cpu_count() or 1,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
-from uwb_mitigation.mitigation.model.ood import OodDetector, features
+from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
 from uwb_mitigation.types.measurement import (
     CorrectedBy,
     CorrectedColumns,
@@ -66,7 +66,7 @@ class CorrectionRule:
         """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
         if self._ood_detector is None:
             return np.zeros(len(windows), np.float32)
-        values = features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
+        values = ood_features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
         return self._ood_detector.score(values)
 
     def apply(

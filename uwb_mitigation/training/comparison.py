@@ -20,7 +20,7 @@ from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, cover
 from uwb_mitigation.training.fit import candidates
 from uwb_mitigation.training.fit.candidates import Recipe, linear_bias_m, network_m
 from uwb_mitigation.training.fit.fitting import fit
-from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize
+from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize_network
 
 INNER_FOLDS = 4
 """Folds of the training part, by configuration, for calibrating the intervals."""
@@ -208,7 +208,7 @@ def _hold_out(
         linear_bias = linear_bias_m(card.linear_bias, test)
         outputs = [("shipped_float", network_m(network, test.inputs).astype(np.float32))]
         if dataset.has_cirs:
-            integers = quantize(network, calibration_inputs(train_data, seed), exact=False)
+            integers = quantize_network(network, calibration_inputs(train_data, seed), exact=False)
             outputs.append(("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)))
         for name, output in outputs:
             corrections = zero_shot.correct_with_card(test, card, (linear_bias + output).astype(np.float32))
@@ -237,5 +237,5 @@ def _baselines(
     yield "mlp", network_m(fit(Mlp(samples=samples), subset.inputs, subset.error_m, options), test.inputs)
     network_only = fit(Remnet(samples=samples), subset.inputs, subset.error_m, options)
     yield "remnet_float", network_m(network_only, test.inputs)
-    integers = quantize(network_only, calibration_inputs(train_data, seed), exact=False)
+    integers = quantize_network(network_only, calibration_inputs(train_data, seed), exact=False)
     yield "remnet_int8", IntegerNetwork(integers).predict_m(test.inputs)

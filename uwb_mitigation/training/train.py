@@ -24,9 +24,9 @@ from uwb_mitigation.training.evaluation.metrics import ErrorStatistics, mae_by_g
 from uwb_mitigation.training.fit import candidates as models
 from uwb_mitigation.training.fit import selection as selections
 from uwb_mitigation.training.fit.candidates import Candidate, Recipe, fit_new_model, linear_bias_m
-from uwb_mitigation.training.fit.cards import card_of, ood_bands_of
+from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize
+from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize_network
 from uwb_mitigation.training.fit.selection import NESTED, Selection
 
 AUTO = "auto"
@@ -93,8 +93,8 @@ class TrainedBundle:
         return {
             "model_id": self.bundle.model_id,
             "n": len(dataset),
-            "refused": dict(dataset.skipped),
-            "helped": self.improved,
+            "skipped": dict(dataset.skipped),
+            "improved": self.improved,
             "rows": [{"name": row, **values} for row, values in self.validation.statistics().items()],
             "by_configuration": {name: group._asdict() for name, group in groups.items()},
             **({} if self.selection is None else {"choice": self.selection.as_json()}),
@@ -148,7 +148,7 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
     on_epoch = selections.step_counter(total, lambda share: job.on_progress("training", share))
     validation = cross_validate(dataset, recipe, folds, seed, on_epoch, quantised=dataset.has_cirs)
     fitted = fit_new_model(dataset, recipe, seed, on_epoch)
-    card = make_card(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
+    card = site_card(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
     card = replace(card, needs_cir=dataset.has_cirs)
     mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
     mae_m = mae.get("int8", mae["float"]) if selection is None else selection.mae()[NESTED]
@@ -206,7 +206,7 @@ def _write_selected(
     recipe = Recipe(zero_network.architecture, options, line=linear_bias.needs_power, network=is_trained)
     errors = {**selection.errors, "float": selection.errors[selection.chosen]}
     validation = CrossValidation(job.dataset, errors, selection.folds, selection.seed)
-    card = make_card(job.output.stem, recipe, linear_bias, validation, job.name)
+    card = site_card(job.output.stem, recipe, linear_bias, validation, job.name)
     training = {
         **card.training,
         "started_from": f"{start_bundle.model_id:08x}",
@@ -249,7 +249,7 @@ def cross_validate(
             errors["l1_line"][fold.test] = residual
         errors["float"][fold.test] = residual - known * floating.predict_m(fitted.network, test.inputs)
         if quantised:
-            integers = quantize(fitted.network, calibration_inputs(train, seed), exact=False)
+            integers = quantize_network(fitted.network, calibration_inputs(train, seed), exact=False)
             errors["int8"][fold.test] = residual - known * IntegerNetwork(integers).predict_m(test.inputs)
     return CrossValidation(dataset, errors, folds, seed)
 
@@ -264,10 +264,10 @@ def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[M
     validation = cross_validate(dataset, recipe, folds, seed, quantised=False)
     fitted = fit_new_model(dataset, recipe, seed)
     assert fitted.network is not None
-    return make_card("", recipe, fitted.linear_bias, validation, ""), fitted.network
+    return site_card("", recipe, fitted.linear_bias, validation, ""), fitted.network
 
 
-def make_card(
+def site_card(
     name: str, recipe: Recipe, linear_bias: LinearBiasModel, validation: CrossValidation, data: str
 ) -> ModelCard:
     """Return the card of a float model that was fitted to the dataset of `validation`."""

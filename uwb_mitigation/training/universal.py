@@ -22,19 +22,19 @@ from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.simulation.buildings import PLACEMENTS, RADIO
 from uwb_mitigation.simulation.radio import Receiver
 from uwb_mitigation.training.data.augmentation import (
-    calibration_inputs,
     normalised,
+    scaled_calibration_inputs,
     vary_channel,
     vary_receiver,
 )
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.simulated import building_dataset
 from uwb_mitigation.training.evaluation.metrics import ErrorStatistics
-from uwb_mitigation.training.fit.cards import card_of, ood_bands_of
 from uwb_mitigation.training.fit.fitting import fit
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias_to_rows
+from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.fit.quantization import quantize
+from uwb_mitigation.training.fit.quantization import quantize_network
 from uwb_mitigation.training.fit.selection import step_counter
 
 CALIBRATION_INPUTS = 512
@@ -84,7 +84,7 @@ class UniversalModel:
     held_out: dict[str, dict[str, ErrorStatistics]]
 
 
-def train(
+def train_universal_model(
     plan: TrainingPlan,
     name: str,
     workers: int,
@@ -129,7 +129,7 @@ def train(
         else lambda inputs, generator: normalised(vary_receiver(vary_channel(inputs, generator), generator)),
     )
     subset = train_data.inputs[:: max(1, len(train_data) // CALIBRATION_INPUTS)]
-    integers = quantize(network, calibration_inputs(subset, plan.scaling))
+    integers = quantize_network(network, scaled_calibration_inputs(subset, plan.scaling))
     on_share(1.0, "evaluating")
     return _evaluate(plan, name, network, integers, train_data, held_out)
 

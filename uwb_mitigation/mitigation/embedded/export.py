@@ -142,12 +142,12 @@ def _mlp(network: PackedNetwork) -> Iterable[str]:
 
 def _ood_bands(ood_bands: OodBands) -> str:
     bands = "".join(
-        f"    {{{number(band.low)}, {number(band.high)}, {number(np.float32(1) / np.float32(band.margin))}}},\n"
+        f"    {{{format_number(band.low)}, {format_number(band.high)}, {format_number(np.float32(1) / np.float32(band.margin))}}},\n"
         if band
         else "    {0.0f, 0.0f, 0.0f},\n"
         for band in ood_bands.bands
     )
-    offset = number(ood_bands.known_offset_m)
+    offset = format_number(ood_bands.known_offset_m)
     return f"static const uwb_ood_bands uwb_model_ood_bands = {{{offset}, {{\n{bands}}}}};\n"
 
 
@@ -158,7 +158,7 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
         f"0x{model_id:08x}u",
         f"{network.samples}u",
         _SCALINGS[card.preprocessing.scaling],
-        number(network.input_scale),
+        format_number(network.input_scale),
         f"{network.first_kernel}u",
         f"{len(network.modules)}u",
         "uwb_first_weights" if remnet else "NULL",
@@ -169,15 +169,15 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
         "uwb_head_weights",
         f"{len(network.head_weights)}u",
         f"{network.head_bias}",
-        number(network.head_scale),
-        number(linear_bias.offset_m),
-        number(linear_bias.per_rx_power),
-        number(linear_bias.per_power_gap),
-        number(low),
-        number(high),
-        number(card.variance_m2),
-        number(card.variance_per_m2),
-        number(card.variance_uncorrected_m2),
+        format_number(network.head_scale),
+        format_number(linear_bias.offset_m),
+        format_number(linear_bias.per_rx_power),
+        format_number(linear_bias.per_power_gap),
+        format_number(low),
+        format_number(high),
+        format_number(card.variance_m2),
+        format_number(card.variance_per_m2),
+        format_number(card.variance_uncorrected_m2),
         "NULL" if card.ood_bands is None else "&uwb_model_ood_bands",
     ]
     return f"static const uwb_model uwb_model_data = {{\n{_wrapped(values)}}};\n"
@@ -185,8 +185,8 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
 
 def _golden(golden: Golden) -> str:
     count, samples = golden.windows.shape
-    rows = "\n".join(f"    {{\n{_wrapped(map(number, row.tolist()))}    }}," for row in golden.windows)
-    outputs = _wrapped(map(number, golden.outputs_m.tolist()))
+    rows = "\n".join(f"    {{\n{_wrapped(map(format_number, row.tolist()))}    }}," for row in golden.windows)
+    outputs = _wrapped(map(format_number, golden.outputs_m.tolist()))
     return (
         "#ifdef UWB_GOLDEN_VECTORS\n"
         f"enum {{ UWB_GOLDEN_COUNT = {count} }};\n"
@@ -196,7 +196,7 @@ def _golden(golden: Golden) -> str:
     )
 
 
-def number(value: float | np.floating[Any]) -> str:
+def format_number(value: float | np.floating[Any]) -> str:
     """Return a float32 as a C literal that is read back with the same bits.
 
     Raises:

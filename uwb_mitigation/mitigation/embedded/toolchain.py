@@ -69,7 +69,7 @@ def require_tools() -> None:
         raise MissingDependencyError(f"{', '.join(missing)} not found", valid=APT)
 
 
-def build_image(
+def compile_image(
     export: Path,
     build: Path,
     board: Target,

@@ -123,7 +123,7 @@ class OodBands:
 
     @property
     def bands(self) -> tuple[Band | None, ...]:
-        """Bands in the order of the columns of `features`."""
+        """Bands in the order of the columns of `ood_features`."""
         return tuple(getattr(self, field.name) for field in fields(self)[1:])
 
     @property
@@ -133,7 +133,7 @@ class OodBands:
 
     @classmethod
     def of(cls, known_offset_m: float, values: NDArray[np.float32]) -> OodBands:
-        """Compute the bands of training data with these `features`.
+        """Compute the bands of training data with these `ood_features`.
 
         A feature without finite values has no band; rows in which another feature is not finite are ignored.
 
@@ -156,7 +156,7 @@ class OodBands:
         return cls(float(np.float32(known_offset_m)), *(*bands, lead))
 
 
-def features(
+def ood_features(
     windows: NDArray[np.float32],
     scaling: Scaling,
     *reported: NDArray[np.floating],
@@ -207,7 +207,7 @@ class OodDetector:
         self._per_unit = np.float32(1) / table[:, 2]
 
     def score(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the largest excess over a band, in margins, of `features` (n, 6): float32 (n,).
+        """Return the largest excess over a band, in margins, of `ood_features` (n, 6): float32 (n,).
 
         0 or less: in distribution; 1 or more, or NaN: out of distribution.
         """

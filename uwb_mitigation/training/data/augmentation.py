@@ -77,7 +77,7 @@ def normalised(inputs: Tensor) -> Tensor:
     return amplitude / amplitude.amax(1, keepdim=True)
 
 
-def calibration_inputs(inputs: NDArray[np.float32], scaling: Scaling) -> NDArray[np.float32]:
+def scaled_calibration_inputs(inputs: NDArray[np.float32], scaling: Scaling) -> NDArray[np.float32]:
     """Convert inputs that are scaled by the preamble count to `scaling` for int8 calibration.
 
     With levels, amplified copies are appended, so that the activations do not saturate with a strong radio.

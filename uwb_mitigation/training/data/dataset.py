@@ -37,7 +37,7 @@ class Dataset:
         configurations: name of the placement. Measurements of one placement are not independent; all
             measurements without a name count as one placement.
         labels: propagation condition; may be empty.
-        refused: {reason: number of measurements that were not used}.
+        skipped: {reason: number of measurements that were not used}.
         headers: float32 (n, 2), preamble count and noise threshold; None = not kept.
         tags, anchors: ids, int (n,), for splits by location; None = not kept.
         radios, segments: known sources of the CIRs.

@@ -52,7 +52,7 @@ class Accuracy:
         }
 
 
-def evaluate(
+def evaluate_accuracy(
     mitigation: Mitigation,
     records: Iterable[Record],
     on_record: Callable[[], None] = lambda: None,

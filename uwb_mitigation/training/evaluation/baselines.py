@@ -45,8 +45,8 @@ def ridge(train: Dataset, *, header: bool) -> Predict:
         scikit_learn("preprocessing"),
     )
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear.Ridge(RIDGE_PENALTY))
-    model.fit(features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
-    return lambda data: np.asarray(model.predict(features(data, header=header)), np.float64)
+    model.fit(baseline_features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
+    return lambda data: np.asarray(model.predict(baseline_features(data, header=header)), np.float64)
 
 
 def gradient_boosting(train: Dataset, seed: int) -> Predict:
@@ -56,11 +56,11 @@ def gradient_boosting(train: Dataset, seed: int) -> Predict:
     )
     # On data this small, threads only add overhead.
     with importlib.import_module("threadpoolctl").threadpool_limits(1):
-        model.fit(features(train, header=True), train.error_m, sample_weight=_weights(train))
-    return lambda data: np.asarray(model.predict(features(data, header=True)), np.float64)
+        model.fit(baseline_features(train, header=True), train.error_m, sample_weight=_weights(train))
+    return lambda data: np.asarray(model.predict(baseline_features(data, header=True)), np.float64)
 
 
-def features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
+def baseline_features(dataset: Dataset, *, header: bool) -> NDArray[np.float64]:
     """Return nine features of each CIR window and, with `header`, six of its header: float64 (n, 9 or 15).
 
     Unknown values of the header are 0.

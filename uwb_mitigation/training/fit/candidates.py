@@ -25,7 +25,6 @@ from uwb_mitigation.mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.fit import linear_fit
-from uwb_mitigation.training.fit.linear_fit import fit_constant
 from uwb_mitigation.training.fit.options import FitOptions
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB
 
@@ -156,7 +155,9 @@ def fit_new_model(
         linear_bias = _constant(data)
     if not recipe.network:
         with fitting.single_thread(seed):
-            return FittedModel(linear_bias, networks.weights_of(networks.build(recipe.architecture, 0)))
+            return FittedModel(
+                linear_bias, networks.weights_of(networks.build_network(recipe.architecture, 0))
+            )
     options = replace(recipe.fit, seed=seed)
     network = _fit_residuals(
         data, linear_bias, recipe.per_configuration, options, recipe.architecture, on_epoch=on_epoch
@@ -190,7 +191,7 @@ def _constant(data: Dataset) -> LinearBiasModel:
     """Fit a constant: to configurations, or without CIRs to single ranges."""
     # Each range counts as a configuration.
     configurations = data.configurations if data.has_cirs else np.arange(len(data)).astype(str)
-    return fit_constant(configurations, data.error_m)
+    return linear_fit.fit_constant(configurations, data.error_m)
 
 
 def fit_line(data: Dataset) -> LinearBiasModel:
@@ -236,7 +237,7 @@ class SiteOffset(Candidate):
 
     def fit(self, data: Dataset, seed: int) -> FittedModel:
         """See `Candidate`."""
-        return FittedModel(fit_constant(data.configurations, data.error_m))
+        return FittedModel(linear_fit.fit_constant(data.configurations, data.error_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +285,7 @@ class NewOffset(Unchanged):
         is_finite = np.isfinite(residual)
         shift = 0.0
         if is_finite.any():
-            shift = fit_constant(data.configurations[is_finite], residual[is_finite]).offset_m
+            shift = linear_fit.fit_constant(data.configurations[is_finite], residual[is_finite]).offset_m
         offset_m = float(np.float32(self.linear_bias.offset_m + shift))
         return FittedModel(replace(self.linear_bias, offset_m=offset_m), self.network)
 
@@ -364,7 +365,7 @@ def has_few_configurations(data: Dataset) -> bool:
 
 
 def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
-    return fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
+    return linear_fit.fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,7 +394,7 @@ class SiteUniversal(Candidate):
         if self.has_line and _has_both_powers(data):
             linear_bias = _site_line(data, residual)
         else:
-            linear_bias = fit_constant(data.configurations, residual)
+            linear_bias = linear_fit.fit_constant(data.configurations, residual)
         return FittedModel(linear_bias, scaled(self.network, factor), factor)
 
 
@@ -407,7 +408,7 @@ class SiteFineTuned(Candidate):
         """See `Candidate`."""
         from uwb_mitigation.training.fit import fitting
 
-        shift = fit_constant(data.configurations, data.error_m - _universal_m(data))
+        shift = linear_fit.fit_constant(data.configurations, data.error_m - _universal_m(data))
         subset = data.rows(splits.subsample(data.configurations, FINE_TUNING_PER_CONFIGURATION, seed))
         if len(subset) > MAX_FINE_TUNING_INPUTS:
             chosen = np.random.default_rng(seed).choice(len(subset), MAX_FINE_TUNING_INPUTS, replace=False)

@@ -58,7 +58,7 @@ def fit(
     with single_thread(options.seed):
         # A separate generator, so that augmentation changes neither the order nor the dropout.
         generator = torch.Generator().manual_seed(options.seed + 77)
-        network = networks.build(architecture, options.dropout, start)
+        network = networks.build_network(architecture, options.dropout, start)
         # The paper's betas and epsilon (section III-B) are torch's defaults.
         optimizer = torch.optim.AdamW(
             network.parameters(), options.learning_rate, weight_decay=options.weight_decay, fused=True

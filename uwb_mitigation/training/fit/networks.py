@@ -92,7 +92,7 @@ class MlpModule(nn.Module):
 Network = RemnetModule | MlpModule
 
 
-def build(architecture: Architecture, dropout: float, start: FloatWeights | None = None) -> Network:
+def build_network(architecture: Architecture, dropout: float, start: FloatWeights | None = None) -> Network:
     """Return a network with random weights or with those of `start`. Only REMNet has dropout, as in the paper."""
     network = (
         MlpModule(architecture) if isinstance(architecture, Mlp) else RemnetModule(architecture, dropout)

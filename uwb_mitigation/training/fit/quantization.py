@@ -37,12 +37,12 @@ CALIBRATION_PER_CONFIGURATION = 40
 
 
 def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
-    """Return inputs of every configuration for `quantize`."""
+    """Return inputs of every configuration for `quantize_network`."""
     rows = splits.subsample(dataset.configurations, CALIBRATION_PER_CONFIGURATION, seed)
     return dataset.inputs[rows]
 
 
-def quantize(
+def quantize_network(
     weights: FloatWeights,
     calibration: NDArray[np.float32],
     percentile: float | None = 100.0,
@@ -110,12 +110,12 @@ def quantize_bundle(source: Bundle, dataset: Dataset, percentile: float, output:
     """Quantise a float bundle with the data that it was trained on, and write it.
 
     Raises:
-        ModelError: it is quantised already; see also `quantize`. ParameterError: `percentile` is below 90.
+        ModelError: it is quantised already; see also `quantize_network`. ParameterError: `percentile` is below 90.
     """
     check(source, percentile)
     inputs = calibration_inputs(dataset, seed=0)
     network = graph.float_weights(source.model, source.architecture)
-    integers = quantize(network, inputs, percentile)
+    integers = quantize_network(network, inputs, percentile)
     difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
     card = replace(source.card, name=output.stem, quantised=True)
     return Quantised(save_bundle(output, graph.int8_model(integers), card), difference)

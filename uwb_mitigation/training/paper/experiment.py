@@ -26,9 +26,9 @@ from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation import baselines
 from uwb_mitigation.training.fit import fitting
 from uwb_mitigation.training.fit.candidates import fit_line, linear_bias_m
-from uwb_mitigation.training.fit.cards import card_of
+from uwb_mitigation.training.fit.model_card import card_of
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.fit.quantization import MSE, quantize
+from uwb_mitigation.training.fit.quantization import MSE, quantize_network
 from uwb_mitigation.training.paper import published
 from uwb_mitigation.training.paper.data import Parts, fingerprint
 from uwb_mitigation.training.paper.jobs import run_jobs
@@ -53,7 +53,7 @@ VARIANCE_FOLDS = 5
 CALIBRATIONS: Mapping[str, float | None] = dict(
     zip(("max", "p99.99", "p99.9", "p99", "mse"), (100.0, 99.99, 99.9, 99.0, MSE), strict=True)
 )
-"""{name: percentile of `quantize`} to choose activation scales by."""
+"""{name: percentile of `quantize_network`} to choose activation scales by."""
 
 CALIBRATION_INPUTS, CHECK_INPUTS = 512, 1024
 _BATCH = 1024
@@ -160,14 +160,14 @@ class _Worker:
 
 
 def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> TrainedModel:
-    """Train one network from random weights to int8, on parts with the task's windows; raises as `fit` and `quantize`."""
+    """Train one network from random weights to int8, on parts with the task's windows; raises as `fit` and `quantize_network`."""
     train, test, architecture = parts.train, parts.test, task.architecture
     start = time.perf_counter()
     fields: dict[str, Any] = {}
     weights = fitting.fit(architecture, train.inputs, train.error_m, options)
     training_s = time.perf_counter() - start
     files = {form: folder / f"{task.name}_{form}.onnx" for form in FORMS}
-    card = make_card(task.name, architecture, parts, options)
+    card = paper_card(task.name, architecture, parts, options)
     maes, best, integers = calibrate_quantization(weights, train.inputs, train.error_m, options.seed)
     save_bundle(files["float"], graph.float_model(weights), card)
     # Use only optimisations that do not depend on the processor, so that the file runs on other ones.
@@ -208,7 +208,7 @@ def calibrate_quantization(
         MAE of each on training inputs that it was not calibrated on, m; the best; its network.
 
     Raises:
-        DatasetError: fewer than two inputs. ModelError: see `quantize`.
+        DatasetError: fewer than two inputs. ModelError: see `quantize_network`.
     """
     if len(inputs) < 2:
         raise DatasetError(f"{len(inputs)} inputs for calibration and check", valid="at least 2")
@@ -217,10 +217,10 @@ def calibrate_quantization(
     calibration, check_rows = inputs[order[:count]], order[count : count + CHECK_INPUTS]
     maes = {}
     for name, percentile in CALIBRATIONS.items():
-        network = IntegerNetwork(quantize(weights, calibration, percentile, exact=False))
+        network = IntegerNetwork(quantize_network(weights, calibration, percentile, exact=False))
         maes[name] = float(np.abs(targets[check_rows] - network.predict_m(inputs[check_rows])).mean())
     best = min(maes, key=lambda name: maes[name])
-    return maes, best, quantize(weights, calibration, CALIBRATIONS[best])
+    return maes, best, quantize_network(weights, calibration, CALIBRATIONS[best])
 
 
 def _session(path: Path, settings: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession:
@@ -268,7 +268,7 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
     return (*rows, row("line", np.nan_to_num(linear_bias_m(line, test))))
 
 
-def make_card(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> ModelCard:
+def paper_card(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> ModelCard:
     """Return the card of a float network without a linear bias model that was fitted to the whole training part.
 
     Its variance comes from a second network, fitted to a fifth of the training configurations and tested on the others.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.baselines import scikit_learn
-from uwb_mitigation.training.page import render_page
+from uwb_mitigation.training.html import render_page
 from uwb_mitigation.training.paper import figures, published, tables
 from uwb_mitigation.training.paper.data import TEST_ROOM
 from uwb_mitigation.training.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
@@ -127,7 +127,7 @@ def _material(configuration: str) -> str:
     return "none (LOS)" if not materials else materials[0] if len(materials) == 1 else "several"
 
 
-def build(
+def build_report(
     study: Study, trainings: ExperimentResults | None = None, firmware: Sequence[FirmwareRow] = ()
 ) -> Report:
     """Return every table and figure that the data, the trainings and the firmware results allow."""
@@ -197,14 +197,14 @@ def _data_table(study: Study) -> ReportTable:
         is_test_room = name == ROOMS[TEST_ROOM]
         return (
             Cell(name, "head"),
-            tables.number(published_rows, "{:,}", "paper"),
-            *tables.numbers(
+            tables.number_cell(published_rows, "{:,}", "paper"),
+            *tables.number_cells(
                 (published.RAW_MAE_M, published.RAW_SIGMA_M) if is_test_room else (None, None),
                 "{:.4f}",
                 "paper",
             ),
-            tables.number(part.n, "{:,}", "measured"),
-            *tables.numbers((part.mae_raw, part.sigma_raw), "{:.4f}", "measured"),
+            tables.number_cell(part.n, "{:,}", "measured"),
+            *tables.number_cells((part.mae_raw, part.sigma_raw), "{:.4f}", "measured"),
         )
 
     rows = []

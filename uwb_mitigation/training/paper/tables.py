@@ -82,14 +82,14 @@ class ReportTable:
         return any(cell.kind == "missing" for row in self.rows for cell in row)
 
 
-def number(value: float | None, form: str, kind: str, otherwise: Cell = NONE) -> Cell:
+def number_cell(value: float | None, form: str, kind: str, otherwise: Cell = NONE) -> Cell:
     """Return a formatted number, or `otherwise` without a value."""
     return otherwise if value is None else Cell(form.format(value), kind, value)
 
 
-def numbers(values: Iterable[float | None], form: str, kind: str) -> list[Cell]:
-    """Return `number` of each value."""
-    return [number(value, form, kind) for value in values]
+def number_cells(values: Iterable[float | None], form: str, kind: str) -> list[Cell]:
+    """Return `number_cell` of each value."""
+    return [number_cell(value, form, kind) for value in values]
 
 
 def accuracy(
@@ -101,8 +101,8 @@ def accuracy(
         paper = [NONE] * 4
         if published_row:
             paper = [
-                number(published_row.parameters, "{:.0f}", "paper"),
-                *numbers(published_row.mae_m, "{:.4f}", "paper"),
+                number_cell(published_row.parameters, "{:.0f}", "paper"),
+                *number_cells(published_row.mae_m, "{:.4f}", "paper"),
             ]
         rows.append((*heads, *paper, parameters, *_forms(models, "mae", 1.0, 4)))
     baselines_by_name = {baseline.name: baseline for baseline in trainings.baselines}
@@ -112,7 +112,7 @@ def accuracy(
     }
     mae_by_name["raw"] = trainings.models[0].mae_raw if trainings.models else None
     for name in dict.fromkeys(["raw", "los_median", "overall_median", "line", *baselines_by_name]):
-        cell = number(mae_by_name[name], "{:.4f}", "measured") if name in mae_by_name else MISSING
+        cell = number_cell(mae_by_name[name], "{:.4f}", "measured") if name in mae_by_name else MISSING
         head = Cell(NAMES.get(name, name), "head"), Cell("–", "head")
         rows.append((*head, *[NONE] * 5, cell, NONE, NONE))
     reasons = [
@@ -139,7 +139,7 @@ def sizes(trainings: ExperimentResults, provenance: Provenance, missing: str) ->
     """Return Table 2, file sizes."""
     rows = []
     for heads, parameters, models, published_row in _networks(trainings):
-        paper = numbers(published_row.size_kb if published_row else [None] * 3, "{:.3f}", "paper")
+        paper = number_cells(published_row.size_kb if published_row else [None] * 3, "{:.3f}", "paper")
         rows.append((*heads, parameters, *paper, *_forms(models, "bytes", 1000.0, 3)))
     return ReportTable(
         "table2",
@@ -168,16 +168,16 @@ def firmware(bench: Sequence[FirmwareRow], provenance: Provenance, missing: str)
         paper = [NONE] * 5
         if published_row:
             paper = [
-                *numbers(published_row.board[:4], "{:.1f}", "paper"),
-                number(published_row.board[4], "{:g}", "paper"),
+                *number_cells(published_row.board[:4], "{:.1f}", "paper"),
+                number_cell(published_row.board[4], "{:g}", "paper"),
             ]
         measured_cells = [MISSING, MISSING if published_row else NONE, *[MISSING] * 4]
         if row is not None:
             measured_cells = [
-                number(row.rate_hz, "≈ {:.1f}", "estimated"),
-                number(row.energy_mj, "≈ {:.3f}", "estimated"),
-                number(row.instructions, "{:,.0f}", "measured"),
-                *numbers((row.ram_bytes / 1000, row.flash_bytes / 1000), "{:.1f}", "measured"),
+                number_cell(row.rate_hz, "≈ {:.1f}", "estimated"),
+                number_cell(row.energy_mj, "≈ {:.3f}", "estimated"),
+                number_cell(row.instructions, "{:,.0f}", "measured"),
+                *number_cells((row.ram_bytes / 1000, row.flash_bytes / 1000), "{:.1f}", "measured"),
                 Cell(f"{row.mismatches} of {row.inputs:,}", "measured", row.mismatches, n=row.inputs),
             ]
         heads = [Cell(text, "head") for text in (name, str(samples), NAMES.get(kernels, kernels))]
@@ -215,7 +215,7 @@ def _networks(trainings: ExperimentResults) -> list[_Row]:
         shape = Mlp if network == "mlp" else Remnet
         count = models[0].parameters if models else shape(samples).parameters
         published_row = published.MODELS.get((network, samples))
-        rows.append((heads, number(count, "{}", "measured"), models, published_row))
+        rows.append((heads, number_cell(count, "{}", "measured"), models, published_row))
     return rows
 
 

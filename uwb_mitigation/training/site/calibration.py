@@ -17,7 +17,7 @@ from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.fit.candidates import FittedModel, site_models
-from uwb_mitigation.training.fit.cards import card_of, ood_bands_of
+from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
 from uwb_mitigation.training.fit.selection import MIN_GAIN
 from uwb_mitigation.training.site.data import SiteData
 from uwb_mitigation.training.site.live_position import RAW, LiveError, live_errors

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.training.page import render_page
+from uwb_mitigation.training.html import render_page
 from uwb_mitigation.training.site.calibration import SiteCalibration
 
 MAX_POINTS = 2000

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.mitigation.model.architecture import Architecture
 from uwb_mitigation.mitigation.model.bundle import ModelCard
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.model.ood import OodBands, features
+from uwb_mitigation.mitigation.model.ood import OodBands, ood_features
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
@@ -76,7 +76,7 @@ def ood_bands_of(dataset: Dataset, known_offset_m: float | None = None) -> OodBa
     scaling = dataset.preprocessing.scaling
     with_levels = scaling is Scaling.PREAMBLE
     unknown = np.full(len(dataset), np.nan, np.float32)
-    values = features(
+    values = ood_features(
         dataset.inputs,
         scaling,
         dataset.range_m.astype(np.float32),
