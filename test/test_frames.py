@@ -28,10 +28,10 @@ from uwb_mitigation.recordings.bag.odometry import (
     encode_imu_row,
     encode_odometry_row,
     encode_transform_row,
-    yaw_of,
 )
 from uwb_mitigation.simulation.odometry import RATE_HZ, simulate_motion
 from uwb_mitigation.types.anchors import dump_anchors
+from uwb_mitigation.types.ros.poses import yaw_of
 
 pytestmark = pytest.mark.ros
 

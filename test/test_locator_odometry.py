@@ -33,8 +33,8 @@ from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
-from uwb_mitigation.recordings.bag.odometry import yaw_of
 from uwb_mitigation.types.anchors import dump_anchors
+from uwb_mitigation.types.ros.poses import yaw_of
 
 pytestmark = pytest.mark.ros
 

@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
-from uwb_mitigation.recordings.bag.odometry import yaw_of
-from uwb_mitigation.types.ros.poses import BodyTwist
+from uwb_mitigation.types.ros.poses import BodyTwist, yaw_of
 from uwb_mitigation.types.ros.topics import TF_STATIC, relative
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
@@ -57,8 +56,8 @@ class OdometryInput:
         self._last: TransformStamped | None = None
         self._last_ns = 0
         self.lever_arm_is_set = bool(node.value("lever_arm"))
-        # {child frame: (parent frame, translation, rotation)} of static transforms.
-        self._static: dict[str, tuple[str, Vector, Rotation]] = {}
+        # {child frame: (parent frame, translation, quaternion)} of static transforms.
+        self._static: dict[str, tuple[str, Vector, tuple[float, ...]]] = {}
 
         def subscribe(kind: type, topic: str, callback: Any) -> None:
             received = endpoints.create_subscription(
@@ -86,7 +85,7 @@ class OdometryInput:
             if frame not in self._static:
                 return None
             frame, (x, y, z), rotation = self._static[frame]
-            dx, dy, dz = rotation.apply(point).tolist()
+            dx, dy, dz = _rotate(rotation, point)
             point = x + dx, y + dy, z + dz
         return None
 
@@ -168,9 +167,17 @@ class OdometryInput:
                 and all(map(math.isfinite, (t.x, t.y, t.z)))
                 and 0.9 < norm < 1.1  # false for NaN
             ):
-                rotation = Rotation.from_quat((r.x, r.y, r.z, r.w))
+                rotation = (r.x / norm, r.y / norm, r.z / norm, r.w / norm)
                 parent = transform.header.frame_id
                 self._static[transform.child_frame_id] = parent, (t.x, t.y, t.z), rotation
+
+
+def _rotate(quaternion: tuple[float, ...], point: Vector) -> Vector:
+    """Rotate a point; SciPy would double the time until the locator is active."""
+    *axis, w = quaternion
+    turned = np.cross(axis, point)
+    x, y, z = (np.asarray(point) + 2.0 * (w * turned + np.cross(axis, turned))).tolist()
+    return x, y, z
 
 
 def transform_type() -> Any:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning.batch.smoother import Smoother, fused_with_batch
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, protection_levels
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.online.filter import RangeFilter
@@ -82,6 +81,9 @@ class FixedLagSmoother:
 
     def estimate(self) -> Estimate | None:
         """Return the position `LAG_S` before the latest range; None: it is not known for that long."""
+        # SciPy is imported on demand: it would delay the first position by 0.2 s.
+        from uwb_mitigation.positioning.batch.smoother import Smoother, fused_with_batch
+
         if not self._states or len(self._ranges) < 2:
             return None
         config, (start_ns, known, _) = self._config, self._states[0]

@@ -14,7 +14,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import check_topic, decode_messages
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.ros.poses import header, quaternion, vector
+from uwb_mitigation.types.ros.poses import header, quaternion, vector, yaw_of
 from uwb_mitigation.types.ros.schemas import serialize
 from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, ROBOT_IMU, ROBOT_ODOMETRY, TF, TF_TYPE
 from uwb_mitigation.types.stamps import to_ns
@@ -132,16 +132,6 @@ def read_imu(path: Path, topic: str) -> Imu:
     stamp_ns, values = _columns(rows, path, topic)
     yaw_rate, yaw_rate_variance, yaw, yaw_variance, known_yaw = values.T
     return Imu(stamp_ns, yaw_rate, yaw_rate_variance, np.where(known_yaw, yaw, np.nan), yaw_variance)
-
-
-def yaw_of(orientation: Any) -> float:
-    """Return the yaw (rad) of a quaternion with the fields x, y, z, w; NaN: it is not a rotation."""
-    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
-    norm = x * x + y * y + z * z + w * w
-    # An orientation that nobody set is zero.
-    if not 0.25 < norm < 4.0:
-        return math.nan
-    return math.atan2(2.0 * (w * z + x * y) / norm, 1.0 - 2.0 * (y * y + z * z) / norm)
 
 
 def _messages(path: Path, topic: str, kind: str) -> Any:

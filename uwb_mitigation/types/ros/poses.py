@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import SimpleNamespace as Fields
+from typing import Any
 
 import numpy as np
 
@@ -161,6 +162,16 @@ def header(stamp_ns: int, frame_id: str) -> Fields:
 def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Fields:
     """Return the fields of a `geometry_msgs` Vector3 or Point."""
     return Fields(x=x, y=y, z=z)
+
+
+def yaw_of(orientation: Any) -> float:
+    """Return the yaw (rad) of a quaternion with the fields x, y, z, w; NaN: it is not a rotation."""
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    norm = x * x + y * y + z * z + w * w
+    # An orientation that nobody set is zero.
+    if not 0.25 < norm < 4.0:
+        return math.nan
+    return math.atan2(2.0 * (w * z + x * y) / norm, 1.0 - 2.0 * (y * y + z * z) / norm)
 
 
 def quaternion(yaw: float) -> Fields:
