@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.radios.dw1000.driver import RadioDriver
-from uwb_mitigation.radios.evb1000 import Evb1000Bus
+from uwb_mitigation.radios import evb1000
+from uwb_mitigation.radios.evb1000 import Evb1000Settings
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import RadioSettings, Role
 from uwb_mitigation.radios.wire.layout import Mode
-from uwb_mitigation.types.measurement import DEVICE_TIME_WRAP, RangeMeasurement
+from uwb_mitigation.types.measurement import DEVICE_TIME_WRAP
 
 PPM_PAIRS = ((-20.0, 20.0), (-10.0, 10.0), (0.0, 0.0), (10.0, -10.0), (20.0, -20.0))
 DISTANCES_M = (0.3, 1.0, 5.01, 20.0, 100.0)
@@ -119,16 +119,22 @@ def evb1000_rate_hz(seconds: float) -> float:
         UwbMitigationError: no ranges arrive.
     """
     with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board") as paths:
-        ports = [
-            RadioDriver(_bus_opener(path), RadioSettings(role=role))
+        settings = [
+            Evb1000Settings(PortAddress.parse(str(path)), RadioSettings(role=role))
             for path, role in zip(paths, (Role.TAG, Role.ANCHOR), strict=True)
         ]
+        ports = evb1000.open(settings, lambda event: None)
         try:
-            _await_range(ports[0])
+            until = time.monotonic() + _START_TIMEOUT_S
+            while not ports[0].status.ranged:
+                if time.monotonic() > until:
+                    problem = ports[0].problem or "no answer"
+                    raise UwbMitigationError(f"emulated EVB1000s do not range: {problem}")
+                time.sleep(0.05)
             time.sleep(_WARM_UP_S)
-            before, began = ports[0].report().status.ranged, time.monotonic()
+            before, began = ports[0].status.ranged, time.monotonic()
             time.sleep(seconds)
-            return (ports[0].report().status.ranged - before) / (time.monotonic() - began)
+            return (ports[0].status.ranged - before) / (time.monotonic() - began)
         finally:
             for port in ports:
                 port.close()
@@ -247,16 +253,3 @@ class _SoakMonitor:
             distance_m = self._distances_m[self._by_address[int(row["anchor"])]]
             self.wrong += bool(abs(row["range_m"] - distance_m) > WRONG_M)
         return rows
-
-
-def _bus_opener(path: Path) -> Callable[[], Evb1000Bus]:
-    return lambda: Evb1000Bus(PortAddress.parse(str(path)))
-
-
-def _await_range(port: RadioDriver) -> None:
-    until = time.monotonic() + _START_TIMEOUT_S
-    while not isinstance(port.get(0.2), RangeMeasurement):
-        if time.monotonic() > until:
-            raise UwbMitigationError(
-                f"emulated EVB1000s do not range: {port.report().problem or 'no answer'}"
-            )

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
 import numpy as np
 
 from benchmarks.equipment.uci_board import EmulatedUciBoards, UciBoardModel, taps_of
 from uwb_mitigation.errors import LinkError
+from uwb_mitigation.radios import uci
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import Role
-from uwb_mitigation.radios.uci import UciDriver, UciEvent
+from uwb_mitigation.radios.uci import UciPortSettings
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 _TIMEOUT_S = 10.0
-_DISTANCE_AT = 4 + 25 + 4
+_DISTANCE_OFFSET = 4 + 25 + 4
 """Position of the distance in the packet of a range with a short address."""
 
 _SAME_TAPS = 0.5
@@ -76,9 +78,9 @@ def joins(
         octets[hit] = random.integers(0, 256, int(hit.sum()), dtype=np.uint8)
         return b"" if random.random() < lose else octets.tobytes()
 
-    def check(found: list[RangeMeasurement]) -> None:
+    def check(measurements: list[RangeMeasurement]) -> None:
         nonlocal ranges, with_cir, wrong
-        for measured in found:
+        for measured in measurements:
             ranges += 1
             if not len(measured.cir):
                 continue
@@ -95,7 +97,7 @@ def joins(
         distance_m = 1.0 + sequence * 7919 % 60_000 / 100
         packet = damaged(board.range_packet(handle, sequence, distance_m))
         if packet:
-            received_cm[sequence] = int.from_bytes(packet[_DISTANCE_AT : _DISTANCE_AT + 2], "little")
+            received_cm[sequence] = int.from_bytes(packet[_DISTANCE_OFFSET : _DISTANCE_OFFSET + 2], "little")
         received_cm.pop(sequence - 100, None)
         check(session.receive(packet, now_ns, now_ns))
         check(
@@ -118,55 +120,67 @@ def joins(
 
 def rate_hz(taps: int, seconds: float) -> float:
     """Return the ranges with complete CIR per second of two emulated boards with the default interval."""
-    with EmulatedUciBoards() as boards, ExitStack() as stack:
-        tag, _ = [
-            stack.enter_context(closing(_driver(port, number, taps)))
-            for number, port in enumerate(boards.ports)
-        ]
-        _wait(tag, taps)
+    with EmulatedUciBoards() as boards, _opened(boards.ports, taps) as tag:
+        tag.wait()
         began, ranges = time.monotonic(), 0
         while (elapsed := time.monotonic() - began) < seconds:
-            ranges += _has_cir(tag.get(0.1), taps)
+            ranges += tag.has_range(0.1)
         return ranges / elapsed
 
 
 def recoveries_s(unplugs: int) -> list[float]:
     """Return the times from plugging a board in to the next range."""
-    found = []
+    durations_s = []
     with ExitStack() as stack:
         # A pseudo-terminal gets a new name when it is plugged in again: open it through a link.
         links = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "uci"
         boards = stack.enter_context(EmulatedUciBoards(links=links))
-        tag, _ = [
-            stack.enter_context(closing(_driver(f"{links}{number}", number, 16))) for number in range(2)
-        ]
+        tag = stack.enter_context(_opened((f"{links}0", f"{links}1"), 16))
         for number in range(unplugs):
-            _wait(tag, 16)
-            which = number % 2
-            boards.unplug(which)
+            tag.wait()
+            boards.unplug(number % 2)
             time.sleep(0.7)
-            boards.plug(which)
+            boards.plug(number % 2)
             began = time.monotonic()
-            while tag.get(0.0) is not None:
-                pass
-            _wait(tag, 16)
-            found.append(time.monotonic() - began)
-    return found
+            tag.events = SimpleQueue()
+            tag.wait()
+            durations_s.append(time.monotonic() - began)
+    return durations_s
 
 
-def _driver(port: str, number: int, taps: int) -> UciDriver:
-    role, peer = (Role.ANCHOR, 1) if number else (Role.TAG, 2)
-    return UciDriver(PortAddress.parse(port), UciSettings(role, number + 1, (peer,), window=taps))
+class _Tag:
+    """The events of a tag."""
+
+    def __init__(self, port: str, taps: int) -> None:
+        self.events: SimpleQueue[object] = SimpleQueue()
+        self._taps = taps
+        settings = UciPortSettings(PortAddress.parse(port), UciSettings(window=taps))
+        (self.port,) = uci.open([settings], lambda event: self.events.put(event))
+
+    def wait(self) -> None:
+        """Wait for a range with a complete CIR.
+
+        Raises:
+            LinkError: there is none within the timeout.
+        """
+        until = time.monotonic() + _TIMEOUT_S
+        while not self.has_range(0.1):
+            if time.monotonic() > until:
+                raise LinkError(f"no range within {_TIMEOUT_S:g} s", where=self.port.problem)
+
+    def has_range(self, timeout_s: float) -> bool:
+        """Return whether the next event is a range with a complete CIR."""
+        try:
+            event = self.events.get(timeout=timeout_s)
+        except Empty:
+            return False
+        return isinstance(event, RangeMeasurement) and len(event.cir) == self._taps
 
 
-def _wait(tag: UciDriver, taps: int) -> None:
-    until = time.monotonic() + _TIMEOUT_S
-    while True:
-        if _has_cir(tag.get(0.1), taps):
-            return
-        if time.monotonic() > until:
-            raise LinkError(f"no range within {_TIMEOUT_S:g} s", where=tag.report().problem)
-
-
-def _has_cir(event: UciEvent | None, taps: int) -> bool:
-    return isinstance(event, RangeMeasurement) and len(event.cir) == taps
+@contextmanager
+def _opened(ports: Sequence[str], taps: int) -> Iterator[_Tag]:
+    """Open a tag and its anchor."""
+    settings = UciPortSettings(PortAddress.parse(ports[1]), UciSettings(Role.ANCHOR, 2, (1,), window=taps))
+    (anchor,) = uci.open([settings], lambda event: None)
+    with closing(anchor), closing((tag := _Tag(ports[0], taps)).port):
+        yield tag

@@ -5,27 +5,24 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from port_events import PortEvents, wait_until
 
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import LinkError
+from uwb_mitigation.radios import serial
 from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.port import PortAddress
-from uwb_mitigation.radios.serial import BoardDriver
-from uwb_mitigation.radios.wire.events import Connected, Disconnected, Event, Loss
+from uwb_mitigation.radios.serial import SerialSettings
+from uwb_mitigation.radios.wire.events import Connected, Disconnected, Loss
 from uwb_mitigation.radios.wire.messages import Hello
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
-
-TIMEOUT_S = 240
-"""Timeout for expected events."""
 
 IDENTITY = Hello(board_id=0xB0, model_id=0xCAFE, window=157)
 
@@ -58,46 +55,25 @@ def board(link: Path) -> Iterator[EmulatedBoard]:
 
 
 @pytest.fixture
-def port(board: EmulatedBoard, link: Path) -> Iterator[BoardDriver]:
-    opened = BoardDriver(PortAddress(str(link)))
-    yield opened
-    opened.close()
+def events(board: EmulatedBoard, link: Path) -> Iterator[PortEvents]:
+    with PortEvents(serial, SerialSettings(PortAddress(str(link)))) as opened:
+        yield opened
 
 
-def wait_for(port: BoardDriver, wanted: Callable[[Event], bool]) -> Event:
-    deadline = time.monotonic() + TIMEOUT_S
-    while time.monotonic() < deadline:
-        event = port.get(0.1)
-        if event is not None and wanted(event):
-            return event
-    raise AssertionError(f"what was waited for did not come: {port.report()}")
-
-
-def of(kind: type) -> Callable[[Event], bool]:
-    return lambda event: isinstance(event, kind)
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-def test_measurements_arrive_complete_and_in_order(port):
-    first = wait_for(port, of(RangeMeasurement))
-    sequences = [wait_for(port, of(RangeMeasurement)).sequence for _ in range(50)]
+def test_measurements_arrive_complete_and_in_order(events):
+    (first,) = events.wait_for(RangeMeasurement)
+    sequences = [measured.sequence for measured in events.wait_for(RangeMeasurement, 50)]
 
     assert sequences == list(range(first.sequence + 1, first.sequence + 51))
     assert first.cir.samples.tolist() == [first.sequence % 100] * 314
     assert first.device_time == first.sequence * 7
 
 
-def test_replugged_board_is_found_under_another_port_name(board, port, tmp_path):
-    wait_for(port, of(RangeMeasurement))
+def test_replugged_board_is_found_under_another_port_name(board, events, tmp_path):
+    events.wait_for(RangeMeasurement)
     first = board.port
     board.unplug()
-    wait_for(port, lambda event: event == Disconnected(Loss.CLOSED))
+    events.wait_for(lambda event: event == Disconnected(Loss.CLOSED))
     holders = [EmulatedBoard(link=tmp_path / "other")]  # Takes the free name,
     board.plug()
     while board.port == first:  # unless another process uses it.
@@ -105,31 +81,32 @@ def test_replugged_board_is_found_under_another_port_name(board, port, tmp_path)
         holders.append(EmulatedBoard(link=tmp_path / f"other{len(holders)}"))
         board.plug()
 
-    wait_for(port, of(Connected))
-    wait_for(port, of(RangeMeasurement))
+    events.wait_for(Connected)
+    events.wait_for(RangeMeasurement)
 
     for holder in holders:
         holder.close()
 
 
-def test_board_that_resets_is_connected_again(board, port):
-    wait_for(port, of(RangeMeasurement))
+def test_board_that_resets_is_connected_again(board, events):
+    events.wait_for(RangeMeasurement)
     board.reset()
 
-    loss = wait_for(port, of(Disconnected))
+    (loss,) = events.wait_for(Disconnected)
 
     assert loss.loss in (Loss.RESET, Loss.OUT_OF_SEQUENCE)
-    wait_for(port, of(RangeMeasurement))
+    events.wait_for(RangeMeasurement)
 
 
 def test_faulty_channel_delivers_only_sent_messages(link):
     faults = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05)
     # Long enough that the numbers do not start again while the port is opened.
-    with EmulatedBoard(Recording(10**6), rate_hz=1000, faults=faults, link=link, seed=4):
-        port = BoardDriver(PortAddress(str(link)))
-        received = [wait_for(port, of(RangeMeasurement)) for _ in range(300)]
-        counts = port.report().counts
-        port.close()
+    with (
+        EmulatedBoard(Recording(10**6), rate_hz=1000, faults=faults, link=link, seed=4),
+        PortEvents(serial, SerialSettings(PortAddress(str(link)))) as events,
+    ):
+        received = events.wait_for(RangeMeasurement, 300)
+        counts = events.port.session.totals()
 
     sequences = [event.sequence for event in received]
     assert all(event.cir.samples.tolist() == [event.sequence % 100] * 314 for event in received)
@@ -142,13 +119,10 @@ def test_faulty_channel_delivers_only_sent_messages(link):
 
 def test_missing_port_is_reported_and_awaited(tmp_path):
     path = tmp_path / "later"
-    port = BoardDriver(PortAddress(str(path)))
-    assert port.get(0.01) is None
-    assert "is not there" in port.report().problem
-
-    with EmulatedBoard(link=path):
-        wait_for(port, of(Connected))
-        port.close()
+    with PortEvents(serial, SerialSettings(PortAddress(str(path)))) as events:
+        assert "is not there" in events.port.report().problem
+        with EmulatedBoard(link=path):
+            events.wait_for(Connected)
 
 
 @pytest.mark.parametrize("exclusive", [True, False])
@@ -162,42 +136,16 @@ def test_port_in_use_is_reported_with_the_program(exclusive: bool):
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
-        port = BoardDriver(PortAddress(name))
-        place = "in use by" if exclusive else "also open in"
-        wait_until(lambda: place in port.report().problem)
-        assert f"(process {other.pid})" in port.report().problem
-        port.close()
+        with PortEvents(serial, SerialSettings(PortAddress(name))) as events:
+            text = "in use by" if exclusive else "also open in"
+            wait_until(lambda: text in events.port.problem)
+            assert f"(process {other.pid})" in events.port.problem
         if exclusive:
             with pytest.raises(LinkError, match=rf"in use by .*\(process {other.pid}\)"):
                 Evb1000Bus(PortAddress(name))
         other.stdin.close()
     os.close(controller)
     os.close(device)
-
-
-def test_close_ends_a_wait_in_another_thread(link):
-    port = BoardDriver(PortAddress(str(link)))
-    events = []
-    reader = threading.Thread(target=lambda: events.append(port.get(60.0)))
-    reader.start()
-    time.sleep(0.05)
-
-    port.close()
-    reader.join(TIMEOUT_S)
-
-    assert not reader.is_alive()
-    assert events == [None]
-
-
-def test_unread_events_are_dropped_and_counted(board, link):
-    port = BoardDriver(PortAddress(str(link)), capacity=5)
-    wait_until(lambda: port.report().counts["overflowed"] > 20)
-
-    oldest = port.get(TIMEOUT_S)
-    port.close()
-
-    assert isinstance(oldest, RangeMeasurement)
-    assert oldest.sequence > 10
 
 
 @pytest.mark.parametrize(

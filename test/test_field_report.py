@@ -20,6 +20,7 @@ from compilers import NEEDS_CC
 from typer.testing import CliRunner
 
 from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
+from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.commands import cli, field_report
 from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
@@ -39,9 +40,10 @@ def report(tmp_path: Path) -> Report:
         command = ["field-report", "--source", source, "--port", names, "--distance", "3.0", "--seconds", "3"]
         files = ["-o", str(tmp_path / "out.zip"), "--json", str(tmp_path / "out.json")]
         result = CliRunner().invoke(cli.app, [*command, *files, *(options or ("--no-unplug",))])
-        assert result.exit_code == 0, (result.output, result.exception)
         checks = json.loads((tmp_path / "out.json").read_text())["checks"]
-        return {check["name"]: check for check in checks}
+        by_name = {check["name"]: check for check in checks}
+        assert result.exit_code == (1 if failed(by_name) else 0), (result.output, result.exception)
+        return by_name
 
     return run
 
@@ -69,7 +71,11 @@ def test_good_uci_boards_pass_and_the_file_names_nobody(
     assert checks["model"]["verdict"] == "warning"
     assert checks["read back: CIR taps"]["value"] == "157"
     assert "recovery after reconnecting" in checks
-    assert b"emulated".hex() in zipfile.Path(tmp_path / "out.zip", "report.html").read_text()
+    assert checks["warnings of the driver"]["value"] == "none"
+    page = zipfile.Path(tmp_path / "out.zip", "report.html").read_text()
+    assert b"emulated".hex() in page
+    assert "the release of the kernel" in page
+    assert "calibration writes" in page
     with zipfile.ZipFile(tmp_path / "out.zip") as archive:
         assert set(archive.namelist()) == {"capture.txt", "ranges.mcap", "report.html", "report.json"}
         archive.extractall(tmp_path / "out")
@@ -91,7 +97,6 @@ def test_good_uci_boards_pass_and_the_file_names_nobody(
     [
         ({"offset_m": 0.5}, {"error of the median range"}),
         ({"empty_cir": True}, {"share of ranges with CIR"}),
-        ({"swapped_ids": True}, {"ids", "ranges per second"}),
         ({"clock_ppm": 60.0}, {"clock error"}),
     ],
 )
@@ -111,11 +116,40 @@ def test_good_evb1000s_pass_and_a_low_supply_fails(report: Report, tmp_path: Pat
         assert failed(report("evb1000")) == {"supply"}
 
 
-def test_missing_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("uwb_mitigation.commands.field.test.START_TIMEOUT_S", 0.5)
+def test_negative_distances_and_timeouts_are_named_with_their_cause(report: Report, tmp_path: Path):
+    with EmulatedUciBoards(links=tmp_path / "uci", distance_m=0.2, faults=UciFaults(offset_m=-0.3)):
+        checks = report("uci")
+    assert checks["failed exchanges: negative distance"]["verdict"] == "fail"
+    assert "antenna delay" in checks["failed exchanges: negative distance"]["remedy"]
+    with EmulatedUciBoards(links=tmp_path / "uci"):
+        assert "session id" in report("uci", 1)["failed exchanges: reception timeout"]["remedy"]
+
+
+def test_board_that_nobody_unplugs_is_not_a_failure(
+    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("uwb_mitigation.commands.field.test.UNPLUG_TIMEOUT_S", 0.5)
+    with EmulatedUciBoards(links=tmp_path / "uci"):
+        check = report("uci", 2, "--unplug")["recovery after reconnecting"]
+    assert (check["verdict"], check["value"]) == ("warning", "not unplugged")
+
+
+def test_absent_port_is_reported_at_once(tmp_path: Path):
+    command = ["field-report", "--source", "uci", "--port", str(tmp_path / "no"), "--distance", "3"]
+    began_s = time.monotonic()
+    result = CliRunner().invoke(cli.app, [*command, "-o", str(tmp_path / "out.zip")])
+    assert time.monotonic() - began_s < 2.0
+    assert "is not there" in str(result.exception)
+
+
+def test_silent_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("uwb_mitigation.commands.field.test.START_TIMEOUT_S", 1.0)
+    terminal = PseudoTerminal(tmp_path / "uci0")
+    terminal.plug()
     checks = report("uci", 1)
+    terminal.unplug()
     assert {"problem of the driver", "ranges per second", "ids"} <= failed(checks)
-    assert "PATH" in checks["problem of the driver"]["value"]
+    assert "no answer to the reset" in checks["problem of the driver"]["value"]
     page = zipfile.Path(tmp_path / "out.zip", "report.html").read_text()
     assert "<h1>Field report: board with UCI firmware</h1>" in page
     assert "issue of type <em>Field report</em>" in page
@@ -151,7 +185,8 @@ RANGE = RangeMeasurement(0, 1, 2, 0, 0, 3.0, Cir(np.tile(np.int16([3, -3]), 20),
         ({"written": {"channel": 5}, "read": {"channel": 9}}, "read back: channel"),
         ({"expected_ids": (2, 1)}, "ids"),
         ({"temperature_c": 95.0}, "temperature"),
-        ({"recovery_s": math.inf}, "recovery after reconnecting"),
+        ({"unplugged": True}, "recovery after reconnecting"),
+        ({"failures": {"STS error": 900}}, "failed exchanges: STS error"),
         ({"damaged": 500}, "damaged packets per range"),
         ({"ranges": []}, "ranges per second"),
         ({"problem": "lost"}, "problem of the driver"),

@@ -18,18 +18,18 @@ import pytest
 import serial
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
+from port_events import PortEvents, wait_until
 
 from benchmarks.equipment.dw1000_model.air import Air, Chip
 from benchmarks.equipment.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
 from uwb_mitigation.errors import LinkError, MissingDependencyError, ParameterError
+from uwb_mitigation.radios import evb1000
 from uwb_mitigation.radios import spi as spidev_bus
-from uwb_mitigation.radios.dw1000.driver import RadioDriver, RadioLost
 from uwb_mitigation.radios.dw1000.native import NativeRadio
-from uwb_mitigation.radios.evb1000 import Evb1000Bus
+from uwb_mitigation.radios.evb1000 import Evb1000Bus, Evb1000Settings
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, Role
 from uwb_mitigation.radios.spi import SpidevBus
-from uwb_mitigation.radios.wire.messages import RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
@@ -41,25 +41,6 @@ def bus(path: object) -> Callable[[], Evb1000Bus]:
     return lambda: Evb1000Bus(PortAddress.parse(str(path)))
 
 
-def wait_for(port: RadioDriver, kind: type, count: int = 1) -> list:
-    """Wait for a number of events of one type; ignore others."""
-    found: list = []
-    until = time.monotonic() + GENEROUS_S
-    while len(found) < count:
-        assert time.monotonic() < until, f"{len(found)} of {count} {kind.__name__}: {port.report()}"
-        event = port.get(0.2)
-        if isinstance(event, kind):
-            found.append(event)
-    return found
-
-
-def wait_until(true: Callable[[], bool]) -> None:
-    until = time.monotonic() + GENEROUS_S
-    while not true():
-        assert time.monotonic() < until
-        time.sleep(0.02)
-
-
 @pytest.fixture(scope="module")
 def boards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[EmulatedEvb1000s, Path]]:
     prefix = tmp_path_factory.mktemp("ports with spaces") / "radio"
@@ -67,66 +48,60 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[EmulatedE
         yield emulated, prefix
 
 
-def test_tag_and_anchor_on_usb_recover_from_unplugging(
-    boards: tuple[EmulatedEvb1000s, Path],
-):
+def settings(path: object, **radio: object) -> Evb1000Settings:
+    return Evb1000Settings(PortAddress.parse(str(path)), RadioSettings(**radio))
+
+
+def test_tag_and_anchor_on_usb_recover_from_unplugging(boards: tuple[EmulatedEvb1000s, Path]):
     emulated, prefix = boards
-    anchor = RadioDriver(bus(f"{prefix}1"), RadioSettings(role=Role.ANCHOR))
-    tag = RadioDriver(bus(f"{prefix}0"), RadioSettings())
-    try:
-        (radio,) = wait_for(tag, RadioConfigured)
-        assert radio.settings.address
-        assert radio.settings.antenna_delay == 2 * 16436
-        for measured in wait_for(tag, RangeMeasurement, 10):
+    pair = settings(f"{prefix}0"), settings(f"{prefix}1", role=Role.ANCHOR)
+    with PortEvents(evb1000, *pair) as events:
+        tag, anchor = events.ports
+        for measured in events.wait_for(RangeMeasurement, 10):
             assert abs(measured.range_m - 3) < 0.05
-            assert (measured.tag_id, measured.anchor_id) == (
-                radio.settings.address,
-                anchor.report().settings.address,
-            )
+            assert (measured.tag_id, measured.anchor_id) == (tag.settings.address, anchor.settings.address)
             assert len(measured.cir) == 157
             assert abs(time.time_ns() - measured.stamp_ns) < GENEROUS_S * 1e9
-        wait_until(lambda: tag.report().problem == "")
+        assert tag.settings.antenna_delay == 2 * 16436
+        wait_until(lambda: tag.problem == "")
 
         taken: list[int] = []
         # USB requests of 0.4 s and the pause before a retry restart a radio within a second. A busy computer
         # exceeds the timeout of a request and needs more than one try.
         while len(taken) < 10 and not (taken and taken[-1] < 0.4 / ROUND_TRIP_S):
             emulated.unplug(0)
-            lost = wait_for(tag, RadioLost)[-1]
-            assert "radio0" in lost.text
-            wait_until(lambda: "is not there" in tag.report().problem)
+            wait_until(lambda: "radio0" in tag.problem and "is not there" in tag.problem)
             before = emulated.requests[0]
             emulated.plug(0)
-            wait_for(tag, RadioConfigured)
+            wait_until(lambda: tag.settings is not None)
             taken.append(emulated.requests[0] - before)
         assert 50 < min(taken) < 0.4 / ROUND_TRIP_S
-        wait_for(tag, RangeMeasurement, 2)
+        events.wait_for(RangeMeasurement, 2)
 
-        openings = anchor.report().openings
+        openings = anchor.openings
         emulated.unplug(1)
-        wait_until(lambda: "is not there" in anchor.report().problem)
-        before = tag.report().status
-        wait_until(lambda: tag.report().status.no_answer > before.no_answer)
-        wait_until(lambda: tag.report().status.state is RadioState.RUNNING)
+        wait_until(lambda: "is not there" in anchor.problem)
+        before = tag.status
+        wait_until(lambda: tag.status.no_answer > before.no_answer)
+        wait_until(lambda: tag.status.state is RadioState.RUNNING)
+        wait_until(lambda: "no range for" in tag.report().warning)
+        assert "no answer: no anchor answers" in tag.report().warning
         emulated.plug(1)
-        wait_for(tag, RangeMeasurement, 2)
-        assert anchor.report().openings > openings
+        events.wait_for(RangeMeasurement, 2)
+        assert anchor.openings > openings
+        assert not tag.report().warning
 
-        tag.set_radio(RadioSettings(window=16))
-        wait_for(tag, RadioConfigured)
-        assert len(wait_for(tag, RangeMeasurement, 2)[-1].cir) == 16
-    finally:
-        tag.close()
-        anchor.close()
+        tag.apply(settings(f"{prefix}0", window=16))
+        events.wait_for(lambda event: isinstance(event, RangeMeasurement) and len(event.cir) == 16)
 
 
 def test_board_that_modem_manager_has_written_to_is_opened(boards: tuple[EmulatedEvb1000s, Path]):
     _, prefix = boards
     with serial.Serial(f"{prefix}1") as port:
         port.write(b"AT+GCAP\r")
-    with contextlib.closing(bus(f"{prefix}1")()) as found:
-        assert found.version == "EVB1000 USB2SPI 2.0"
-        assert found.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade")
+    with contextlib.closing(bus(f"{prefix}1")()) as opened:
+        assert opened.version == "EVB1000 USB2SPI 2.0"
+        assert opened.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade")
 
 
 def test_modem_manager_ignores_the_boards():

@@ -19,9 +19,16 @@ from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from benchmarks.equipment.emulated_board import EmulatedBoard, PseudoTerminal
 from uwb_mitigation.errors import ParameterError, format_id
-from uwb_mitigation.nodes.feeds.radios import anchor_values, settings_of
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
-from uwb_mitigation.radios.settings import AGE_UNKNOWN_MS, AnchorStatus, RadioSettings, RadioStatus, Role
+from uwb_mitigation.radios.settings import (
+    AGE_UNKNOWN_MS,
+    AnchorStatus,
+    RadioSettings,
+    RadioStatus,
+    Role,
+    radio_values,
+    read_radio,
+)
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
 pytestmark = [
@@ -59,7 +66,7 @@ def test_tag_ranges_with_two_anchors(ros: ros_harness.Ros, boards: EmulatedEvb10
     status = ros.diagnosis("driver", lambda status: level_of(status) == 0 and "ranging" in status.message)
     values = diagnostic_values(status)
     assert int(values["radio 0: ranged"]) > 0
-    assert sum(key.startswith("anchor ") and "dBm" in value for key, value in values.items()) == 2
+    assert sum("anchor 0x" in key and "dBm" in value for key, value in values.items()) == 2
 
 
 def test_settings_are_applied_live(ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path):
@@ -89,29 +96,29 @@ def test_settings_are_applied_live(ros: ros_harness.Ros, boards: EmulatedEvb1000
 )
 def test_unsupported_setting_is_refused_and_named(name: str, value: object, named: str):
     with pytest.raises(ParameterError, match=named):
-        settings_of(lambda key: value if key == name else DEFAULTS[key])
+        read_radio(lambda key: value if key == name else DEFAULTS[key])
 
 
 @pytest.mark.parametrize("address", [34, 0xDECA010203040506])
 def test_address_is_read_as_it_is_printed(address: int):
     values = DEFAULTS | {"radio.address": format_id(address), "radio.anchors": f"7, {format_id(address)}"}
-    settings = settings_of(values.__getitem__)
+    settings = read_radio(values.__getitem__)
     assert (settings.address, settings.anchors) == (address, (7, address))
     if address < 1 << 16:
-        assert settings_of((values | {"radio.address": address}).__getitem__).address == address
+        assert read_radio((values | {"radio.address": address}).__getitem__).address == address
 
 
 def test_anchor_that_never_answered_has_no_last_seen_time():
     status = RadioStatus(
         anchors=(AnchorStatus(7, 9, 0, np.nan, AGE_UNKNOWN_MS), AnchorStatus(8, 9, 9, -80.0, 1500))
     )
-    never, recent = anchor_values(status).values()
+    never, recent = [*radio_values(None, status).values()][-2:]
     assert never == "0 of 9 ranged, nan dBm, last seen never"
     assert recent == "9 of 9 ranged, -80.0 dBm, last seen 1.5 s ago"
 
 
 def test_default_parameters_do_not_change_the_radio_of_a_board():
-    assert settings_of(DEFAULTS.__getitem__) == RadioSettings()
+    assert read_radio(DEFAULTS.__getitem__) == RadioSettings()
 
 
 class ModelledBoard:
@@ -160,7 +167,7 @@ def test_radio_of_a_serial_board_is_configured_and_reports_its_status(ros: ros_h
         assert level_of(status) == 0
         assert (values["radio: role"], values["radio: antenna delay"]) == ("tag", str(2 * 16436))
         assert "radio" in status.hardware_id
-        assert any(key.startswith("anchor ") and "dBm" in value for key, value in values.items())
+        assert any("anchor 0x" in key and "dBm" in value for key, value in values.items())
 
         driver.wait_for_output("channel 5, 6800 kbit/s")
         for name, value in (("radio.prf", 16), ("radio.channel", 2)):

@@ -14,10 +14,9 @@ from firmware_on_model import ModelBus, ranging, use_virtual_time
 from benchmarks.equipment.dw1000_model.air import Air, Chip, Host
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.nodes.feeds import radios as live_feeds
 from uwb_mitigation.radios.dw1000 import structures
 from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
-from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role
+from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role, status_warning
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
@@ -309,7 +308,7 @@ def test_unreported_pll_lock_is_a_warning(air: Air):
     assert len(run.ranges) > 10
     for status in run.statuses:
         assert status.state is RadioState.LOCK_UNCONFIRMED
-        assert "PLL" in live_feeds.radio_warning(None, status)
+        assert "PLL" in status_warning(status)
 
 
 def test_unlocked_clock_is_an_error(air: Air):

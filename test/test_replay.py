@@ -27,7 +27,6 @@ from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.types.offsets import NO_OFFSETS
 
 MS = 1_000_000
 COUNT = 400
@@ -104,7 +103,7 @@ class Player:
             self.on_record(self, record.measurement.sequence)
 
     def set(self, **values: object) -> None:
-        self.feed.apply(values, values.__getitem__, NO_OFFSETS)
+        self.feed.apply(values, values.__getitem__)
 
     def on_time(self, time_ns: int) -> None:
         self.clock_times.append(time_ns)

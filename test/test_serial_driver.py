@@ -17,6 +17,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from faulty_board import FaultyBoard
+from port_events import PortEvents, wait_until
 from ros_harness import Process, Ros, diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
@@ -25,8 +26,9 @@ from benchmarks.equipment.faults import Faults
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
-from uwb_mitigation.radios.serial import BoardDriver
+from uwb_mitigation.radios.serial import SerialSettings
 from uwb_mitigation.radios.wire.messages import Hello
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import CorrectedBy
@@ -80,7 +82,7 @@ def test_measurements_of_a_board_are_published_with_their_stamps(ros: Ros, link:
         device.pause()
         driver = drive(ros, link)
         connected = ros.diagnosis(
-            "driver", lambda s: s.message == "connected" and diagnostic_value(s, LOST) != ""
+            "driver", lambda s: s.message.startswith("connected") and diagnostic_value(s, LOST) != ""
         )
         device.resume()
         ros.spin_until(lambda: len(received) >= 100)
@@ -251,7 +253,7 @@ def test_board_subtracts_the_offsets_of_the_driver(ros: Ros, link: Path):
 
 def test_unusable_port_is_logged_once(ros: Ros, link: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     driver = drive(ros, link)
-    absent = f"{link}: is not there (plug the board in); waiting for the board"
+    absent = f"{link}: is not there (plug the board in); waiting for the radio"
     driver.wait_for_output(absent)
     with board(link):
         driver.wait_for_output("connected to board")
@@ -269,11 +271,7 @@ def test_port_without_permission_is_reported_with_the_remedy(tmp_path: Path, mon
     monkeypatch.setattr(serial.Serial, "open", forbidden)
     place = tmp_path / "port"
     place.touch()
-    port = BoardDriver(PortAddress(str(place)))
-    deadline = time.monotonic() + 240
-    while "cannot be opened" not in port.problem:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    port.close()
-    assert "Permission denied" in port.problem
-    assert "usermod -aG dialout" in port.problem
+    with PortEvents(serial_source, SerialSettings(PortAddress(str(place)))) as events:
+        wait_until(lambda: "cannot be opened" in events.port.problem)
+        assert "Permission denied" in events.port.problem
+        assert "usermod -aG dialout" in events.port.problem

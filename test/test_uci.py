@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from benchmarks import uci
 from benchmarks.equipment.uci_board import FIRST_PATH, UciBoardModel, UciFaults, _Session, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterError, RecordingError
-from uwb_mitigation.radios.fira import messages
+from uwb_mitigation.radios.fira import codes, messages
 from uwb_mitigation.radios.fira.capture import FIRST_LINE, CaptureWriter, UciCapture
 from uwb_mitigation.radios.fira.cir import read_cir
+from uwb_mitigation.radios.fira.codes import PacketType
 from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher
-from uwb_mitigation.radios.fira.messages import Diagnostics, MessageType
-from uwb_mitigation.radios.fira.packets import MAX_GAP_NS, PacketDecoder, encode
+from uwb_mitigation.radios.fira.messages import Diagnostics
+from uwb_mitigation.radios.fira.packets import MAX_GAP_NS, PacketDecoder, encode_packets
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.settings import Role
 from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment
@@ -241,7 +242,7 @@ def test_error_answers_are_repeated_until_the_board_ranges():
 def test_rejected_optional_settings_are_left_out():
     class Old(UciBoardModel):
         def _command(self, name, payload, now_s):
-            if name == messages.SET_APP_CONFIG and bytes([0x35, 1, 1]) in payload:
+            if name == codes.SET_APP_CONFIG and bytes([0x35, 1, 1]) in payload:
                 return self._respond(name, bytes([0x04, 1, 0x35, 0x04]))
             return super()._command(name, payload, now_s)
 
@@ -255,7 +256,7 @@ def test_firmware_that_sends_no_handle_uses_the_number_of_the_session():
     class Later(UciBoardModel):
         def _command(self, name, payload, now_s):
             answer = super()._command(name, payload, now_s)
-            if name == messages.SESSION_INIT:
+            if name == codes.SESSION_INIT:
                 (number,) = struct.unpack_from("<I", payload)
                 self.sessions[number] = self.sessions.pop(self._handles)
                 answer = self._respond(name, b"\0")
@@ -354,7 +355,7 @@ def test_intact_packets_between_damaged_ones_are_found():
 
 
 def test_a_long_command_is_sent_in_fragments():
-    sent = encode(1, 3, bytes(600))
+    sent = encode_packets(1, 3, bytes(600))
     assert [sent[0], sent[254], sent[508]] == [0x31, 0x31, 0x21]
     assert len(sent) == 600 + 3 * 4
 
@@ -414,7 +415,7 @@ def test_a_capture_that_is_damaged_is_refused(tmp_path, text: str, error: type):
 
 def test_responses_have_no_effect_before_their_command():
     run = Bench()
-    run.step(encode(*messages.RANGE_START, b"\0", MessageType.RESPONSE) * 10)
+    run.step(encode_packets(*codes.RANGE_START, b"\0", PacketType.RESPONSE) * 10)
     assert run.session.state
 
 
@@ -441,7 +442,7 @@ def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges(
         refusals = 3
 
         def _command(self, name, payload, now_s):
-            if name == messages.SESSION_INIT and self.sessions and self.refusals:
+            if name == codes.SESSION_INIT and self.sessions and self.refusals:
                 self.refusals -= 1
                 return self._respond(name, b"\x12")
             return super()._command(name, payload, now_s)
@@ -463,12 +464,12 @@ def test_a_board_that_starts_slowly_after_a_reset_gets_its_window():
         def receive(self, data, now_s):
             if now_s < self.ready_s:
                 return b""
-            ready = self._notify(messages.DEVICE_STATUS, b"\1") if self.ready_s else b""
+            ready = self._notify(codes.DEVICE_STATUS, b"\1") if self.ready_s else b""
             self.ready_s = 0.0
-            if data.startswith(encode(*messages.RESET, b"\0")):
+            if data.startswith(encode_packets(*codes.RESET, b"\0")):
                 self.ready_s = now_s + 0.4
                 self.sessions.clear()
-                return self._respond(messages.RESET, b"\0")
+                return self._respond(codes.RESET, b"\0")
             return ready + super().receive(data, now_s)
 
     run = Bench(Slow(), window=157).start()
@@ -487,7 +488,7 @@ class Unnamed(UciBoardModel):
     """Refuses a whole packet of parameters without naming the one that it does not know."""
 
     def _command(self, name, payload, now_s):
-        if name == messages.SET_APP_CONFIG and (payload[4] > 1 or payload[5] == 0x35):
+        if name == codes.SET_APP_CONFIG and (payload[4] > 1 or payload[5] == 0x35):
             return self._respond(name, b"\x04")
         return super()._command(name, payload, now_s)
 
@@ -496,7 +497,7 @@ class OneByOne(UciBoardModel):
     """Names only the first of several unknown parameters."""
 
     def _command(self, name, payload, now_s):
-        if name == messages.SET_APP_CONFIG:
+        if name == codes.SET_APP_CONFIG:
             for tag in (0x2C, 0x32, 0x35):
                 if bytes([tag, 2 if tag == 0x32 else 1]) in payload:
                     return self._respond(name, bytes([0x04, 1, tag, 0x04]))
@@ -509,11 +510,11 @@ class NoReset(UciBoardModel):
     def _command(self, name, payload, now_s):
         number = struct.unpack_from("<I", payload)[0] if len(payload) >= 4 else 0
         existing = [handle for handle, session in self.sessions.items() if session.number == number]
-        if name == messages.RESET:
+        if name == codes.RESET:
             return self._respond(name, b"\x01")
-        if name == messages.SESSION_INIT and existing:
+        if name == codes.SESSION_INIT and existing:
             return self._respond(name, b"\x13")
-        if name == messages.SESSION_DEINIT and existing:
+        if name == codes.SESSION_DEINIT and existing:
             payload = struct.pack("<I", existing[0])
         return super()._command(name, payload, now_s)
 
@@ -523,7 +524,7 @@ class OnlyReady(UciBoardModel):
 
     def _command(self, name, payload, now_s):
         answer = super()._command(name, payload, now_s)
-        return answer[:5] if name == messages.RESET else answer
+        return answer[:5] if name == codes.RESET else answer
 
 
 class Numbers(UciBoardModel):
@@ -531,7 +532,7 @@ class Numbers(UciBoardModel):
 
     def _notify(self, name, payload):
         sent = super()._notify(name, payload)
-        at = {messages.RANGE_START: 8, messages.RANGE_DIAGNOSTICS: 4, messages.SESSION_STATUS: 4}.get(name)
+        at = {codes.RANGE_START: 8, codes.RANGE_DIAGNOSTICS: 4, codes.SESSION_STATUS: 4}.get(name)
         if at is None:
             return sent
         (handle,) = struct.unpack_from("<I", sent, at)
@@ -554,28 +555,28 @@ class Chatty(UciBoardModel):
     """Sends notifications and fields that no source describes, and bytes after the ranges."""
 
     def _notify(self, name, payload):
-        if name == messages.RANGE_START:
+        if name == codes.RANGE_START:
             payload += b"\1\2\3"
-        if name == messages.RANGE_DIAGNOSTICS:
+        if name == codes.RANGE_DIAGNOSTICS:
             payload = payload[:12] + bytes([payload[12] + 1, 0x77, 3, 0, 1, 2, 3]) + payload[13:]
-        return encode(0xA, 0x3E, b"new", MessageType.NOTIFICATION) + super()._notify(name, payload)
+        return encode_packets(0xA, 0x3E, b"new", PacketType.NOTIFICATION) + super()._notify(name, payload)
 
 
 class Active(UciBoardModel):
     """Does not answer the first start, and refuses the second one."""
 
     def _command(self, name, payload, now_s):
-        if name == messages.RANGE_START and any(session.active for session in self.sessions.values()):
+        if name == codes.RANGE_START and any(session.active for session in self.sessions.values()):
             return self._respond(name, b"\x13")
         answer = super()._command(name, payload, now_s)
-        return answer[5:] if name == messages.RANGE_START else answer
+        return answer[5:] if name == codes.RANGE_START else answer
 
 
 class Extended(UciBoardModel):
     """Reports addresses of eight bytes."""
 
     def _notify(self, name, payload):
-        if name == messages.RANGE_START:
+        if name == codes.RANGE_START:
             payload = payload[:15] + b"\1" + payload[16:27] + bytes(6) + payload[27:-6]
         return super()._notify(name, payload)
 
@@ -637,7 +638,7 @@ def test_a_cir_of_an_unknown_layout_is_skipped_but_its_levels_are_used():
 def test_an_anchor_without_its_tag_waits_if_the_board_cannot_report_its_state():
     class Old(UciBoardModel):
         def _command(self, name, payload, now_s):
-            if name == messages.GET_SESSION_STATE:
+            if name == codes.GET_SESSION_STATE:
                 return self._respond(name, b"\x08")
             return super()._command(name, payload, now_s)
 

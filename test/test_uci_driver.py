@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,11 +15,9 @@ from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import shipped_model_path
-from uwb_mitigation.nodes.feeds.uci import _warning, uci_settings
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
-from uwb_mitigation.radios.fira.session import UciSettings
 from uwb_mitigation.radios.settings import Role
-from uwb_mitigation.radios.uci import UciReport
+from uwb_mitigation.radios.uci import read_settings
 
 DEFAULTS = {row.name: row.default for row in DRIVER}
 
@@ -46,7 +43,7 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert all(abs(message.range - 3.0) < 0.2 for message in raw)
 
     status = ros.diagnosis("driver", lambda status: "ranging" in status.message)
-    assert diagnostic_values(status)["board 0: CIR taps"] == "16"
+    assert diagnostic_values(status)["radio 0: CIR taps"] == "16"
 
     status = ros.diagnosis("mitigator", lambda status: "DW3000 STS" in status.message)
     assert "trained for DW1000 IPATOV" in status.message
@@ -78,21 +75,13 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
 
 
-def test_rejected_parameters_and_a_missing_calibration_are_warnings():
-    counts = {"ranges": 30, "without_cir": 0, "inconsistent_cir": 0, "joined": 30}
-    counts |= {"without_diagnostics": 0, "unknown_session": 0}
-    report = UciReport("p", "", UciSettings(), (16, 5), {0xE9: 4, 0x35: 4}, b"", 0.0, counts)
-    assert _warning(report).endswith("rejected: 0x35, 0xe9")
-    assert not _warning(replace(report, rejected={}))
-    none = counts | {"ranges": 0}
-    assert "load its calibration" in _warning(replace(report, counts=none | {"transmission_failed": 29}))
-    assert "no range yet" in _warning(replace(report, counts=none | {"transmission_failed": 9}))
-    assert "other addresses" in _warning(replace(report, counts=none | {"unknown_session": 9}))
-
-
 def value_of(**changes: object):
     values = DEFAULTS | {name.replace("__", "."): value for name, value in changes.items()}
     return values.__getitem__
+
+
+def uci_settings(value):
+    return [settings.board for settings in read_settings(value)]
 
 
 def test_the_first_board_is_the_tag_of_the_others():

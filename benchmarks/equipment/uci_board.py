@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from benchmarks.equipment.emulated_board import PseudoTerminal
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.radios.fira import messages
-from uwb_mitigation.radios.fira.messages import MessageType, SessionState
-from uwb_mitigation.radios.fira.packets import encode
+from uwb_mitigation.radios.fira import codes
+from uwb_mitigation.radios.fira.codes import PacketType, SessionState
+from uwb_mitigation.radios.fira.packets import encode_packets
 
 TAPS, LEAD = "rx_diag_config.cir_n_taps", "rx_diag_config.cir_fp_tap_offset"
 FIRST_PATH = 362
@@ -130,7 +130,7 @@ class UciBoardModel:
         self._parts.clear()
         self.sessions: dict[int, _Session] = {}
         self._handles = 0
-        return self._notify(messages.BOOT, b"\0") + self._notify(messages.DEVICE_STATUS, b"\1")
+        return self._notify(codes.BOOT, b"\0") + self._notify(codes.DEVICE_STATUS, b"\1")
 
     def receive(self, data: bytes, now_s: float) -> bytes:
         """Return the answers to the commands in `data`."""
@@ -140,7 +140,7 @@ class UciBoardModel:
             first, opcode, _, length = self._buffer[:4]
             self._parts += self._buffer[4 : 4 + length]
             del self._buffer[: 4 + length]
-            if first >> 5 != MessageType.COMMAND:
+            if first >> 5 != PacketType.COMMAND:
                 self._parts.clear()
             elif not first & 0x10:
                 payload = bytes(self._parts)
@@ -153,41 +153,41 @@ class UciBoardModel:
             return self._respond(name, bytes([_REJECTED]))
         handle = struct.unpack_from("<I", payload)[0] if len(payload) >= 4 else 0
         session = self.sessions.get(handle)
-        if name == messages.RESET:
+        if name == codes.RESET:
             self.sessions.clear()
-            return self._notify(messages.DEVICE_STATUS, b"\1") + self._respond(name, b"\0")
-        if name == messages.DEVICE_INFO:
+            return self._notify(codes.DEVICE_STATUS, b"\1") + self._respond(name, b"\0")
+        if name == codes.DEVICE_INFO:
             return self._respond(name, b"\0" + b"emulated")
-        if name == messages.SESSION_INIT:
+        if name == codes.SESSION_INIT:
             self._handles += 1
             self.sessions[self._handles] = _Session(handle, {})
             created = struct.pack("<I", self._handles)
             return self._respond(name, b"\0" + created) + self._state(self._handles, SessionState.INIT)
-        if name == messages.SET_CALIBRATION:
+        if name == codes.SET_CALIBRATION:
             return self._respond(name, bytes([0 if self._set_calibration(payload) else _INVALID_PARAMETER]))
-        if name == messages.GET_CALIBRATION:
+        if name == codes.GET_CALIBRATION:
             return self._respond(name, self._get_calibration(payload))
         if session is None:
             return self._respond(name, bytes([_NO_SESSION]))
-        if name == messages.SET_APP_CONFIG:
+        if name == codes.SET_APP_CONFIG:
             at = 5
             while at + 1 < len(payload):
                 session.config[payload[at]] = payload[at + 2 : at + 2 + payload[at + 1]]
                 at += 2 + payload[at + 1]
             return self._respond(name, b"\0\0") + self._state(handle, SessionState.IDLE)
-        if name == messages.GET_SESSION_STATE:
+        if name == codes.GET_SESSION_STATE:
             return self._respond(
                 name, bytes([0, SessionState.ACTIVE if session.active else SessionState.IDLE])
             )
-        if name == messages.RANGE_START:
+        if name == codes.RANGE_START:
             if not set(session.config) >= _NEEDED:
                 return self._respond(name, bytes([_NOT_CONFIGURED]))
             session.active, session.due_s = True, now_s + session.value(0x09) / 1e3
             return self._respond(name, b"\0") + self._state(handle, SessionState.ACTIVE)
-        if name == messages.RANGE_STOP:
+        if name == codes.RANGE_STOP:
             session.active = False
             return self._respond(name, b"\0") + self._state(handle, SessionState.IDLE)
-        if name == messages.SESSION_DEINIT:
+        if name == codes.SESSION_DEINIT:
             del self.sessions[handle]
             return self._respond(name, b"\0") + self._state(handle, SessionState.DEINIT)
         return self._respond(name, bytes([_REJECTED]))
@@ -218,12 +218,12 @@ class UciBoardModel:
     def range_packet(self, handle: int, sequence: int, distance_m: float) -> bytes:
         """Return a range notification."""
         session = self.sessions[handle]
-        failed = distance_m != distance_m
-        distance_cm = 0xFFFF if failed else max(0, round(100 * (distance_m + self.faults.offset_m)))
+        status = 0x21 if distance_m != distance_m else 0x1B if distance_m + self.faults.offset_m < 0 else 0
+        distance_cm = 0xFFFF if status else round(100 * (distance_m + self.faults.offset_m))
         peer = session.value(0x06 if self.faults.swapped_ids else 0x07)
         header = struct.pack("<IIBIBBBIIB", sequence, handle, 0, session.value(0x09), 1, 0, 0, 0, 0, 1)
-        record = struct.pack("<HBBH12xBB11x", peer, 0x21 if failed else 0, 0xFF, distance_cm, 0, 0)
-        return self._notify(messages.RANGE_START, header + record)
+        record = struct.pack("<HBBH12xBB11x", peer, status, 0xFF, distance_cm, 0, 0)
+        return self._notify(codes.RANGE_START, header + record)
 
     def diagnostics_packet(self, handle: int, sequence: int) -> bytes:
         """Return a diagnostics notification: of the frame that an initiator receives, or of those of a responder."""
@@ -246,7 +246,7 @@ class UciBoardModel:
                     fields.append(_field(_CIR_FIELD, self._cir(sequence)))
             reports.append(bytes([frame, 0 if frame in received else 1, 0, len(fields)]) + b"".join(fields))
         payload = struct.pack("<IIB", handle, sequence, len(reports)) + b"".join(reports)
-        return self._notify(messages.RANGE_DIAGNOSTICS, payload)
+        return self._notify(codes.RANGE_DIAGNOSTICS, payload)
 
     def _metrics(self, sequence: int) -> bytes:
         rx, first_path = round(256 * 80.5), round(256 * 84.0)
@@ -287,13 +287,13 @@ class UciBoardModel:
         return b"\0" + payload[:2] + answer
 
     def _state(self, handle: int, state: int) -> bytes:
-        return self._notify(messages.SESSION_STATUS, struct.pack("<IBB", handle, state, 0))
+        return self._notify(codes.SESSION_STATUS, struct.pack("<IBB", handle, state, 0))
 
     def _respond(self, name: tuple[int, int], payload: bytes) -> bytes:
-        return encode(*name, payload, MessageType.RESPONSE, _FRAGMENT_BYTES)
+        return encode_packets(*name, payload, PacketType.RESPONSE, _FRAGMENT_BYTES)
 
     def _notify(self, name: tuple[int, int], payload: bytes) -> bytes:
-        return encode(*name, payload, MessageType.NOTIFICATION, _FRAGMENT_BYTES)
+        return encode_packets(*name, payload, PacketType.NOTIFICATION, _FRAGMENT_BYTES)
 
 
 def _field(kind: int, data: bytes) -> bytes:

@@ -49,8 +49,9 @@ def field_report(
     """Test a pair of radios at a known distance and write a report.
 
     Place both radios in line of sight, 2 m to 10 m apart, and stop all drivers. The zip file contains the page
-    report.html, the ranges with their CIRs and, for UCI boards, the raw bytes. It contains no host name, user name or
-    path. Attach it to an issue of type "Field report".
+    report.html, the ranges with their CIRs, the release of the kernel and, for UCI boards, the raw bytes and the device
+    information of the board. It contains no host name, user name or path. Attach it to an issue of type "Field report".
+    The exit code is 1 if a check fails.
 
         uwb-mitigation field-report --source uci --port /dev/ttyACM0,/dev/ttyACM1 --distance 3.00
     """
@@ -66,9 +67,14 @@ def field_report(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with console.share_bar("ranging") as advance:
-            observe(source, ports, observation, folder / "capture.txt", _ask if unplug else None, advance)
+            unplug_request = _ask if unplug else None
+            observe(source, ports, observation, folder / "capture.txt", unplug_request, advance, console.warn)
         _correct(observation)
         observation.problem = anonymise(observation.problem, ports)
+        observation.warnings = [anonymise(text, ports) for text in observation.warnings]
+        observation.counters = {
+            name: anonymise(str(value), ports) for name, value in observation.counters.items()
+        }
         observation.identity = {name: anonymise(text, ports) for name, text in observation.identity.items()}
         checks = run_checks(observation)
         _write(folder, source, observation, checks)
@@ -80,6 +86,8 @@ def field_report(
         f"{output}: {len(checks)} checks, {failed} failed; read report.html in it, and attach the file to an issue"
     )
     console.write_json(json, {"checks": [asdict(check) for check in checks]})
+    if failed:
+        raise typer.Exit(1)
 
 
 def _ask(port: str) -> None:
@@ -123,6 +131,7 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
         "seconds": observation.seconds,
         "ranges": len(observation.ranges),
         "system": system,
+        "counters": observation.counters,
     }
     templates = Path(__file__).parent / "field" / "templates"
     shown = {name: counts[name] for name in ("pass", "warning", "fail")}

@@ -1,4 +1,4 @@
-"""An EVB1000 with factory firmware as a bridge from USB to the SPI of its DW1000.
+"""Source `evb1000`: EVB1000 boards with factory firmware as bridges from USB to the SPI of their DW1000.
 
 Decawave's own PC programs use the same protocol with EVK1000 and TREK1000 kits: each request is one chip-select
 period. A request with its answer takes 1 to 2 ms; there is no interrupt and no reset line.
@@ -11,15 +11,26 @@ import os
 import select
 import struct
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import serial
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.dw1000.port import ChipPort, read_chips
+from uwb_mitigation.radios.port import OnEvent, PortAddress
+from uwb_mitigation.radios.settings import DEFAULT_RADIO, RadioSettings, ValueReader
 
 ANSWER_TIMEOUT_S = 0.4
+REPEATED_TIMEOUT_S = 0.2
+"""Timeout of a repeated request: a board that is gone is detected within a second."""
+
 MAX_TRIES = 3
 """Number of tries: after stray octets from another program (ModemManager), the firmware ignores the first one."""
+
+QUIET_S = 0.02
+"""Time without input after which the rest of a damaged answer has been discarded."""
 
 MAX_READ_BYTES = 4093
 
@@ -27,6 +38,41 @@ _START, _END = 0x02, 0x03
 _WRITE, _FAST = 1, 2
 _HEADER = struct.Struct("<BBHH")
 _REMEDY = "DIP switch S1-3 off (TREK1000: S1-4 to S1-7 on), then power the board on again: the display shows USB to SPI"
+
+
+@dataclass(frozen=True, slots=True)
+class Evb1000Settings:
+    """Settings of an EVB1000: address of its port, and what its radio does."""
+
+    address: PortAddress
+    radio: RadioSettings = DEFAULT_RADIO
+
+
+def read_settings(value: ValueReader) -> list[Evb1000Settings]:
+    """Return the settings of each board from the parameters of the driver.
+
+    Raises:
+        ParameterError: a parameter is invalid.
+    """
+    return [Evb1000Settings(PortAddress.parse(port), radio) for port, radio in read_chips(value)]
+
+
+def open(
+    settings: Sequence[Evb1000Settings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
+) -> list[ChipPort]:
+    """Open boards; `RadioPort.close` ends them. See `ChipPort` for the events.
+
+    Raises:
+        ParameterError: the settings are invalid.
+        MissingDependencyError: there is no C compiler.
+    """
+    ports = [
+        ChipPort(str(board.address), partial(Evb1000Bus, board.address), board.radio, on_event, stamp_clock)
+        for board in settings
+    ]
+    for port in ports:
+        port.start()
+    return ports
 
 
 class Evb1000Bus:
@@ -37,6 +83,7 @@ class Evb1000Bus:
 
     Attributes:
         version: firmware version that the board reports.
+        repeated: number of requests that were repeated after a damaged or missing answer.
 
     Raises:
         LinkError: the port is absent or in use, or the board is in another mode; the message contains the remedy.
@@ -48,6 +95,7 @@ class Evb1000Bus:
     timeout_us = 60_000
 
     def __init__(self, address: PortAddress) -> None:
+        self.repeated = 0
         self._address = address
         self._fast = False
         self._port: serial.Serial | None = address.open()
@@ -68,11 +116,30 @@ class Evb1000Bus:
         if data > MAX_READ_BYTES:
             raise self._error(f"{data} octets in one transaction", f"{MAX_READ_BYTES}")
         request = _HEADER.pack(_START, flags, _HEADER.size + len(payload) + 1, data) + payload + bytes([_END])
-        self._send(request)
-        answer = self._receive(3 + (count if out is None else 0))
-        if answer[0] != _START or answer[-1] != _END or answer[1]:
-            raise self._error(f"the board answered {answer[:2].hex()}...{answer[-1:].hex()}", "0200...03")
-        return answer[2:-1]
+        size = 3 + (count if out is None else 0)
+        error: LinkError | None = None
+        for timeout_s in (ANSWER_TIMEOUT_S, *[REPEATED_TIMEOUT_S] * (MAX_TRIES - 1)):
+            if error is None:
+                self._read_some(0.0)
+            else:
+                self.repeated += 1
+                self._discard_input()
+            self._send(request)
+            answer = self._receive(size, timeout_s)
+            if len(answer) < size:
+                error = self._error(f"received {len(answer)} of {size} octets within {timeout_s} s")
+            elif len(answer) > size or answer[0] != _START or answer[1] or answer[-1] != _END:
+                # A stray octet moves the answer: its content cannot be trusted.
+                error = self._error(
+                    f"the board answered {answer[:2].hex()}...{answer[-1:].hex()}", "0200...03"
+                )
+            else:
+                if error is not None:
+                    # The answer to the first request may be late.
+                    self._discard_input()
+                return answer[2:-1]
+        assert error is not None
+        raise error
 
     def speed(self, fast: bool) -> None:
         self._fast = fast
@@ -118,7 +185,7 @@ class Evb1000Bus:
         """Discard the rest of earlier answers."""
         with contextlib.suppress(LinkError):
             until = time.monotonic() + ANSWER_TIMEOUT_S
-            while time.monotonic() < until and self._read_some(0.02):
+            while time.monotonic() < until and self._read_some(QUIET_S):
                 pass
 
     def _send(self, data: bytes) -> None:
@@ -133,15 +200,13 @@ class Evb1000Bus:
         except OSError as error:
             raise self._lost(error.strerror or str(error)) from error
 
-    def _receive(self, count: int) -> bytes:
+    def _receive(self, count: int, timeout_s: float) -> bytes:
+        """Return an answer of `count` octets; fewer after the timeout, more if there are stray octets."""
         answer = b""
-        until = time.monotonic() + ANSWER_TIMEOUT_S
-        while len(answer) < count:
-            piece = self._read_some(until - time.monotonic())
-            if not piece:
-                raise self._error(f"received {len(answer)} of {count} octets within {ANSWER_TIMEOUT_S} s")
+        until = time.monotonic() + timeout_s
+        while len(answer) < count and (piece := self._read_some(until - time.monotonic())):
             answer += piece
-        return answer[:count]
+        return answer
 
     def _read_some(self, within_s: float) -> bytes:
         """Read at least one octet; return no octets after a timeout."""

@@ -1,74 +1,184 @@
-"""A connection to hardware that a thread opens, serves, and reopens after a loss.
+"""Ports of radios: one thread for each opens the hardware, serves it, and reopens it after a loss.
 
-Used for boards on serial ports (`board_driver`) and radios of this computer (`radio.radio_driver`).
+Everything that a radio reports is passed to a callback: measurements, the events of its session, and `PortMessage`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
+import select
 import threading
+import time
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import serial
 from serial.tools import list_ports
 
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 MIN_RETRY_S = 0.1
 MAX_RETRY_S = 0.4
 """Hardware that was plugged in again is found within a second; the search takes little time."""
 
-QUEUE_CAPACITY = 1024
-"""Default size of the event queue; if it is full, the oldest events are dropped."""
+PROBLEM_DELAY_S = 0.5
+"""A problem that lasts longer is logged; a handshake is shorter."""
 
-_Event = TypeVar("_Event")
+PERIOD_S = 3.0
+"""The diagnostics depend on the exchanges of this period; a longer interval of a radio extends it to three intervals."""
+
+FAILURE_SHARE = 0.2
+"""Share of failed exchanges above which a cause is a warning, for the causes that are not expected out of range."""
+
+_READ_BYTES = 1 << 16
+
+OnEvent = Callable[[Any], None]
+"""Called with each event, from the thread of the port."""
 
 
-class PortThread(ABC, Generic[_Event]):
-    """Keeps hardware connected until `close`, and queues its events. Methods may be called from any thread.
+@dataclass(frozen=True, slots=True)
+class PortMessage:
+    """A text for the log; `level` is one of `logging`."""
+
+    level: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class PortReport:
+    """The state of a radio for the diagnostics.
+
+    Attributes:
+        device: device file or bus in use; empty = it is not open.
+        hardware: identity of the radio for users.
+        problem: reason why the radio does not work; empty while it works.
+        warning: reason why it has no ranges, or not all of them, without a problem; or empty.
+        activity: what it does if there is neither problem nor warning.
+        values: {name: value}.
+    """
+
+    device: str
+    hardware: str
+    problem: str
+    warning: str
+    activity: str
+    values: dict[str, object] = field(default_factory=dict)
+
+
+class ExchangeMonitor:
+    """Ranges and failed exchanges of the last seconds, from which the warning of a radio without ranges follows.
+
+    Args:
+        remedies: {cause: cause in words and what to do}.
+        unexpected: causes that are a warning also next to ranges, if more than `FAILURE_SHARE` of the exchanges fail.
+
+    Attributes:
+        period_s: duration that is considered.
+        remedies: see above.
+        totals: number of all failed exchanges, {cause: count}.
+    """
+
+    def __init__(self, remedies: Mapping[str, str], unexpected: Iterable[str] = ()) -> None:
+        self.period_s = PERIOD_S
+        self.remedies, self._unexpected = remedies, frozenset(unexpected)
+        self.totals: Counter[str] = Counter()
+        self._failures: deque[tuple[float, str, int]] = deque()
+        self._ranges: deque[float] = deque(maxlen=4096)
+        self._last_range_s: float | None = None
+
+    def add_range(self, now_s: float) -> None:
+        """Add a range."""
+        self._ranges.append(now_s)
+        self._last_range_s = now_s
+
+    def add_failures(self, cause: str, count: int, now_s: float) -> None:
+        """Add failed exchanges."""
+        if count > 0:
+            self.totals[cause] += count
+            self._failures.append((now_s, cause, count))
+            if len(self._failures) > 4096:
+                self._failures.popleft()
+
+    def reset(self) -> None:
+        """Forget all exchanges, for example after the radio was lost."""
+        self._failures.clear()
+        self._ranges.clear()
+        self._last_range_s = None
+
+    def warning(self, now_s: float) -> str:
+        """Return what is wrong with the exchanges of the period; empty if there are ranges."""
+        begin_s = now_s - self.period_s
+        while self._failures and self._failures[0][0] < begin_s:
+            self._failures.popleft()
+        while self._ranges and self._ranges[0] < begin_s:
+            self._ranges.popleft()
+        causes: Counter[str] = Counter()
+        for _, cause, count in self._failures:
+            causes[cause] += count
+        total = causes.total() + len(self._ranges)
+        if self._ranges:
+            text = "ranging"
+            causes = Counter({cause: causes[cause] for cause in self._unexpected})
+        elif self._last_range_s is None:
+            text = "no range yet"
+        else:
+            text = f"no range for {now_s - self._last_range_s:.1f} s"
+        cause, count = causes.most_common(1)[0] if causes else ("", 0)
+        if self._ranges and count <= FAILURE_SHARE * total:
+            return ""
+        if not cause:
+            return text
+        return f"{text}: {count} of {total} exchanges failed: {cause}: {self.remedies.get(cause, 'send a field report')}"
+
+
+class RadioPort(ABC):
+    """Keeps a radio connected until `close`. Methods may be called from any thread.
 
     Hardware errors neither end the thread nor raise an exception; `problem` describes them.
 
     Args:
-        name: of the thread.
-        problem: value of `problem` before the first attempt.
-        capacity: see `QUEUE_CAPACITY`.
+        name: of the radio, for users.
+        on_event: see `OnEvent`.
+        monitor: of the exchanges.
 
     Attributes:
         openings: how often the hardware was opened.
-        overflowed: number of events dropped because the queue was full.
+        device: device file or bus in use; empty = it is not open.
+        monitor: its exchanges.
     """
 
-    def __init__(self, name: str, problem: str, capacity: int = QUEUE_CAPACITY) -> None:
+    _range_types: tuple[type, ...] = (RangeMeasurement,)
+    """Types of the events that count as ranges."""
+
+    def __init__(self, name: str, on_event: OnEvent, monitor: ExchangeMonitor) -> None:
         self.openings = 0
-        self.overflowed = 0
-        self._problem = problem
+        self.device = ""
+        self._name = name
+        self._on_event = on_event
+        self.monitor = monitor
+        self._lost = f"{name} is not there"
         self._was_connected = False
-        self._capacity = capacity
-        self._events: deque[_Event] = deque()
-        # Guards the state of the connection; the condition signals new events.
         self._lock = threading.RLock()
-        self._changed = threading.Condition(self._lock)
+        """Guards the state of the radio; it is not held while `on_event` runs."""
         self._stop = threading.Event()
+        self._logged_problem, self._problem_since_s = "", 0.0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def get(self, timeout_s: float) -> _Event | None:
-        """Return the next event; None after the timeout or if the connection is closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._events or self.closed, timeout_s)
-            return self._events.popleft() if self._events and not self.closed else None
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
 
     @property
     def problem(self) -> str:
-        """Reason why the hardware does not work; empty if it works."""
-        with self._lock:
-            return self._problem
+        """Reason why the radio does not work; empty if it works."""
+        return self._lost
 
     @property
     def closed(self) -> bool:
@@ -78,28 +188,46 @@ class PortThread(ABC, Generic[_Event]):
     def close(self) -> None:
         """Stop the thread and close the hardware; may be called twice."""
         self._stop.set()
-        with self._changed:
-            self._changed.notify_all()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    @abstractmethod
+    def report(self) -> PortReport:
+        """Return the present state."""
+
+    @abstractmethod
+    def apply(self, settings: Any) -> None:
+        """Use other settings of the same source; those of the port itself stay."""
 
     @abstractmethod
     def _connect(self) -> None:
-        """Open the hardware and serve it until the connection is closed.
+        """Open the hardware and serve it until the port is closed.
 
         Raises:
             UwbMitigationError: it cannot be opened, or was lost.
         """
 
-    def _on_loss(self, text: str) -> None:
-        """Handle a loss or a failed attempt; called with the lock held."""
+    def _emit(self, events: Iterable[object]) -> None:
+        for event in events:
+            if isinstance(event, self._range_types):
+                with self._lock:
+                    self.monitor.add_range(time.monotonic())
+            self._on_event(event)
 
-    def _put(self, events: Iterable[_Event]) -> None:
-        with self._changed:
-            self._events.extend(events)
-            while len(self._events) > self._capacity:
-                self._events.popleft()
-                self.overflowed += 1
-            self._changed.notify_all()
+    def _log(self, level: int, text: str) -> None:
+        self._on_event(PortMessage(level, text))
+
+    def _log_problem(self) -> None:
+        """Log a problem once if it lasts; call it at least every `PROBLEM_DELAY_S`."""
+        problem, now_s = self.problem, time.monotonic()
+        if not problem:
+            self._logged_problem, self._problem_since_s = "", 0.0
+            return
+        self._problem_since_s = self._problem_since_s or now_s
+        lasts = now_s - self._problem_since_s >= PROBLEM_DELAY_S
+        if lasts and problem != self._logged_problem and not self.closed:
+            self._log(logging.WARNING, f"{problem}; waiting for the radio")
+            self._logged_problem = problem
 
     def _run(self) -> None:
         retry_s = MIN_RETRY_S
@@ -109,12 +237,111 @@ class PortThread(ABC, Generic[_Event]):
                 self._connect()
             except UwbMitigationError as error:
                 with self._lock:
-                    self._on_loss(str(error))
-                    self._problem = str(error)
+                    self._lost = str(error)
+                    self.monitor.reset()
+            with self._lock:
+                self.device = ""
             if self._was_connected:
                 retry_s = MIN_RETRY_S
+            self._log_problem()
             self._stop.wait(retry_s)
             retry_s = min(2 * retry_s, MAX_RETRY_S)
+
+
+class StreamPort(RadioPort):
+    """A serial port whose bytes a session encodes and decodes.
+
+    Args:
+        address: address of the port.
+        name, on_event, monitor: see `RadioPort`.
+        stamp_clock: the clock of the stamps, ns.
+        baud, dtr: see `PortAddress.open`.
+        tick_s: maximum time between two calls of the session.
+    """
+
+    def __init__(
+        self,
+        address: PortAddress,
+        on_event: OnEvent,
+        monitor: ExchangeMonitor,
+        *,
+        stamp_clock: Callable[[], int],
+        baud: int,
+        dtr: bool = True,
+        tick_s: float = 0.05,
+    ) -> None:
+        super().__init__(str(address), on_event, monitor)
+        self._address, self._baud, self._dtr = address, baud, dtr
+        self._stamp_clock = stamp_clock
+        self._tick_s = tick_s
+
+    @abstractmethod
+    def _opened(self, now_ns: int) -> list[Any]:
+        """Start the session; called with the lock held, like the three functions below. Return events."""
+
+    @abstractmethod
+    def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
+        """Pass bytes and the time to the session; return events.
+
+        Raises:
+            LinkError: the port must be opened again.
+        """
+
+    @abstractmethod
+    def _outgoing(self) -> bytes:
+        """Return the bytes to send."""
+
+    @abstractmethod
+    def _closed(self, now_ns: int) -> list[Any]:
+        """End the session after the port was lost; return events."""
+
+    def _is_stopped(self, now_ns: int) -> bool:
+        """Return whether the port may be closed; called after `close`, until it returns true."""
+        return True
+
+    def _on_sent(self, data: bytes) -> None:
+        """Handle bytes that were sent."""
+
+    def _connect(self) -> None:
+        port = self._address.open(self._baud, self._dtr)
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+            # Without this flag USB bridges delay bytes by 16 ms. Other ports do not support it.
+            port.set_low_latency_mode(True)
+        with self._lock:
+            self.device, self._lost = port.port, ""
+            self.openings += 1
+            events = self._opened(time.monotonic_ns())
+        try:
+            self._emit(events)
+            self._serve(port.fileno())
+        except OSError as error:
+            raise LinkError(f"was lost: {error.strerror}", where=str(self._address)) from error
+        finally:
+            with self._lock:
+                events = self._closed(time.monotonic_ns())
+            self._emit(events)
+            port.close()
+
+    def _serve(self, fd: int) -> None:
+        outgoing = bytearray()
+        while not (self.closed and self._is_stopped(time.monotonic_ns())):
+            readable, _, _ = select.select([fd], [], [], self._tick_s)
+            data = os.read(fd, _READ_BYTES) if readable else b""
+            if readable and not data:
+                raise LinkError("was unplugged", where=str(self._address))
+            now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
+            with self._lock:
+                events = self._received(data, now_ns, stamp_ns)
+                # While the port accepts no bytes, requests wait in the bounded queue of the session.
+                if not outgoing:
+                    outgoing += self._outgoing()
+            if outgoing:
+                with contextlib.suppress(BlockingIOError):
+                    written = os.write(fd, outgoing)
+                    self._on_sent(bytes(outgoing[:written]))
+                    del outgoing[:written]
+            self._emit(events)
+            self._log_problem()
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +427,7 @@ def processes_using(path: str) -> list[str]:
 
     Without root, only the programs of this user are visible.
     """
-    device, found = os.path.realpath(path), []
+    device, programs = os.path.realpath(path), []
     for process in os.listdir("/proc"):
         if not process.isdigit() or int(process) == os.getpid():
             continue
@@ -208,8 +435,8 @@ def processes_using(path: str) -> list[str]:
             folder = f"/proc/{process}/fd"
             if any(os.readlink(f"{folder}/{fd}") == device for fd in os.listdir(folder)):
                 with open(f"/proc/{process}/comm", encoding="utf-8") as name:
-                    found.append(f"{name.read().strip()} (process {process})")
-    return found
+                    programs.append(f"{name.read().strip()} (process {process})")
+    return programs
 
 
 def _open_error(path: str, error: Exception) -> str:

@@ -1,171 +1,309 @@
-"""The serial port of a board, kept open by a thread. `session` decodes the bytes."""
+"""Source `serial`: boards with our firmware, or with another one that uses the wire protocol."""
 
 from __future__ import annotations
 
-import contextlib
+import logging
 import math
-import os
-import select
+import re
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
-import serial
-
-from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.port import QUEUE_CAPACITY, PortAddress, PortThread, processes_using
-from uwb_mitigation.radios.settings import RadioSettings
-from uwb_mitigation.radios.wire.events import Event, LinkState
-from uwb_mitigation.radios.wire.layout import Mode
-from uwb_mitigation.radios.wire.messages import Hello
+from uwb_mitigation.errors import LinkError, ParameterError, format_id
+from uwb_mitigation.radios.port import (
+    PERIOD_S,
+    ExchangeMonitor,
+    OnEvent,
+    PortAddress,
+    PortMessage,
+    PortReport,
+    StreamPort,
+    processes_using,
+)
+from uwb_mitigation.radios.settings import (
+    DEFAULT_RADIO,
+    EXCHANGE_REMEDIES,
+    STATE_PROBLEMS,
+    RadioSettings,
+    RadioStatus,
+    Role,
+    ValueReader,
+    count_failures,
+    radio_values,
+    read_radio,
+    settings_text,
+    status_warning,
+)
+from uwb_mitigation.radios.wire.events import (
+    Connected,
+    Disconnected,
+    Event,
+    LinkState,
+    ModeChanged,
+    ModeRefused,
+    OffsetsRefused,
+    RadioRefused,
+    VersionMismatch,
+)
+from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, LogLevel, Mode
+from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Log, RadioConfigured
 from uwb_mitigation.radios.wire.session import BoardSession
-from uwb_mitigation.types.offsets import Offsets
-from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
 
-REOPEN_TIMEOUT_NS = 10 * NS_PER_S
-"""Timeout after which the port is reopened. After a suspend, an open port may never receive data again."""
+REOPEN_TIMEOUT_NS = 10 * 10**9
+"""Timeout after which the port is opened again. After a suspend, an open port may never receive data again."""
 
-_TICK_S = 0.05
-_READ_BYTES = 1 << 16
+_OFFSETS_PROBLEM, _RADIO_PROBLEM = "the offsets are not set", "the radio's settings are not used"
 
 
 @dataclass(frozen=True, slots=True)
-class BoardReport:
-    """The state of a port and its board, for diagnostics.
+class SerialSettings:
+    """Settings of a board on a serial port.
 
     Attributes:
-        port: the device file in use; empty = no port is open.
-        problem: reason why the board is not connected; empty while it is.
-        hello: HELLO of the connected board.
-        clock_offset_s: host's clock minus the board's uptime.
-        clock_drift_ppm: drift of the host's clock relative to the board's.
-        clock_uncertainty_us: standard deviation of the offset; NaN before the first round trip.
-        counts: {name: count} of frames and events that were lost, and why.
+        address: address of the port.
+        baud: baud rate of a serial line; native USB ignores it.
+        dtr: the level of DTR. Boards with native USB send only while it is set; on boards with a USB bridge, its change
+            resets the board.
+        mode: what the board sends; None = do not change it.
+        model_id: expected model of the board, whose corrections are delivered; None = any.
+        radio: settings of the board's radio; None = the board keeps its own.
+        offsets: offsets that the board subtracts in mode DEVICE.
     """
 
-    port: str
-    problem: str
-    hello: Hello | None
-    clock_offset_s: float
-    clock_drift_ppm: float
-    clock_uncertainty_us: float
-    counts: dict[str, int]
+    address: PortAddress
+    baud: int = 921_600
+    dtr: bool = True
+    mode: Mode | None = None
+    model_id: int | None = None
+    radio: RadioSettings | None = None
+    offsets: Offsets = NO_OFFSETS
 
 
-class BoardDriver(PortThread[Event]):
-    """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise.
+def read_settings(value: ValueReader) -> list[SerialSettings]:
+    """Return the settings of the board from the parameters of the driver.
+
+    Raises:
+        ParameterError: a parameter is invalid.
+    """
+    digits = value("board_model")
+    if digits and not re.fullmatch("[0-9a-fA-F]{8}", digits):
+        raise ParameterError(
+            f"parameter board_model = {digits!r}", valid="eight hexadecimal digits, or empty"
+        )
+    radio = read_radio(value)
+    settings = SerialSettings(
+        PortAddress.parse(value("port")),
+        value("baud"),
+        value("dtr"),
+        Mode[value("mode").upper()],
+        int(digits, 16) if digits else None,
+        radio if radio != DEFAULT_RADIO else None,
+        read_offsets(str(value("offsets"))),
+    )
+    return [settings]
+
+
+def open(
+    settings: Sequence[SerialSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
+) -> list[BoardPort]:
+    """Open boards; `RadioPort.close` ends them.
 
     Args:
-        address: where the board is.
-        baud: baud rate of a serial line; native USB ignores it.
-        dtr: the level of DTR. Boards with native USB send only while it is set; on boards with a
-            USB bridge, its change resets the board.
-        mode, expected_model_id: see `BoardSession`.
-        stamp_clock: the clock that stamps are on, ns; a node passes its own.
-        capacity: see `PortThread`.
+        settings: of each board.
+        on_event: called with measurements, corrections, events of the session and `PortMessage`.
+        stamp_clock: the clock of the stamps, ns.
+    """
+    ports = [BoardPort(each_settings, on_event, stamp_clock) for each_settings in settings]
+    for port in ports:
+        port.start()
+    return ports
+
+
+class BoardPort(StreamPort):
+    """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise; see `open`.
+
+    Attributes:
+        session: the state of the board.
     """
 
-    def __init__(
-        self,
-        address: PortAddress,
-        *,
-        baud: int = 921_600,
-        dtr: bool = True,
-        mode: Mode | None = None,
-        expected_model_id: int | None = None,
-        stamp_clock: Callable[[], int] = time.time_ns,
-        capacity: int = QUEUE_CAPACITY,
-    ) -> None:
-        super().__init__(f"board at {address}", f"{address} is not there", capacity)
-        self._address = address
-        self._baud = baud
-        self._dtr = dtr
-        self._stamp_clock = stamp_clock
-        self._session = BoardSession(mode=mode, expected_model_id=expected_model_id)
-        self._port = self._others = ""
-        self._thread.start()
+    _range_types = (RangeMeasurement, Correction)
 
-    def set_mode(self, mode: Mode) -> None:
-        """See `BoardSession.set_mode`."""
-        with self._lock:
-            self._session.set_mode(mode)
+    def __init__(self, settings: SerialSettings, on_event: OnEvent, stamp_clock: Callable[[], int]) -> None:
+        monitor = ExchangeMonitor(EXCHANGE_REMEDIES)
+        super().__init__(
+            settings.address,
+            on_event,
+            monitor,
+            stamp_clock=stamp_clock,
+            baud=settings.baud,
+            dtr=settings.dtr,
+        )
+        self.session = BoardSession(mode=settings.mode, expected_model_id=settings.model_id)
+        self._settings = settings
+        self._connections = 0
+        self._other_users = ""
+        self._refused: dict[str, str] = {}
+        self._status: BoardStatus | None = None
+        self._radio: RadioSettings | None = None
+        self._radio_status: RadioStatus | None = None
+        self._delivered = {"corrections published": 0}
+        if settings.radio is not None:
+            self.session.set_radio(settings.radio)
+        if settings.mode is Mode.DEVICE:
+            self.session.set_offsets(settings.offsets)
 
-    def set_radio(self, settings: RadioSettings) -> None:
-        """See `BoardSession.set_radio`."""
+    def apply(self, settings: SerialSettings) -> None:
+        """Send the settings that differ to the board."""
         with self._lock:
-            self._session.set_radio(settings)
-
-    def set_offsets(self, offsets: Offsets) -> None:
-        """See `BoardSession.set_offsets`."""
-        with self._lock:
-            self._session.set_offsets(offsets)
-
-    def report(self) -> BoardReport:
-        """Return the present state."""
-        with self._lock:
-            session, clock = self._session, self._session.clock
-            return BoardReport(
-                port=self._port,
-                problem=self.problem,
-                hello=session.hello,
-                clock_offset_s=clock.offset_ns / 1e9,
-                clock_drift_ppm=clock.drift * 1e6,
-                clock_uncertainty_us=clock.uncertainty_ns / 1e3 if clock.synchronised else math.nan,
-                counts=session.totals() | {"overflowed": self.overflowed, "openings": self.openings},
-            )
+            before, self._settings = self._settings, settings
+            if settings.radio != before.radio:
+                self._refused.pop(_RADIO_PROBLEM, None)
+                self.session.set_radio(settings.radio or DEFAULT_RADIO)
+            if settings.mode is Mode.DEVICE and (settings.mode, settings.offsets) != (
+                before.mode,
+                before.offsets,
+            ):
+                self._refused.pop(_OFFSETS_PROBLEM, None)
+                self.session.set_offsets(settings.offsets)
+            if settings.mode is not None and settings.mode != before.mode:
+                self.session.set_mode(settings.mode)
 
     @property
     def problem(self) -> str:
-        """Reason why the board is not connected; empty while it is."""
+        """Reason why the board is not connected or does not do what was requested; empty if it does."""
         with self._lock:
-            session = self._session
-            if self._problem:
-                return self._problem
+            session = self.session
+            if self._lost:
+                return self._lost
             if session.state is LinkState.WRONG_VERSION:
                 return f"{session.state.value}: {session.foreign_version}"
             if session.state is not LinkState.READY:
-                others = f"; the port is also open in {self._others}" if self._others else ""
-                return f"{session.state.value}{others}"
+                users = f"; the port is also open in {self._other_users}" if self._other_users else ""
+                return f"{session.state.value}{users}"
             return "" if session.model_matches else "the board has another model than the expected one"
 
-    def _connect(self) -> None:
-        port = self._address.open(self._baud, self._dtr)
-        with contextlib.suppress(OSError, ValueError, NotImplementedError):
-            # Without this flag USB bridges delay bytes by 16 ms. Other ports do not support it.
-            port.set_low_latency_mode(True)
-        others = ", ".join(processes_using(port.port))
-        connections = self._session.counts.connections
+    def report(self) -> PortReport:
+        """Return the present state."""
         with self._lock:
-            self._port, self._problem, self._others = port.port, "", others
-            self.openings += 1
-            self._put(self._session.opened(time.monotonic_ns()))
-        try:
-            self._serve(port)
-        except OSError as error:
-            raise LinkError(f"was lost: {error.strerror}", where=str(self._address)) from error
-        finally:
-            with self._lock:
-                self._port = ""
-                self._put(self._session.closed(time.monotonic_ns()))
-            port.close()
-            self._was_connected = self._session.counts.connections > connections
+            hello, clock, radio, status = (
+                self.session.hello,
+                self.session.clock,
+                self._radio,
+                self._radio_status,
+            )
+            uncertainty_us = clock.uncertainty_ns / 1e3 if clock.synchronised else math.nan
+            values: dict[str, object] = dict(self._delivered)
+            hardware = "no board"
+            if hello is not None:
+                hardware = f"board {format_id(hello.board_id)}"
+                values |= {
+                    "firmware": f"{hello.firmware_name} {hello.firmware_version}",
+                    "model id": f"{hello.model_id:08x} ({hello.model_id})",
+                    "mode": hello.mode.name.lower(),
+                }
+            values |= {
+                "clock offset s": f"{clock.offset_ns / 1e9:.6f}",
+                "clock drift ppm": f"{clock.drift * 1e6:.2f}",
+                "clock uncertainty us": f"{uncertainty_us:.1f}",
+            }
+            values |= self.session.totals() | {"openings": self.openings}
+            if self._status is not None:
+                values |= {f"board: {name}": count for name, count in asdict(self._status).items()}
+            problems = [self.problem, *(f"{name}: {text}" for name, text in self._refused.items())]
+            warning = ""
+            if radio is not None:
+                hardware += f", radio {format_id(radio.address)}"
+            if status is not None:
+                values |= radio_values(radio, status, "radio: ")
+                problems.append(STATE_PROBLEMS.get(status.state, ""))
+                warning = status_warning(status)
+            if radio is None or radio.role is Role.TAG or radio.report:
+                interval_s = radio.interval_us / 1e6 if radio is not None else 0.0
+                self.monitor.period_s = max(PERIOD_S, 3 * interval_s)
+                exchanges = self.monitor.warning(time.monotonic())
+                warning = warning or (f"connected; {exchanges}" if exchanges else "")
+            return PortReport(
+                self.device, hardware, next(filter(None, problems), ""), warning, "connected", values
+            )
 
-    def _serve(self, port: serial.Serial) -> None:
-        fd = port.fileno()
-        outgoing = bytearray()
-        while not self.closed:
-            readable, _, _ = select.select([fd], [], [], _TICK_S)
-            data = os.read(fd, _READ_BYTES) if readable else b""
-            if readable and not data:
-                raise LinkError("was unplugged", where=str(self._address))
-            now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
-            with self._lock:
-                self._put(self._session.receive(data, now_ns, stamp_ns))
-                if self._session.idle_ns(now_ns) > REOPEN_TIMEOUT_NS:
-                    raise LinkError("sends no data", where=str(self._address))
-                # While the port accepts no bytes, requests wait in the bounded queue of the session.
-                if not outgoing:
-                    outgoing += self._session.outgoing()
-            if outgoing:
-                with contextlib.suppress(BlockingIOError):
-                    del outgoing[: os.write(fd, outgoing)]
+    def _opened(self, now_ns: int) -> list[Any]:
+        self._other_users = ", ".join(processes_using(self.device))
+        self._connections = self.session.counts.connections
+        return self._observed(self.session.opened(now_ns))
+
+    def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
+        events = self._observed(self.session.receive(data, now_ns, stamp_ns))
+        if self.session.idle_ns(now_ns) > REOPEN_TIMEOUT_NS:
+            raise LinkError("sends no data", where=str(self._address))
+        return events
+
+    def _outgoing(self) -> bytes:
+        return self.session.outgoing()
+
+    def _closed(self, now_ns: int) -> list[Any]:
+        self._was_connected = self.session.counts.connections > self._connections
+        return self._observed(self.session.closed(now_ns))
+
+    def _observed(self, events: list[Event]) -> list[Any]:
+        """Update the state for the diagnostics; return the events and the messages for the log."""
+        observed: list[Any] = []
+        for event in events:
+            observed.append(event)
+            if (message := self._message(event)) is not None:
+                observed.append(message)
+        return observed
+
+    def _message(self, event: Event) -> PortMessage | None:
+        level, text = logging.INFO, ""
+        match event:
+            case Correction():
+                self._delivered["corrections published"] += 1
+            case BoardStatus():
+                self._status = event
+            case RadioStatus():
+                count_failures(self.monitor, self._radio_status, event, time.monotonic())
+                self._radio_status = event
+            case RadioConfigured(settings=settings):
+                # A board may repeat its settings.
+                if settings != self._radio:
+                    text = f"the board's radio {format_id(settings.address)}: {settings_text(settings)}"
+                self._radio = settings
+            case RadioRefused(text=reason):
+                self._refused[_RADIO_PROBLEM] = reason
+                level, text = logging.ERROR, f"{_RADIO_PROBLEM}: {reason}"
+            case Connected(hello=hello):
+                self._refused.clear()
+                self._radio = self._radio_status = None
+                board, model = format_id(hello.board_id), f"{hello.model_id:08x} ({hello.model_id})"
+                text = f"connected to board {board}, model {model}, mode {hello.mode.name}"
+            case Disconnected(loss=loss):
+                self.monitor.reset()
+                if not self.closed:
+                    level, text = (
+                        logging.WARNING,
+                        f"disconnected from the board: {loss.value}; waiting for it",
+                    )
+            case VersionMismatch(version=version):
+                level = logging.ERROR
+                text = (
+                    f"the board uses version {version} of the protocol, this driver version {PROTOCOL_VERSION}: "
+                    "update the older one"
+                )
+            case ModeChanged(mode=mode):
+                text = f"the board is in mode {mode.name}"
+            case ModeRefused(mode=mode, requested=requested):
+                level = logging.WARNING
+                text = (
+                    f"the board stays in mode {mode.name} instead of {requested.name}: does it have a model?"
+                )
+            case OffsetsRefused(text=reason):
+                self._refused[_OFFSETS_PROBLEM] = reason
+                level = logging.ERROR
+                text = f"the board's corrections are not published: {_OFFSETS_PROBLEM}: {reason}"
+            case Log(level=severity, text=board_text):
+                level = logging.WARNING if severity >= LogLevel.WARNING else logging.INFO
+                text = f"board: {board_text}"
+        return PortMessage(level, text) if text else None

@@ -1,12 +1,24 @@
-"""The settings and the status of a radio. No I/O."""
+"""The settings and the status of a radio, and their texts for users. No I/O."""
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, format_id, parse_id
+
+if TYPE_CHECKING:
+    from uwb_mitigation.radios.port import ExchangeMonitor
+
+ValueReader = Callable[[str], Any]
+"""Returns the value of a parameter of the driver."""
+
+PREFIX = "radio."
+"""Prefix of the parameters of radios."""
 
 
 class Role(enum.IntEnum):
@@ -119,6 +131,9 @@ class RadioSettings:
             _within("anchors", anchor, 1, 2**64 - 2)
 
 
+DEFAULT_RADIO = RadioSettings()
+
+
 @dataclass(frozen=True, slots=True)
 class AnchorStatus:
     """Exchanges of a tag with one anchor; the fields of `layout.RADIO_ANCHOR`, in the same order."""
@@ -148,6 +163,140 @@ class RadioStatus:
     voltage: float = math.nan
     state: RadioState = RadioState.RUNNING
     anchors: tuple[AnchorStatus, ...] = ()
+
+
+STATE_PROBLEMS = {
+    RadioState.ABSENT: "no DW1000 answers: check wiring and supply",
+    RadioState.BUS: "the SPI of the DW1000 fails",
+    RadioState.NO_CLOCK: "the clock PLL of the DW1000 does not lock: check its supply",
+}
+
+EXCHANGE_REMEDIES = {
+    "no answer": "no anchor answers: check their power, channel, data rate and PAN id",
+    "late": "this computer is too slow for radio.reply_us: stop other programs",
+    "timeout": "the frames of the anchors do not arrive in time: all radios need the same firmware and settings",
+    "damaged": "damaged frames: other radios transmit on this channel, or the signal is weak",
+    "implausible": "the antennas are too close, or the antenna delays are wrong",
+    "broken": "the radio was reset or its bus failed: check supply and wiring",
+}
+"""{cause of a failed exchange: what to do}; the causes are the names of counts of `RadioStatus`."""
+
+
+def read_ports(value: ValueReader) -> list[str]:
+    """Return the ports of the parameter `port`.
+
+    Raises:
+        ParameterError: it is empty.
+    """
+    ports = [text.strip() for text in value("port").split(",") if text.strip()]
+    if not ports:
+        valid = "/dev/ttyACM0 or usb:VENDOR:PRODUCT[:SERIAL], or several with commas"
+        if value("source") == "spi":
+            valid = "/dev/spidevBUS.SELECT, or several with commas"
+        raise ParameterError("parameter port is empty", valid=valid)
+    return ports
+
+
+def read_addresses(value: ValueReader, name: str, highest: int = 2**64 - 2) -> tuple[int, ...]:
+    """Return the addresses of the parameter `radio.NAME`: a number, a text with commas, or an array.
+
+    Raises:
+        ParameterError: one of them is not an address.
+    """
+    content = value(PREFIX + name)
+    texts = content.split(",") if isinstance(content, str) else content
+    texts = texts if isinstance(texts, Iterable) else [texts]
+    addresses = []
+    for text in filter(None, (str(item).strip() for item in texts)):
+        address = 0
+        with contextlib.suppress(ValueError):
+            address = parse_id(text)
+        if not 0 < address <= highest:
+            valid = (
+                "1 to 65534"
+                if highest == 0xFFFE
+                else "a number below 65536, or 0x and up to 16 hexadecimal digits"
+            )
+            raise ParameterError(
+                f"parameter {PREFIX}{name} = {text!r:.40}", valid=f"{valid}; several with commas"
+            )
+        addresses.append(address)
+    return tuple(addresses)
+
+
+def read_radio(value: ValueReader) -> RadioSettings:
+    """Return the settings of a DW1000 from the parameters `radio.*`.
+
+    Raises:
+        ParameterError: a setting is invalid; names the parameter.
+    """
+    names = {"prf_mhz": "prf", "rate_kbps": "data_rate"}
+    computed = ("role", "address", "anchors", "channel", "interval_us", "reply_us", "timeout_us")
+    settings = {
+        row.name: value(PREFIX + names.get(row.name, row.name))
+        for row in fields(RadioSettings)
+        if row.name not in computed
+    }
+    rate_hz = value(PREFIX + "rate")
+    radio = RadioSettings(
+        role=Role[value(PREFIX + "role").upper()],
+        address=(*read_addresses(value, "address"), 0)[0],
+        anchors=read_addresses(value, "anchors"),
+        channel=value(PREFIX + "channel") or DEFAULT_RADIO.channel,
+        interval_us=round(1e6 / rate_hz) if rate_hz else 0,
+        **settings,
+    )
+    try:
+        radio.check()
+    except ParameterError as error:
+        raise ParameterError(f"parameters {PREFIX}*: {error.what}", valid=error.valid) from error
+    return radio
+
+
+def settings_text(settings: RadioSettings) -> str:
+    """Return the settings as text for the log."""
+    return (
+        f"{settings.role.name.lower()}, channel {settings.channel}, {settings.rate_kbps} kbit/s, preamble "
+        f"{settings.preamble}, PAN 0x{settings.pan:04x}"
+    )
+
+
+def status_warning(status: RadioStatus) -> str:
+    """Return the warning of a radio whose state is not certain; empty if it is."""
+    if status.state is RadioState.LOCK_UNCONFIRMED:
+        return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
+    return ""
+
+
+def count_failures(
+    monitor: ExchangeMonitor, before: RadioStatus | None, status: RadioStatus, now_s: float
+) -> None:
+    """Add the exchanges that failed between two statuses of a radio to its monitor."""
+    for cause in EXCHANGE_REMEDIES:
+        name = cause.replace(" ", "_")
+        earlier = getattr(before, name) if before is not None else getattr(status, name)
+        monitor.add_failures(cause, getattr(status, name) - earlier, now_s)
+
+
+def radio_values(settings: RadioSettings | None, status: RadioStatus, prefix: str = "") -> dict[str, object]:
+    """Return the values of a radio and of its anchors for the diagnostics."""
+    values: dict[str, object] = {}
+    if settings is not None:
+        values = {
+            "address": format_id(settings.address),
+            "role": settings.role.name.lower(),
+            "antenna delay": settings.antenna_delay,
+        }
+    counts = (row.name for row in fields(RadioStatus) if row.type == "int")
+    values |= {name.replace("_", " "): getattr(status, name) for name in counts}
+    values |= {"temperature C": f"{status.temperature_c:.1f}", "voltage V": f"{status.voltage:.2f}"}
+    values = {f"{prefix}{name}": value for name, value in values.items()}
+    for anchor in status.anchors:
+        last_seen = "never" if anchor.age_ms == AGE_UNKNOWN_MS else f"{anchor.age_ms / 1000:.1f} s ago"
+        values[f"anchor {format_id(anchor.address)}"] = (
+            f"{anchor.ranged} of {anchor.tried} ranged, {anchor.rx_power_dbm:.1f} dBm, last seen {last_seen}"
+        )
+    return values
 
 
 def preamble_codes(channel: int, prf_mhz: int) -> range:

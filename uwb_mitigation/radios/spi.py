@@ -1,4 +1,4 @@
-"""A DW1000 on the SPI of a Linux computer, through spidev, with an optional reset line on a GPIO."""
+"""Source `spi`: a DW1000 on the SPI of a Linux computer, through spidev, with an optional reset line on a GPIO."""
 
 from __future__ import annotations
 
@@ -9,9 +9,15 @@ import os
 import re
 import struct
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, not_installed
+from uwb_mitigation.radios.dw1000.port import ChipPort, read_chips
+from uwb_mitigation.radios.port import OnEvent
+from uwb_mitigation.radios.settings import DEFAULT_RADIO, PREFIX, RadioSettings, ValueReader
 
 SLOW_HZ, FAST_HZ = 2_000_000, 16_000_000
 RESET_PULSE_S = 0.001
@@ -21,6 +27,42 @@ _LINES = 64
 _REQUEST = struct.Struct(f"{_LINES}I I {_LINES}s 32s I i")
 _GET_LINE = 3 << 30 | _REQUEST.size << 16 | 0xB4 << 8 | 0x03
 _INPUT, _OUTPUT, _OPEN_DRAIN = 1 << 0, 1 << 1, 1 << 3
+
+
+@dataclass(frozen=True, slots=True)
+class SpiSettings:
+    """Settings of a chip at `/dev/spidevBUS.SELECT`: device file, reset line (see `SpidevBus`), and what it does."""
+
+    device: str
+    reset: str = ""
+    radio: RadioSettings = DEFAULT_RADIO
+
+
+def read_settings(value: ValueReader) -> list[SpiSettings]:
+    """Return the settings of each chip from the parameters of the driver.
+
+    Raises:
+        ParameterError: a parameter is invalid.
+    """
+    return [SpiSettings(port, value(PREFIX + "reset"), radio) for port, radio in read_chips(value)]
+
+
+def open(
+    settings: Sequence[SpiSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
+) -> list[ChipPort]:
+    """Open chips; `RadioPort.close` ends them. See `ChipPort` for the events.
+
+    Raises:
+        ParameterError: the settings are invalid.
+        MissingDependencyError: there is no C compiler.
+    """
+    ports = [
+        ChipPort(chip.device, partial(SpidevBus, chip.device, chip.reset), chip.radio, on_event, stamp_clock)
+        for chip in settings
+    ]
+    for port in ports:
+        port.start()
+    return ports
 
 
 class SpidevBus:
@@ -53,7 +95,7 @@ class SpidevBus:
             raise not_installed("spidev") from None
         self.name = device
         self._line = (f"/dev/{line[1]}", int(line[2])) if line is not None else None
-        self._held: int | None = None
+        self._line_fd: int | None = None
         self._spi: Any = spidev.SpiDev()
         try:
             self._spi.open(int(match[1]), int(match[2]))
@@ -103,12 +145,12 @@ class SpidevBus:
     def _float(self) -> None:
         # The chip pulls the line up itself: the host must not drive it high.
         if self._line is not None:
-            self._held = self._request(_INPUT)
+            self._line_fd = self._request(_INPUT)
 
     def _release(self) -> None:
-        if self._held is not None:
-            os.close(self._held)
-            self._held = None
+        if self._line_fd is not None:
+            os.close(self._line_fd)
+            self._line_fd = None
 
     def _request(self, flags: int) -> int:
         assert self._line is not None

@@ -1,190 +1,278 @@
-"""A UCI board on a serial port, operated by a thread."""
+"""Source `uci`: boards with Qorvo's UCI firmware on serial ports."""
 
 from __future__ import annotations
 
-import contextlib
+import logging
 import math
-import os
-import select
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
-import serial
-
-from uwb_mitigation.errors import LinkError
+from uwb_mitigation.errors import LinkError, ParameterError, format_id
 from uwb_mitigation.radios.fira.capture import CaptureWriter
+from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES, parameter_name
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
-from uwb_mitigation.radios.port import PortAddress, PortThread
-from uwb_mitigation.radios.settings import Role
-from uwb_mitigation.types.measurement import RangeMeasurement
-from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.radios.port import (
+    PERIOD_S,
+    ExchangeMonitor,
+    OnEvent,
+    PortAddress,
+    PortMessage,
+    PortReport,
+    StreamPort,
+)
+from uwb_mitigation.radios.settings import PREFIX, Role, ValueReader, read_addresses, read_ports
+from uwb_mitigation.types.measurement import Segment
 
 BAUD = 115_200
-REOPEN_NS = 10 * NS_PER_S
-"""Time without ranging after which the port is opened again."""
+DEFAULT_CHANNEL = 9
+"""The channel of the configuration that is known from a real board."""
 
-_TICK_S = 0.02
-_READ_BYTES = 1 << 16
+REOPEN_NS = 10 * 10**9
+"""Time without an answer after which the port is opened again."""
 
+SHUTDOWN_NS = 10**9
+"""Maximum duration of the commands that end the sessions and restore the calibration of a board."""
 
-@dataclass(frozen=True, slots=True)
-class UciStarted:
-    """The board ranges."""
+EXPERIMENTAL_MODEL = "dw3000_sts"
+"""Name of the shipped model for CIRs of the STS segment."""
 
-    settings: UciSettings
-    window: tuple[int, int] | None
-
-
-UciEvent = RangeMeasurement | UciStarted
+_MIN_RANGES, _CIR_SHARE = 20, 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class UciReport:
-    """The state of a board, for diagnostics.
+class UciPortSettings:
+    """Settings of a UCI board: address of its port, what the board does, and a file for the raw bytes; None = none."""
 
-    Attributes:
-        port: the device file in use; empty = no port is open.
-        problem: reason why the board does not range; empty while it works.
-        settings: active settings.
-        window: taps and lead of the CIR that the board has confirmed; None = unknown.
-        rejected: parameters that the board did not accept, {tag: status}.
-        device_info: identity of the board, not decoded.
-        clock_offset_ppm: median carrier frequency offset of the peers; NaN = unknown.
-        counts: {name: count}.
+    address: PortAddress
+    board: UciSettings
+    capture: Path | None = None
+
+
+def read_settings(value: ValueReader) -> list[UciPortSettings]:
+    """Return the settings of the boards at `port`. The first has the role of the parameter, the others are anchors.
+
+    Raises:
+        ParameterError: a setting is invalid; names the parameter.
     """
+    ports = [PortAddress.parse(port) for port in read_ports(value)]
+    is_tag = value(PREFIX + "role") == "tag"
+    address = (*read_addresses(value, "address", 0xFFFE), 1 if is_tag else 2)[0]
+    local_anchors = tuple(address + number for number in range(1, len(ports)))
+    if local_anchors and not is_tag:
+        raise ParameterError("several ports and radio.role = anchor", valid="one port, or radio.role = tag")
+    anchors = read_addresses(value, "anchors", 0xFFFE) or local_anchors or (2,)
+    tags = read_addresses(value, "tags", 0xFFFE) or (1,)
+    peers = anchors if is_tag else tags
+    rate_hz = value(PREFIX + "rate")
+    first = UciSettings(
+        role=Role.TAG if is_tag else Role.ANCHOR,
+        address=address,
+        peers=peers,
+        channel=value(PREFIX + "channel") or DEFAULT_CHANNEL,
+        preamble_code=value(PREFIX + "preamble_code"),
+        window=value(PREFIX + "window"),
+        interval_ms=round(1000 * len(peers) / rate_hz) if rate_hz else 0,
+        report=value(PREFIX + "report"),
+        sessions=len(peers),
+    )
+    anchor = replace(first, role=Role.ANCHOR, peers=(address,))
+    boards = [first, *(replace(anchor, address=local) for local in local_anchors)]
+    try:
+        for board in boards:
+            board.check()
+    except ParameterError as error:
+        raise ParameterError(f"parameters {PREFIX}*: {error.what}", valid=error.valid) from error
+    capture = Path(value("capture")).expanduser() if value("capture") else None
+    return [UciPortSettings(port, board, capture) for port, board in zip(ports, boards, strict=True)]
 
-    port: str
-    problem: str
-    settings: UciSettings
-    window: tuple[int, int] | None
-    rejected: dict[int, int]
-    device_info: bytes
-    clock_offset_ppm: float
-    counts: dict[str, int]
 
-
-class UciDriver(PortThread[UciEvent]):
-    """Operates one board until `close`; starts it again after a loss.
-
-    Events are measurements and `UciStarted`. An anchor delivers its measurements only if its settings
-    request it.
+def open(
+    settings: Sequence[UciPortSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
+) -> list[UciPort]:
+    """Open boards; `RadioPort.close` ends them.
 
     Args:
-        address: port of the board.
-        settings: what the board does.
-        stamp_clock: clock for stamps, ns.
-        capture: stores the raw bytes; None = not stored.
+        settings: of each board; all have the same capture.
+        on_event: called with measurements and `PortMessage`. An anchor delivers its measurements only if its
+            settings request it.
+        stamp_clock: the clock of the stamps, ns.
+
+    Raises:
+        ParameterError: the file of the capture cannot be written.
+    """
+    path = settings[0].capture
+    capture = CaptureWriter(path, boards=len(settings)) if path is not None else None
+    ports = [UciPort(board, number, capture, on_event, stamp_clock) for number, board in enumerate(settings)]
+    for port in ports:
+        port.start()
+    return ports
+
+
+class UciPort(StreamPort):
+    """Operates one board until `close`; starts it again after a loss. See `open`.
+
+    Args:
+        settings: see `open`.
         number: number of the board in the capture.
+        capture: stores the raw bytes; None = not stored.
+        on_event, stamp_clock: see `open`.
+
+    Attributes:
+        session: the state of the board.
     """
 
     def __init__(
         self,
-        address: PortAddress,
-        settings: UciSettings,
-        *,
-        stamp_clock: Callable[[], int] = time.time_ns,
-        capture: CaptureWriter | None = None,
-        number: int = 0,
+        settings: UciPortSettings,
+        number: int,
+        capture: CaptureWriter | None,
+        on_event: OnEvent,
+        stamp_clock: Callable[[], int],
     ) -> None:
-        super().__init__(f"UCI board at {address}", f"{address} has not been opened")
-        self._address = address
-        self._stamp_clock = stamp_clock
-        self._capture = capture
-        self._number = number
-        self._session = UciSession(settings)
-        self._port = ""
-        self._thread.start()
+        remedies = {cause.name: cause.remedy for cause in EXCHANGE_CAUSES.values()}
+        unexpected = [cause.name for cause in EXCHANGE_CAUSES.values() if cause.unexpected]
+        monitor = ExchangeMonitor(remedies, unexpected)
+        super().__init__(settings.address, on_event, monitor, stamp_clock=stamp_clock, baud=BAUD, tick_s=0.01)
+        self.session = UciSession(settings.board)
+        self._number, self._capture = number, capture
+        self._starts = 0
+        self._worked_ns = self._stop_ns = 0
+        self._model_logged = False
 
-    def set_settings(self, settings: UciSettings) -> None:
+    def apply(self, settings: UciPortSettings) -> None:
         """Start the board again with other settings.
 
         Raises:
             ParameterError: the settings are invalid.
         """
-        settings.check()
+        settings.board.check()
         with self._lock:
-            self._session.settings = settings
-            if self._port:
-                self._begin()
+            if settings.board != self.session.settings:
+                self.session.settings = settings.board
+                if self.device:
+                    self._opened(time.monotonic_ns())
+
+    def close(self) -> None:
+        """End the sessions, restore the calibration, and close the port."""
+        already_closed = self.closed
+        super().close()
+        if self._capture is not None and not already_closed:
+            self._capture.close()
 
     @property
     def problem(self) -> str:
         """Reason why the board does not range; empty while it works."""
         with self._lock:
-            return self._problem or self._session.state
+            return self._lost or self.session.state
 
-    def report(self) -> UciReport:
+    def report(self) -> PortReport:
         """Return the present state."""
         with self._lock:
-            session = self._session
-            return UciReport(
-                self._port,
-                self._problem or session.state,
-                session.settings,
-                session.window,
-                session.rejected,
-                session.device_info,
-                statistics.median(session.clock_offsets_ppm or [math.nan]),
-                session.totals() | {"openings": self.openings, "overflowed": self.overflowed},
-            )
+            session, s = self.session, self.session.settings
+            values: dict[str, object] = {
+                "port": self.device or "none",
+                "address": format_id(s.address),
+                "role": s.role.name.lower(),
+                "interval ms": s.effective_interval_ms,
+            }
+            if session.window is not None:
+                values |= {"CIR taps": session.window[0], "CIR taps before the first path": session.window[1]}
+            if session.position_unit.name:
+                values["unit of the first-path positions"] = session.position_unit.name
+            if self._model_logged:
+                values["correction"] = f"set model:={EXPERIMENTAL_MODEL} at the mitigator (experimental)"
+            values |= {name.replace("_", " "): count for name, count in session.totals().items()}
+            values |= {"openings": self.openings}
+            self.monitor.period_s = max(PERIOD_S, 3 * s.effective_interval_ms / 1e3)
+            hardware = f"UCI board {format_id(s.address)}"
+            activity = "ranging" if s.role is Role.TAG else "answering"
+            return PortReport(self.device, hardware, self.problem, self._warning(), activity, values)
 
-    def _connect(self) -> None:
-        port = self._address.open(BAUD)
+    @property
+    def clock_offset_ppm(self) -> float:
+        """Median carrier frequency offset of the peers; NaN = unknown."""
         with self._lock:
-            self._port, self._problem = port.port, ""
-            self.openings += 1
-            self._begin()
-        try:
-            self._serve(port)
-        except OSError as error:
-            raise LinkError(f"was lost: {error.strerror}", where=str(self._address)) from error
-        finally:
-            stop = self._session.stop_commands()
-            with contextlib.suppress(OSError):
-                os.write(port.fileno(), stop)
-            with self._lock:
-                self._port = ""
-                self._session.closed()
-            port.close()
+            return statistics.median(self.session.clock_offsets_ppm or [math.nan])
 
-    def _begin(self) -> None:
+    def _warning(self) -> str:
+        """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
+        session, counts = self.session, self.session.counts
+        if not counts["ranges"] and counts["unknown_session"]:
+            return "the only ranges are of other addresses: are the ids swapped, or other boards in reach?"
+        is_tag = session.settings.role is Role.TAG
+        if (is_tag or session.settings.report) and (warning := self.monitor.warning(time.monotonic())):
+            return warning
+        if counts["ranges"] >= _MIN_RANGES:
+            if counts["without_cir"] > _CIR_SHARE * counts["ranges"]:
+                return "most ranges have no CIR: the firmware may not support it; ranges are not corrected"
+            if counts["inconsistent_cir"] > _CIR_SHARE * counts["ranges"]:
+                return "the reported first path contradicts the samples of most CIRs; they are not used"
+            if session.position_unit.name == "contradictory":
+                return "the first-path positions contradict the whole taps, which are used instead"
+        if session.rejected:
+            names = ", ".join(parameter_name(tag) for tag in sorted(session.rejected))
+            return f"ranging without the parameters that the board rejected: {names}"
+        return ""
+
+    def _opened(self, now_ns: int) -> list[Any]:
         if self._capture is not None:
-            self._capture.add_board(self._number, self._session.settings)
-        self._session.opened(time.monotonic_ns())
+            self._capture.add_board(self._number, self.session.settings)
+        self._worked_ns = now_ns
+        self.monitor.reset()
+        self.session.opened(now_ns)
+        return []
 
-    def _serve(self, port: serial.Serial) -> None:
-        fd = port.fileno()
-        outgoing = bytearray()
-        starts, worked_ns = self._session.starts, time.monotonic_ns()
-        while not self.closed:
-            readable, _, _ = select.select([fd], [], [], _TICK_S)
-            data = os.read(fd, _READ_BYTES) if readable else b""
-            if readable and not data:
-                raise LinkError("was unplugged", where=str(self._address))
-            now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
-            if self._capture is not None:
-                self._capture.add(self._number, data, sent=False)
-            with self._lock:
-                session = self._session
-                found = session.receive(data, now_ns, stamp_ns)
-                events: list[UciEvent] = []
-                if session.starts != starts:
-                    starts, self._worked = session.starts, True
-                    events.append(UciStarted(session.settings, session.window))
-                if not session.state:
-                    worked_ns = now_ns
-                if session.settings.role is Role.TAG or session.settings.report:
-                    events += found
-                self._put(events)
-                if not outgoing:
-                    outgoing += session.outgoing()
-            if now_ns - worked_ns > REOPEN_NS:
-                raise LinkError(session.state, where=str(self._address))
-            if outgoing:
-                with contextlib.suppress(BlockingIOError):
-                    written = os.write(fd, outgoing)
-                    if self._capture is not None:
-                        self._capture.add(self._number, bytes(outgoing[:written]), sent=True)
-                    del outgoing[:written]
+    def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
+        if self._capture is not None:
+            self._capture.add(self._number, data, sent=False)
+        session = self.session
+        measurements = session.receive(data, now_ns, stamp_ns)
+        messages: list[Any] = []
+        for cause, count in session.take_failures().items():
+            self.monitor.add_failures(cause, count, now_ns / 1e9)
+        if session.starts != self._starts:
+            self._starts, self._was_connected = session.starts, True
+            messages.append(PortMessage(logging.INFO, self._started_text()))
+        if not session.state or session.is_waiting:
+            self._worked_ns = now_ns
+        if now_ns - self._worked_ns > REOPEN_NS:
+            raise LinkError(session.state, where=str(self._address))
+        if not (session.settings.role is Role.TAG or session.settings.report):
+            return messages
+        is_sts = any(len(measured.cir) and measured.cir.segment is Segment.STS for measured in measurements)
+        if is_sts and not self._model_logged:
+            # The default model passes these ranges through.
+            self._model_logged = True
+            text = "the mitigator corrects CIRs of DW3000 STS only with"
+            messages.append(PortMessage(logging.INFO, f"{text} model:={EXPERIMENTAL_MODEL} (experimental)"))
+        return messages + measurements
+
+    def _outgoing(self) -> bytes:
+        return self.session.outgoing()
+
+    def _closed(self, now_ns: int) -> list[Any]:
+        self.session.closed()
+        return []
+
+    def _is_stopped(self, now_ns: int) -> bool:
+        with self._lock:
+            if not self._stop_ns:
+                self._stop_ns = now_ns
+                self.session.stop(now_ns)
+            return self.session.stopped or now_ns - self._stop_ns > SHUTDOWN_NS
+
+    def _on_sent(self, data: bytes) -> None:
+        if self._capture is not None:
+            self._capture.add(self._number, data, sent=True)
+
+    def _started_text(self) -> str:
+        s, window = self.session.settings, self.session.window
+        taps = f"{window[0]} taps" if window is not None else "size of the CIR not confirmed"
+        return (
+            f"UCI board {format_id(s.address)} at {self.device}: {s.role.name.lower()}, channel {s.channel}, "
+            f"peers {', '.join(map(format_id, s.peers))}, {s.effective_interval_ms} ms, {taps}"
+        )

@@ -57,8 +57,13 @@ class Observation:
         damaged: number of damaged packets.
         temperature_c, voltage: NaN = not reported.
         clock_offset_ppm: clock relative to that of the peer; NaN = not reported.
-        recovery_s: time from the reopening of the port to the next range; NaN = not tested, infinite = none.
+        unplugged: whether the user unplugged the board; None = not tested.
+        recovery_s: time from the reopening of the port to the next range; NaN = there was none.
         problem: last problem of the driver; empty = none.
+        warnings: all warnings of the driver.
+        failures: number of failed exchanges, {cause: count}.
+        remedies: {cause: what to do}.
+        counters: last diagnostics of the driver, {name: value}.
     """
 
     distance_m: float
@@ -75,8 +80,13 @@ class Observation:
     temperature_c: float = math.nan
     voltage: float = math.nan
     clock_offset_ppm: float = math.nan
+    unplugged: bool | None = None
     recovery_s: float = math.nan
     problem: str = ""
+    warnings: list[str] = field(default_factory=list)
+    failures: Mapping[str, int] = field(default_factory=dict)
+    remedies: Mapping[str, str] = field(default_factory=dict)
+    counters: Mapping[str, object] = field(default_factory=dict)
 
 
 def run_checks(o: Observation) -> list[Check]:
@@ -87,9 +97,11 @@ def run_checks(o: Observation) -> list[Check]:
     rate_hz = len(o.ranges) / o.seconds
     checks = [
         Check("problem of the driver", o.problem or "none", "none", verdict, remedy),
+        _warnings(o),
         *_settings(o.written, o.read),
         _judge("ranges per second", rate_hz, 5, 1, "Hz", "see the troubleshooting of the board", low=True),
         _ids(o),
+        *_failures(o),
     ]
     if o.ranges:
         checks += [*_ranges(o), *_cirs(o), *_model(o)]
@@ -103,9 +115,37 @@ def run_checks(o: Observation) -> list[Check]:
     if not math.isnan(o.clock_offset_ppm):
         remedy = "one crystal is out of its limits: check its trim"
         checks.append(_judge("clock error", abs(o.clock_offset_ppm), 25, 40, "ppm", remedy))
-    if not math.isnan(o.recovery_s):
-        checks.append(_judge("recovery after reconnecting", o.recovery_s, 1.0, 5.0, "s", "send this report"))
+    if o.unplugged is not None:
+        checks.append(_recovery(o))
     return checks
+
+
+def _warnings(o: Observation) -> Check:
+    name, remedy = "warnings of the driver", "see the troubleshooting of the board"
+    if not o.warnings:
+        return Check(name, "none", "none", Verdict.PASS)
+    return Check(name, "; ".join(o.warnings[:5]), "none", Verdict.WARNING, remedy)
+
+
+def _failures(o: Observation) -> Iterator[Check]:
+    total = sum(o.failures.values()) + len(o.ranges)
+    for cause, count in o.failures.items():
+        verdict = (
+            Verdict.FAIL if count > 0.5 * total else Verdict.WARNING if count > 0.05 * total else Verdict.PASS
+        )
+        remedy = "" if verdict is Verdict.PASS else o.remedies.get(cause, "send this report")
+        yield Check(f"failed exchanges: {cause}", f"{count} of {total}", "at most 5 %", verdict, remedy)
+
+
+def _recovery(o: Observation) -> Check:
+    name = "recovery after reconnecting"
+    if not o.unplugged:
+        return Check(
+            name, "not unplugged", "at most 1 s", Verdict.WARNING, "repeat the test and unplug the board"
+        )
+    if math.isnan(o.recovery_s):
+        return Check(name, "not recovered", "at most 1 s", Verdict.FAIL, "send this report")
+    return _judge(name, o.recovery_s, 1.0, 5.0, "s", "send this report")
 
 
 def _judge(
@@ -127,18 +167,18 @@ def _judge(
 
 def _settings(written: Mapping[str, object], read: Mapping[str, object]) -> Iterator[Check]:
     for name, value in written.items():
-        found = read.get(name)
-        verdict = Verdict.PASS if found == value else Verdict.WARNING if found is None else Verdict.FAIL
-        shown = "not answered" if found is None else str(found)
+        answer = read.get(name)
+        verdict = Verdict.PASS if answer == value else Verdict.WARNING if answer is None else Verdict.FAIL
+        shown = "not answered" if answer is None else str(answer)
         remedy = "" if verdict is Verdict.PASS else "the radio did not accept the value that was written"
         yield Check(f"read back: {name}", shown, str(value), verdict, remedy)
 
 
 def _ids(o: Observation) -> Check:
-    found = sorted({(measured.tag_id, measured.anchor_id) for measured in o.ranges})
+    pairs = sorted({(measured.tag_id, measured.anchor_id) for measured in o.ranges})
     expected = "one pair" if o.expected_ids is None else "tag {}, anchor {}".format(*o.expected_ids)
-    good = len(found) == 1 and o.expected_ids in (None, found[0]) and o.foreign <= len(o.ranges) / 100
-    shown = ", ".join(f"tag {tag}, anchor {anchor}" for tag, anchor in found[:5]) or "none"
+    good = len(pairs) == 1 and o.expected_ids in (None, pairs[0]) and o.foreign <= len(o.ranges) / 100
+    shown = ", ".join(f"tag {tag}, anchor {anchor}" for tag, anchor in pairs[:5]) or "none"
     if o.foreign:
         shown += f"; {o.foreign} ranges of other addresses"
     remedy = "" if good else "switch other radios off, and check that the ids are not swapped"
@@ -193,9 +233,9 @@ def _model(o: Observation) -> Iterator[Check]:
         remedy = "ranges are published without correction; offsets work"
         yield Check("model", o.model, "trained for this radio", Verdict.WARNING, remedy)
         return
-    residual_m = abs(float(np.median([each.range_m for each in o.corrected])) - o.distance_m)
+    residual_m = abs(float(np.median([corrected.range_m for corrected in o.corrected])) - o.distance_m)
     remedy = "calibrate the offset of the pair"
     yield _judge("error of the median corrected range", residual_m, 0.15, 0.3, "m", remedy)
-    refused = sum(each.status is not Status.OK for each in o.corrected) / len(o.corrected)
+    refused = sum(corrected.status is not Status.OK for corrected in o.corrected) / len(o.corrected)
     remedy = "the model does not fit this radio or site"
     yield _judge("share of ranges without correction", refused, 0.2, 0.8, "%", remedy)

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import contextlib
-import math
+import logging
+import os
+import re
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING
 
 from uwb_mitigation.commands.field.checks import Observation
-from uwb_mitigation.errors import ParameterError, UwbMitigationError
-from uwb_mitigation.radios.dw1000.bus import bus_opener
-from uwb_mitigation.radios.dw1000.driver import RadioDriver
-from uwb_mitigation.radios.fira.capture import CaptureWriter
+from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
+from uwb_mitigation.radios import evb1000, serial, spi, uci
+from uwb_mitigation.radios.dw1000.port import ChipPort
+from uwb_mitigation.radios.evb1000 import Evb1000Bus, Evb1000Settings
 from uwb_mitigation.radios.fira.session import UciSettings
-from uwb_mitigation.radios.port import PortAddress, PortThread
-from uwb_mitigation.radios.serial import BoardDriver
-from uwb_mitigation.radios.settings import RadioSettings, RadioStatus, Role
-from uwb_mitigation.radios.uci import UciDriver
+from uwb_mitigation.radios.port import OnEvent, PortAddress, PortMessage, RadioPort
+from uwb_mitigation.radios.serial import BoardPort, SerialSettings
+from uwb_mitigation.radios.settings import RadioSettings, Role
+from uwb_mitigation.radios.spi import SpidevBus, SpiSettings
+from uwb_mitigation.radios.uci import UciPort, UciPortSettings
 from uwb_mitigation.radios.wire.layout import Mode
-from uwb_mitigation.radios.wire.messages import RadioConfigured
 from uwb_mitigation.types.measurement import RangeMeasurement
+
+if TYPE_CHECKING:
+    from uwb_mitigation.radios.dw1000.bus import Bus
 
 SOURCES = {
     "uci": "board with UCI firmware",
@@ -35,6 +42,8 @@ SOURCES = {
 
 START_TIMEOUT_S = 30.0
 UNPLUG_TIMEOUT_S = 60.0
+REPORT_INTERVAL_S = 0.5
+"""Interval at which the warnings of the driver are collected."""
 
 _WINDOW = 157
 # Registers of the DW1000: name, header of a read, octets (user manual, chapters 2.2 and 7).
@@ -54,8 +63,9 @@ def observe(
     capture: Path,
     unplug: Callable[[str], None] | None,
     on_progress: Callable[[float], None],
+    on_warning: Callable[[str], None],
 ) -> None:
-    """Range for the duration of the observation and fill it in.
+    """Range for the duration of the observation and fill it in; without ranges it ends after `START_TIMEOUT_S`.
 
     Args:
         source: one of `SOURCES`.
@@ -64,134 +74,179 @@ def observe(
         capture: file for the raw bytes of UCI boards.
         unplug: asks the user to unplug and reconnect the first port; None = skip this test.
         on_progress: called with the completed fraction.
+        on_warning: called with each warning of the driver.
 
     Raises:
         ParameterError: a port is invalid.
+        LinkError: a port does not exist.
         MissingDependencyError: a library of the source is not installed.
     """
+    if source not in SOURCES:
+        raise ParameterError(f"source {source!r}", valid=", ".join(SOURCES))
+    if not 1 <= len(ports) <= (1 if source == "serial" else 2):
+        raise ParameterError(f"{len(ports)} ports", valid="the tag's, or the tag's and the anchor's")
+    for port in ports:
+        if not (os.path.exists(port) if source == "spi" else PortAddress.parse(port).find()):
+            raise LinkError("is not there", where=port, valid="connect the board")
+    events: SimpleQueue[object] = SimpleQueue()
     with ExitStack() as stack:
-        drivers = _open(source, ports, capture, stack)
-        collect = _Collector(drivers[0], observation)
-        collect.until(lambda: bool(observation.ranges), START_TIMEOUT_S)
-        observation.ranges.clear()
-        began = time.monotonic()
-        while (elapsed := time.monotonic() - began) < observation.seconds:
-            collect.once()
-            on_progress(elapsed / observation.seconds)
-        _describe(source, drivers, observation)
-        measured = list(observation.ranges)
-        if unplug is not None:
+        radios = _open(source, ports, capture, lambda event: events.put(event))
+        for radio in radios:
+            stack.enter_context(closing(radio))
+        collector = _Collector(radios, events, observation, on_warning)
+        if collector.until(lambda: bool(observation.ranges), START_TIMEOUT_S):
+            observation.ranges.clear()
+            observation.warnings.clear()
+            before = Counter(radios[0].monitor.totals)
+            began_s = time.monotonic()
+            while (elapsed_s := time.monotonic() - began_s) < observation.seconds:
+                collector.collect()
+                on_progress(elapsed_s / observation.seconds)
+            observation.failures = dict(radios[0].monitor.totals - before)
+        else:
+            observation.failures = dict(radios[0].monitor.totals)
+        _describe(radios, observation)
+        measured, warnings = list(observation.ranges), list(observation.warnings)
+        if unplug is not None and measured:
             unplug(ports[0])
-            observation.recovery_s = _recovery_s(drivers[0], collect)
-        observation.ranges[:] = measured
+            _test_recovery(radios[0], collector, observation)
+        observation.ranges[:], observation.warnings[:] = measured, warnings
     if source in ("evb1000", "spi"):
         _read_registers(source, ports[0], observation)
 
 
 class _Collector:
-    """Collects the events of a driver."""
+    """Collects the events and warnings of radios; only the first one measures."""
 
-    def __init__(self, driver: PortThread[Any], observation: Observation) -> None:
-        self._driver = driver
-        self._observation = observation
+    def __init__(
+        self,
+        radios: Sequence[RadioPort],
+        events: SimpleQueue[object],
+        observation: Observation,
+        on_warning: Callable[[str], None],
+    ) -> None:
+        self._radios, self._events = radios, events
+        self._observation, self._on_warning = observation, on_warning
+        self._kinds: set[str] = set()
+        self._report_due_s = time.monotonic() + REPORT_INTERVAL_S
 
-    def once(self) -> None:
-        event = self._driver.get(0.1)
-        if isinstance(event, RangeMeasurement):
-            self._observation.ranges.append(event)
-        elif isinstance(event, RadioStatus):
-            self._observation.temperature_c, self._observation.voltage = event.temperature_c, event.voltage
-        elif isinstance(event, RadioConfigured):
-            self._observation.read |= _values(event.settings)
+    def collect(self) -> None:
+        """Wait for the next event, for a short time."""
+        with contextlib.suppress(Empty):
+            event = self._events.get(timeout=0.1)
+            if isinstance(event, RangeMeasurement):
+                self._observation.ranges.append(event)
+            elif isinstance(event, PortMessage) and event.level >= logging.WARNING:
+                self._add_warning(event.text)
+        if time.monotonic() >= self._report_due_s:
+            self._report_due_s = time.monotonic() + REPORT_INTERVAL_S
+            for radio in self._radios if self._observation.ranges else ():
+                if warning := radio.report().warning:
+                    self._add_warning(warning)
 
-    def until(self, done: Callable[[], bool], timeout_s: float) -> bool:
-        end = time.monotonic() + timeout_s
-        while not done() and time.monotonic() < end:
-            self.once()
-        return done()
+    def until(self, is_complete: Callable[[], bool], timeout_s: float) -> bool:
+        """Collect until a condition is true or the timeout; return whether it is."""
+        end_s = time.monotonic() + timeout_s
+        while not is_complete() and time.monotonic() < end_s:
+            self.collect()
+        return is_complete()
+
+    def _add_warning(self, text: str) -> None:
+        # A warning may contain a duration and counts, which change.
+        kind = re.sub(r"[\d.]+", "", text)
+        if kind not in self._kinds:
+            self._kinds.add(kind)
+            self._observation.warnings.append(text)
+            self._on_warning(text)
 
 
-def _open(source: str, ports: list[str], capture: Path, stack: ExitStack) -> list[Any]:
-    if source not in SOURCES:
-        raise ParameterError(f"source {source!r}", valid=", ".join(SOURCES))
-    if not 1 <= len(ports) <= (1 if source == "serial" else 2):
-        raise ParameterError(f"{len(ports)} ports", valid="the tag's, or the tag's and the anchor's")
-    if source == "uci":
-        writer = CaptureWriter(capture, 64 << 20)
-        stack.callback(writer.close)
-        roles = (UciSettings(identify=True), UciSettings(Role.ANCHOR, 2, (1,)))
-        return [
-            stack.enter_context(
-                closing(UciDriver(PortAddress.parse(port), settings, capture=writer, number=number))
-            )
-            for number, (port, settings) in enumerate(zip(ports, roles, strict=False))
-        ]
+def _open(source: str, ports: list[str], capture: Path, on_event: OnEvent) -> Sequence[RadioPort]:
     if source == "serial":
-        board = BoardDriver(PortAddress.parse(ports[0]), mode=Mode.HOST)
-        return [stack.enter_context(closing(board))]
-    settings = RadioSettings(window=_WINDOW)
-    of_roles = (settings, replace(settings, role=Role.ANCHOR))
-    return [
-        stack.enter_context(closing(RadioDriver(bus_opener(source, port), role)))
-        for port, role in zip(ports, of_roles, strict=False)
-    ]
+        return serial.open([SerialSettings(PortAddress.parse(ports[0]), mode=Mode.HOST)], on_event)
+    if source == "uci":
+        boards = (UciSettings(identify=True), UciSettings(Role.ANCHOR, 2, (1,)))
+        return uci.open(
+            [
+                UciPortSettings(PortAddress.parse(port), board, capture)
+                for port, board in zip(ports, boards, strict=False)
+            ],
+            on_event,
+        )
+    tag = RadioSettings(window=_WINDOW)
+    radios = (tag, replace(tag, role=Role.ANCHOR))
+    if source == "spi":
+        return spi.open(
+            [SpiSettings(port, radio=radio) for port, radio in zip(ports, radios, strict=False)], on_event
+        )
+    return evb1000.open(
+        [Evb1000Settings(PortAddress.parse(port), radio) for port, radio in zip(ports, radios, strict=False)],
+        on_event,
+    )
 
 
 def _values(settings: RadioSettings) -> dict[str, object]:
     return {"channel": settings.channel, "PRF (MHz)": settings.prf_mhz, "CIR samples": settings.window}
 
 
-def _describe(source: str, drivers: list[Any], o: Observation) -> None:
-    """Copy the state of the drivers to the observation."""
-    report = drivers[0].report()
-    o.problem = report.problem
-    if source == "uci":
-        settings = report.settings
+def _describe(radios: Sequence[RadioPort], o: Observation) -> None:
+    """Copy the state of the radios to the observation."""
+    tag = radios[0]
+    report = tag.report()
+    o.problem, o.counters, o.remedies = report.problem, report.values, tag.monitor.remedies
+    if isinstance(tag, UciPort):
+        session, settings = tag.session, tag.session.settings
+        counts = session.totals()
         o.expected_ids = (settings.address, settings.peers[0])
         o.identity = {
-            "device info": report.device_info.hex() or "not answered",
-            "rejected parameters": ", ".join(f"0x{tag:02x}" for tag in sorted(report.rejected)) or "none",
+            "device info": session.device_info.hex() or "not answered",
+            "rejected parameters": ", ".join(f"0x{tag_id:02x}" for tag_id in sorted(session.rejected))
+            or "none",
         }
         o.written = {"CIR taps": settings.window, "CIR taps before the first path": 5}
-        if report.window is not None:
-            o.read = dict(zip(o.written, report.window, strict=True))
-        o.clock_offset_ppm = report.clock_offset_ppm
-        o.damaged, o.foreign = report.counts["damaged"], report.counts["unknown_session"]
-    elif source == "serial":
-        if (hello := report.hello) is not None:
+        if session.window is not None:
+            o.read = dict(zip(o.written, session.window, strict=True))
+        o.clock_offset_ppm = tag.clock_offset_ppm
+        o.damaged, o.foreign = counts["damaged"], counts["unknown_session"]
+    elif isinstance(tag, BoardPort):
+        if (hello := tag.session.hello) is not None:
             o.identity = {
                 "firmware": f"{hello.firmware_name} {hello.firmware_version}",
                 "model": f"{hello.model_id:08x}",
             }
-        o.damaged = report.counts.get("corrupt", 0)
-    else:
-        o.identity = {"firmware": report.name.partition(" at ")[0]} if source == "evb1000" else {}
+        o.damaged = tag.session.totals()["corrupt"]
+    elif isinstance(tag, ChipPort):
+        o.identity = {"bus": report.device.partition(" at ")[0]}
         o.written = _values(RadioSettings(window=_WINDOW))
-        o.temperature_c, o.voltage = report.status.temperature_c, report.status.voltage
-        if report.settings is not None:
-            o.written[_ANTENNA_DELAY] = report.settings.antenna_delay
-            other = drivers[1].report().settings if len(drivers) > 1 else None
-            o.expected_ids = None if other is None else (report.settings.address, other.address)
+        o.temperature_c, o.voltage = tag.status.temperature_c, tag.status.voltage
+        if tag.settings is not None:
+            o.read |= _values(tag.settings)
+            o.written[_ANTENNA_DELAY] = tag.settings.antenna_delay
+            anchor = radios[1] if len(radios) > 1 else None
+            if isinstance(anchor, ChipPort) and anchor.settings is not None:
+                o.expected_ids = (tag.settings.address, anchor.settings.address)
 
 
-def _recovery_s(driver: Any, collect: _Collector) -> float:
-    """Return the time from the reopening of the port to the next range; infinite if there is none."""
-    openings = driver.openings
-    if not collect.until(lambda: bool(driver.openings > openings), UNPLUG_TIMEOUT_S):
-        return math.inf
-    began, count = time.monotonic(), len(collect._observation.ranges)
-    if not collect.until(lambda: len(collect._observation.ranges) > count, START_TIMEOUT_S):
-        return math.inf
-    return time.monotonic() - began
+def _test_recovery(radio: RadioPort, collector: _Collector, o: Observation) -> None:
+    """Measure the time from the reopening of the port to the next range."""
+    openings = radio.openings
+    is_unplugged = collector.until(lambda: not radio.device or radio.openings > openings, UNPLUG_TIMEOUT_S)
+    o.unplugged = is_unplugged
+    if not (is_unplugged and collector.until(lambda: radio.openings > openings, UNPLUG_TIMEOUT_S)):
+        return
+    began_s, count = time.monotonic(), len(o.ranges)
+    if collector.until(lambda: len(o.ranges) > count, START_TIMEOUT_S):
+        o.recovery_s = time.monotonic() - began_s
 
 
 def _read_registers(source: str, port: str, o: Observation) -> None:
     """Read registers of a DW1000 that keeps its configuration after the driver was closed."""
     values: dict[str, int] = {}
-    with contextlib.suppress(UwbMitigationError), closing(bus_opener(source, port)()) as bus:
-        bus.speed(False)
-        for name, header, octets in _REGISTERS:
-            values[name] = int.from_bytes(bus.transfer(header, None, octets), "little")
+    with contextlib.suppress(UwbMitigationError):
+        bus: Bus = SpidevBus(port) if source == "spi" else Evb1000Bus(PortAddress.parse(port))
+        with closing(bus):
+            bus.speed(False)
+            for name, header, octets in _REGISTERS:
+                values[name] = int.from_bytes(bus.transfer(header, None, octets), "little")
     o.written |= {"device id": f"0x{_DW1000_ID:08x}"}
     if "RX antenna delay" in values:
         o.read |= {

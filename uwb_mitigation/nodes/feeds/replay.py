@@ -7,16 +7,17 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import clock_reader
 from uwb_mitigation.types.measurement import Record
-from uwb_mitigation.types.offsets import Offsets
+from uwb_mitigation.types.ros.topics import RANGE_RAW
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -34,6 +35,34 @@ ANNOUNCEMENT_S = 3.0
 
 LATE_WARNING_S = 0.5
 """A delay of the replay above this is reported."""
+
+
+def open_source(value: Callable[[str], Any]) -> Source:
+    """Open the recording or simulation of the parameters; `value(name)` returns a parameter's value.
+
+    Raises:
+        ParameterError: the parameter path is empty.
+        RecordingError: the recording cannot be read.
+    """
+    # Import here, because each source needs other dependencies.
+    if value("source") == "simulated":
+        from uwb_mitigation.simulation.simulated import SimulatedSource
+
+        return SimulatedSource(seed=value("seed"), count=value("count"), rate_hz=value("simulated_rate"))
+    if not value("path"):
+        raise ParameterError("parameter path is empty", valid="the recording to replay, as -p path:=FILE")
+    path = Path(value("path")).expanduser()
+    if value("source") == "uci":
+        from uwb_mitigation.radios.fira.capture import UciCapture
+
+        return UciCapture(path)
+    if value("source") == "mcap":
+        from uwb_mitigation.recordings.mcap import McapRecording
+
+        return McapRecording(path, topic=value("topic") or RANGE_RAW)
+    from uwb_mitigation.recordings.decaranging import CirFrame, open_decaranging
+
+    return open_decaranging(path, cir=CirFrame(value("cir")))
 
 
 class ReplayClock:
@@ -142,7 +171,7 @@ class ReplayFeed:
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join()
 
-    def apply(self, changed: Collection[str], value: Callable[[str], Any], offsets: Offsets) -> None:
+    def apply(self, changed: Collection[str], value: Callable[[str], Any]) -> None:
         """Change rate, pause and position."""
         if "rate" in changed:
             self._requested_rate = float(value("rate"))

@@ -20,7 +20,6 @@ from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows
 from uwb_mitigation.recordings.mapping.tables import LOG_TIME, TOPIC, UNREADABLE, Chunk
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement
-from uwb_mitigation.types.offsets import Offsets
 
 _WARNING_PERIOD_S = 10.0
 
@@ -119,7 +118,7 @@ class TopicFeed:
             level, text = diagnostics.WARN, "no ranges yet"
         return f"topic {self._names[0]}", level, text, entries
 
-    def apply(self, changed: Collection[str], value: Callable[[str], Any], offsets: Offsets) -> None:
+    def apply(self, changed: Collection[str], value: Callable[[str], Any]) -> None:
         """Change nothing: no parameter of this source is live."""
 
     def _callback(self, name: str) -> Callable[[Any], None]:

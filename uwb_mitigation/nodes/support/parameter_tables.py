@@ -6,6 +6,7 @@ generate_parameter_library is not used: it generates code at build time and is n
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,7 @@ class Parameter:
         description: one sentence for the user.
         unit: unit of a number; empty if it has no unit.
         or_number: whether a string parameter also accepts a number.
+        or_array: whether it also accepts an array of whole numbers or strings.
         low, high: inclusive range of a number.
         choices: valid values of a string; empty: any.
         filed: whether the parameter file contains it; otherwise the user must set it.
@@ -46,6 +48,7 @@ class Parameter:
     filed: bool = True
     unit: str = ""
     or_number: bool = False
+    or_array: bool = False
 
     @property
     def valid(self) -> str:
@@ -55,6 +58,8 @@ class Parameter:
         if self.low is not None and self.high is not None:
             low, high = (f"{bound:.10g}" for bound in (self.low, self.high))
             return f"{_TYPE_NAMES[type(self.default)]}, {low} to {high} {self.unit}".rstrip()
+        if self.or_array:
+            return "a number, a text, or an array"
         return "a number or a text" if self.or_number else _TYPE_NAMES[type(self.default)]
 
     @property
@@ -68,6 +73,8 @@ class Parameter:
         """Raise ParameterError unless `value` has the right type and is in the range."""
         numeric = isinstance(self.default, float) and type(value) is int
         numeric |= self.or_number and type(value) in (int, float)
+        if self.or_array and not isinstance(value, str | float | bool) and isinstance(value, Iterable):
+            numeric = all(type(item) in (int, str) for item in value)
         if type(value) is not type(self.default) and not numeric:
             raise ParameterError(f"parameter {self.name} = {value!r}", valid=self.valid)
         if self.choices:
@@ -115,7 +122,7 @@ RADIO = (
            low=0, high=0x1FFFE, unit="ticks"),
     _radio("window", 157, "Number of CIR samples of each range; 1016: all, or 255 with uci", low=0, high=1016),
     _radio("anchors", "", "Addresses that a tag polls in turn, separated by commas; empty: all anchors that answer; with "
-           "uci, those at the other ports", or_number=True),
+           "uci, those at the other ports", or_number=True, or_array=True),
     _radio("rate", 0.0, "Maximum rate of exchanges; 0: as fast as possible; with uci, 55 for a "
            "window of 16 and 11 for 157. All uci boards need the same rate", low=0.0, high=1000.0, unit="Hz"),
     _radio("report", False, "An anchor also publishes its ranges"),
@@ -170,7 +177,7 @@ DRIVER = (
               "another model are not published. Empty: any (serial)."),
     *RADIO,
     Parameter("radio.tags", "", "Addresses of the tags of an anchor, separated by commas; empty: 1 (uci).",
-              live=True, or_number=True),
+              live=True, or_number=True, or_array=True),
     Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced. Empty: none (uci)."),
     Parameter("radio.reset", "", "Reset line of the chip, such as gpiochip0:25; empty: not connected (spi)."),
     Parameter("frame_id", "uwb_antenna", "Frame id of the receiving antenna, if the source contains none."),

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from typing import Protocol
-
-from uwb_mitigation.radios.port import PortAddress
 
 
 class Bus(Protocol):
@@ -51,25 +47,3 @@ class Bus(Protocol):
     def close(self) -> None:
         """Close the bus; may be called twice."""
         ...
-
-
-def bus_opener(source: str, address: str, reset: str = "") -> Callable[[], Bus]:
-    """Return a function that opens the bus of one radio.
-
-    Args:
-        source: `evb1000` or `spi`.
-        address: `/dev/ttyACM0`, `usb:0483:5740`; or `/dev/spidev0.0`.
-        reset: for spi, the reset line, such as `gpiochip0:25`; empty = not wired.
-
-    Raises:
-        ParameterError: `address` is not valid.
-        MissingDependencyError: a dependency of this type of bus is not installed.
-    """
-    # Import the dependencies of a type of bus only if it is used.
-    if source == "spi":
-        from uwb_mitigation.radios.spi import SpidevBus
-
-        return functools.partial(SpidevBus, address, reset)
-    from uwb_mitigation.radios.evb1000 import Evb1000Bus
-
-    return functools.partial(Evb1000Bus, PortAddress.parse(address))

@@ -32,20 +32,21 @@ class CaptureWriter:
 
     Args:
         path: replaced if it exists.
+        boards: number of boards; the last of as many calls of `close` closes the file.
         limit_bytes: size after which nothing more is written.
 
     Raises:
         ParameterError: the file cannot be written.
     """
 
-    def __init__(self, path: Path, limit_bytes: int = 1 << 30) -> None:
+    def __init__(self, path: Path, boards: int = 1, limit_bytes: int = 1 << 30) -> None:
         try:
             self._file: IO[str] = path.open("w", encoding="ascii")
         except OSError as error:
             raise ParameterError(
                 f"the capture cannot be written: {error.strerror}", where=str(path)
             ) from error
-        self._left = limit_bytes
+        self._free_bytes, self._users = limit_bytes, boards
         self._lock = threading.Lock()
         self._began_ns = time.monotonic_ns()
         self._write(FIRST_LINE)
@@ -62,14 +63,16 @@ class CaptureWriter:
             self._write(f"{seconds:.6f} {number} {'>' if sent else '<'} {data.hex()}")
 
     def close(self) -> None:
-        """Close the file; may be called twice."""
+        """Close the file for one board."""
         with self._lock:
-            self._file.close()
+            self._users -= 1
+            if self._users <= 0:
+                self._file.close()
 
     def _write(self, line: str) -> None:
         with self._lock:
-            self._left -= len(line) + 1
-            if self._left >= 0 and not self._file.closed:
+            self._free_bytes -= len(line) + 1
+            if self._free_bytes >= 0 and not self._file.closed:
                 self._file.write(line + "\n")
                 self._file.flush()
 
@@ -133,11 +136,11 @@ class UciCapture(Source):
                 yield from self._records(session, b"", now_ns + _TAIL_NS, board in reported)
 
     def _records(self, session: UciSession, data: bytes, now_ns: int, reported: bool) -> Iterator[Record]:
-        found = session.receive(data, now_ns, now_ns)
+        measurements = session.receive(data, now_ns, now_ns)
         # The commands of the replayed session repeat the captured ones.
         session.outgoing()
         if reported:
-            yield from (Record(measurement) for measurement in found)
+            yield from (Record(measurement) for measurement in measurements)
 
     def _open(self) -> IO[str]:
         try:

@@ -6,7 +6,7 @@ or damaged, equal numbers alone do not prove that two notifications belong toget
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
@@ -16,7 +16,7 @@ STRICT_MESSAGES = 64
 """Number of messages without losses or damage after which equal sequence numbers are sufficient again."""
 
 ORDER_MESSAGES = 8
-"""Number of pairs from which the usual order of the two notifications is known."""
+"""Number of pairs from which the usual order and the usual delay of the two notifications are known."""
 
 ORDER_SHARE = 0.9
 MAX_WAITING = 8
@@ -25,30 +25,37 @@ MAX_WAITING = 8
 UNSUPPORTED_RANGES = 32
 """Number of ranges without diagnostics after which ranges no longer wait for them."""
 
-SPLIT_EXCHANGES, MAX_PARTS = 2, 3
+SPLIT_EXCHANGES, MAX_NOTIFICATIONS = 2, 3
 """Number of exchanges with a further notification of diagnostics after which ranges wait for it; one for each frame."""
 
 MIN_TIMEOUT_NS = 50 * 10**6
-"""Minimum time that a range waits for its diagnostics; otherwise two intervals."""
+"""Minimum time that a range waits for its diagnostics while their delay is unknown; otherwise two intervals."""
+
+SHORT_TIMEOUT_NS, DELAY_FACTOR = 5 * 10**6, 3
+"""Later it waits for this multiple of the longest of the latest delays, and at least this time."""
 
 _Content = TypeVar("_Content")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class RangeArrival:
-    """A range and the time of its arrival on the clock of the stamps."""
+    """A range, the time of its arrival, and the diagnostics that were joined.
 
-    record: RangeRecord
-    stamp_ns: int
+    Attributes:
+        handle, sequence: session and number of the exchange.
+        record: the range.
+        arrived_ns, stamp_ns: time of the arrival, monotonic, and on the clock of the stamps.
+        diagnostics: diagnostics of the exchange; None = they have not arrived.
+        is_complete: the range does not wait for diagnostics any more.
+    """
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MatchedRange:
-    """A range with the diagnostics of its exchange; None = they were lost."""
-
+    handle: int
     sequence: int
-    arrival: RangeArrival
-    diagnostics: Diagnostics | None
+    record: RangeRecord
+    arrived_ns: int
+    stamp_ns: int
+    diagnostics: Diagnostics | None = None
+    is_complete: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,21 +63,21 @@ class _Waiting(Generic[_Content]):
     """A notification whose counterpart has not arrived.
 
     Attributes:
-        at_ns: time of arrival.
+        arrived_ns: time of arrival.
         gap_ns: time since the message before it.
         strict: notifications were lost or damaged shortly before.
         follows: the message before it belongs to the previous exchange.
         damages: number of damaged places in the stream before it.
-        parts: number of notifications in the content.
+        notifications: number of notifications in the content.
     """
 
     content: _Content
-    at_ns: int
+    arrived_ns: int
     gap_ns: int
     strict: bool
     follows: bool
     damages: int
-    parts: int = 1
+    notifications: int = 1
 
 
 class DiagnosticsMatcher:
@@ -92,96 +99,105 @@ class DiagnosticsMatcher:
     def __init__(self, interval_ns: int) -> None:
         self.counts = Counter(joined=0, without_diagnostics=0, refused=0, gaps=0)
         self._interval_ns = interval_ns
-        self._timeout_ns = max(2 * interval_ns, MIN_TIMEOUT_NS)
+        self._max_timeout_ns = max(2 * interval_ns, MIN_TIMEOUT_NS)
+        self._delays_ns: deque[int] = deque(maxlen=32)
+        self._expired_ns: dict[int, int] = {}
         self._ranges: dict[int, _Waiting[RangeArrival]] = {}
         self._diagnostics: dict[int, _Waiting[Diagnostics]] = {}
-        self._held: dict[int, tuple[int, RangeArrival, Diagnostics, int]] = {}
-        self._parts, self._further = 1, 0
+        self._incomplete: dict[int, tuple[int, RangeArrival, Diagnostics, int]] = {}
+        self._expected_notifications, self._further = 1, 0
         self._completed: int | None = None
         self._step = 1
         self._steps = (1, 0)
         self._latest: tuple[bool, int] | None = None
         self._latest_ns = 0
-        self._latest_of: dict[bool, int] = {}
+        self._latest_sequences: dict[bool, int] = {}
         self._range_first: Counter[bool] = Counter()
         self._damages = 0
         self._strict = 0
         self._unanswered = 0
 
-    def add_range(
-        self, sequence: int, arrival: RangeArrival, damages: int, now_ns: int
-    ) -> list[MatchedRange]:
-        """Add a range.
+    def add_range(self, arrival: RangeArrival, damages: int, now_ns: int) -> None:
+        """Add a range; it becomes complete at once, with its diagnostics, or in `expire`.
 
         Args:
-            sequence: sequence number of the exchange.
             arrival: the range.
             damages: number of damaged places in the stream so far.
             now_ns: time of the arrival.
-
-        Returns:
-            Ranges that are complete, or have waited too long.
         """
+        sequence = arrival.sequence
         adjacent, strict, follows, gap_ns = self._observe(True, sequence, damages, now_ns)
         waiting = self._diagnostics.pop(sequence, None)
-        diagnostics = None
-        if waiting is not None and self._accept(
-            waiting, adjacent, strict, damages, gap_ns, range_first=False
-        ):
-            diagnostics = waiting.content
-        elif waiting is None and self._unanswered < UNSUPPORTED_RANGES and sequence not in self._ranges:
+        if waiting is not None:
+            accepted = self._accept(waiting, adjacent, strict, damages, gap_ns, range_first=False)
+            diagnostics = waiting.content if accepted else None
+            self._complete(arrival, diagnostics, waiting.notifications, now_ns)
+        elif self._unanswered < UNSUPPORTED_RANGES and sequence not in self._ranges:
             self._ranges[sequence] = _Waiting(arrival, now_ns, gap_ns, strict, follows, damages)
-            return self.expire(now_ns)
-        parts = waiting.parts if waiting is not None else 0
-        return [*self.expire(now_ns), *self._complete(sequence, arrival, diagnostics, parts, now_ns)]
+        else:
+            self._finish(arrival, None)
+        self.expire(now_ns)
 
-    def add_diagnostics(self, diagnostics: Diagnostics, damages: int, now_ns: int) -> list[MatchedRange]:
+    def add_diagnostics(self, diagnostics: Diagnostics, damages: int, now_ns: int) -> None:
         """Add diagnostics; see `add_range`."""
         sequence = diagnostics.sequence
         adjacent, strict, follows, gap_ns = self._observe(False, sequence, damages, now_ns)
         self._unanswered = 0
-        if (held := self._held.pop(sequence, None)) is not None:
-            _, arrival, whole, parts = held
-            whole = whole if strict else merge(whole, diagnostics)
-            return [*self.expire(now_ns), *self._complete(sequence, arrival, whole, parts + 1, now_ns)]
-        waiting = self._ranges.pop(sequence, None)
-        if waiting is None:
+        if (incomplete := self._incomplete.pop(sequence, None)) is not None:
+            since_ns, arrival, first, notifications = incomplete
+            self._delays_ns.append(now_ns - since_ns)
+            merged = first if strict else merge(first, diagnostics)
+            self._complete(arrival, merged, notifications + 1, now_ns)
+        elif (waiting := self._ranges.pop(sequence, None)) is not None:
+            accepted = self._accept(waiting, adjacent, strict, damages, gap_ns, range_first=True)
+            self._delays_ns.append(now_ns - waiting.arrived_ns)
+            self._complete(waiting.content, diagnostics if accepted else None, 1, now_ns)
+        else:
             arrived = _Waiting(diagnostics, now_ns, gap_ns, strict, follows, damages)
+            if (expired_ns := self._expired_ns.pop(sequence, None)) is not None:
+                self._delays_ns.append(now_ns - expired_ns)
             if sequence == self._completed and not strict:
                 self._further += 1
                 if self._further >= SPLIT_EXCHANGES:
-                    self._parts, self._further = min(self._parts + 1, MAX_PARTS), 0
+                    self._expected_notifications = min(self._expected_notifications + 1, MAX_NOTIFICATIONS)
+                    self._further = 0
             elif (before := self._diagnostics.get(sequence)) is not None and not strict:
-                arrived = replace(before, content=merge(before.content, diagnostics), parts=before.parts + 1)
+                merged = merge(before.content, diagnostics)
+                arrived = replace(before, content=merged, notifications=before.notifications + 1)
             self._diagnostics[sequence] = arrived
-            return self.expire(now_ns)
-        accepted = self._accept(waiting, adjacent, strict, damages, gap_ns, range_first=True)
-        complete = self._complete(sequence, waiting.content, diagnostics if accepted else None, 1, now_ns)
-        return [*self.expire(now_ns), *complete]
+        self.expire(now_ns)
 
-    def expire(self, now_ns: int) -> list[MatchedRange]:
-        """Return the ranges that have waited too long for their diagnostics."""
+    def expire(self, now_ns: int) -> None:
+        """Complete the ranges that have waited too long for their diagnostics."""
         for sequence, old in list(self._diagnostics.items()):
-            if now_ns - old.at_ns > self._timeout_ns or len(self._diagnostics) > MAX_WAITING:
+            if now_ns - old.arrived_ns > self._max_timeout_ns or len(self._diagnostics) > MAX_WAITING:
                 del self._diagnostics[sequence]
-        expired = []
-        for sequence, (at_ns, arrival, diagnostics, _) in list(self._held.items()):
-            if now_ns - at_ns > self._timeout_ns or len(self._held) > MAX_WAITING:
-                del self._held[sequence]
-                self._parts = max(self._parts - 1, 1)
-                expired.append(self._joined(sequence, arrival, diagnostics))
+        timeout_ns = self._timeout_ns()
+        for sequence, (since_ns, arrival, diagnostics, _) in list(self._incomplete.items()):
+            if now_ns - since_ns > timeout_ns or len(self._incomplete) > MAX_WAITING:
+                del self._incomplete[sequence]
+                self._expected_notifications = max(self._expected_notifications - 1, 1)
+                self._finish(arrival, diagnostics)
         for sequence, waiting in list(self._ranges.items()):
-            if now_ns - waiting.at_ns > self._timeout_ns or len(self._ranges) > MAX_WAITING:
+            if now_ns - waiting.arrived_ns > timeout_ns or len(self._ranges) > MAX_WAITING:
                 del self._ranges[sequence]
                 self._unanswered += 1
-                expired.append(self._joined(sequence, waiting.content, None))
-        return expired
+                self._expired_ns[sequence] = waiting.arrived_ns
+                if len(self._expired_ns) > MAX_WAITING:
+                    del self._expired_ns[next(iter(self._expired_ns))]
+                self._finish(waiting.content, None)
+
+    def _timeout_ns(self) -> int:
+        """Return how long a range waits: a multiple of the usual delay of the diagnostics once that is known."""
+        if len(self._delays_ns) < ORDER_MESSAGES:
+            return self._max_timeout_ns
+        return min(max(DELAY_FACTOR * max(self._delays_ns), SHORT_TIMEOUT_NS), self._max_timeout_ns)
 
     def _observe(
         self, is_range: bool, sequence: int, damages: int, now_ns: int
     ) -> tuple[bool, bool, bool, int]:
         """Return whether a message follows its counterpart, may be damaged, follows the previous exchange; and the gap."""
-        before = self._latest_of.get(is_range)
+        before = self._latest_sequences.get(is_range)
         second = not is_range and sequence == before
         if is_range and before is not None:
             # Sessions may share a counter: learn the step between the exchanges of this session.
@@ -197,7 +213,7 @@ class DiagnosticsMatcher:
             self._strict -= 1
         latest, self._latest = self._latest, (is_range, sequence)
         gap_ns, self._latest_ns = now_ns - self._latest_ns, now_ns
-        self._latest_of[is_range], self._damages = sequence, damages
+        self._latest_sequences[is_range], self._damages = sequence, damages
         adjacent = latest == (not is_range, sequence) and not second
         if adjacent:
             self._range_first[not is_range] += 1
@@ -223,16 +239,16 @@ class DiagnosticsMatcher:
         return accepted
 
     def _complete(
-        self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None, parts: int, now_ns: int
-    ) -> list[MatchedRange]:
-        """Return a range with its diagnostics, or keep it until their last part."""
-        if diagnostics is not None and parts < self._parts:
-            self._held[sequence] = now_ns, arrival, diagnostics, parts
-            return []
-        return [self._joined(sequence, arrival, diagnostics)]
+        self, arrival: RangeArrival, diagnostics: Diagnostics | None, notifications: int, now_ns: int
+    ) -> None:
+        """Complete a range, or keep it until the last notification of its diagnostics."""
+        if diagnostics is not None and notifications < self._expected_notifications:
+            self._incomplete[arrival.sequence] = now_ns, arrival, diagnostics, notifications
+        else:
+            self._finish(arrival, diagnostics)
 
-    def _joined(self, sequence: int, arrival: RangeArrival, diagnostics: Diagnostics | None) -> MatchedRange:
+    def _finish(self, arrival: RangeArrival, diagnostics: Diagnostics | None) -> None:
         if diagnostics is not None:
-            self._completed = sequence
+            self._completed = arrival.sequence
         self.counts["joined" if diagnostics is not None else "without_diagnostics"] += 1
-        return MatchedRange(sequence, arrival, diagnostics)
+        arrival.diagnostics, arrival.is_complete = diagnostics, True

@@ -17,64 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import LinkError
-
-
-class MessageType(enum.IntEnum):
-    """Message type (MT) of a packet."""
-
-    COMMAND = 1
-    RESPONSE = 2
-    NOTIFICATION = 3
-
-
-class GroupId(enum.IntEnum):
-    """Group identifier (GID) of a packet."""
-
-    CORE = 0x0
-    SESSION = 0x1
-    RANGING = 0x2
-    VENDOR = 0xB
-    CALIBRATION = 0xE
-
-
-RESET = (GroupId.CORE, 0)
-DEVICE_STATUS = (GroupId.CORE, 1)
-DEVICE_INFO = (GroupId.CORE, 2)
-GENERIC_ERROR = (GroupId.CORE, 7)
-SESSION_INIT = (GroupId.SESSION, 0)
-SESSION_DEINIT = (GroupId.SESSION, 1)
-SESSION_STATUS = (GroupId.SESSION, 2)
-SET_APP_CONFIG = (GroupId.SESSION, 3)
-GET_SESSION_STATE = (GroupId.SESSION, 6)
-RANGE_START = (GroupId.RANGING, 0)
-"""The command that starts a session; the notification of this number contains ranges."""
-RANGE_STOP = (GroupId.RANGING, 1)
-RANGE_DIAGNOSTICS = (GroupId.VENDOR, 3)
-BOOT = (GroupId.VENDOR, 0x31)
-SET_CALIBRATION = (GroupId.CALIBRATION, 0x2A)
-GET_CALIBRATION = (GroupId.CALIBRATION, 0x2B)
-
-STATUS_OK = 0
-DEVICE_READY = 1
-
-
-class SessionState(enum.IntEnum):
-    """State of a session in `SESSION_STATUS`."""
-
-    INIT = 0
-    DEINIT = 1
-    ACTIVE = 2
-    IDLE = 3
-
-
-RANGE_STATUSES = {
-    0x1B: "negative distance",
-    0x20: "transmission failed",
-    0x21: "reception timeout",
-    0x22: "PHY decoding error",
-    0x23: "no time of arrival",
-    0x24: "STS error",
-}
+from uwb_mitigation.radios.fira.codes import STATUS_OK, PacketType
 
 
 class RxFrame(enum.IntEnum):
@@ -91,7 +34,7 @@ class RangeRecord:
 
     Attributes:
         peer: address of the other board.
-        status: 0 or a key of `RANGE_STATUSES`.
+        status: 0 or a key of `codes.EXCHANGE_CAUSES`.
         range_m: NaN = invalid.
         rssi_dbm: receive level; NaN = unknown.
     """
@@ -204,18 +147,20 @@ def parse_ranges(payload: bytes) -> RangeNotification:
         raise LinkError(f"range notification of {len(payload)} bytes", valid=f"{_RANGE_HEADER.size} or more")
     sequence, handle, _, _, extended, _, count = _RANGE_HEADER.unpack_from(payload)
     expected = _RANGE_HEADER.size + count * _RANGE_RECORD_BYTES
-    rest = payload[expected : expected + 1]
-    if len(payload) < expected or (rest and rest[0] >> 5 in (MessageType.RESPONSE, MessageType.NOTIFICATION)):
+    surplus = payload[expected : expected + 1]
+    if len(payload) < expected or (
+        surplus and surplus[0] >> 5 in (PacketType.RESPONSE, PacketType.NOTIFICATION)
+    ):
         raise LinkError(f"range notification of {len(payload)} bytes", valid=f"{expected}")
     width = 8 if extended else 2
     records = []
-    for at in range(_RANGE_HEADER.size, expected, _RANGE_RECORD_BYTES):
-        status, _, distance_cm = struct.unpack_from("<BBH", payload, at + width)
-        rssi = payload[at + width + 17]
+    for start in range(_RANGE_HEADER.size, expected, _RANGE_RECORD_BYTES):
+        status, _, distance_cm = struct.unpack_from("<BBH", payload, start + width)
+        rssi = payload[start + width + 17]
         valid = status == STATUS_OK and distance_cm != _INVALID_CM
         records.append(
             RangeRecord(
-                int.from_bytes(payload[at : at + width], "little"),
+                int.from_bytes(payload[start : start + width], "little"),
                 status,
                 distance_cm / 100 if valid else math.nan,
                 -rssi / 2 if rssi else math.nan,
@@ -232,23 +177,23 @@ def parse_diagnostics(payload: bytes) -> Diagnostics:
     """
     try:
         handle, sequence, count = _DIAGNOSTICS_HEADER.unpack_from(payload)
-        at, frames = _DIAGNOSTICS_HEADER.size, []
+        start, frames = _DIAGNOSTICS_HEADER.size, []
         for _ in range(count):
-            frame, action, _, fields = _REPORT.unpack_from(payload, at)
-            at += _REPORT.size
-            found: defaultdict[int, bytes] = defaultdict(bytes)
+            frame, action, _, fields = _REPORT.unpack_from(payload, start)
+            start += _REPORT.size
+            contents: defaultdict[int, bytes] = defaultdict(bytes)
             for _ in range(fields):
-                kind, size = _FIELD.unpack_from(payload, at)
-                at += _FIELD.size
-                if at + size > len(payload):
+                kind, size = _FIELD.unpack_from(payload, start)
+                start += _FIELD.size
+                if start + size > len(payload):
                     raise LinkError(f"diagnostics field {kind} of {size} bytes ends after the notification")
-                found[kind] += payload[at : at + size]
-                at += size
-            frames.append(_frame(frame, action, found))
+                contents[kind] += payload[start : start + size]
+                start += size
+            frames.append(_frame(frame, action, contents))
     except struct.error as error:
         raise LinkError(f"diagnostics notification of {len(payload)} bytes ends early") from error
-    if any(payload[at:]):
-        raise LinkError(f"diagnostics notification with {len(payload) - at} further bytes")
+    if any(payload[start:]):
+        raise LinkError(f"diagnostics notification with {len(payload) - start} further bytes")
     return Diagnostics(handle, sequence, tuple(frames))
 
 
@@ -278,7 +223,7 @@ def _frame(frame: int, action: int, fields: Mapping[int, bytes]) -> FrameReport:
         action == 0,
         int.from_bytes(emitter, "little") if len(emitter) in (2, 8) else None,
         int.from_bytes(offset, "little", signed=True) / (1 << 26) * 1e6 if len(offset) == 4 else math.nan,
-        tuple(_metrics(metrics, at) for at in range(0, len(metrics), _METRICS.size))
+        tuple(_metrics(metrics, start) for start in range(0, len(metrics), _METRICS.size))
         if len(metrics) % _METRICS.size == 0
         else (),
         _cir_blocks(fields.get(7, b"")),
@@ -286,8 +231,8 @@ def _frame(frame: int, action: int, fields: Mapping[int, bytes]) -> FrameReport:
     )
 
 
-def _metrics(data: bytes, at: int) -> SegmentMetrics:
-    receiver, _, rx, index, level, position, peak, _, _ = _METRICS.unpack_from(data, at)
+def _metrics(data: bytes, start: int) -> SegmentMetrics:
+    receiver, _, rx, index, level, position, peak, _, _ = _METRICS.unpack_from(data, start)
     return SegmentMetrics(
         receiver >> 4,
         receiver & 7,
@@ -301,15 +246,15 @@ def _metrics(data: bytes, at: int) -> SegmentMetrics:
 
 
 def _cir_blocks(data: bytes) -> tuple[CirBlock, ...]:
-    blocks, at = [], 0
+    blocks, start = [], 0
     # A field of another layout is skipped: the frame keeps its metrics.
-    while at + _CIR.size <= len(data):
-        receiver, offset, count, tap_bytes = _CIR.unpack_from(data, at)
-        at += _CIR.size
-        if tap_bytes not in _TAP_BYTES or at + count * tap_bytes > len(data):
+    while start + _CIR.size <= len(data):
+        receiver, offset, count, tap_bytes = _CIR.unpack_from(data, start)
+        start += _CIR.size
+        if tap_bytes not in _TAP_BYTES or start + count * tap_bytes > len(data):
             return ()
-        taps = _taps(data[at : at + count * tap_bytes], tap_bytes // 2)
-        at += count * tap_bytes
+        taps = _taps(data[start : start + count * tap_bytes], tap_bytes // 2)
+        start += count * tap_bytes
         blocks.append(CirBlock(receiver >> 4, receiver & 7, bool(receiver & 8), offset, taps))
     return tuple(blocks)
 
@@ -351,13 +296,13 @@ def get_calibration(keys: Sequence[str]) -> bytes:
 def calibration_values(payload: bytes) -> dict[str, int]:
     """Return the values in a response to GET_CALIBRATION that the board knows, {key: value}."""
     values: dict[str, int] = {}
-    at = 3
-    while at < len(payload):
-        key = payload[at + 1 : at + 1 + payload[at]]
-        at += 1 + len(key)
-        status, length = (*payload[at : at + 2], 0, 0)[:2]
-        value = payload[at + 2 : at + 2 + length]
-        at += 2 + length
+    start = 3
+    while start < len(payload):
+        key = payload[start + 1 : start + 1 + payload[start]]
+        start += 1 + len(key)
+        status, length = (*payload[start : start + 2], 0, 0)[:2]
+        value = payload[start + 2 : start + 2 + length]
+        start += 2 + length
         if status == STATUS_OK and len(value) == length > 0:
             values[key.decode("ascii", "replace")] = int.from_bytes(value, "little")
     return values

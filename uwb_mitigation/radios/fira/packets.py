@@ -11,8 +11,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.fira import messages
-from uwb_mitigation.radios.fira.messages import Diagnostics, MessageType, RangeNotification
+from uwb_mitigation.radios.fira import codes, messages
+from uwb_mitigation.radios.fira.codes import PacketType
+from uwb_mitigation.radios.fira.messages import Diagnostics, RangeNotification
 
 COMMAND_BYTES = 250
 """Maximum payload of a command packet; a longer command is sent in fragments."""
@@ -25,15 +26,15 @@ MAX_GAP_NS = 250 * 10**6
 
 _HEADER_BYTES = 4
 _MORE = 0x10
-_RANGES = (MessageType.NOTIFICATION, *messages.RANGE_START)
-_DIAGNOSTICS = (MessageType.NOTIFICATION, *messages.RANGE_DIAGNOSTICS)
-_OTHERS = (messages.DEVICE_STATUS, messages.GENERIC_ERROR, messages.SESSION_STATUS, messages.BOOT)
-_NOTIFICATIONS = {_RANGES, _DIAGNOSTICS, *((MessageType.NOTIFICATION, *name) for name in _OTHERS)}
+_RANGES = (PacketType.NOTIFICATION, *codes.RANGE_START)
+_DIAGNOSTICS = (PacketType.NOTIFICATION, *codes.RANGE_DIAGNOSTICS)
+_STATE_NOTIFICATIONS = (codes.DEVICE_STATUS, codes.GENERIC_ERROR, codes.SESSION_STATUS, codes.BOOT)
+_NOTIFICATIONS = {_RANGES, _DIAGNOSTICS, *((PacketType.NOTIFICATION, *name) for name in _STATE_NOTIFICATIONS)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """A response or notification.
+class Packet:
+    """A response or notification, assembled from its fragments.
 
     Attributes:
         kind, group, opcode: from the header.
@@ -41,7 +42,7 @@ class Message:
         content: the parsed content of ranges and diagnostics.
     """
 
-    kind: MessageType
+    kind: PacketType
     group: int
     opcode: int
     payload: bytes
@@ -53,18 +54,19 @@ class Message:
         return self.payload[0] if self.payload else 0xFF
 
 
-def encode(
+def encode_packets(
     group: int,
     opcode: int,
     payload: bytes,
-    kind: MessageType = MessageType.COMMAND,
+    kind: PacketType = PacketType.COMMAND,
     size: int = COMMAND_BYTES,
 ) -> bytes:
     """Return the packets of a message, in fragments of `size` bytes."""
-    parts = [payload[at : at + size] for at in range(0, len(payload), size)] or [b""]
+    fragments = [payload[start : start + size] for start in range(0, len(payload), size)] or [b""]
+    more = [_MORE] * (len(fragments) - 1) + [0]
     return b"".join(
-        bytes([kind << 5 | (_MORE if number < len(parts) - 1 else 0) | group, opcode, 0, len(part)]) + part
-        for number, part in enumerate(parts)
+        bytes([kind << 5 | flag | group, opcode, 0, len(fragment)]) + fragment
+        for flag, fragment in zip(more, fragments, strict=True)
     )
 
 
@@ -80,7 +82,7 @@ class PacketDecoder:
         self.counts = Counter(messages=0, unknown=0, damaged=0, skipped=0)
         self.damages = 0
         self._buffer = bytearray()
-        self._parts = bytearray()
+        self._fragments = bytearray()
         self._name: tuple[int, int, int] | None = None
         self._since_ns = 0
         self._lost = False
@@ -88,10 +90,10 @@ class PacketDecoder:
     def reset(self) -> None:
         """Forget incomplete packets and messages."""
         self._buffer.clear()
-        self._drop_parts()
+        self._drop_fragments()
         self._lost = False
 
-    def feed(self, data: bytes, now_ns: int) -> list[Message]:
+    def feed(self, data: bytes, now_ns: int) -> list[Packet]:
         """Return the messages that are complete with `data`; call it with no data to end a timeout."""
         late = len(self._buffer) > 0 and now_ns - self._since_ns > MAX_GAP_NS
         if self._name is not None and now_ns - self._since_ns > MAX_GAP_NS:
@@ -99,15 +101,15 @@ class PacketDecoder:
         if data:
             self._since_ns = now_ns
         self._buffer += data
-        found: list[Message] = []
+        packets: list[Packet] = []
         if late:
             # The length of the waiting packet is wrong: search for packets inside of it.
             self._skip()
-        while (size := self._next(found)) is not None:
+        while (size := self._next(packets)) is not None:
             del self._buffer[:size]
-        return found
+        return packets
 
-    def _next(self, found: list[Message]) -> int | None:
+    def _next(self, packets: list[Packet]) -> int | None:
         """Handle the packet at the start of the buffer; return the number of bytes used, None = more are needed."""
         buffer = self._buffer
         if len(buffer) < _HEADER_BYTES:
@@ -129,32 +131,32 @@ class PacketDecoder:
             self._damage()
         if more:
             self._name = name
-            self._parts += payload
-            if len(self._parts) > MAX_MESSAGE_BYTES:
+            self._fragments += payload
+            if len(self._fragments) > MAX_MESSAGE_BYTES:
                 self._damage()
             return end
-        whole = bytes(self._parts) + payload
-        message = _parsed(name, whole)
+        assembled = bytes(self._fragments) + payload
+        message = _parsed(name, assembled)
         if message is None:
             self._damage()
             self._skip()
             return 0
-        self._drop_parts()
+        self._drop_fragments()
         self._lost = False
         self.counts["messages"] += 1
-        if name[0] == MessageType.NOTIFICATION and name not in _NOTIFICATIONS:
+        if name[0] == PacketType.NOTIFICATION and name not in _NOTIFICATIONS:
             self.counts["unknown"] += 1
-        found.append(message)
+        packets.append(message)
         return end
 
-    def _is_header(self, at: int) -> bool:
-        first, opcode, reserved = self._buffer[at : at + 3]
+    def _is_header(self, start: int) -> bool:
+        first, opcode, reserved = self._buffer[start : start + 3]
         kind, group = first >> 5, first & 0xF
-        plausible = kind in (MessageType.RESPONSE, MessageType.NOTIFICATION) and opcode < 64 and not reserved
+        plausible = kind in (PacketType.RESPONSE, PacketType.NOTIFICATION) and opcode < 64 and not reserved
         if not plausible or not self._lost:
             return plausible
         # Among damaged bytes, only believe in the packets that the host needs.
-        return kind == MessageType.RESPONSE or (kind, group, opcode) in _NOTIFICATIONS
+        return kind == PacketType.RESPONSE or (kind, group, opcode) in _NOTIFICATIONS
 
     def _skip(self) -> None:
         """Skip one byte of the buffer."""
@@ -167,14 +169,14 @@ class PacketDecoder:
     def _damage(self) -> None:
         self.damages += 1
         self.counts["damaged"] += 1
-        self._drop_parts()
+        self._drop_fragments()
 
-    def _drop_parts(self) -> None:
-        self._parts.clear()
+    def _drop_fragments(self) -> None:
+        self._fragments.clear()
         self._name = None
 
 
-def _parsed(name: tuple[int, int, int], payload: bytes) -> Message | None:
+def _parsed(name: tuple[int, int, int], payload: bytes) -> Packet | None:
     """Return a message; None if its content is damaged."""
     content: RangeNotification | Diagnostics | None = None
     with contextlib.suppress(LinkError):
@@ -182,5 +184,5 @@ def _parsed(name: tuple[int, int, int], payload: bytes) -> Message | None:
             content = messages.parse_ranges(payload)
         elif name == _DIAGNOSTICS:
             content = messages.parse_diagnostics(payload)
-        return Message(MessageType(name[0]), name[1], name[2], payload, content)
+        return Packet(PacketType(name[0]), name[1], name[2], payload, content)
     return None

@@ -9,24 +9,17 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter, deque
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.radios.fira import messages
-from uwb_mitigation.radios.fira.cir import read_cir
-from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher, MatchedRange, RangeArrival
-from uwb_mitigation.radios.fira.messages import (
-    DEVICE_READY,
-    RANGE_STATUSES,
-    STATUS_OK,
-    Diagnostics,
-    MessageType,
-    RangeNotification,
-    SessionState,
-)
-from uwb_mitigation.radios.fira.packets import Message, PacketDecoder, encode
+from uwb_mitigation.radios.fira import codes, messages
+from uwb_mitigation.radios.fira.cir import PositionUnit, read_cir
+from uwb_mitigation.radios.fira.codes import DEVICE_READY, STATUS_OK, PacketType, SessionState
+from uwb_mitigation.radios.fira.joining import MIN_TIMEOUT_NS, DiagnosticsMatcher, RangeArrival
+from uwb_mitigation.radios.fira.messages import Diagnostics, RangeNotification
+from uwb_mitigation.radios.fira.packets import Packet, PacketDecoder, encode_packets
 from uwb_mitigation.radios.settings import Role
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -59,13 +52,21 @@ READY_NS = 600 * _MS
 """Timeout of the notification that a board is ready after a reset; it ignores commands before."""
 
 TRIES = 3
-RETRY_NS = 300 * _MS
-"""Time after which a start that failed is repeated."""
+MIN_PAUSE_NS, MAX_PAUSE_NS = 500 * _MS, 30_000 * _MS
+"""Pause before a board or session is started again; it doubles until the board has ranged for `STABLE_NS`."""
+
+STABLE_NS = 30_000 * _MS
+STOP_NS = 100 * _MS
+"""Timeout of a command at the end."""
+
+LATEST_NOTIFICATIONS = 16
+"""Number of notifications among which repetitions are detected."""
 
 SILENCE_NS = 1500 * _MS
 """Time without a notification, in addition to five intervals, after which the host asks whether the board works."""
 
 MAX_OUTGOING_BYTES = 1 << 14
+_NO_ANSWER = "no answer to the reset: is this a board with UCI firmware?"
 
 _TAPS, _LEAD = "rx_diag_config.cir_n_taps", "rx_diag_config.cir_fp_tap_offset"
 _ROUND_SLOTS, _SLOT_RSTU = 6, 2400
@@ -144,18 +145,19 @@ class _Command:
     payload: bytes = b""
     tries: int = TRIES
     timeout_ns: int = ANSWER_NS
-    left: int = 0
+    remaining: int = 0
     due_ns: int = 0
 
 
-_Steps = Generator[_Command, Message | None, str]
+_Steps = Generator[_Command, Packet | None, str]
 
 
 class UciSession:
     """The host's side of one board.
 
     Call `receive` after each read, and at least every 50 ms; send `outgoing`. `now_ns` is monotonic, `stamp_ns` is
-    the clock of the stamps.
+    the clock of the stamps. Calibration keys may be in flash memory: a key is read first, written only if it differs,
+    and restored by `stop`.
 
     Args:
         settings: what the board does.
@@ -168,6 +170,8 @@ class UciSession:
         counts: numbers of messages, ranges and problems.
         starts: how often ranging was started.
         clock_offsets_ppm: latest carrier frequency offsets of the peers.
+        position_unit: unit of the first-path positions.
+        stopped: the commands of `stop` were answered.
     """
 
     def __init__(self, settings: UciSettings) -> None:
@@ -178,24 +182,30 @@ class UciSession:
         self.rejected: dict[int, int] = {}
         self.device_info = b""
         self.starts = 0
-        self.counts: Counter[str] = Counter(
-            ranges=0, without_cir=0, inconsistent_cir=0, unknown_session=0, restarts=0, error_answers=0
-        )
+        names = "ranges without_cir inconsistent_cir unknown_session duplicates restarts error_answers calibration_writes"
+        self.counts: Counter[str] = Counter(dict.fromkeys(names.split(), 0))
         self.clock_offsets_ppm: deque[float] = deque(maxlen=200)
+        self.position_unit = PositionUnit()
+        self.stopped = False
         self._decoder = PacketDecoder()
-        self._joined_before: Counter[str] = Counter(DiagnosticsMatcher(0).counts)
+        self._earlier_counts: Counter[str] = Counter(DiagnosticsMatcher(0).counts)
         self._outgoing = bytearray()
         self._steps: _Steps | None = None
         self._pending: _Command | None = None
+        self._peers: dict[int, int] = {}
         self._handles: dict[int, int] = {}
-        self._handle_of: dict[int, int] = {}
-        self._joiners: dict[int, DiagnosticsMatcher] = {}
+        self._matchers: dict[int, DiagnosticsMatcher] = {}
+        self._arrivals: deque[RangeArrival] = deque()
+        self._notifications: deque[bytes] = deque(maxlen=LATEST_NOTIFICATIONS)
+        self._failures: Counter[str] = Counter()
         self._active: set[int] = set()
+        self._ended: dict[int, str] = {}
+        self._calibration = _Calibration()
         self._ready = False
-        self._boot_due = False
-        self._has_ranged = False
-        self._received_ns = self._ended_ns = 0
-        self._asked = False
+        self._restart_ns: int | None = None
+        self._pause_ns = MIN_PAUSE_NS
+        self._has_ranged = self._stopping = self._state_requested = False
+        self._received_ns = self._started_ns = 0
 
     def opened(self, now_ns: int) -> None:
         """Start the board after its port was opened."""
@@ -205,10 +215,21 @@ class UciSession:
 
     def closed(self) -> None:
         """Stop after the port was lost."""
-        self._steps = self._pending = None
+        self._steps = self._pending = self._restart_ns = None
         self._outgoing.clear()
         self._end_sessions()
         self.state = "not connected"
+
+    def stop(self, now_ns: int) -> None:
+        """End all sessions and restore the calibration, before the port is closed; `stopped` follows."""
+        self._stopping, self._restart_ns = True, None
+        self._steps = self._shut_down()
+        self._advance(None, now_ns)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the session pauses before it starts the board again."""
+        return self._restart_ns is not None
 
     def outgoing(self) -> bytes:
         """Return the bytes to send, once."""
@@ -216,97 +237,112 @@ class UciSession:
         self._outgoing.clear()
         return data
 
-    def stop_commands(self) -> bytes:
-        """Return the commands that end all sessions, to be sent before the port is closed."""
-        handles = [struct.pack("<I", handle) for handle in self._handles]
-        return b"".join(
-            encode(*name, handle)
-            for handle in handles
-            for name in (messages.RANGE_STOP, messages.SESSION_DEINIT)
-        )
+    def take_failures(self) -> Counter[str]:
+        """Return the numbers of failed exchanges since the last call, {cause: count}."""
+        failures, self._failures = self._failures, Counter()
+        return failures
 
     def totals(self) -> dict[str, int]:
         """Return all counts for diagnostics, {name: count}."""
-        joined = Counter(self._joined_before)
-        for joiner in self._joiners.values():
-            joined.update(joiner.counts)
-        return {**self.counts, **joined, **self._decoder.counts}
+        matched = Counter(self._earlier_counts)
+        for matcher in self._matchers.values():
+            matched.update(matcher.counts)
+        return {**self.counts, **matched, **self._decoder.counts}
 
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
-        """Handle received bytes and timeouts; return new measurements."""
-        found: list[RangeMeasurement] = []
-        for message in self._decoder.feed(data, now_ns):
-            found += self._handle(message, now_ns, stamp_ns)
-        for handle, joiner in self._joiners.items():
-            found += self._measurements(handle, joiner.expire(now_ns))
+        """Handle received bytes and timeouts; return new measurements in the order of their arrival."""
+        for packet in self._decoder.feed(data, now_ns):
+            self._handle(packet, now_ns, stamp_ns)
+        for matcher in self._matchers.values():
+            matcher.expire(now_ns)
+        measurements = self._complete_measurements(now_ns)
         self._check_times(now_ns)
-        return found
+        return measurements
 
     def _begin(self, now_ns: int) -> None:
+        """Start the board with a reset."""
+        reason = self.state if self.is_waiting else ""
         self._end_sessions()
-        self.state = "no answer to the reset: is this a board with UCI firmware?"
+        self.state = reason or _NO_ANSWER
         self._steps = self._start_up()
         self._received_ns = now_ns
-        self._asked = self._has_ranged = False
+        self._restart_ns = None
+        self._state_requested = self._has_ranged = self.stopped = self._stopping = False
         self._advance(None, now_ns)
 
+    def _schedule(self, reason: str, now_ns: int) -> None:
+        """Start the board, or the sessions that have ended, again after a pause."""
+        if self.is_waiting or self._stopping:
+            return
+        if self._started_ns and not self.state and now_ns - self._started_ns > STABLE_NS:
+            self._pause_ns = MIN_PAUSE_NS
+        self.state = f"{reason}; it is started again after {self._pause_ns / 1e9:g} s"
+        self._restart_ns = now_ns + self._pause_ns
+        self._pause_ns = min(2 * self._pause_ns, MAX_PAUSE_NS)
+
     def _end_sessions(self) -> None:
-        for joiner in self._joiners.values():
-            self._joined_before.update(joiner.counts)
-        self._handles, self._handle_of, self._joiners, self._active = {}, {}, {}, set()
+        for matcher in self._matchers.values():
+            self._earlier_counts.update(matcher.counts)
+        for arrival in self._arrivals:
+            arrival.is_complete = True
+        self._handles, self._matchers, self._active, self._ended = {}, {}, set(), {}
 
     def _start_up(self) -> _Steps:
         """Send the commands that start ranging; return the problem, or an empty string."""
         # A board that is starting answers late: repeat the reset for as long as it takes.
         errors, tries = self.counts["error_answers"], 0
         self._ready = False
-        while (yield _Command(messages.RESET, b"\0", tries=1, timeout_ns=RESET_NS)) is None:
+        while (yield _Command(codes.RESET, b"\0", tries=1, timeout_ns=RESET_NS)) is None:
             tries += 1
             if tries >= RESET_TRIES and (self._ready or self.counts["error_answers"] > errors):
                 break
+            if tries >= RESET_TRIES:
+                self.state = _NO_ANSWER
             self._ready = False
         yield _Command(None, tries=1, timeout_ns=READY_NS)
+        if self.state == _NO_ANSWER:
+            self.state = "the board has not confirmed its settings"
         self.rejected = {}
-        self.state = "the board does not accept its settings"
-        yield from self._set_window()
+        if self.settings.window:
+            self.window = yield from self._calibration.set_window(self.settings.window, self.counts)
         for peer in self.settings.peers:
             problem = yield from self._open(peer)
             if problem:
                 return problem
         self.starts += 1
         if self.settings.identify:
-            answer = yield _Command(messages.DEVICE_INFO, tries=1)
+            answer = yield _Command(codes.DEVICE_INFO, tries=1)
             if answer is not None and answer.status == STATUS_OK:
                 self.device_info = answer.payload[1:]
         return ""
 
-    def _set_window(self) -> _Steps:
-        """Request the window of the CIR. A board that refuses keeps its own: the CIR contains its size."""
-        wanted = {_TAPS: self.settings.window, _LEAD: WINDOW_LEAD}
-        self.window = None
-        if not self.settings.window:
-            return ""
-        for count_bytes in (2, 1):
-            for key, value in wanted.items():
-                payload = messages.set_calibration(key, value, count_bytes)
-                yield _Command(messages.SET_CALIBRATION, payload, tries=1)
-            values = {}
-            answer = yield _Command(messages.GET_CALIBRATION, messages.get_calibration(list(wanted)), tries=2)
-            if answer is not None:
-                values = messages.calibration_values(answer.payload)
-                if _TAPS in values:
-                    self.window = values[_TAPS], values.get(_LEAD, WINDOW_LEAD)
-            if values == wanted or answer is None:
-                break
+    def _open_again(self, handles: list[int]) -> _Steps:
+        """Open sessions again that have ended, without a reset of the board and its other sessions."""
+        for handle in handles:
+            peer = self._peers[handle]
+            yield _Command(codes.SESSION_DEINIT, struct.pack("<I", handle), tries=1)
+            del self._ended[handle]
+            self._earlier_counts.update(self._matchers.pop(handle).counts)
+            problem = yield from self._open(peer)
+            if problem:
+                return problem
+        self.starts += 1
         return ""
+
+    def _shut_down(self) -> _Steps:
+        for handle in list(self._matchers):
+            for name in (codes.RANGE_STOP, codes.SESSION_DEINIT):
+                yield _Command(name, struct.pack("<I", handle), tries=1, timeout_ns=STOP_NS)
+        yield from self._calibration.restore(self.counts)
+        return "not connected"
 
     def _open(self, peer: int) -> _Steps:
         number = struct.pack("<I", self.settings.session_id(peer))
-        answer = yield _Command(messages.SESSION_INIT, number + b"\0")
+        answer = yield _Command(codes.SESSION_INIT, number + b"\0")
         if answer is not None and answer.status != STATUS_OK:
             # The session may exist from before, on a board that has refused the reset.
-            yield _Command(messages.SESSION_DEINIT, number, tries=1)
-            answer = yield _Command(messages.SESSION_INIT, number + b"\0")
+            yield _Command(codes.SESSION_DEINIT, number, tries=1)
+            answer = yield _Command(codes.SESSION_INIT, number + b"\0")
         if answer is None or answer.status != STATUS_OK:
             return _refused("SESSION_INIT", answer)
         # FiRa 1.3 firmware answers without a handle: it uses the session's number.
@@ -316,10 +352,11 @@ class UciSession:
             return problem
         interval_ns = self.settings.effective_interval_ms * _MS
         # The first range may arrive before the answer to the start.
-        self._handles[handle], self._joiners[handle] = peer, DiagnosticsMatcher(interval_ns)
+        self._peers[handle], self._matchers[handle] = peer, DiagnosticsMatcher(interval_ns)
+        self._notifications.clear()
         # Notifications may contain the handle, or the number of the session.
-        self._handle_of |= {self.settings.session_id(peer): handle, handle: handle}
-        answer = yield _Command(messages.RANGE_START, struct.pack("<I", handle))
+        self._handles |= {self.settings.session_id(peer): handle, handle: handle}
+        answer = yield _Command(codes.RANGE_START, struct.pack("<I", handle))
         # The answer may be lost, and a repeated start is refused.
         started = handle in self._active or (answer is not None and answer.status == STATUS_OK)
         return "" if started else _refused("RANGE_START", answer)
@@ -329,7 +366,7 @@ class UciSession:
         waiting, repeats = [entries], 1
         while waiting:
             packet = waiting.pop(0)
-            answer = yield _Command(messages.SET_APP_CONFIG, messages.app_config(handle, packet))
+            answer = yield _Command(codes.SET_APP_CONFIG, messages.app_config(handle, packet))
             if answer is None:
                 return _refused("SET_APP_CONFIG", answer)
             named = messages.rejected_tags(answer.payload)
@@ -344,30 +381,30 @@ class UciSession:
             if _NEEDED & rejected.keys():
                 return _refused("SET_APP_CONFIG", answer, rejected)
             self.rejected |= rejected
-            left = [entry for entry in packet if entry[0] not in rejected]
-            if failed and left:
+            accepted = [entry for entry in packet if entry[0] not in rejected]
+            if failed and accepted:
                 # An answer that names no parameter: set each one with its own command.
-                waiting = [left] if rejected else [[entry] for entry in left]
+                waiting = [accepted] if rejected else [[entry] for entry in accepted]
         return ""
 
     def _app_config(self, peer: int) -> list[tuple[int, bytes]]:
         """Return the parameters of a session, {tag, value}: those that worked on a real board, in their order."""
         s, is_tag = self.settings, self.settings.role is Role.TAG
-        one, zero = b"\1", b"\0"
+        on, off = b"\1", b"\0"
         entries = [
-            (0x00, one if is_tag else zero),  # device type: controller, controlee
-            (0x11, one if is_tag else zero),  # device role: initiator, responder
-            (0x03, zero),  # unicast
+            (0x00, on if is_tag else off),  # device type: controller, controlee
+            (0x11, on if is_tag else off),  # device role: initiator, responder
+            (0x03, off),  # unicast
             (0x01, b"\2"),  # DS-TWR, deferred
             (0x06, struct.pack("<H", s.address)),
             (0x04, bytes([s.channel])),
-            (0x22, one),  # time-scheduled
-            (0x02, zero),  # static STS
+            (0x22, on),  # time-scheduled
+            (0x02, off),  # static STS
             (0x12, b"\3"),  # SP3
             (0x2E, b"\x0b"),  # result report
             (0x27, b"\x08\x07"),  # vendor id
             (0x28, b"\1\2\3\4\5\6"),  # static STS IV
-            (0x0D, one),  # AoA request
+            (0x0D, on),  # AoA request
             (0x2B, bytes(8)),  # initiation time
             (0x14, bytes([s.preamble_code or 10])),
             (0x15, b"\2"),  # SFD
@@ -375,170 +412,264 @@ class UciSession:
             (0x09, struct.pack("<I", s.effective_interval_ms)),
             (0x1B, bytes([_ROUND_SLOTS])),
             (0x32, bytes(2)),  # no limit of measurements
-            (0x2C, zero),  # no hopping
-            (0x13, zero),  # RSSI: part of the diagnostics
-            (0x2D, zero),  # block stride
-            (0x05, one),  # controlees
+            (0x2C, off),  # no hopping
+            (0x13, off),  # RSSI: part of the diagnostics
+            (0x2D, off),  # block stride
+            (0x05, on),  # controlees
             (0x07, struct.pack("<H", peer)),
-            (0x24, zero),  # key rotation rate
-            (0x35, one),  # STS length
+            (0x24, off),  # key rotation rate
+            (0x35, on),  # STS length
         ]
         return [
             *entries,
-            (_ENABLE_DIAGNOSTICS, one),
+            (_ENABLE_DIAGNOSTICS, on),
             (_DIAGNOSTICS_MASK, bytes([_CIR_METRICS_EMITTER_OFFSET])),
         ]
 
-    def _advance(self, answer: Message | None, now_ns: int) -> None:
-        """Go on with the start-up after an answer or a timeout."""
+    def _advance(self, answer: Packet | None, now_ns: int) -> None:
+        """Go on with the commands after an answer or a timeout."""
         assert self._steps is not None
         try:
             self._pending = self._steps.send(answer)
         except StopIteration as end:
             self._steps = self._pending = None
             self.state = str(end.value)
-            self._received_ns = self._ended_ns = now_ns
+            self._received_ns = self._started_ns = now_ns
+            self.stopped = self._stopping
+            if self.state:
+                self._started_ns = 0
+                self._schedule(self.state, now_ns)
             return
-        self._pending.left = self._pending.tries
+        self._pending.remaining = self._pending.tries
         self._send_pending(now_ns)
 
     def _send_pending(self, now_ns: int) -> None:
         command = self._pending
         assert command is not None
-        command.left -= 1
+        command.remaining -= 1
         command.due_ns = now_ns + command.timeout_ns
         if command.name is not None:
             if len(self._outgoing) > MAX_OUTGOING_BYTES:
                 # The port accepts no bytes.
                 self._outgoing.clear()
-            self._outgoing += encode(*command.name, command.payload)
+            self._outgoing += encode_packets(*command.name, command.payload)
         elif self._ready:
             self._advance(None, now_ns)
 
     def _check_times(self, now_ns: int) -> None:
-        if self._boot_due:
-            self._boot_due = False
-            self.counts["restarts"] += 1
-            self._begin(now_ns)
-        elif self._pending is not None:
+        if self._pending is not None:
             if now_ns >= self._pending.due_ns:
-                if self._pending.left > 0 and self._pending.name is not None:
+                if self._pending.remaining > 0 and self._pending.name is not None:
                     self._send_pending(now_ns)
                 else:
                     self._advance(None, now_ns)
+        elif self._restart_ns is not None:
+            if now_ns >= self._restart_ns:
+                self._restart(now_ns)
         elif self._steps is None and self.state != "not connected":
-            silence = now_ns - self._received_ns
-            limit = SILENCE_NS + 5 * self.settings.effective_interval_ms * _MS
-            if silence > 2 * limit or (self.state and now_ns - self._ended_ns > RETRY_NS):
-                self._boot_due = True
-            elif silence > limit and not self._asked:
+            idle_ns = now_ns - self._received_ns
+            limit_ns = SILENCE_NS + 5 * self.settings.effective_interval_ms * _MS
+            if self._ended:
+                self._schedule(next(iter(self._ended.values())), now_ns)
+            elif idle_ns > 2 * limit_ns:
+                self._schedule("the board sends no data", now_ns)
+            elif idle_ns > limit_ns and not self._state_requested:
                 # An anchor without its tag may have nothing to report: ask whether the board works.
-                self._asked = True
-                for handle in self._handles:
-                    self._outgoing += encode(*messages.GET_SESSION_STATE, struct.pack("<I", handle))
+                self._state_requested = True
+                for handle in self._matchers:
+                    self._outgoing += encode_packets(*codes.GET_SESSION_STATE, struct.pack("<I", handle))
 
-    def _handle(self, message: Message, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
-        name = (message.group, message.opcode)
+    def _restart(self, now_ns: int) -> None:
+        """Open the sessions that have ended, or start the board if it does not range at all."""
+        self.counts["restarts"] += 1
+        if self._ended and self._started_ns:
+            self._restart_ns = None
+            self._steps = self._open_again(sorted(self._ended))
+            self._advance(None, now_ns)
+        else:
+            self._begin(now_ns)
+
+    def _handle(self, packet: Packet, now_ns: int, stamp_ns: int) -> None:
+        name = (packet.group, packet.opcode)
         if self._steps is None:
             self._received_ns = now_ns
-            self._asked = False
-        if message.kind is MessageType.RESPONSE:
-            if name == messages.GET_SESSION_STATE and self._steps is None:
-                if message.status == STATUS_OK:
-                    self._boot_due = message.payload[1:2] != bytes([SessionState.ACTIVE])
-                else:
-                    # The firmware has no such command, or no such session any more.
-                    self._boot_due = self._has_ranged
-            self._answer(name, message, now_ns)
-        elif name == messages.GENERIC_ERROR:
+            self._state_requested = False
+        if packet.kind is PacketType.RESPONSE:
+            if name == codes.GET_SESSION_STATE and self._steps is None:
+                is_active = packet.payload[1:2] == bytes([SessionState.ACTIVE])
+                # The firmware may have no such command, or no such session any more.
+                if self._has_ranged if packet.status != STATUS_OK else not is_active:
+                    self._started_ns = 0
+                    self._schedule("the board has ended its sessions", now_ns)
+            self._answer(name, packet, now_ns)
+        elif name == codes.GENERIC_ERROR:
             if self._pending is not None and self._pending.name is not None:
-                self._answer(self._pending.name, message, now_ns)
-        elif name == messages.DEVICE_STATUS:
-            self._ready = message.status == DEVICE_READY
+                self._answer(self._pending.name, packet, now_ns)
+        elif name == codes.DEVICE_STATUS:
+            self._ready = packet.status == DEVICE_READY
             if self._ready and self._pending is not None and self._pending.name is None:
                 self._advance(None, now_ns)
-        elif name == messages.BOOT:
-            # The board has restarted by itself and has lost its sessions.
-            self._boot_due = self._steps is None
-        elif name == messages.SESSION_STATUS:
-            self._follow(message)
-        elif isinstance(message.content, RangeNotification):
-            return self._ranges(message.content, now_ns, stamp_ns)
-        elif isinstance(message.content, Diagnostics):
-            return self._diagnostics(message.content, now_ns)
-        return []
+        elif name == codes.BOOT:
+            if self._steps is None:
+                # The board has lost its sessions.
+                self._schedule("the board has restarted by itself", now_ns)
+                self._started_ns = 0
+        elif name == codes.SESSION_STATUS:
+            self._follow(packet)
+        elif packet.content is not None:
+            if packet.payload in self._notifications:
+                self.counts["duplicates"] += 1
+                return
+            self._notifications.append(packet.payload)
+            if isinstance(packet.content, RangeNotification):
+                self._add_ranges(packet.content, now_ns, stamp_ns)
+            else:
+                self._add_diagnostics(packet.content, now_ns)
 
-    def _answer(self, name: tuple[int, int], message: Message, now_ns: int) -> None:
-        if message.status != STATUS_OK:
+    def _answer(self, name: tuple[int, int], packet: Packet, now_ns: int) -> None:
+        if packet.status != STATUS_OK:
             self.counts["error_answers"] += 1
         if self._pending is not None and self._pending.name == name:
-            if name == messages.RESET and message.status != STATUS_OK:
+            if name == codes.RESET and packet.status != STATUS_OK:
                 return  # The reset is repeated after its timeout.
-            self._advance(message, now_ns)
+            self._advance(packet, now_ns)
 
-    def _follow(self, message: Message) -> None:
-        """Restart the board if a session that was active has ended."""
-        if len(message.payload) < 5:
+    def _follow(self, packet: Packet) -> None:
+        """Note a session that was active and has ended."""
+        if len(packet.payload) < 5:
             return
-        number, state = struct.unpack_from("<IB", message.payload)
-        handle = self._handle_of.get(number)
-        if handle is None:
+        number, state = struct.unpack_from("<IB", packet.payload)
+        handle = self._handles.get(number)
+        if handle is None or handle not in self._matchers:
             return
         if state == SessionState.ACTIVE:
             self._active.add(handle)
-        elif handle in self._active and self._steps is None:
-            self._boot_due = True
+        elif handle in self._active and not self._stopping:
+            self._active.discard(handle)
+            reason = packet.payload[5] if len(packet.payload) > 5 else 0
+            peer = f"session with {self._peers[handle]}"
+            self._ended[handle] = f"the board has ended the {peer}: {codes.reason_text(reason)}"
 
-    def _ranges(self, content: RangeNotification, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
-        found: list[RangeMeasurement] = []
-        handle = self._handle_of.get(content.handle)
+    def _add_ranges(self, content: RangeNotification, now_ns: int, stamp_ns: int) -> None:
+        handle = self._handles.get(content.handle)
         for record in content.records:
-            if handle is None or record.peer != self._handles[handle]:
+            if handle is None or handle not in self._matchers or record.peer != self._peers[handle]:
                 self.counts["unknown_session"] += 1
                 continue
             self._has_ranged = True
-            if record.status != STATUS_OK:
-                name = RANGE_STATUSES.get(record.status, f"status 0x{record.status:02x}")
-                self.counts[name.replace(" ", "_")] += 1
-            joiner, arrival = self._joiners[handle], RangeArrival(record, stamp_ns)
-            complete = joiner.add_range(content.sequence, arrival, self._decoder.damages, now_ns)
-            found += self._measurements(handle, complete)
-        return found
+            arrival = RangeArrival(handle, content.sequence, record, now_ns, stamp_ns)
+            if record.status == STATUS_OK and record.range_m >= 0:
+                self._arrivals.append(arrival)
+            else:
+                cause = codes.exchange_cause(record.status) if record.status else "no distance"
+                self.counts[cause.replace(" ", "_")] += 1
+                self._failures[cause] += 1
+            self._matchers[handle].add_range(arrival, self._decoder.damages, now_ns)
 
-    def _diagnostics(self, content: Diagnostics, now_ns: int) -> list[RangeMeasurement]:
-        handle = self._handle_of.get(content.handle)
+    def _add_diagnostics(self, content: Diagnostics, now_ns: int) -> None:
+        handle = self._handles.get(content.handle)
         emitters = {frame.emitter for frame in content.frames if frame.received}
-        if handle is None or emitters & (set(self.settings.peers) - {self._handles[handle]}):
+        if (
+            handle is None
+            or handle not in self._matchers
+            or emitters & (set(self.settings.peers) - {self._peers[handle]})
+        ):
             self.counts["unknown_session"] += 1
-            return []
-        complete = self._joiners[handle].add_diagnostics(content, self._decoder.damages, now_ns)
-        return self._measurements(handle, complete)
+        else:
+            self._matchers[handle].add_diagnostics(content, self._decoder.damages, now_ns)
 
-    def _measurements(self, handle: int, complete: list[MatchedRange]) -> list[RangeMeasurement]:
-        """Return the measurements of successful exchanges."""
-        s, peer = self.settings, self._handles[handle]
+    def _complete_measurements(self, now_ns: int) -> list[RangeMeasurement]:
+        """Return the measurements that wait for nothing; later ones wait for earlier ones."""
+        timeout_ns = 2 * max(2 * self.settings.effective_interval_ms * _MS, MIN_TIMEOUT_NS)
+        measurements = []
+        while self._arrivals:
+            arrival = self._arrivals[0]
+            if not arrival.is_complete and now_ns - arrival.arrived_ns <= timeout_ns:
+                break
+            measurements.append(self._measurement(self._arrivals.popleft()))
+        return measurements
+
+    def _measurement(self, arrival: RangeArrival) -> RangeMeasurement:
+        s, peer, record = self.settings, self._peers[arrival.handle], arrival.record
         tag, anchor = (s.address, peer) if s.role is Role.TAG else (peer, s.address)
-        found = []
-        for joined in complete:
-            record = joined.arrival.record
-            if record.status != STATUS_OK or not record.range_m >= 0:
-                continue
-            reading = read_cir(joined.diagnostics, s.channel, record.rssi_dbm)
-            if not math.isnan(reading.clock_offset_ppm):
-                self.clock_offsets_ppm.append(reading.clock_offset_ppm)
-            self.counts["ranges"] += 1
-            self.counts["without_cir"] += not len(reading.cir)
-            self.counts["inconsistent_cir"] += not reading.consistent
-            found.append(
-                RangeMeasurement(
-                    joined.arrival.stamp_ns, tag, anchor, joined.sequence, 0, record.range_m, reading.cir
-                )
-            )
-        return found
+        report = read_cir(arrival.diagnostics, s.channel, record.rssi_dbm, self.position_unit)
+        if not math.isnan(report.clock_offset_ppm):
+            self.clock_offsets_ppm.append(report.clock_offset_ppm)
+        self.counts["ranges"] += 1
+        self.counts["without_cir"] += not len(report.cir)
+        self.counts["inconsistent_cir"] += not report.consistent
+        return RangeMeasurement(
+            arrival.stamp_ns, tag, anchor, arrival.sequence, 0, record.range_m, report.cir
+        )
 
 
-def _refused(command: str, answer: Message | None, rejected: Mapping[int, int] = {}) -> str:
+class _Calibration:
+    """The calibration keys of a board that determine the window of the CIR.
+
+    They may be in flash memory: a key that could not be read is not written, one that already has the requested value
+    is not written either, and a value that the board did not accept is not written again.
+    """
+
+    def __init__(self) -> None:
+        self._original: dict[str, int] = {}
+        self._written: set[tuple[str, int]] = set()
+        self._results: dict[tuple[str, int], int | None] = {}
+        self._count_sizes: tuple[int, ...] = (2, 1)
+
+    def set_window(
+        self, taps: int, counts: Counter[str]
+    ) -> Generator[_Command, Packet | None, tuple[int, int] | None]:
+        """Request a window; return the taps and the lead that the board has, None = unknown.
+
+        A board that refuses keeps its own window: the CIR contains its size.
+        """
+        requested = {_TAPS: taps, _LEAD: WINDOW_LEAD}
+        values = yield from self._read(requested)
+        for size in self._count_sizes:
+            different = {
+                key: value
+                for key, value in requested.items()
+                if key in values and values[key] != value and self._results.get((key, value)) != values[key]
+            }
+            if not different:
+                break
+            for key in different:
+                if (key, values[key]) not in self._written:
+                    self._original[key] = values[key]
+            before = values
+            yield from self._write(different, size, counts)
+            values = yield from self._read(requested)
+            if any(values.get(key) != before[key] for key in different):
+                self._count_sizes = (size,)
+                break
+        for key, value in requested.items():
+            self._results[key, value] = values.get(key)
+            if key in self._original:
+                self._written.add((key, values.get(key, value)))
+        return (values[_TAPS], values.get(_LEAD, WINDOW_LEAD)) if _TAPS in values else None
+
+    def restore(self, counts: Counter[str]) -> Generator[_Command, Packet | None, None]:
+        """Write the original values of the keys that were changed."""
+        values = (yield from self._read(self._original)) if self._original else {}
+        changed = {key: value for key, value in self._original.items() if values.get(key, value) != value}
+        yield from self._write(changed, self._count_sizes[0], counts)
+
+    def _read(self, keys: Iterable[str]) -> Generator[_Command, Packet | None, dict[str, int]]:
+        answer = yield _Command(codes.GET_CALIBRATION, messages.get_calibration(list(keys)), tries=2)
+        return messages.calibration_values(answer.payload) if answer is not None else {}
+
+    def _write(
+        self, values: Mapping[str, int], count_size: int, counts: Counter[str]
+    ) -> Generator[_Command, Packet | None, None]:
+        for key, value in values.items():
+            counts["calibration_writes"] += 1
+            yield _Command(codes.SET_CALIBRATION, messages.set_calibration(key, value, count_size), tries=1)
+
+
+def _refused(command: str, answer: Packet | None, rejected: Mapping[int, int] = {}) -> str:
     if answer is None:
         return f"the board does not answer {command}"
-    tags = "".join(f", parameter 0x{tag:02x}: 0x{status:02x}" for tag, status in rejected.items())
-    return f"the board refuses {command} with status 0x{answer.status:02x}{tags}"
+    names = "".join(
+        f"; {codes.parameter_name(tag)}: {codes.status_text(status)}" for tag, status in rejected.items()
+    )
+    return f"the board refuses {command}: {codes.status_text(answer.status)}{names}"

@@ -59,9 +59,9 @@ class ModeChanged:
 
 @dataclass(frozen=True, slots=True)
 class ModeRefused:
-    """The board was requested to use the mode `wanted` but stays in `mode`."""
+    """The board was requested to use the mode `requested` but stays in `mode`."""
 
-    wanted: Mode
+    requested: Mode
     mode: Mode
 
 

@@ -326,8 +326,9 @@ class BoardSession:
             self._next_request_ns = now_ns
             events.append(Connected(hello))
         elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
-            wanted = hello.mode if self._mode is None else self._mode
-            events.append(ModeChanged(wanted) if hello.mode == wanted else ModeRefused(wanted, hello.mode))
+            requested = hello.mode if self._mode is None else self._mode
+            is_set = hello.mode == requested
+            events.append(ModeChanged(requested) if is_set else ModeRefused(requested, hello.mode))
         return events
 
     @property

@@ -1,0 +1,175 @@
+"""A DW1000 at this computer, operated by a thread; `evb1000` and `spi` open its bus."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.radios.dw1000.bus import Bus
+from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
+from uwb_mitigation.radios.port import PERIOD_S, ExchangeMonitor, OnEvent, PortReport, RadioPort
+from uwb_mitigation.radios.settings import (
+    EXCHANGE_REMEDIES,
+    PREFIX,
+    RadioSettings,
+    RadioState,
+    RadioStatus,
+    Role,
+    ValueReader,
+    count_failures,
+    radio_values,
+    read_ports,
+    read_radio,
+    settings_text,
+    status_warning,
+)
+
+STATUS_INTERVAL_S = 1.0
+SENSORS_INTERVAL_S = 10.0
+"""Interval between readings of temperature and voltage. The receiver is off meanwhile: 20 ms over USB."""
+
+_EXCHANGE_TIMEOUT_S = 0.1
+
+
+def read_chips(value: ValueReader) -> list[tuple[str, RadioSettings]]:
+    """Return the port and the settings of each radio. The first has the role of the parameter, the others are anchors.
+
+    Raises:
+        ParameterError: a parameter is invalid.
+    """
+    radio, ports = read_radio(value), read_ports(value)
+    if radio.address and len(ports) > 1:
+        raise ParameterError(
+            f"parameter {PREFIX}address with {len(ports)} ports",
+            valid="empty: each radio uses the address of its chip",
+        )
+    anchor = replace(radio, role=Role.ANCHOR, anchors=())
+    return [(port, anchor if number else radio) for number, port in enumerate(ports)]
+
+
+class ChipPort(RadioPort):
+    """Operates one radio until `close`, and reopens its bus after a loss.
+
+    Events are measurements, `RadioStatus` once a second, and `PortMessage`.
+
+    Args:
+        name: of the bus.
+        open_bus: opens the bus; called again after it was lost.
+        settings: what the radio does.
+        on_event: see `RadioPort`.
+        stamp_clock: clock for stamps, ns.
+
+    Attributes:
+        settings: active settings; None while the chip has not started.
+        status: state and counts.
+
+    Raises:
+        ParameterError: the settings are invalid.
+        MissingDependencyError: no C compiler is installed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        open_bus: Callable[[], Bus],
+        settings: RadioSettings,
+        on_event: OnEvent,
+        stamp_clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        super().__init__(name, on_event, ExchangeMonitor(EXCHANGE_REMEDIES))
+        settings.check()
+        load_native()
+        self.settings: RadioSettings | None = None
+        self.status = RadioStatus(state=RadioState.BUS)
+        self._open_bus = open_bus
+        self._stamp_clock = stamp_clock
+        self._requested_settings = settings
+        self._settings_changed = False
+        self._radio: NativeRadio | None = None
+
+    def apply(self, settings: Any) -> None:
+        """Use other settings of the radio (`settings.radio`), starting with the next exchange.
+
+        Raises:
+            ParameterError: the settings are invalid.
+        """
+        radio: RadioSettings = settings.radio
+        radio.check()
+        with self._lock:
+            if radio != self._requested_settings:
+                self._requested_settings, self._settings_changed = radio, True
+
+    def report(self) -> PortReport:
+        """Return the present state."""
+        with self._lock:
+            settings, status = self.settings, self.status
+            is_tag = self._requested_settings.role is Role.TAG
+            warning = "" if settings is None else status_warning(status)
+            if is_tag or self._requested_settings.report:
+                self.monitor.period_s = max(PERIOD_S, 3 * self._requested_settings.interval_us / 1e6)
+                warning = warning or self.monitor.warning(time.monotonic())
+            hardware = "no radio" if settings is None else f"radio {format_id(settings.address)}"
+            values: dict[str, object] = {"port": self.device or "none", "openings": self.openings}
+            values |= radio_values(settings, status)
+            activity = "ranging" if is_tag else "answering"
+            return PortReport(self.device, hardware, self._lost, warning, activity, values)
+
+    def close(self) -> None:
+        """Stop the thread, close the bus and free the radio."""
+        super().close()
+        if self._radio is not None:
+            self._radio.close()
+
+    def _connect(self) -> None:
+        bus = self._open_bus()
+        try:
+            if self._radio is None:
+                self._radio = NativeRadio(bus, self._requested_settings, stamp_clock=self._stamp_clock)
+            self._radio.use(bus)
+            with self._lock:
+                self.device = bus.name
+                self.openings += 1
+            self._serve(self._radio)
+        finally:
+            bus.close()
+            with self._lock:
+                self.settings = None
+
+    def _serve(self, radio: NativeRadio) -> None:
+        """Range until the port is closed; raise an exception if the bus is lost."""
+        started = False
+        status_due = sensors_due = 0.0
+        while not self.closed:
+            with self._lock:
+                changed, self._settings_changed = self._settings_changed, False
+                requested = self._requested_settings
+            if changed:
+                radio.configure(requested)
+                started = False
+            measured = radio.exchange(_EXCHANGE_TIMEOUT_S)
+            events: list[object] = [] if measured is None else [measured]
+            starts = not started and radio.address != 0
+            started |= starts
+            now_s = time.monotonic()
+            if now_s >= sensors_due:
+                sensors_due = now_s + SENSORS_INTERVAL_S
+                radio.read_sensors()
+            status = radio.status()
+            if now_s >= status_due:
+                status_due = now_s + STATUS_INTERVAL_S
+                events.append(status)
+            with self._lock:
+                self._lost = ""
+                self.settings = radio.settings if started else None
+                count_failures(self.monitor, self.status, status, now_s)
+                self.status = status
+            if starts:
+                self._was_connected = True
+                text = f"radio {format_id(radio.address)} at {self.device}: {settings_text(radio.settings)}"
+                self._log(logging.INFO, text)
+            self._emit(events)
+            self._log_problem()
