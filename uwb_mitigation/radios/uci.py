@@ -174,7 +174,6 @@ class UciPort(StreamPort):
         with self._lock:
             session, s = self.session, self.session.settings
             values: dict[str, object] = {
-                "port": self.device or "none",
                 "address": format_id(s.address),
                 "role": s.role.name.lower(),
                 "interval ms": s.effective_interval_ms,

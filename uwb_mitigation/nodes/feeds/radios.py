@@ -104,6 +104,7 @@ class RadioFeed:
         values: dict[str, object] = {"ranges published": self._ranges} | self._meter.entries()
         for number, report in enumerate(reports):
             prefix = f"radio {number}: " if len(reports) > 1 else ""
+            values[f"{prefix}port"] = report.device or "none"
             values |= {f"{prefix}{name}": value for name, value in report.values.items()}
         problem = "; ".join(report.problem for report in reports if report.problem)
         warning = next((report.warning for report in reports if report.warning), "")

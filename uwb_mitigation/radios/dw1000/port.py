@@ -113,7 +113,7 @@ class ChipPort(RadioPort):
                 self.monitor.period_s = max(PERIOD_S, 3 * self._requested_settings.interval_us / 1e6)
                 warning = warning or self.monitor.warning(time.monotonic())
             hardware = "no radio" if settings is None else f"radio {format_id(settings.address)}"
-            values: dict[str, object] = {"port": self.device or "none", "openings": self.openings}
+            values: dict[str, object] = {"openings": self.openings}
             values |= radio_values(settings, status)
             activity = "ranging" if is_tag else "answering"
             return PortReport(self.device, hardware, self._lost, warning, activity, values)
