@@ -41,7 +41,7 @@ def nodes_of(context):
         launching.from_files(node, *files[node])
     values = launching.parameters({name: texts[name] for name in PARAMETERS}, NODES, NODES)
     common = {"use_sim_time": flags["use_sim_time"]}
-    environment = launching.kept_parameters()
+    environment = launching.respawn_environment()
     nodes = []
     for entry in texts["boards"].split():
         name, separator, port = entry.partition("=")

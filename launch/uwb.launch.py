@@ -75,7 +75,7 @@ def nodes_of(context):
         }
     # The driver ends after the recording and must not be respawned.
     ending = ("driver", "pipeline") if source in ("mcap", "decaranging") else ()
-    environment = launching.kept_parameters()
+    environment = launching.respawn_environment()
     return displays(flags, common) + [
         Node(
             package="uwb_mitigation",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import signal
 from bisect import bisect
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
+from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.types.anchors import dump_anchors
 from uwb_mitigation.types.ros.poses import yaw_of
 
@@ -90,6 +92,10 @@ class LiveRobot:
                 self._ros.spin_until(
                     lambda last_ns=last_ns: bool(self.poses) and stamp_ns(self.poses[-1].header) >= last_ns
                 )
+
+    def skip(self, until_s: float) -> None:
+        """Drive on without sending messages."""
+        self._at_s = until_s
 
     def send_range(self, row: int, tag: int = 7) -> None:
         # The first ranges are in no frame.
@@ -327,6 +333,39 @@ def test_predictions_and_transforms_end_30_s_after_the_last_range(ros: Ros, anch
     wait_for_timer(46.2)
     assert stamp_ns(live.poses[-1].header) == predicted_ns
     assert stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS
+
+
+def test_respawned_locator_continues_with_transform_and_heading(
+    ros: Ros, anchors: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path))
+    parameters = ("lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
+    locator = start(ros, anchors, *parameters)
+    locator.wait_for_output("locating")
+    clock = ros.node.create_publisher(Clock, "/clock", 10)
+    live = LiveRobot(ros, seconds=25.0)
+    live.wait()
+    live.play(16.0)
+    (tmp_path / "locator.state").unlink(missing_ok=True)
+    ros.spin_until((tmp_path / "locator.state").exists)
+    locator.signal(signal.SIGKILL)
+    before = live.transforms[-1].transforms[0].transform
+    live.transforms.clear()
+    start(ros, anchors, *parameters)
+    # Before any message arrives.
+    now = live.header(18 * NANOSECONDS)
+    ros.spin_until(lambda: clock.publish(Clock(clock=now.stamp)) or bool(live.transforms))
+    assert live.transforms[0].transforms[0].transform == before
+    live.poses.clear()
+    live.wait()
+    live.skip(18.6)
+    live.play(19.6)
+    assert max(pose.pose.covariance[35] for pose in live.poses[1:]) < 0.01
+    distance, of_yaw = live.errors(live.poses[1:])
+    assert np.abs(of_yaw).max() < math.radians(6.0)
+    assert distance.max() < 0.3
+    steps = [yaw_of(message.transforms[0].transform.rotation) for message in live.transforms]
+    assert np.abs(wrapped(np.diff([yaw_of(before.rotation), *steps]))).max() < math.radians(2.0)
 
 
 def test_lever_arm_of_zero_is_not_read_from_tf(ros: Ros, anchors: Path):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +16,8 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from ros_harness import PAUSED, Ros, domain
 from uwb_mitigation_msgs.msg import RangeCir
 
-from uwb_mitigation.nodes.support.parameter_tables import KEPT_PARAMETERS, TABLES, Parameter
+from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER, TABLES, Parameter
+from uwb_mitigation.nodes.support.respawn import StateFile
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
@@ -75,7 +78,7 @@ def test_parameters_of_other_nodes_in_a_shared_file_are_logged_in_one_line(ros: 
 
 
 def test_live_parameters_survive_a_respawn(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv(KEPT_PARAMETERS, str(tmp_path))
+    monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path))
     mitigator = ros.start("mitigator", "offsets:=0.1")
     mitigator.wait_for_output("correcting with")
     assert ros.set_parameter("mitigator", "offsets", 0.22).successful
@@ -89,6 +92,24 @@ def test_live_parameters_survive_a_respawn(ros: Ros, tmp_path: Path, monkeypatch
         "mitigator", lambda one: any(v.key == "offsets" and "0.22" in v.value for v in one.values)
     )
     assert status
+
+
+def test_state_of_a_crashed_node_is_loaded_once_and_only_if_it_is_new_and_readable(tmp_path: Path):
+    path, warnings = tmp_path / "locator.state", []
+    logger = SimpleNamespace(info=lambda text: None, warning=warnings.append)
+    StateFile(path, logger).save({"yaw": 1.0})
+    respawned = StateFile(path, logger)
+    assert respawned.load(30.0) == {"yaw": 1.0}
+    respawned.save({"yaw": 2.0})
+    assert not path.exists(), "a state that leads to a crash is used once"
+    StateFile(path, logger).save({"yaw": 1.0})
+    os.utime(path, (0.0, 0.0))
+    assert StateFile(path, logger).load(30.0) is None
+    assert not warnings
+    path.write_bytes(b"\x80garbage")
+    assert StateFile(path, logger).load(30.0) is None
+    assert len(warnings) == 1
+    assert StateFile(None, logger).load(30.0) is None
 
 
 @pytest.mark.parametrize("value", ["reliability:=perhaps", "depth:=deep"])

@@ -23,10 +23,11 @@ from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.nodes import markers
-from uwb_mitigation.nodes.robot_motion import OdometryInput, transform_type
+from uwb_mitigation.nodes.robot_motion import HOLD_S, OdometryInput, transform_type
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
+from uwb_mitigation.nodes.support.respawn import StateFile
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, TagState
 from uwb_mitigation.positioning.noise_model import NoiseModel
@@ -117,6 +118,7 @@ class Locator(ManagedNode):
         self._unknown_anchors: set[int] = set()
         self._processing_ns: list[int] = []
         self._meter = diagnostics.RateMonitor(self.now_ns)
+        self._state_file = StateFile(self.respawn_file("state"), self.get_logger())
         # Without anchors it keeps running, so that the diagnostics name the reason.
         with contextlib.suppress(ParameterError, MissingDependencyError):
             self.autostart()
@@ -137,9 +139,6 @@ class Locator(ManagedNode):
         self._make_estimator = lambda anchors: MultiTagEstimator(
             EstimatorConfig(anchors, model, height, area, robot=robot), self.value("tag"), path_of_base
         )
-        kind, _, topic = path.partition(":")
-        if kind not in markers.ANCHOR_TYPES:
-            self._estimator = self._make_estimator(load_anchors(Path(path).expanduser()))
         self._period_ns = round(NS_PER_S / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * NS_PER_S)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")
@@ -159,6 +158,9 @@ class Locator(ManagedNode):
             self._tf = self.publisher(self._tf_type, topics.TF, QoSProfile(depth=100))
         if robot is not None:
             self._robot = OdometryInput(self, path_of_base)
+        kind, _, topic = path.partition(":")
+        if kind not in markers.ANCHOR_TYPES:
+            self._use_anchors(load_anchors(Path(path).expanduser()))
         self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, endpoints.LATCHED)
         if kind in markers.ANCHOR_TYPES:
             # Some publishers send the anchors once for late subscribers, others repeatedly.
@@ -173,8 +175,6 @@ class Locator(ManagedNode):
             self.destroy_at_close(heights, self.destroy_subscription)
         timer = self.create_timer(PERIOD_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.destroy_at_close(timer, self.destroy_timer)
-        if self._estimator is not None:
-            self.get_logger().info(f"{len(self._estimator.anchors)} anchors from {path}")
 
     def begin(self) -> None:
         self._show_anchors()
@@ -237,10 +237,25 @@ class Locator(ManagedNode):
     def _on_anchors(self, message: Any) -> None:
         """Use the first anchors that a topic sends."""
         if self._estimator is None and (anchors := markers.anchors_in(message)) is not None:
-            self._estimator = self._make_estimator(anchors)
-            self.get_logger().info(f"{len(anchors)} anchors from {self.value('anchors')}")
+            self._use_anchors(anchors)
             if self.is_active:
                 self._show_anchors()
+
+    def _use_anchors(self, anchors: AnchorMap) -> None:
+        self.get_logger().info(f"{len(anchors)} anchors from {self.value('anchors')}")
+        self._estimator = self._resumed_estimator(anchors) or self._make_estimator(anchors)
+
+    def _resumed_estimator(self, anchors: AnchorMap) -> MultiTagEstimator | None:
+        """Return the estimator of a process of this node that has crashed; None: none, or with other anchors."""
+        if (state := self._state_file.load(HOLD_S)) is None:
+            return None
+        estimator, motion = state
+        if estimator.anchors.anchors != anchors.anchors:
+            return None
+        if self._robot is not None and motion is not None:
+            self._robot.resume(motion, estimator.odometry)
+        resumed: MultiTagEstimator = estimator
+        return resumed
 
     def _on_lost(self, info: Any) -> None:
         self._lost += info.total_count_change
@@ -305,10 +320,10 @@ class Locator(ManagedNode):
     def _update_lever_arm(self, tag_id: int, frame: Callable[[], str]) -> None:
         """Set the lever arm of the robot's antenna when the frame of its ranges is known on /tf_static."""
         outputs, motion = self._outputs.get(tag_id), self._robot
-        if outputs is None or outputs.robot is None or motion is None or motion.lever_arm_is_set:
+        if outputs is None or outputs.robot is None or motion is None or motion.state.lever_arm_is_set:
             return
         if (arm := motion.lever_arm(frame())) is not None:
-            outputs.robot.lever_arm, motion.lever_arm_is_set = arm, True
+            outputs.robot.lever_arm, motion.state.lever_arm_is_set = arm, True
             self.get_logger().info(f"lever arm of the antenna: {arm[0]:.3f}, {arm[1]:.3f}, {arm[2]:.3f} m")
 
     def _publish_estimate(self, outputs: _Outputs, estimate: Estimate) -> None:
@@ -319,7 +334,7 @@ class Locator(ManagedNode):
             outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
         else:
             twist = BodyTwist() if robot.rejects_odometry else self._robot.twist(estimate.stamp_ns)
-            frame = self._robot.base_frame or "base_link"
+            frame = self._robot.state.base_frame or "base_link"
             outputs.odometry.publish(encode_odometry(base, self._map, frame, twist))
         # tf warns of a repeated stamp.
         if self._tf is None or estimate.stamp_ns <= outputs.transform_ns:
@@ -388,6 +403,8 @@ class Locator(ManagedNode):
                 self._publish_transform(outputs, last, stamp_ns)
         if self._anchors_out is not None and estimator.tags and self._anchors_out.get_subscription_count():
             self._show_anchors()
+        if estimator.tags:
+            self._state_file.save((estimator, None if self._robot is None else self._robot.state))
 
     def _show_anchors(self) -> None:
         estimator, publisher = self._estimator, self._anchors_out

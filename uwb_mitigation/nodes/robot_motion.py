@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,36 @@ HOLD_S = 30.0
 
 _MAX_FRAMES = 1000
 
+_BRIDGE_STEP_NS = NS_PER_S // 5
+"""Spacing of the poses that are interpolated over a restart; shorter than the timeout of the odometry."""
+
+_BRIDGE_SPEED = 0.5
+"""If the odometry moved by this much faster than before and after a restart (m/s), it was reset meanwhile."""
+
+
+@dataclass(slots=True)
+class MotionState:
+    """What a respawned locator continues with.
+
+    Attributes:
+        odom_frame: frame of the odometry; empty before its first message.
+        base_frame: the parameter, or else the child frame of the odometry.
+        lever_arm_is_set: it is a parameter, or was found.
+        map_to_odom: x, y, z (m) and yaw (rad) of the last transform; None: there was none.
+        map_to_odom_ns: stamp of its estimate.
+        pose: x, y (m) and yaw (rad) of the latest odometry; None: there was none.
+        pose_ns, speed: its stamp, and its speed in m/s.
+    """
+
+    odom_frame: str
+    base_frame: str
+    lever_arm_is_set: bool
+    map_to_odom: tuple[float, float, float, float] | None = None
+    map_to_odom_ns: int = 0
+    pose: tuple[float, float, float] | None = None
+    pose_ns: int = 0
+    speed: float = 0.0
+
 
 class OdometryInput:
     """Subscribes to the topics of the parameters `odometry` and `imu`, and to /tf_static.
@@ -39,23 +70,21 @@ class OdometryInput:
         ParameterError: the frames of the robot and the map are equal.
 
     Attributes:
-        odom_frame: frame of the odometry; empty before its first message.
-        base_frame: the parameter, or else the child frame of the odometry.
-        lever_arm_is_set: it is a parameter, or was found.
+        path: as given, or that of `resume`.
+        state: frames, and the latest pose and transform.
     """
 
     def __init__(self, node: ManagedNode, path: DeadReckoning) -> None:
-        self.path, self.odom_frame, self.base_frame = path, "", node.value("base_frame")
+        self.path = path
+        self.state = MotionState("", node.value("base_frame"), bool(node.value("lever_arm")))
         self._map, self._log = node.value("map_frame"), node.get_logger()
-        if self.base_frame == self._map:
+        if self.state.base_frame == self._map:
             raise ParameterError(
                 f"parameter base_frame = {self._map!r} is the frame of the map",
                 valid="the robot's frame, such as base_link",
             )
         self._uses_orientation = node.value("imu_orientation")
-        self._last: TransformStamped | None = None
-        self._last_ns = 0
-        self.lever_arm_is_set = bool(node.value("lever_arm"))
+        self._is_resuming = False
         # {child frame: (parent frame, translation, quaternion)} of static transforms.
         self._static: dict[str, tuple[str, Vector, tuple[float, ...]]] = {}
 
@@ -69,7 +98,7 @@ class OdometryInput:
         if node.value("imu"):
             subscribe(Imu, node.value("imu"), self._on_imu)
         message = transform_type()
-        if not self.lever_arm_is_set and message is not None:
+        if not self.state.lever_arm_is_set and message is not None:
             qos = QoSProfile(
                 depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
             )
@@ -80,7 +109,7 @@ class OdometryInput:
         """Return the position of a range's frame in the frame of the base, from /tf_static; None: unknown."""
         point: Vector = (0.0, 0.0, 0.0)
         for _ in range(len(self._static) + 1):
-            if frame and frame == self.base_frame:
+            if frame and frame == self.state.base_frame:
                 return point
             if frame not in self._static:
                 return None
@@ -95,58 +124,82 @@ class OdometryInput:
             return BodyTwist()
         return BodyTwist(*self.path.twist, *self.path.twist_variance)
 
+    def resume(self, state: MotionState, path: DeadReckoning) -> None:
+        """Continue with the state and the path of a process that has crashed."""
+        self.state, self.path, self._is_resuming = state, path, True
+
     def last_map_to_odom(self, stamp_ns: int, tolerance_ns: int) -> TransformStamped | None:
         """Return the last transform with a new stamp, for `HOLD_S`; None: later, or no heading was known yet."""
-        if self._last is None or not 0 <= stamp_ns - self._last_ns <= HOLD_S * NS_PER_S:
+        last = self.state.map_to_odom
+        if last is None or not 0 <= stamp_ns - self.state.map_to_odom_ns <= HOLD_S * NS_PER_S:
             return None
-        self._last.header = endpoints.header(stamp_ns + tolerance_ns, self._map)
-        return self._last
+        x, y, z, yaw = last
+        return TransformStamped(
+            header=endpoints.header(stamp_ns + tolerance_ns, self._map),
+            child_frame_id=self.state.odom_frame,
+            transform=Transform(
+                translation=Vector3(x=x, y=y, z=z),
+                rotation=Quaternion(z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0)),
+            ),
+        )
 
     def map_to_odom(self, base: Estimate, tolerance_ns: int) -> TransformStamped | None:
         """Return the transform from map to odom for an estimate of the base, valid for `tolerance_ns` longer.
 
         While the heading is unknown again, it is `last_map_to_odom`.
         """
-        pose, stamp_ns = self.path.pose_at(base.stamp_ns), base.stamp_ns + tolerance_ns
-        if pose is None or base.heading is None or not self.odom_frame:
-            return self.last_map_to_odom(base.stamp_ns, tolerance_ns)
-        odom_x, odom_y, odom_yaw = pose
-        yaw = base.heading.yaw - odom_yaw
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        x, y, z = base.position.tolist()
-        translation = Vector3(
-            x=x - cosine * odom_x + sine * odom_y, y=y - sine * odom_x - cosine * odom_y, z=z
-        )
-        self._last_ns = base.stamp_ns
-        self._last = TransformStamped(
-            header=endpoints.header(stamp_ns, self._map),
-            child_frame_id=self.odom_frame,
-            transform=Transform(
-                translation=translation,
-                rotation=Quaternion(z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0)),
-            ),
-        )
-        return self._last
+        pose = self.path.pose_at(base.stamp_ns)
+        if pose is not None and base.heading is not None and self.state.odom_frame:
+            odom_x, odom_y, odom_yaw = pose
+            yaw = base.heading.yaw - odom_yaw
+            cosine, sine = math.cos(yaw), math.sin(yaw)
+            x, y, z = base.position.tolist()
+            x, y = x - cosine * odom_x + sine * odom_y, y - sine * odom_x - cosine * odom_y
+            self.state.map_to_odom, self.state.map_to_odom_ns = (x, y, z, yaw), base.stamp_ns
+        return self.last_map_to_odom(base.stamp_ns, tolerance_ns)
 
     def _on_odometry(self, message: Odometry) -> None:
-        pose, twist, covariance = message.pose.pose, message.twist.twist, message.twist.covariance
-        frame = message.header.frame_id
-        if not self.odom_frame and frame:
+        state, frame = self.state, message.header.frame_id
+        if not state.odom_frame and frame:
             if frame == self._map:
                 self._log.error(
                     f"the odometry is in the frame {frame} of the anchors: it must be in odom",
                     throttle_duration_sec=10.0,
                 )
                 return
-            self.odom_frame = frame
-            self.base_frame = self.base_frame or message.child_frame_id
-            self._log.info(f"odometry of {self.base_frame} in {frame}")
-        self.path.add(
-            to_ns(message.header.stamp),
-            (pose.position.x, pose.position.y, yaw_of(pose.orientation)),
-            (twist.linear.x, twist.linear.y, twist.angular.z),
-            (covariance[0], covariance[7], covariance[35]),
+            state.odom_frame = frame
+            state.base_frame = state.base_frame or message.child_frame_id
+            self._log.info(f"odometry of {state.base_frame} in {frame}")
+        position, twist, covariance = (
+            message.pose.pose.position,
+            message.twist.twist,
+            message.twist.covariance,
         )
+        stamp_ns = to_ns(message.header.stamp)
+        pose = (position.x, position.y, yaw_of(message.pose.pose.orientation))
+        velocity = (twist.linear.x, twist.linear.y, twist.angular.z)
+        variance = (covariance[0], covariance[7], covariance[35])
+        speed = math.hypot(twist.linear.x, twist.linear.y)
+        if self._is_resuming:
+            self._is_resuming = False
+            self._bridge(stamp_ns, pose, velocity, variance, max(speed, state.speed))
+        self.path.add(stamp_ns, pose, velocity, variance)
+        state.pose, state.pose_ns, state.speed = pose, stamp_ns, speed
+
+    def _bridge(self, stamp_ns: int, pose: Vector, velocity: Vector, variance: Vector, speed: float) -> None:
+        """Interpolate the poses of the odometry over a restart of this process: they contain the motion meanwhile."""
+        before, gap_ns = self.state.pose, stamp_ns - self.state.pose_ns
+        if before is None or not 0 < gap_ns <= HOLD_S * NS_PER_S:
+            return
+        dx, dy, dyaw = (now - then for now, then in zip(pose, before, strict=True))
+        # Also false for NaN.
+        if not math.hypot(dx, dy) <= (speed + _BRIDGE_SPEED) * gap_ns / NS_PER_S:
+            return
+        dyaw = math.remainder(dyaw, math.tau)
+        steps = math.ceil(gap_ns / _BRIDGE_STEP_NS)
+        for weight in (step / steps for step in range(1, steps)):
+            x, y, yaw = before[0] + weight * dx, before[1] + weight * dy, before[2] + weight * dyaw
+            self.path.add(self.state.pose_ns + round(weight * gap_ns), (x, y, yaw), velocity, variance)
 
     def _on_imu(self, message: Imu) -> None:
         # A -1 in front of the covariance marks rates that are not measured.

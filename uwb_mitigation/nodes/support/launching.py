@@ -18,7 +18,7 @@ import yaml
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, check_name, did_you_mean
 from uwb_mitigation.nodes.support.parameter_tables import (
-    KEPT_PARAMETERS,
+    RESPAWN_FOLDER,
     STANDARD,
     TABLES,
     Parameter,
@@ -264,11 +264,11 @@ def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str
     return values
 
 
-def kept_parameters() -> dict[str, str]:
-    """Return the environment that lets a respawned node restore the parameters that were set while it ran."""
+def respawn_environment() -> dict[str, str]:
+    """Return the environment that lets a respawned node continue with its parameters and state."""
     folder = tempfile.mkdtemp(prefix="uwb_mitigation_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return {KEPT_PARAMETERS: folder}
+    return {RESPAWN_FOLDER: folder}
 
 
 def _entries(tree: Any, section: str) -> Iterator[tuple[str, str, Any]]:

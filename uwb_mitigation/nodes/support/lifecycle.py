@@ -29,7 +29,7 @@ from uwb_mitigation.errors import (
 )
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.nodes.support import diagnostics, endpoints
-from uwb_mitigation.nodes.support.parameter_tables import KEPT_PARAMETERS, STANDARD, TABLES, Parameter
+from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER, STANDARD, TABLES, Parameter
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.topics import relative
 
@@ -108,6 +108,12 @@ class ManagedNode(LifecycleNode):
         else:
             resource = self.create_lifecycle_publisher(kind, relative(topic), qos)
         return self.destroy_at_close(resource, self.destroy_lifecycle_publisher)
+
+    def respawn_file(self, suffix: str) -> Path | None:
+        """Return a file with which this node continues after a crash; None: it is not respawned by a launch file."""
+        folder = os.environ.get(RESPAWN_FOLDER)
+        name = self.get_fully_qualified_name().strip("/").replace("/", ".")
+        return Path(folder, f"{name}.{suffix}") if folder else None
 
     def describe(self) -> diagnostics.Description:
         """Return the content of the diagnostics."""
@@ -259,9 +265,8 @@ class ManagedNode(LifecycleNode):
 
     def _keep_live_parameters(self, live: Collection[str]) -> None:
         """Restore the parameters that were set before a respawn, and save those that are set from now on."""
-        if not (folder := os.environ.get(KEPT_PARAMETERS)):
+        if (path := self.respawn_file("json")) is None:
             return
-        path = Path(folder, self.get_fully_qualified_name().strip("/").replace("/", "."))
         saved: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
         if saved:
             self.set_parameters([RosParameter(name, value=value) for name, value in saved.items()])

@@ -256,9 +256,9 @@ VIEWER = (
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
-KEPT_PARAMETERS = "UWB_MITIGATION_KEPT_PARAMETERS"
-"""Environment variable with the folder where nodes save parameters that were set at run time. A launch file creates
-the folder while it runs, and a respawned node restores its parameters from there."""
+RESPAWN_FOLDER = "UWB_MITIGATION_RESPAWN_FOLDER"
+"""Environment variable with a folder that exists while a launch file runs. A respawned node finds there the parameters
+that were set at run time, and the locator also its latest state."""
 
 STANDARD = ("qos_overrides.", "use_sim_time", "start_type_description_service")
 """Prefixes of the parameters that rclpy declares for every node."""
