@@ -368,6 +368,17 @@ def test_respawned_locator_continues_with_transform_and_heading(
     assert np.abs(wrapped(np.diff([yaw_of(before.rotation), *steps]))).max() < math.radians(2.0)
 
 
+def test_unknown_lever_arm_is_reported(ros: Ros, anchors: Path):
+    locator = start(ros, anchors)
+    locator.wait_for_output("locating")
+    live = LiveRobot(ros, seconds=2.0)
+    live.wait()
+    live.play(2.0)
+    text = "no transform from base_link to uwb_antenna on /tf_static"
+    ros.spin_until(lambda: text in live.values()[""])
+    assert text in locator.output
+
+
 def test_lever_arm_of_zero_is_not_read_from_tf(ros: Ros, anchors: Path):
     locator = start(ros, anchors, "lever_arm:=0,0,0")
     locator.wait_for_output("locating")

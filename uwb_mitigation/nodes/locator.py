@@ -193,6 +193,9 @@ class Locator(ManagedNode):
         if estimator is None:
             return "host", diagnostics.WARN, "no anchors", {}
         warnings = estimator.warnings()
+        if self._robot is not None and (warning := self._robot.warning()):
+            warnings.insert(0, warning)
+            self.get_logger().warning(warning, throttle_duration_sec=60.0)
         level, text = diagnostics.OK, "locating" if estimator.tags else "no ranges yet"
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings[:5])

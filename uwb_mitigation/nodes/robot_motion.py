@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,9 @@ Vector = tuple[float, float, float]
 
 HOLD_S = 30.0
 """The last map to odom is repeated for this time: odometry alone is useful for as long."""
+
+LEVER_ARM_WAIT_S = 5.0
+"""The lever arm is reported as unknown if it is not on /tf_static this time after the first range."""
 
 _MAX_FRAMES = 1000
 
@@ -85,6 +89,9 @@ class OdometryInput:
             )
         self._uses_orientation = node.value("imu_orientation")
         self._is_resuming = False
+        self._antenna_frame: str | None = None
+        self._static_topic = node.resolve_topic_name(relative(TF_STATIC))
+        self._first_range_s = 0.0
         # {child frame: (parent frame, translation, quaternion)} of static transforms.
         self._static: dict[str, tuple[str, Vector, tuple[float, ...]]] = {}
 
@@ -102,11 +109,14 @@ class OdometryInput:
             qos = QoSProfile(
                 depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
             )
-            static = node.create_subscription(message, relative(TF_STATIC), self._on_static, qos)
+            static = node.create_subscription(message, self._static_topic, self._on_static, qos)
             node.destroy_at_close(static, node.destroy_subscription)
 
     def lever_arm(self, frame: str) -> Vector | None:
         """Return the position of a range's frame in the frame of the base, from /tf_static; None: unknown."""
+        if self._antenna_frame is None:
+            self._first_range_s = time.monotonic()
+        self._antenna_frame = frame
         point: Vector = (0.0, 0.0, 0.0)
         for _ in range(len(self._static) + 1):
             if frame and frame == self.state.base_frame:
@@ -117,6 +127,17 @@ class OdometryInput:
             dx, dy, dz = _rotate(rotation, point)
             point = x + dx, y + dy, z + dz
         return None
+
+    def warning(self) -> str:
+        """Return a warning if the lever arm is unknown, although it should have been received."""
+        waiting = self._antenna_frame is None or time.monotonic() - self._first_range_s < LEVER_ARM_WAIT_S
+        if self.state.lever_arm_is_set or waiting or not self.state.base_frame:
+            return ""
+        base, antenna = self.state.base_frame, self._antenna_frame or "the antenna (ranges without frame_id)"
+        return (
+            f"lever arm of the antenna unknown, 0,0,0 is used: no transform from {base} to {antenna} on "
+            f"{self._static_topic}: publish it with static_transform_publisher, or set lever_arm"
+        )
 
     def twist(self, stamp_ns: int) -> BodyTwist:
         """Return the velocity of the base at a time; unobserved without odometry, or just after it started."""
