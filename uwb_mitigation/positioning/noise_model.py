@@ -132,6 +132,12 @@ NETWORK_SD = 0.03
 """Prior standard deviation of the factor of the universal network's predictions. It is small because errors of the
 predictor reduce a free factor, and the remaining errors would appear in the offsets."""
 
+SLOW_SD_M, CORRECTED_SLOW_SD_M = 0.12, 0.05
+"""Standard deviation of the errors of a pair that stay the same for many seconds: reflections and obstacles at one position,
+and the range bias of a DW1000, which changes by 0.1 m with the received power (Decawave APS011). The second value is for
+ranges that the network corrects. Averaging does not reduce these errors, and residuals hardly show them, because the track
+follows them. Simulated flats in which the first value was 0.05 got offsets of anchors with errors of 0.3 m."""
+
 SLOPE_SD = 0.1
 """Prior standard deviation of the slope of a line in the received power, m/dB."""
 
@@ -145,6 +151,7 @@ class Regressors:
         rows: float64 (n, q), derivative of each range with respect to each parameter; 0: unknown.
         mean, sd: float64 (q,), prior knowledge; an infinite sd: none.
         noise_group: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
+        slow_sd_m: standard deviation of the errors that remain with these parameters and persist, see `SLOW_SD_M`.
     """
 
     names: tuple[str, ...]
@@ -152,6 +159,7 @@ class Regressors:
     mean: NDArray[np.float64]
     sd: NDArray[np.float64]
     noise_group: NDArray[np.intp]
+    slow_sd_m: float = SLOW_SD_M
 
     @classmethod
     def one(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
@@ -176,7 +184,7 @@ class Regressors:
     def only(self, kept: NDArray[np.bool_]) -> Regressors:
         """Return only the parameters `kept`, bool (q,)."""
         names = tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept)
-        return Regressors(names, self.rows[:, kept], self.mean[kept], self.sd[kept], self.noise_group)
+        return replace(self, names=names, rows=self.rows[:, kept], mean=self.mean[kept], sd=self.sd[kept])
 
     def joined(self, other: Regressors) -> Regressors:
         """Return these parameters followed by the others; `noise_group` is unchanged."""
@@ -186,4 +194,5 @@ class Regressors:
             np.concatenate([self.mean, other.mean]),
             np.concatenate([self.sd, other.sd]),
             self.noise_group,
+            min(self.slow_sd_m, other.slow_sd_m),
         )

@@ -29,10 +29,9 @@ SD_INFLATION = 1.5
 the number of independent ranges does not contain. With it, 9 of 10 offsets of simulated drives are within two standard
 deviations."""
 
-SLOW_SD_M, SLOW_S = 0.05, 20.0
-"""Errors of a pair that stay the same for many seconds: reflections at one position, and the range bias of a DW1000, which
-changes by 0.1 m with the received power (Decawave APS011). Averaging does not reduce them. Where the geometry is weak, as
-outside of the anchors, they contribute most of the error of the common offset."""
+SLOW_S = 20.0
+"""Time for which the slow errors of a pair (see `Regressors`) stay the same. Where the geometry is weak, as outside of the
+anchors, they contribute most of the error of the common offset."""
 
 AROUND_M = 5.0
 """Standard deviation of the prior of a known position: it only affects positions with too few anchors."""
@@ -340,7 +339,7 @@ class _JointProblem:
         summed = np.zeros((int(of.max(initial=0)) + 1, observations.rows.shape[1]))
         np.add.at(summed, of.reshape(-1), gain)
         found: NDArray[np.float64] = (
-            SD_INFLATION**2 * solution.shared_covariance + SLOW_SD_M**2 * summed.T @ summed
+            SD_INFLATION**2 * solution.shared_covariance + self._prior.slow_sd_m**2 * summed.T @ summed
         )
         return found
 

@@ -49,6 +49,13 @@ MIN_CONFIDENCE = 0.99
 OBSERVABLE = 0.6
 """An own offset is estimated if its standard deviation is a smaller part of the scatter of such offsets."""
 
+MAX_OWN_SD_M = 0.1
+"""Standard deviation of the own offsets of radios of one kind (0.3 m at three sigma, Decawave APS014): their prior is not
+wider."""
+
+MAX_OWN_SCATTER_M = 0.2
+"""Own offsets that differ more are not those of radios: obstacles or wrong anchor positions cause them."""
+
 MIN_SHARE = 0.5
 """If a smaller share of the own offsets is observable, none is estimated."""
 
@@ -338,9 +345,11 @@ def with_own_offsets(
     excess = float(np.sum(free**2 / alone))
     scatter = float(np.sum((free**2 - alone) / alone**2) / np.sum(1.0 / alone**2))
     sd = float(np.sqrt(max(scatter, 0.0)))
-    if excess < chi2.ppf(MIN_CONFIDENCE, max(count - 1, 1)) or scatter < MIN_OWN_SD_M**2:
+    is_significant = excess >= chi2.ppf(MIN_CONFIDENCE, max(count - 1, 1))
+    if not is_significant or not MIN_OWN_SD_M**2 <= scatter <= MAX_OWN_SCATTER_M**2:
         return None, [], sd
-    observable = np.sqrt(1.0 / (1.0 / alone + 1.0 / scatter)) < OBSERVABLE * sd
+    sd = min(sd, MAX_OWN_SD_M)
+    observable = np.sqrt(1.0 / (1.0 / alone + 1.0 / sd**2)) < OBSERVABLE * sd
     if observable.mean() < MIN_SHARE:
         return None, [], sd
     names = [name for name, is_observable in zip(members, observable, strict=True) if is_observable]

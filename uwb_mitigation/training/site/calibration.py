@@ -29,9 +29,6 @@ MIN_LABELLED = 40
 MAX_OFFSET_M = 1.0
 """Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
 
-MIN_VARIANCE_SHARE = 0.25
-"""Without ground truth, residuals contain the error of the estimated true range; at least this share is that of the range."""
-
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SiteCalibration:
@@ -175,7 +172,7 @@ class SiteCalibration:
         has_network = model.network is not None
         network = scaled(float_network(universal), 0.0) if model.network is None else model.network
         ood_bands = ood_bands_of(self.data) if has_network else None
-        residual_m = range_residuals(self.held_out_error_m, self.solution.truth_sd_m)
+        residual_m = self.held_out_error_m * self.solution.residual_scale
         fitted = output.stem, universal.architecture, self.data, model.linear_bias
         card = card_of(*fitted, self.data, residual_m, training, ood_bands)
         if has_network:
@@ -261,7 +258,7 @@ def _select_model(
     errors = held_out_site_errors(
         data, candidates, seed, offset_change, lambda share: on_progress("selecting the model", share)
     )
-    live = live_errors(site, solution, errors.by_segment, _variances(raw, errors, solution.truth_sd_m))
+    live = live_errors(site, solution, errors.by_segment, _variances(raw, errors, solution.residual_scale))
     chosen = errors.select(live)
     (candidate,) = (item for item in candidates if item.name == chosen)
     return SiteCalibration(
@@ -277,19 +274,12 @@ def _select_model(
     )
 
 
-def range_residuals(residual_m: NDArray[np.float64], truth_sd_m: float) -> NDArray[np.float64]:
-    """Return residuals (n,) without the part that is due to the error of the estimated true range."""
-    mean_square = float(np.mean(residual_m**2))
-    share = 1.0 - truth_sd_m**2 / mean_square if mean_square > 0.0 else 1.0
-    return residual_m * math.sqrt(max(share, MIN_VARIANCE_SHARE))
-
-
-def _variances(raw: Dataset, errors: SiteErrors, truth_sd_m: float) -> dict[str, NDArray[np.float64]]:
+def _variances(raw: Dataset, errors: SiteErrors, scale: float) -> dict[str, NDArray[np.float64]]:
     """Return the variances (n,) that a bundle with each model publishes, m^2."""
     variances = {}
     for name, error_m in errors.by_segment.items():
         predicted_m = raw.error_m - error_m
-        intervals = fit_intervals(range_residuals(error_m, truth_sd_m), predicted_m, raw.configurations)
+        intervals = fit_intervals(scale * error_m, predicted_m, raw.configurations)
         variances[name] = intervals.variance_m2 + intervals.variance_per_m2 * predicted_m**2
     return variances
 

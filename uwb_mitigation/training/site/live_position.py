@@ -26,7 +26,7 @@ RAW = "raw"
 FILTERS = (NoiseModel(), NoiseModel(offset_sd=1e-3))
 """Models of the filters: that of the locator, and one that does not estimate a common offset, like a plain EKF."""
 
-MAX_INCREASE = 0.01
+MAX_INCREASE = 0.02
 """A larger increase of the live position error is harm; a smaller one is not significant."""
 
 MIN_POSITIONS = 20

@@ -16,7 +16,13 @@ from uwb_mitigation.positioning.batch.anchor_errors import validate_anchor_map
 from uwb_mitigation.positioning.batch.pose_alignment import PoseAlignment, align_poses
 from uwb_mitigation.positioning.batch.self_calibration import SelfCalibration, self_calibrate
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.noise_model import MAD_TO_SD, NETWORK_SD, SLOPE_SD, Regressors
+from uwb_mitigation.positioning.noise_model import (
+    CORRECTED_SLOW_SD_M,
+    MAD_TO_SD,
+    NETWORK_SD,
+    SLOPE_SD,
+    Regressors,
+)
 from uwb_mitigation.training.fit.candidates import network_m
 from uwb_mitigation.training.site.data import SiteData
 from uwb_mitigation.types.offsets import Offsets
@@ -66,7 +72,8 @@ class SiteSolution:
         offset_changes_without: returns for held-out rows of `rows` the change of the pair offsets, m, if they are estimated
             without these rows.
         prior: prior knowledge with which the locator runs at this site.
-        truth_sd_m: standard deviation of `true_m` (RMS) without ground truth; 0 with it.
+        residual_scale: without ground truth, the size of the errors of ranges relative to that of their differences from
+            `true_m`, which contain the error of the track of the other anchors.
         truth: topic of the localisation; None: only ranges were used. alignment: its time offset and lever arms.
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
         stationary_positions: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several
@@ -89,7 +96,7 @@ class SiteSolution:
     notes: tuple[str, ...]
     offset_changes_without: Callable[[NDArray[np.intp]], Mapping[tuple[int, int], float]]
     prior: LivePrior
-    truth_sd_m: float = 0.0
+    residual_scale: float = 1.0
     truth: str | None = None
     alignment: PoseAlignment | None = None
     track: NDArray[np.float64]
@@ -213,9 +220,7 @@ class _RangesOnly:
             notes=tuple(notes),
             offset_changes_without=self.offset_changes_without,
             prior=prior,
-            truth_sd_m=float(np.sqrt(np.mean(calibration.pseudo_sd_m[labelled] ** 2)))
-            if len(labelled)
-            else 0.0,
+            residual_scale=self._residual_scale(),
             track=calibration.fit.position,
             track_of=observations.knot_segment,
             stationary_positions=_stationary_positions(calibration),
@@ -224,6 +229,24 @@ class _RangesOnly:
             common_sd_m=calibration.mean()[1],
             position_scatter_m=calibration.position_scatter_m,
         )
+
+    def _residual_scale(self) -> float:
+        fit, labelled = self._calibration.fit, self._labelled
+        if not len(labelled):
+            return 1.0
+        anchors = len(np.unique(fit.observations.anchor))
+        # The track follows errors: of m ranges with d unknowns, (m - d) / m of the variance remains in the residuals.
+        redundancy = max(1.0 - fit.config.dims / anchors, 0.25)
+        joint_m = fit.residual_m[fit.observations.of][labelled] / math.sqrt(redundancy)
+        corrected_m = (
+            self._calibration.segments.ranges.range_m
+            - (fit.observations.rows @ fit.parameters)[fit.observations.of]
+        )
+        residual_m = (corrected_m - self._calibration.pseudo_m)[labelled]
+        of_joint, of_residuals = (
+            float(np.quantile(np.abs(error_m), 0.68)) for error_m in (joint_m, residual_m)
+        )
+        return min(1.0, of_joint / max(of_residuals, 1e-3))
 
     def _ids(self, tag: int, row: int) -> tuple[int, int]:
         return self._calibration.tag_ids[tag], self._anchor_ids[row]
@@ -384,7 +407,7 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
         edges = np.quantile(size[site.has_usable_cir], np.linspace(0.0, 1.0, NETWORK_GROUPS + 1)[1:-1])
         # Ranges without a CIR are not corrected, so they have their own standard deviation.
         group = np.where(site.has_usable_cir, np.searchsorted(edges, size), NETWORK_GROUPS)
-        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), group)
+        return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), group, CORRECTED_SLOW_SD_M)
     power = site.rx_power_dbm.astype(np.float64)
     has_power = np.isfinite(power)
     if has_power.mean() < 0.5 or np.ptp(power[has_power]) < 1.0:
