@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,7 @@ import typer
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.support.console import JsonOption
-from uwb_mitigation.errors import ParameterError, format_id, parse_id
+from uwb_mitigation.errors import ParameterError, parse_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.training.site.radio_offsets import OffsetEstimate
@@ -50,6 +51,7 @@ def offset(
             "--common", help="Write one common offset, if the same boards were at several positions."
         ),
     ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the range offset due to the antenna delays.
@@ -71,8 +73,11 @@ def offset(
         raise ParameterError("no distance, or two sources of it", valid="either --distance or --truth")
     if distance is not None and not 0.0 < distance <= MAX_DISTANCE_M:
         raise ParameterError(f"distance = {distance}", valid=f"above 0, at most {MAX_DISTANCE_M:g} m")
-    if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
-        raise ParameterError("cannot be written", where=str(output), valid="a file in an existing folder")
+    if output is not None:
+        if output.is_dir() or not output.absolute().parent.is_dir():
+            raise ParameterError("cannot be written", where=str(output), valid="a file in an existing folder")
+        if output.exists() and not force:
+            raise ParameterError("the file exists", where=str(output), valid="--force replaces it")
     anchor_id, tag_id = (
         _id(name, text) if text is not None else None for name, text in (("anchor", anchor), ("tag", tag))
     )
@@ -88,7 +93,7 @@ def offset(
             f"Standard deviation {estimate.sd_m:.3f} m."
         )
         write_atomically(output, dump_offsets(estimate.offsets(common=common), comment), ParameterError)
-    console.write_json(json, estimate.as_json())
+    console.write_json(json, estimate)
 
 
 def _id(name: str, text: str) -> int:
@@ -101,34 +106,24 @@ def _id(name: str, text: str) -> int:
 
 
 def _show(estimate: OffsetEstimate) -> None:
-    from uwb_mitigation.commands.support.console import MAX_ROWS, print_line, show_table
+    from uwb_mitigation.commands.support.console import print_line, show_table, warn
 
-    rows: list[tuple[object, ...]] = []
-    for placement in estimate.placements:
-        pair = format_id(placement.anchor_id), format_id(placement.tag_id)
-        values = ("", "") if placement.refused else (placement.offset_m, placement.sd_m)
-        rows.append(
-            (
-                *pair,
-                placement.placement,
-                placement.ranges,
-                *values,
-                f"{placement.power_gap_db:.1f}".replace("nan", "-"),
-                placement.predicted_m,
-            )
-        )
-    show_table(
-        "",
-        ("anchor", "tag", "placement", "ranges", "offset, m", "sd, m", "power gap, dB", "predicted error, m"),
-        rows,
-    )
-    rejected = [placement for placement in estimate.placements if placement.refused]
-    for placement in rejected[:MAX_ROWS]:
-        pair = format_id(placement.anchor_id), format_id(placement.tag_id)
-        text = f"skipped: anchor {pair[0]}, tag {pair[1]} {placement.placement}: {placement.refused}"
-        console.err.print(text, markup=False)
-    if len(rejected) > MAX_ROWS:
-        console.err.print(f"skipped: {len(rejected) - MAX_ROWS} more placements")
+    accepted = [placement for placement in estimate.placements if not placement.refused]
+    columns = {
+        "anchor": "anchor_id:id",
+        "tag": "tag_id:id",
+        "placement": "placement",
+        "ranges": "ranges:d",
+        "offset, m": "offset_m:.3f",
+        "sd, m": "sd_m:.3f",
+        "power gap, dB": "power_gap_db:.1f",
+        "predicted, m": "predicted_m:.3f",
+    }
+    show_table("", columns, accepted, optional=("predicted, m", "power gap, dB"))
+    rejected = Counter(placement.refused.partition(":")[0] for placement in estimate.placements)
+    for reason, count in rejected.items():
+        if reason:
+            warn(f"skipped: {count} placements: {reason} (each one: --json)")
     print_line(
         f"offset {estimate.offset_m:.3f} m, standard deviation {estimate.sd_m:.3f} m, from {estimate.ranges} ranges, "
         f"for model {estimate.model_id:08x}"

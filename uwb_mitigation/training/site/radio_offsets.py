@@ -20,7 +20,13 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import FIRST_PATH_TAPS
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, RangeMeasurement, Record, Status
+from uwb_mitigation.types.measurement import (
+    LINE_OF_SIGHT_DB,
+    CorrectedRange,
+    RangeMeasurement,
+    Record,
+    Status,
+)
 from uwb_mitigation.types.offsets import MAX_OFFSET_M, Offsets
 
 PLACEMENT_SD_M = 0.15
@@ -87,15 +93,19 @@ class OffsetEstimate:
         for placement in self.placements:
             if not placement.refused and not common:
                 pairs.setdefault((placement.tag_id, placement.anchor_id), []).append(placement.offset_m)
-        return Offsets(self.offset_m, pairs={pair: float(np.median(found)) for pair, found in pairs.items()})
+        return Offsets(
+            self.offset_m, pairs={pair: float(np.median(values)) for pair, values in pairs.items()}
+        )
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation offset`; null: unknown."""
-        rows = [asdict(placement) | {"refused": placement.refused or None} for placement in self.placements]
-        for row in rows:
-            row |= {key: None for key, value in row.items() if isinstance(value, float) and math.isnan(value)}
-        found = {"offset_m": self.offset_m, "sd_m": self.sd_m, "ranges": self.ranges}
-        return found | {"model_id": self.model_id, "pairs": rows}
+        return {
+            "offset_m": self.offset_m,
+            "sd_m": self.sd_m,
+            "ranges": self.ranges,
+            "model_id": self.model_id,
+            "pairs": [asdict(row) | {"refused": row.refused or None} for row in self.placements],
+        }
 
 
 def estimate_offset(
@@ -136,43 +146,61 @@ def estimate_offset(
         ]
         results = mitigation.correct([record.measurement for record in selected])
         for record, result in zip(selected, results, strict=True):
-            measured, truth = record.measurement, record.truth
+            measured, truth = record.measurement, record.truth if distance_m is None else None
             true_m = distance_m if distance_m is not None else math.nan if truth is None else truth.range_m
             if not math.isfinite(true_m):
                 without_truth += 1
                 continue
-            placement = truth.configuration if truth is not None and distance_m is None else ""
-            predicted = math.nan
-            cir = measured.cir
-            is_foreign = not mitigation.bundle.card.fits(cir.radio, cir.segment, len(cir) > 0)
-            if is_foreign or (len(cir) == 0 and result.status is Status.NO_CIR):
-                # Without a CIR, or with that of another radio, the whole error is the offset.
-                predicted = 0.0
-            elif result.status is Status.OK:
-                known_offset = mitigation.offsets.of([measured.tag_id], [measured.anchor_id])
-                predicted = result.correction_m - float(known_offset[0])
-            offset, gap = measured.range_m - predicted - true_m, _power_gap_db(measured, preprocessing)
-            is_los = float(gap < LINE_OF_SIGHT_DB) if math.isfinite(gap) else math.nan
-            label = truth.label if truth is not None and distance_m is None and not len(cir) else None
-            if label or (label is not None and math.isnan(is_los)):
-                # Without a CIR the label decides, then the levels; surveyed ranges with neither are used.
-                is_los = float(label in ("", "LOS"))
-            sample = offset, predicted, gap, is_los, result.status.name
+            placement = "" if truth is None else truth.configuration
+            predicted_m = _predicted_m(mitigation, measured, result)
+            gap_db = _power_gap_db(measured, preprocessing)
+            is_los = _is_los(gap_db, None if truth is None or len(measured.cir) else truth.label)
+            offset_m = measured.range_m - predicted_m - true_m
+            sample = offset_m, predicted_m, gap_db, is_los, result.status.name
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
     if not groups:
         if without_truth:
             raise DatasetError(f"none of {without_truth} ranges has a true distance", valid="set --distance")
         raise DatasetError("no ranges of this anchor and tag")
-    pairs = sorted({(tag, anchor) for tag, anchor, _ in groups})
-    if distance_m is not None and len(pairs) > 1:
+    if distance_m is not None:
+        _check_one_pair(sorted({(tag, anchor) for tag, anchor, _ in groups}))
+    limit_m = MAX_EXCESS_M if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else MAX_ERROR_M
+    placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
+    return _combined(placements, mitigation.bundle.model_id)
+
+
+def _check_one_pair(pairs: list[tuple[int, int]]) -> None:
+    if len(pairs) > 1:
         listed = ", ".join(f"anchor {format_id(anchor)} tag {format_id(tag)}" for tag, anchor in pairs[:5])
         raise ParameterError(
             f"one distance for {len(pairs)} pairs ({listed}{', ...' if len(pairs) > 5 else ''})",
             valid="choose one with --anchor and --tag",
         )
-    limit_m = MAX_EXCESS_M if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else MAX_ERROR_M
-    placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
-    return _combined(placements, mitigation.bundle.model_id)
+
+
+def _predicted_m(mitigation: Mitigation, measured: RangeMeasurement, result: CorrectedRange) -> float:
+    """Return the error that the model predicts; NaN: it predicts none."""
+    cir = measured.cir
+    is_foreign = not mitigation.bundle.card.fits(cir.radio, cir.segment, len(cir) > 0)
+    if is_foreign or (len(cir) == 0 and result.status is Status.NO_CIR):
+        # Without a CIR, or with that of another radio, the whole error is the offset.
+        return 0.0
+    if result.status is not Status.OK:
+        return math.nan
+    return result.correction_m - float(mitigation.offsets.of([measured.tag_id], [measured.anchor_id])[0])
+
+
+def _is_los(gap_db: float, label: str | None) -> float:
+    """Return 1: LOS, 0: NLOS, NaN: unknown.
+
+    Args:
+        gap_db: receive level minus first-path level; NaN: unknown.
+        label: label of a surveyed range without a CIR, empty: none; None: any other range.
+    """
+    if label or (label is not None and math.isnan(gap_db)):
+        # Without a CIR the label decides, then the levels; surveyed ranges with neither are used.
+        return float(label in ("", "LOS"))
+    return float(gap_db < LINE_OF_SIGHT_DB) if math.isfinite(gap_db) else math.nan
 
 
 def _power_gap_db(measurement: RangeMeasurement, preprocessing: Preprocessing) -> float:
@@ -192,19 +220,15 @@ def _placement_offset(
     tag_id: int, anchor_id: int, placement: str, samples: list[_Sample], limit_m: float
 ) -> PlacementOffset:
     offset, predicted, gap, los = np.array([sample[:4] for sample in samples], np.float64).T
-    has_gap, is_predicted, is_known, is_los = (
-        np.isfinite(gap),
-        np.isfinite(predicted),
-        np.isfinite(los),
-        los == 1.0,
-    )
+    has_gap, is_predicted, is_labelled = (np.isfinite(values) for values in (gap, predicted, los))
+    is_los = los == 1.0
     used, n = offset[is_los & is_predicted], len(offset)
     median_gap = float(np.median(gap[has_gap])) if has_gap.any() else math.nan
     median_predicted = float(np.median(predicted[is_predicted])) if is_predicted.any() else math.nan
-    found, noise, refused = math.nan, math.nan, ""
-    if 2 * is_known.sum() < n:
+    median_offset, noise, refused = math.nan, math.nan, ""
+    if 2 * is_labelled.sum() < n:
         refused = "the first-path power is unknown, so that line of sight cannot be checked"
-    elif 2 * is_los.sum() < is_known.sum():
+    elif 2 * is_los.sum() < is_labelled.sum():
         refused = "not line of sight: labelled as NLOS"
         if median_gap >= LINE_OF_SIGHT_DB:
             refused = (
@@ -212,8 +236,8 @@ def _placement_offset(
                 f"(line of sight: less than {LINE_OF_SIGHT_DB:g} dB)"
             )
     elif not len(used) or 2 * is_predicted.sum() < n:
-        others = Counter(status for *_, status in samples if status != Status.OK.name).most_common()
-        statuses = ", ".join(f"{count} {name}" for name, count in others)
+        counts = Counter(status for *_, status in samples if status != Status.OK.name).most_common()
+        statuses = ", ".join(f"{count} {name}" for name, count in counts)
         refused = f"the model corrects only {is_predicted.sum()} of {n} ranges ({statuses})"
     elif median_predicted > limit_m:
         refused = f"not line of sight: the model predicts an error of {median_predicted:.2f} m"
@@ -222,19 +246,22 @@ def _placement_offset(
             f"an offset of {np.median(used):.1f} m: check the distance (in metres) and the antenna delay"
         )
     else:
-        found, noise = float(np.median(used)), _MEDIAN_SD_FACTOR * _spread(used) / math.sqrt(len(used))
+        median_offset, noise = (
+            float(np.median(used)),
+            _MEDIAN_SD_FACTOR * _spread(used) / math.sqrt(len(used)),
+        )
     sd, count = math.hypot(noise, PLACEMENT_SD_M), 0 if refused else len(used)
     levels = median_gap, median_predicted
-    return PlacementOffset(tag_id, anchor_id, placement, count, found, sd, noise, *levels, refused)
+    return PlacementOffset(tag_id, anchor_id, placement, count, median_offset, sd, noise, *levels, refused)
 
 
 def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> OffsetEstimate:
     accepted = [placement for placement in placements if not placement.refused]
     if not accepted:
         first = placements[0]
-        others_text = f" (and {len(placements) - 1} other placements)" if len(placements) > 1 else ""
+        more = f" (and {len(placements) - 1} other placements)" if len(placements) > 1 else ""
         raise DatasetError(
-            f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{others_text}",
+            f"anchor {format_id(first.anchor_id)}, tag {format_id(first.tag_id)}: {first.refused}{more}",
             valid="no obstacles between or next to the antennas",
         )
     if (ranges := sum(placement.ranges for placement in accepted)) < MIN_RANGES:
