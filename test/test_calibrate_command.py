@@ -127,7 +127,7 @@ def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
     corrected = Mitigation(bundle, offsets).correct([RangeMeasurement(0, 7, 1, 0, 0, 5.4, cir)])[0]
     assert corrected.status == 0
     assert corrected.range_m == pytest.approx(5.0, abs=0.12)
-    none = run("quantize", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=site)
+    none = run("quantise", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=site)
     assert (none.returncode, "no network to quantise" in none.stderr) == (1, True)
     page = (site / "r.html").read_text()
     assert "polyline" in page
@@ -419,7 +419,7 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
     assert result["calibrated_mae_m"] < 0.7 * result["raw_mae_m"]
     assert load_bundle(tmp_path / "site.onnx").card.needs_cir
     # The drive without true ranges is sufficient for int8.
-    done = run("quantize", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=tmp_path)
+    done = run("quantise", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert load_bundle(tmp_path / "int8.onnx").quantised
 

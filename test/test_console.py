@@ -1,18 +1,23 @@
-"""JSON results of commands."""
+"""The terminal: tables and JSON results, help, and wrong usage of all commands."""
 
 from __future__ import annotations
 
 import io
 import json
 import math
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import typer
+from command_line import run
 from rich.console import Console
 
+from uwb_mitigation.commands import cli
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.types.measurement import Status
 
@@ -65,3 +70,38 @@ def test_table_shows_the_rows_of_the_json_result_and_omits_optional_columns(
 def test_unwritable_json_path_is_refused_before_the_work(place: str):
     with pytest.raises(typer.BadParameter):
         console._check_json_target(Path(place))
+
+
+def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Yield the words of each command."""
+    yield path
+    for name, subcommand in getattr(command, "commands", {}).items():
+        yield from commands(subcommand, (*path, name))
+
+
+@pytest.mark.parametrize("words", list(commands(typer.main.get_command(cli.app))), ids=" ".join)
+def test_help_fits_80_columns_and_needs_no_checkout(words: tuple[str, ...], tmp_path: Path):
+    done = run(*words, "--help", folder=tmp_path, columns=80)
+    assert done.returncode == 0
+    assert not re.search(r"<str>|docs/|\.md\b|…", done.stdout)
+    wrapped_examples = [line for line in done.stdout.splitlines() if re.match(r" (-|/)", line)]
+    assert wrapped_examples == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["trakc"], "No such command 'trakc'"),
+        (["track"], "Missing argument 'BAG'"),
+        (["track", "a.mcap", "-o", "b.mcap", "--rat", "3"], "No such option: --rat"),
+        (["data", "simulate", "-o", "x.mcap", "--like", "drone"], "'drone' is not one of 'drive'"),
+        (["data", "simulate", "-o", "x.mcap", "--ranges", "0"], "0 ranges (1 or more"),
+        (["data", "info", "x.mcap", "--json", "/absent/x.json"], "its folder does not exist"),
+    ],
+)
+def test_wrong_usage_has_one_line_and_one_exit_code(words: list[str], message: str, tmp_path: Path):
+    done = run(*words, folder=tmp_path)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert message in line
+    assert done.stdout == ""

@@ -111,7 +111,7 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
     assert result.exit_code == 0, result.output
     names = [row["name"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]]
     assert names == ["raw", "overall_median", "l1_line", "float", "int8"]
-    assert run("quantize", floats, "--data", "any", "-o", integers).exit_code == 0
+    assert run("quantise", floats, "--data", "any", "-o", integers).exit_code == 0
     assert load_bundle(integers).quantised
     assert load_bundle(integers).linear_bias == load_bundle(floats).linear_bias
     result = run("evaluate", "--data", "any", "--model", integers, "--json", tmp_path / "e.json")
@@ -123,7 +123,7 @@ def test_train_quantize_evaluate_from_end_to_end(tmp_path, recording):
 
 def test_int8_bundle_is_not_quantised_again(tmp_path, recording):
     saved = bundle(tmp_path)
-    result = run("quantize", saved.path, "--data", "any", "-o", tmp_path / "y.onnx")
+    result = run("quantise", saved.path, "--data", "any", "-o", tmp_path / "y.onnx")
     assert isinstance(result.exception, ModelError)
 
 

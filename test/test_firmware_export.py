@@ -48,7 +48,7 @@ def test_float_bundle_is_refused_with_the_remedy(tmp_path: Path):
     architecture = Remnet(samples=32)
     model = graph.float_model(model_material.random_weights(architecture))
     bundle = save_bundle(tmp_path / "float.onnx", model, model_material.card(architecture, quantised=False))
-    with pytest.raises(ModelError, match="quantize"):
+    with pytest.raises(ModelError, match="quantise"):
         export_bundle(bundle, tmp_path)
     assert not (tmp_path / "uwb_model.h").exists()
 

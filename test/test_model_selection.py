@@ -275,7 +275,6 @@ def test_harmful_model_is_reported(tmp_path, monkeypatch):
         (),
         ("--data", "a", "--from-bag", "b"),
         ("--data", "a", "--truth", "c"),
-        ("--data", "a", "--recipe", "best"),
         ("--from-bag", "b", "--recipe", "auto"),
         ("--from-bag", "b", "--samples", 157),
         ("--from-bag", "b", "--scaling", "max"),

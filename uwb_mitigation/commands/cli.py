@@ -27,7 +27,7 @@ from uwb_mitigation.commands import (
     view,
 )
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.errors import UwbMitigationError, missing_dependency
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
 
 PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     "Recordings": {
@@ -43,7 +43,7 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     "Models": {
         "train": model.train,
         "train-universal": universal.train_universal,
-        "quantize": model.quantize,
+        "quantise": model.quantise,
         "evaluate": model.evaluate,
         "offset": offset.offset,
     },
@@ -108,31 +108,46 @@ def _reflow_help(command: Any) -> None:
     command.help = "\n\n".join(
         f"[none]{text}[/none]" if text.startswith(" ") else text.replace("\n", " ") for text in paragraphs
     )
+    for parameter in command.params:
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = " "  # otherwise typer shows flags as `<bool>`
     for subcommand in getattr(command, "commands", {}).values():
         _reflow_help(subcommand)
 
 
-def _exit_with_error(error: UwbMitigationError) -> NoReturn:
+_UsageError: Any = typer.BadParameter.__base__
+"""click's error for wrong usage, of which newer versions of typer contain a copy."""
+
+
+def _exit_with_error(error: object, code: int = 1) -> NoReturn:
     console.err.print(f"uwb-mitigation: {error}", style="red", markup=False, soft_wrap=True)
-    sys.exit(1)
+    sys.exit(code)
 
 
 def main() -> None:
-    """Run the command line; exit 1 with one line on bad input, 130 on Ctrl-C.
+    """Run the command line; exit with 2 and one line for wrong usage, 1 and one line for other errors, 130 on Ctrl-C.
 
     If the reader of standard output (head, less) exits, typer and rich exit with 1 and without a message.
     """
-    command = typer.main.get_command(app)
+    command: Any = typer.main.get_command(app)
     _reflow_help(command)
     try:
-        command()
+        sys.exit(command(standalone_mode=False))
+    except _UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            error.show()
+            sys.exit(2)
+        name = error.ctx.command_path if error.ctx is not None else "uwb-mitigation"
+        _exit_with_error(f"{error.format_message()} (see {name} --help)", 2)
+    except ParameterError as error:
+        _exit_with_error(error, 2)
     except UwbMitigationError as error:
         _exit_with_error(error)
     except ImportError as error:
         if (problem := missing_dependency(error)) is None:
             raise
         _exit_with_error(problem)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
 
 

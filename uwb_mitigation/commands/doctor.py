@@ -53,7 +53,7 @@ def doctor(json: JsonOption = None) -> None:
     broken = [name for name, state, _ in findings if state == "broken"]
     console.write_json(json, {"ok": not broken, "findings": [finding._asdict() for finding in findings]})
     if broken:
-        remedy = "run make setup, or see docs/guides/installation.md"
+        remedy = "run `make setup` in the checkout, or install the named packages"
         raise UwbMitigationError(f"broken: {', '.join(broken)}", valid=remedy)
     console.out.print("No problems found.")
 

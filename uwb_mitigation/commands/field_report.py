@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def field_report(
-    source: Annotated[str, typer.Option(help="Kind of radio: uci, evb1000, spi or serial.")],
+    source: Annotated[Literal["uci", "evb1000", "spi", "serial"], typer.Option(help="Kind of radio.")],
     port: Annotated[
         str,
         typer.Option(
@@ -53,7 +53,7 @@ def field_report(
     information of the board. It contains no host name, user name or path. Attach it to an issue of type "Field report".
     The exit code is 1 if a check fails.
 
-        uwb-mitigation field-report --source uci --port /dev/ttyACM0,/dev/ttyACM1 --distance 3.00
+        uwb-mitigation field-report --source uci --port /dev/ttyACM0 --distance 3
     """
     from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
     from uwb_mitigation.commands.field.test import observe

@@ -1,19 +1,19 @@
-"""`uwb-mitigation train`, `quantize_network` and `evaluate_accuracy`: create and evaluate models."""
+"""`uwb-mitigation train`, `quantise` and `evaluate`: create and evaluate models."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from uwb_mitigation.commands.support import console, model_tables
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.support.checks import OffsetsOption, check_output, needs_torch, scaling_of
+from uwb_mitigation.commands.support.checks import OffsetsOption, ScalingName, check_output, needs_torch
 from uwb_mitigation.commands.support.console import JsonOption
-from uwb_mitigation.errors import ParameterError, check_name
+from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
@@ -66,15 +66,21 @@ def train(
         ),
     ] = None,
     recipe_name: Annotated[
-        str, typer.Option("--recipe", help="With --data: auto, constant, line, line+network, or network.")
+        Literal["auto", "constant", "line", "line+network", "network"],
+        typer.Option("--recipe", help="With --data: kind of model; auto: selected by cross-validation."),
     ] = "auto",
     samples: Annotated[int, typer.Option(help="With --data: window length K.")] = 157,
-    scaling: Annotated[str, typer.Option(help="With --data: preamble or max.")] = "preamble",
-    first_kernel: Annotated[int, typer.Option(help="With --data: kernel k0 of the first convolution.")] = 3,
+    scaling: Annotated[
+        ScalingName,
+        typer.Option(help="With --data: scaling of the CIR by its preamble count, or by its maximum."),
+    ] = "preamble",
+    first_kernel: Annotated[
+        int, typer.Option(help="With --data: kernel size of the network's first convolution.")
+    ] = 3,
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
     per_configuration: Annotated[
-        int, typer.Option(help="With --data: maximum number of ranges of each configuration in the fit.")
+        int, typer.Option(help="With --data: use at most this number of ranges of each placement.")
     ] = 20,
     seed: Annotated[
         int, typer.Option(help="Seed of the splits, the initial weights and the order of the data.")
@@ -92,7 +98,7 @@ def train(
     the error on held-out data.
     """
     from uwb_mitigation.mitigation.model.architecture import Remnet
-    from uwb_mitigation.mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.training.fit.options import FitOptions
 
     if (data is None) == (from_bag is None):
@@ -104,7 +110,7 @@ def train(
             f"{unused} with --from-bag",
             valid="only with --data: with --from-bag the source model determines these options",
         )
-    chosen_scaling = scaling_of(scaling)
+    chosen_scaling = Scaling(scaling)
     if per_configuration < 1:
         raise ParameterError(f"per-configuration = {per_configuration}", valid="at least 1")
     given: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
@@ -116,8 +122,6 @@ def train(
         from uwb_mitigation.training import train as training
         from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)
 
-    if data is not None:
-        check_name("recipe", recipe_name, (training.AUTO, *candidates.NEW_MODELS))
     recording = data or from_bag
     assert recording is not None
     source = None if from_bag is None else bundle_for(model, from_bag)
@@ -137,7 +141,7 @@ def train(
     console.write_json(json, trained.as_json())
 
 
-def quantize(
+def quantise(
     model: Annotated[
         Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, written by `train` or `calibrate`.")
     ],
@@ -192,11 +196,10 @@ def evaluate(
     model: ModelOption = None,
     offsets: OffsetsOption = None,
     cross_validate: Annotated[
-        str | None,
+        Literal["configuration", "tag", "half"] | None,
         typer.Option(
-            metavar="GROUP",
-            help="Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out data: "
-            "configuration, tag (each location in turn) or half (of the anchors).",
+            help="Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out "
+            "placements (configuration), locations (tag) or half of the anchors.",
         ),
     ] = None,
     seeds: Annotated[
@@ -204,7 +207,7 @@ def evaluate(
     ] = 3,
     folds: Annotated[int, typer.Option(help="With --cross-validate configuration: number of folds.")] = 6,
     scaling: Annotated[
-        str, typer.Option(help="With --cross-validate: preamble, or max for data without preamble counts.")
+        ScalingName, typer.Option(help="With --cross-validate: max for data without preamble counts.")
     ] = "preamble",
     json: JsonOption = None,
 ) -> None:
@@ -216,7 +219,9 @@ def evaluate(
             raise ParameterError(
                 "--model with --cross-validate", valid="one of them: cross-validation fits new models"
             )
-        _compare(data, cross_validate, folds, seeds, scaling_of(scaling), json)
+        from uwb_mitigation.mitigation.preprocessing import Scaling
+
+        _compare(data, cross_validate, folds, seeds, Scaling(scaling), json)
         return
     if unused := _options_given(context, _CROSS_VALIDATION_OPTIONS):
         raise ParameterError(f"{unused} without --cross-validate", valid="only with --cross-validate")
@@ -238,7 +243,6 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
     from uwb_mitigation.training.data import splits
     from uwb_mitigation.training.fit.options import FitOptions
 
-    check_name("group of --cross-validate", group, [kind.value for kind in splits.GroupKey])
     if not 1 <= seeds <= 100:
         raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
     from uwb_mitigation.mitigation.model.bundle import load_bundle

@@ -7,12 +7,12 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import needs_torch, scaling_of
+from uwb_mitigation.commands.support.checks import ScalingName, needs_torch
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
@@ -28,13 +28,13 @@ DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: DeepUWB's dataset.pkl, a bag, or a folder of logs.")
 ]
 SplitOption = Annotated[
-    str,
+    Literal["auto", "paper", "all_but_room_2", "configurations"],
     typer.Option(
-        help="paper or all_but_room_2 (DeepUWB: test in the medium room), configurations (a quarter held out), "
-        "or auto: paper for DeepUWB, otherwise configurations."
+        help="paper, all_but_room_2: test in the medium room of DeepUWB; configurations: hold out a quarter; auto: paper for "
+        "DeepUWB, otherwise configurations."
     ),
 ]
-ScalingOption = Annotated[str, typer.Option(help="Scaling of the CIR: max or preamble.")]
+ScalingOption = Annotated[ScalingName, typer.Option(help="Scaling of the CIR.")]
 WorkersOption = Annotated[
     int | None, typer.Option(help="Processes with one thread each; default: one per processor.")
 ]
@@ -99,10 +99,10 @@ def protocol(
     data: DataOption,
     output: FolderOption,
     networks: Annotated[
-        str, typer.Option(help="Networks, separated by commas: remnet, remnet_k5, mlp.")
+        str, typer.Option(metavar="NAME,...", help="Networks, separated by commas: remnet, remnet_k5, mlp.")
     ] = "remnet,mlp",
     windows: Annotated[
-        str, typer.Option(help="Window lengths K, separated by commas.")
+        str, typer.Option(metavar="K,...", help="Window lengths K, separated by commas.")
     ] = "157,128,64,32,16,8",
     seeds: Annotated[int, typer.Option(help="Number of networks of each kind.")] = 5,
     epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 30,
@@ -185,11 +185,11 @@ def _command() -> str:
     return shlex.join(["uwb-mitigation", *sys.argv[1:]])
 
 
-def _parts(path: Path, samples: int, scaling: str, split: str) -> Parts:
-    from uwb_mitigation.mitigation.preprocessing import Preprocessing
+def _parts(path: Path, samples: int, scaling: ScalingName, split: str) -> Parts:
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.training.paper import data as parts
 
-    preprocessing = Preprocessing(samples, scaling_of(scaling))
+    preprocessing = Preprocessing(samples, Scaling(scaling))
     with console.reading() as on_record:
         name, _, dataset = parts.load_paper_data(path, preprocessing, on_record)
     console.show_skipped(dataset.skipped)

@@ -40,21 +40,22 @@ AnchorsOption = Annotated[
     typer.Option(
         "--anchors",
         metavar="FILE",
-        help="Positions of the anchors (format: docs/background/positioning.md). Default: X.anchors.yaml of the first BAG.",
+        help="YAML file of the anchors: `anchors: [{id: 1, x: 0.0, y: 0.0, z: 2.1}]`. Default: X.anchors.yaml next to the first "
+        "BAG X.mcap.",
     ),
 ]
 HeightOption = Annotated[
     float | None,
     typer.Option(help="Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
 ]
-HeightSdOption = Annotated[float, typer.Option("--height-sd", help="How well that is known, m.")]
+HeightSdOption = Annotated[float, typer.Option("--height-sd", help="Standard deviation of the height, m.")]
 HeightTopicOption = Annotated[
     str | None,
     typer.Option(
         "--height-topic",
         metavar="TOPIC",
-        help="Topic of BAG with the measured height of the tag's antenna: sensor_msgs/Range (height above z = 0), "
-        "nav_msgs/Odometry or geometry_msgs/PoseWithCovarianceStamped. --height-sd is used if a message has no variance.",
+        help="Topic of BAG with the measured height of the tag's antenna (Range above z = 0, Odometry or "
+        "PoseWithCovarianceStamped). --height-sd is used if a message has no variance.",
     ),
 ]
 AreaOption = Annotated[
@@ -66,13 +67,14 @@ AreaOption = Annotated[
 OffsetOption = Annotated[
     float,
     typer.Option(
-        "--stamp-offset", help="What to add to the ranges' stamps, s: -0.2 where ranges lag by 0.2 s."
+        "--stamp-offset", help="Time to add to the stamps of the ranges, s; -0.2 if they are late by 0.2 s."
     ),
 ]
 AccelerationOption = Annotated[
     float,
     typer.Option(
-        help="How fast tags change their velocity, m/s^1.5 (root of the spectral density of white acceleration)."
+        help="Agility of the tags: 1 for robots, people and drones, less for slow vehicles. Square root of the spectral "
+        "density of the acceleration, m/s^1.5."
     ),
 ]
 
@@ -128,9 +130,9 @@ def track(
 
         uwb-mitigation data import LOS_A1 -o a1.mcap
 
-        uwb-mitigation track a1.mcap -o track.mcap --height 1.0 --stamp-offset=-0.2
+        uwb-mitigation track a1.mcap -o a1_track.mcap --stamp-offset=-0.2
 
-        uwb-mitigation track drive.mcap -o track.mcap --height 0.4 --odometry /odom --imu /imu
+        uwb-mitigation track drive.mcap -o track.mcap --odometry /odom --imu /imu
     """
     from uwb_mitigation.commands.offline.track import held_out, track_tag, tum_file, write_tracks
     from uwb_mitigation.commands.offline.track import tum as tum_text
@@ -181,7 +183,7 @@ def survey(
     ],
     anchors: AnchorsOption = None,
     off: Annotated[
-        float, typer.Option(help="How far the guesses in FILE may be off, m in each direction.")
+        float, typer.Option(help="Standard deviation of the guesses in FILE, m in each coordinate.")
     ] = 1.0,
     fixed: Annotated[
         list[str] | None,

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from uwb_mitigation.commands.support import console, model_tables
-from uwb_mitigation.commands.support.checks import check_output, needs_torch, scaling_of
+from uwb_mitigation.commands.support.checks import ScalingName, check_output, needs_torch
 from uwb_mitigation.commands.support.console import JsonOption
-from uwb_mitigation.errors import ParameterError, check_name
+from uwb_mitigation.errors import ParameterError
 
 MAX_BLOCKS = 10_000
 
@@ -22,9 +22,11 @@ def train_universal(
     seed: Annotated[int, typer.Option(help="Seed of the simulated buildings and of the network.")] = 0,
     samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[
-        str, typer.Option(help="preamble, or max for windows without preamble counts.")
+        ScalingName, typer.Option(help="max: for windows without preamble counts.")
     ] = "preamble",
-    radio: Annotated[str, typer.Option(help="dw1000, or dw3000 for windows of an STS.")] = "dw1000",
+    radio: Annotated[
+        Literal["dw1000", "dw3000"], typer.Option(help="dw3000: for windows of an STS.")
+    ] = "dw1000",
     blocks: Annotated[
         int | None, typer.Option(help="Number of blocks of 256 placements for training.")
     ] = None,
@@ -44,19 +46,16 @@ def train_universal(
 
         uwb-mitigation train-universal --seed 0 -o universal.onnx
 
-        uwb-mitigation train-universal --seed 0 --scaling max -o universal_amplitude.onnx
-
-        uwb-mitigation train-universal --radio dw3000 --samples 13 --scaling max -o dw3000_sts.onnx
+        uwb-mitigation train-universal --scaling max -o amplitude.onnx
     """
     from uwb_mitigation.mitigation.model import graph
     from uwb_mitigation.mitigation.model.bundle import save_bundle
-    from uwb_mitigation.mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.simulation.buildings import RADIO
     from uwb_mitigation.simulation.radio import DW3000_STS
 
-    preprocessing = Preprocessing(samples, scaling_of(scaling))
+    preprocessing = Preprocessing(samples, Scaling(scaling))
     radios = {"dw1000": RADIO, "dw3000": DW3000_STS}
-    check_name("radio", radio, radios)
     for name, value, low, high in (
         ("seed", seed, 0, 2**31),
         ("blocks", blocks, 1, MAX_BLOCKS),

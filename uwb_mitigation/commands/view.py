@@ -47,10 +47,14 @@ def view(
     ] = None,
     model: ModelOption = None,
     namespace: Annotated[
-        str | None, typer.Option(help="Namespace of the ranges, such as /board1, if BAG has several.")
+        str | None,
+        typer.Option(
+            metavar="NAMESPACE", help="Namespace of the ranges, such as /board1, if BAG has several."
+        ),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to serve at; 0.0.0.0 = every address of this machine.")
+        str,
+        typer.Option(metavar="ADDRESS", help="Address to serve at; 0.0.0.0 = every address of this machine."),
     ] = "localhost",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 = a free one.")] = 5006,
     origins: Annotated[

@@ -128,7 +128,7 @@ class Locator(ManagedNode):
         path = self.value("anchors")
         if not path:
             raise ParameterError(
-                "parameter anchors is empty", valid="anchors:=FILE, as docs/background/positioning.md shows"
+                "parameter anchors is empty", valid="anchors:=FILE of {id, x, y, z}, or a topic"
             )
         model = NoiseModel(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None

@@ -194,15 +194,13 @@ def anchors_path(bag: Path) -> Path:
 
 
 def load_anchors(path: Path | str) -> AnchorMap:
-    """Read an anchors file (format: docs/background/positioning.md).
+    """Read an anchors file (YAML or JSON): `anchors: [{id: 1, x: 0.0, y: 0.0, z: 2.1, name: door}, ...]`, in metres.
 
     Raises:
         ParameterError: it cannot be read, or does not have the format of `positioning.anchors`.
     """
     path = Path(path)
-    data = read_bounded(
-        path, MAX_TEXT, ParameterError, "an anchors file (format: docs/background/positioning.md)"
-    )
+    data = read_bounded(path, MAX_TEXT, ParameterError, SCHEMA)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

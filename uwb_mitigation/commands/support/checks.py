@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, check_name
+from uwb_mitigation.errors import MissingDependencyError, ParameterError
 
-if TYPE_CHECKING:
-    from uwb_mitigation.mitigation.preprocessing import Scaling
-
+ScalingName = Literal["preamble", "max"]
+"""Values of `Scaling`, which takes long to import."""
 
 OffsetsOption = Annotated[
     str | None,
@@ -46,15 +45,3 @@ def check_output(output: Path) -> None:
         raise ParameterError(
             "not a path for a bundle", where=str(output), valid="a file .onnx in an existing folder"
         )
-
-
-def scaling_of(name: str) -> Scaling:
-    """Return the scaling of that name.
-
-    Raises:
-        ParameterError: the name is unknown.
-    """
-    from uwb_mitigation.mitigation.preprocessing import Scaling
-
-    check_name("scaling", name, [kind.value for kind in Scaling])
-    return Scaling(name)

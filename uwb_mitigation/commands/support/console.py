@@ -65,7 +65,7 @@ def show_table(
         columns: {title with unit: "KEY" or "KEY:FORMAT"}: KEY is an attribute or key of each row, with dots for nested
             ones; FORMAT is a format specification, or `id` for ids. Numbers are right-aligned, and unknown values (None,
             NaN) are shown as "-". Or only the titles, if each row is a sequence of cells.
-        rows: the rows of the result, as they are given to `write_json`; or sequences of cells.
+        rows: the rows of the result that `write_json` writes, too; or sequences of cells.
         bold_row: the row with this name is bold.
         left: with titles only: the number of left-aligned columns.
         max_rows: maximum number of rows.
@@ -220,7 +220,7 @@ def write_json(path: Path | None, *results: object) -> None:
 
     A command computes one result, shows it with `show_table`, and gives the same object to this function:
 
-        result = summarize(recording)  # a frozen dataclass whose fields are the keys of the JSON file
+        result = summary_of(recording)  # a frozen dataclass whose fields are the keys of the JSON file
         show_table("Pairs", {"anchor": "anchor_id:id", "mean range, m": "mean_range_m:.3f"}, result.by_pair)
         write_json(json, result, {"output": output})
 

@@ -48,7 +48,7 @@ def export_bundle(bundle: Bundle, folder: Path) -> Path:
         raise ModelError(
             "the firmware only runs int8 networks",
             where=str(bundle.path),
-            valid="run `uwb-mitigation quantize`",
+            valid="run `uwb-mitigation quantise`",
         )
     weights = graph.int8_weights(bundle.model, bundle.architecture)
     try:

@@ -36,7 +36,7 @@ MAX_BYTES = 64 << 20
 
 _MARKER = re.compile(rb'"model_id":"([0-9a-f]{8})"')
 _BLANK = b"00000000"
-_REMEDY = "a bundle written by `uwb-mitigation train`, `quantize` or `calibrate`"
+_REMEDY = "a bundle written by `uwb-mitigation train`, `quantise` or `calibrate`"
 
 
 @dataclass(frozen=True, slots=True)

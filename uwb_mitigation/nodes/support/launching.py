@@ -260,7 +260,7 @@ def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str
                 raise
             values[name] = value
         elif name not in all_names and not name.startswith(STANDARD):
-            check_name("parameter", name, all_names, str(path), "docs/reference/nodes.md lists them")
+            check_name("parameter", name, all_names, str(path), "`ros2 launch ... --show-args` lists them")
     return values
 
 

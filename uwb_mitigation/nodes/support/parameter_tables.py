@@ -190,7 +190,7 @@ MITIGATOR = (
               "evk1000_apartment, dw3000_sts); empty: universal. An invalid bundle is refused, and the previous one "
               "stays in use.", live=True),
     Parameter("offsets", "", "Offset of ranges due to antenna delays, subtracted before the model: a number in "
-              "metres, or a file by anchor, tag or pair (docs/guides/calibration.md); empty: 0. Invalid "
+              "metres, or a file written by `uwb-mitigation offset` or `calibrate`; empty: 0. Invalid "
               "offsets are refused, and "
               "the previous ones stay in use.", live=True, or_number=True),
     Parameter("backend", "onnxruntime", "Inference engine: ONNX Runtime, or the firmware's C, compiled for this "
@@ -200,7 +200,7 @@ MITIGATOR = (
 )  # fmt: skip
 
 LOCATOR = (
-    Parameter("anchors", "", "File with the positions of the anchors (format: docs/background/positioning.md), or a topic: "
+    Parameter("anchors", "", "YAML file with the positions of the anchors, `anchors: [{id: 1, x: 0.0, y: 0.0, z: 2.1}]`, or a topic: "
               "markers:/TOPIC (MarkerArray, marker id = anchor id) or poses:/TOPIC (PoseArray, index = anchor id). Required."),
     Parameter("ranges", "", "Topic of raw ranges (RangeCir) to use without a mitigator, such as uwb/range_raw; or a mapping "
               "file, or the name of a shipped mapping, for messages of other software. Empty: uwb/range_corrected."),
@@ -277,9 +277,7 @@ def help_text(name: str) -> str:
     rows = {row.name: row for node in nodes for row in TABLES.get(node, ())}
     lines = [f"usage: {name} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]"]
     if rows:
-        lines.append(
-            "parameters with their defaults (* = can be set while the node runs); see docs/reference/nodes.md:"
-        )
+        lines.append("parameters with their defaults (* = can be set while the node runs):")
     for row in rows.values():
         lines.append(f"  {row.name}:={row.default_text}{' *' if row.live else ''}")
         lines.append(f"      {row.description} ({row.valid})")
