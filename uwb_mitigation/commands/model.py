@@ -23,7 +23,7 @@ DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
 ]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
-# Options for one mode of `train` or `evaluate_accuracy`; they are errors in the other mode.
+# Options for one mode of `train` or `evaluate`; they are errors in the other mode.
 _DATA_OPTIONS = {
     "recipe_name": "--recipe",
     "samples": "--samples",
