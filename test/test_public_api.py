@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -57,6 +58,14 @@ def test_import_loads_no_other_package_and_all_names_exist():
     assert uwb_mitigation.__all__ == list(uwb_mitigation._MODULES)
     with pytest.raises(AttributeError, match="no attribute 'Mitigator'"):
         uwb_mitigation.Mitigator  # noqa: B018
+
+
+def test_loading_a_model_writes_no_file_to_the_home_folder(tmp_path: Path):
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    environment |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    code = "import uwb_mitigation; uwb_mitigation.load_model()"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY, env=environment)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("number", range(len(EXAMPLES)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import sys
 from pathlib import Path
 
@@ -14,8 +15,9 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticArray
 from ros_harness import Ros, domain
-from uwb_mitigation_msgs.msg import RangeCorrected
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
+from uwb_mitigation import open_recording
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.types.ros import topics
 
@@ -124,3 +126,18 @@ def test_mitigator_receives_the_ranges_of_the_node_on_the_page_about_sources(tmp
     message = received[0]
     assert (message.tag_id, message.anchor_id, message.status) == (7, 1, RangeCorrected.NO_CIR)
     assert message.header.frame_id == "my_antenna"
+
+
+def test_recorder_of_the_installation_guide_writes_a_bag(tmp_path: Path):
+    code = re.search(r"^```python\n(.*?)^```", (GUIDES / "installation.md").read_text(), re.M | re.S)[1]
+    bag = tmp_path / "drive.mcap"
+    with domain(tmp_path) as ros:
+        received = ros.collect(RangeCir, "/uwb/range_raw")
+        recorder = ros.run([sys.executable, "-c", code, str(bag)])
+        ros.spin_until(lambda: ros.node.count_subscribers("/uwb/range_raw") == 2)
+        ros.start("driver", "source:=simulated")
+        ros.spin_until(lambda: len(received) > 20)
+        assert recorder.signal(signal.SIGINT) == 0
+    recorded = [record.measurement.sequence for record in open_recording(bag)]
+    assert len(recorded) > 10
+    assert recorded == list(range(recorded[0], recorded[0] + len(recorded)))

@@ -13,6 +13,7 @@ neither ROS nor PyTorch nor pandas: a name is imported when it is used.
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from uwb_mitigation.types.tracks import Estimate
 
 __version__ = "0.1.0"
+
+# ONNX Runtime reads this when it is imported. By default it stores a device id in ~/.cache and sends usage data to Microsoft.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __all__ = [
     "Anchor",
