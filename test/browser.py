@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 SCREENS = Path(__file__).resolve().parents[1] / "build" / "screens"
-TIMEOUT_S = 240.0
+TIMEOUT_S = 120.0
 CALL_S = 10.0
 """Timeout of one call; a call that a reload of the page interrupts is repeated."""
 

@@ -44,6 +44,7 @@ from uwb_mitigation.types.ros.topics import (
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import playback
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.headline import WHOLE, recorded_cards
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import AnchorPosition, Scene
 
@@ -78,6 +79,13 @@ def open_bag(path: Path, namespace: str | None = None) -> tuple[BagPlayer, Scene
     return BagPlayer(path, feed, lambda: Mitigation(load_bundle(default_model_path())), namespace), scene
 
 
+def seek(player: BagPlayer, position_s: float) -> None:
+    """Show a position; a long read continues at further calls."""
+    player.seek(position_s)
+    while player.is_behind:
+        player.advance()
+
+
 def latest(scene: Scene) -> dict[tuple[int, int], float]:
     return {pair: sample.range_m for pair, _, sample in scene.latest()}
 
@@ -86,13 +94,15 @@ def test_seek_shows_data_up_to_the_position(bag: Path):
     player, scene = open_bag(bag)
     assert player.seconds == pytest.approx((COUNT - 1) * STEP_NS / 1e9)
     for last in (399, 100, 250, 0):
-        player.seek(last * STEP_NS / 1e9)
+        seek(player, last * STEP_NS / 1e9)
         before = last - 1
         expected = {(1 + number % 2, 7): 4.25 + number for number in (before, last) if number >= 0}
         assert latest(scene) == expected
-        assert scene.now_s == pytest.approx((START_NS + last * STEP_NS) / 1e9)
+        assert scene.now_s() == pytest.approx((START_NS + last * STEP_NS) / 1e9)
         assert scene.errors == last + 1, "the truth is joined, and nothing is counted twice"
-        lengths = {key: len(track) for key, track in scene.tracks.items() if key[1] is not TrackKind.RAW}
+        lengths = {
+            key: len(track.points) for key, track in scene.tracks.items() if key[1] is not TrackKind.RAW
+        }
         assert lengths == {
             ("tag", TrackKind.CORRECTED): last // 10 + 1,
             ("tag_9", TrackKind.CORRECTED): last // 10 + 1,
@@ -127,7 +137,7 @@ def test_recording_plays_in_real_time(bag: Path, monkeypatch: pytest.MonkeyPatch
 def test_raw_ranges_are_corrected_for_display(tmp_path: Path):
     player, scene = open_bag(write_bag(tmp_path / "raw.mcap", 30))
     assert player.corrects
-    player.seek(player.seconds)
+    seek(player, player.seconds)
     mitigation = Mitigation(load_bundle(default_model_path()))
     expected = mitigation.correct([record(29).measurement])[0].range_m
     assert latest(scene)[2, 7] == pytest.approx(expected)
@@ -139,12 +149,12 @@ def test_processed_bag_shows_its_truth(bag: Path, tmp_path: Path):
     process_bag(Job(raw, tmp_path / "out.mcap", default_model_path()))
     player, scene = open_bag(tmp_path / "out.mcap")
     assert not player.corrects
-    player.seek(player.seconds)
+    seek(player, player.seconds)
     assert scene.errors == 30
     assert [sample.true_m for sample in scene.pairs[1, 7].samples] == [4.0 + n for n in range(0, 30, 2)]
     assert scene.pairs[1, 7].samples[-1].label == "NDP NLOS"
     raw_player, raw_scene = open_bag(raw)
-    raw_player.seek(raw_player.seconds)
+    seek(raw_player, raw_player.seconds)
     assert scene.error_sums_m == pytest.approx(raw_scene.error_sums_m)
 
 
@@ -162,13 +172,13 @@ def test_output_of_track_is_shown(tmp_path: Path):
     done = run("track", bag, "-o", track, "--height", "1.0", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     player, scene = open_bag(track)
-    player.seek(player.seconds)
+    seek(player, player.seconds)
     kinds = {kind for _, kind in scene.tracks}
     assert kinds >= {TrackKind.CORRECTED, TrackKind.SMOOTHED}
     assert {name for name, kind in scene.tracks if kind is TrackKind.SMOOTHED} == set(scene.tags)
     assert any("0x1122334455667788" in name for name in scene.tags)
-    for points in scene.tracks.values():
-        assert points[-1] == pytest.approx(truth.position[-1, :2], abs=0.5)
+    for view in scene.tracks.values():
+        assert view.points[-1][1:3] == pytest.approx(truth.position[-1, :2], abs=0.5)
     assert "without ranges" in player.missing.ranges
     assert load_anchors(anchors_path(track)).anchors == HALL.anchors
 
@@ -182,32 +192,34 @@ def test_ages_use_the_time_of_the_recording(tmp_path: Path):
             if number != 99:
                 write_corrected(out, item.measurement, corrected(number))
     player, scene = open_bag(path)
-    player.seek(20.0)
+    seek(player, 20.0)
     ages = {pair: scene.age_s(history) for pair, history, _ in scene.latest()}
     assert ages == pytest.approx({(1, 7): 20.0 - 0.98, (2, 7): 20.0 - 0.97})
-    assert scene.now_s == pytest.approx(START_NS / 1e9 + 20.0)
-    player.seek(0.5)
+    assert scene.now_s() == pytest.approx(START_NS / 1e9 + 20.0)
+    seek(player, 0.5)
     assert max(scene.age_s(history) for _, history, _ in scene.latest()) < 0.02
 
 
-def test_seek_reads_a_limited_number_of_messages(bag: Path, monkeypatch: pytest.MonkeyPatch):
+def test_long_read_continues_at_the_next_call(bag: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(playback, "MAX_MESSAGES", 150)
+    monkeypatch.setattr(playback, "READ_S", 0.0)
     player, scene = open_bag(bag)
     player.seek(player.seconds)
-    for _ in range(5):
+    assert player.is_behind
+    while player.is_behind:
         player.advance()
     assert latest(scene)[2, 7] == 4.25 + COUNT - 1
-    assert scene.ranges < COUNT / 2
+    assert scene.ranges < COUNT / 2, "the messages before are skipped"
 
 
 def test_truncated_bag_is_shown_up_to_the_damage(bag: Path, tmp_path: Path):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(write_bag(tmp_path / "whole.mcap", 3000).read_bytes()[:-20_000])
     player, scene = open_bag(cut)
-    player.seek(player.seconds)
+    seek(player, player.seconds)
     assert scene.node_statuses["recording"].level == 2
     assert "nothing beyond" in scene.node_statuses["recording"].message
-    player.seek(0.0)
+    seek(player, 0.0)
     assert latest(scene)
 
 
@@ -230,7 +242,10 @@ def test_implausible_values_of_standard_messages_are_ignored() -> None:
             position=SimpleNamespace(x=1.0, y=2.0, z=float("nan")),
             orientation=SimpleNamespace(x=0.0, y=0.0, z=1e300, w=1e300),
         )
-        message = SimpleNamespace(pose=SimpleNamespace(pose=pose, covariance=[covariance] * 36))
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0))
+        message = SimpleNamespace(
+            header=header, pose=SimpleNamespace(pose=pose, covariance=[covariance] * 36)
+        )
         feed.add(POSE, message)
         shown = scene.tags["tag"].pose
         assert shown is not None
@@ -259,7 +274,7 @@ def test_several_namespaces_need_a_choice(tmp_path: Path):
     with pytest.raises(UwbMitigationError, match="--namespace with one of: '/left', '/right'"):
         open_bag(path)
     player, scene = open_bag(path, "/left")
-    player.seek(1.0)
+    seek(player, 1.0)
     assert scene.ranges == 4
 
 
@@ -273,27 +288,22 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
     player.index(anchors).join()
     timeline = player.timeline
     assert timeline is not None
-    assert len(timeline.time_s) == len(timeline.pairs) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
-    errors_m = {}
-    true_s, true = timeline.tracks["tag_101", TrackKind.TRUE]
-    for kind in (TrackKind.RAW, TrackKind.CORRECTED, TrackKind.SMOOTHED):
-        time_s, position = timeline.tracks["tag_101", kind]
-        late = time_s > 5.0
-        at = [np.interp(time_s[late], true_s, axis) for axis in true.T[:2]]
-        errors_m[kind] = np.hypot(*(position[late, :2].T - at)).mean()
-    assert errors_m[TrackKind.CORRECTED] < 0.8 * errors_m[TrackKind.RAW]
+    assert len(timeline.time_s) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
+    cards = {title: (value, text) for title, value, text in recorded_cards(timeline, None, 101, WHOLE, 10.0)}
+    corrected, references = cards["Position RMSE, whole recording"]
+    assert float(corrected.split()[0]) < 0.8 * float(re.search(r"raw \+ same filter: (\S+) m", references)[1])
+    assert cards["Position error, now"][0] != "-"
     assert sum(entry[1] for entry in timeline.heat.values()) == len(timeline.time_s)
     largest = timeline.largest_error()
-    assert player.jump(largest) == timeline.pairs[largest]
+    assert player.jump(largest) == timeline.pair(largest)
     assert timeline.deviation_m[largest] == np.nanmax(timeline.deviation_m)
     assert player.position_s == pytest.approx(timeline.time_s[largest], abs=1e-4)
     mean = timeline.mean_errors(player.seconds)
-    assert mean["corrected"].mean() < mean["raw"].mean()
-    player.seek(player.seconds)
+    assert np.nanmean(mean["corrected"]) < np.nanmean(mean["raw"])
+    seek(player, player.seconds)
     assert set(scene.tracks) == set(timeline.tracks)
-    assert scene.tracks["tag_101", TrackKind.CORRECTED][-1] == pytest.approx(
-        timeline.tracks["tag_101", TrackKind.CORRECTED][1][-1, :2], abs=0.5
-    )
+    track = timeline.tracks["tag_101", TrackKind.CORRECTED]
+    assert scene.tracks["tag_101", TrackKind.CORRECTED].columns()[-1] == pytest.approx(track[-1])
     assert scene.tags["tag_101"].pose is not None
     innovations = [abs(sample.innovation_m) for sample in scene.pairs[1, 101].samples]
     assert np.nanmedian(innovations[5:]) < 1.0, "also of the ranges that a seek reads"
@@ -312,6 +322,9 @@ def test_next_bad_range_is_found_and_a_step_advances_by_one_range(tmp_path: Path
         assert player.jump(player.timeline.next_bad(player.position_s)) == (1 + number % 2, 7)
         assert player.position_s == pytest.approx(number * STEP_NS / 1e9, abs=1e-5)
     assert player.timeline.next_bad(player.position_s) is None
+    assert player.command("previous_bad") == (1, 7)
+    assert player.command("previous_bad") is None
+    assert player.command("next_bad") == (1, 7)
     player.step()
     assert player.position_s == pytest.approx(31 * STEP_NS / 1e9)
 
@@ -327,7 +340,7 @@ def test_speed_scales_playback_and_the_second_recording_follows(bag: Path, monke
     player.advance()
     assert player.position_s == player.companion.position_s == pytest.approx(2.5)
     assert latest(scene) == latest(second) == {(1, 7): 4.25 + 250, (2, 7): 4.25 + 249}
-    player.seek(1.0)
+    seek(player, 1.0)
     assert latest(second) == {(1, 7): 4.25 + 100, (2, 7): 4.25 + 99}
 
 

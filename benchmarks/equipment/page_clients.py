@@ -1,8 +1,9 @@
-"""Open pages of a viewer without a browser; count and discard the received messages. Does not need ROS."""
+"""Open pages of a viewer without a browser; acknowledge updates, and discard everything else. Does not need ROS."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 from concurrent.futures import Future
 from urllib.parse import urlsplit
@@ -55,12 +56,32 @@ class PageClients:
         request = HTTPRequest(f"ws://{self._host}/ws", headers={"Origin": f"http://{self._host}"})
         page = await websocket_connect(request, subprotocols=["bokeh", token])
         await page.read_message()
+        # The document contains the first update, which a page acknowledges too.
+        await page.write_message(json.dumps({"msgid": "1", "msgtype": "PULL-DOC-REQ"}))
+        await page.write_message("{}")
+        await page.write_message("{}")
         self._pages.append(page)
         self._loop.create_task(self._read(page, number))
 
     async def _read(self, page: WebSocketClientConnection, number: int) -> None:
-        while await page.read_message() is not None:
+        controls = ""
+        while (message := await page.read_message()) is not None:
             self.received[number] += 1
+            if isinstance(message, bytes) or not (message.startswith("{") and "update" in message):
+                continue
+            content = json.loads(message)
+            for model in content.get("doc", {}).get("roots", ()):
+                if model.get("attributes", {}).get("name") == "controls":
+                    controls = model["id"]
+                    await self._acknowledge(page, controls, model["attributes"]["update"][0])
+            for event in content.get("events", ()):
+                if event.get("attr") == "update":
+                    await self._acknowledge(page, controls, event["new"][0])
+
+    async def _acknowledge(self, page: WebSocketClientConnection, controls: str, update: int) -> None:
+        event = {"kind": "ModelChanged", "model": {"id": controls}, "attr": "acknowledged", "new": update}
+        for part in ({"msgid": "2", "msgtype": "PATCH-DOC"}, {}, {"events": [event]}):
+            await page.write_message(json.dumps(part))
 
     def _end(self) -> None:
         self._loop.call_soon_threadsafe(self._close)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 import webbrowser
 from functools import partial
@@ -61,6 +62,9 @@ def view(
         list[str] | None,
         typer.Option(metavar="HOST:PORT", help="Further address of the page, for a proxy or a host name."),
     ] = None,
+    token: Annotated[
+        bool, typer.Option("--token", help="Require a generated token, which is part of the URL.")
+    ] = False,
     browser: Annotated[bool, typer.Option("--browser", help="Open the page in the browser.")] = False,
 ) -> None:
     """Show a recording in the browser: map, ranges, CIRs.
@@ -85,20 +89,20 @@ def view(
 
     lock = Lock()
     file = anchors or anchors_path(bag)
-    known = load_anchors(file) if anchors is not None or file.is_file() else None
+    anchor_map = load_anchors(file) if anchors is not None or file.is_file() else None
     players, scenes = [], []
     for path in (bag, second):
         if path is None:
             continue
         feed = SceneUpdater(Scene(), lock)
         player = BagPlayer(path, feed, partial(_backend, model, path), namespace)
-        if known is not None:
-            feed.anchors(known)
+        if anchor_map is not None:
+            feed.anchors(anchor_map)
         if player.corrects:
             console.err.print(
                 f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
             )
-        player.index(known, None if height is None else Height(height))
+        player.index(anchor_map or feed.anchor_map, None if height is None else Height(height))
         players.append(player)
         scenes.append(feed.scene)
     first = players[0]
@@ -115,7 +119,10 @@ def view(
         plan=None if floor_plan is None else load_floor_plan(floor_plan),
         missing=first.missing,
     )
-    with ViewerServer(shown, host, port, tuple(origins or ())) as server:
+    secret = secrets.token_urlsafe(16) if token else ""
+    with ViewerServer(shown, host, port, tuple(origins or ()), secret) as server:
+        if server.warning:
+            console.err.print(f"warning: {server.warning} (--token).", style="yellow")
         console.out.print(f"{server.url} shows {bag}; Ctrl-C ends it.", markup=False, soft_wrap=True)
         first.play(True)
         if browser:

@@ -6,10 +6,12 @@ It publishes only diagnostics and, with an anchors file, the markers of the anch
 from __future__ import annotations
 
 import re
+import secrets
 import threading
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
@@ -41,14 +43,14 @@ _QOS = QoSProfile(
     reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
     history=HistoryPolicy.KEEP_LAST,
-    depth=200,
+    depth=2000,
 )
 
 DISCOVERY_PERIOD_S = 0.5
 """Interval of the search for new topics."""
 
 READ_PERIOD_S = 0.1
-"""Interval at which the queued ranges are read; only the last `_QOS.depth` are shown."""
+"""Interval at which the queued ranges are read; a queue holds those of 2 s at 1000 ranges per second."""
 
 
 class Viewer(ManagedNode):
@@ -59,6 +61,7 @@ class Viewer(ManagedNode):
         self._subscribed: dict[str, Subscription] = {}
         self._range_node: Node | None = None
         self._ranges: dict[str, Subscription] = {}
+        self._last_sequence, self._has_single_publisher = 0, False
         self._anchors: AnchorMap | None = None
         self._anchors_out: Publisher | None = None
         self._server: ViewerServer | None = None
@@ -109,7 +112,10 @@ class Viewer(ManagedNode):
             plan=load_floor_plan(Path(plan).expanduser()) if (plan := self.value("floor_plan")) else None,
         )
         origins = tuple(origin.strip() for origin in self.value("origins").split(",") if origin.strip())
-        self._server = ViewerServer(self._view, self.value("host"), self.value("port"), origins)
+        token = secrets.token_urlsafe(16) if self.value("token") == "generate" else self.value("token")
+        self._server = ViewerServer(self._view, self.value("host"), self.value("port"), origins, token)
+        if self._server.warning:
+            self.get_logger().warning(f"{self._server.warning} (parameter token)")
         if self._anchors is not None and self._anchors_out is not None:
             shown = markers.anchor_markers(self._anchors, self.value("map_frame"), self.now_ns())
             self._anchors_out.publish(MarkerArray(markers=shown))
@@ -128,7 +134,12 @@ class Viewer(ManagedNode):
     def describe(self) -> diagnostics.Description:
         pages = 0 if self._view is None else self._view.pages
         url = "" if self._server is None else self._server.url
-        values: dict[str, object] = {"url": url, "pages": pages, "malformed": self._feed.malformed}
+        values: dict[str, object] = {
+            "url": url,
+            "pages": pages,
+            "malformed": self._feed.malformed,
+            "dropped": self._scene.dropped,
+        }
         return url, diagnostics.OK, f"serving {pages} page{'' if pages == 1 else 's'}", values
 
     def _subscribe(
@@ -154,6 +165,14 @@ class Viewer(ManagedNode):
             list(endpoints.take_queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
             for topic in (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
         )
+        if corrected:
+            # The gaps are messages that did not reach the viewer: their ranges are not lost by the radio.
+            numbers = np.array([self._last_sequence, *(number for _, number in corrected)], np.int64)
+            dropped = int((np.diff(numbers)[numbers[0] == 0 :] - 1).clip(0).sum())
+            self._last_sequence = int(numbers[-1])
+            if dropped and self._has_single_publisher:
+                with self._lock:
+                    self._scene.count_dropped(dropped)
         for topic, queued in (
             (topics.RANGE_TRUTH, truths),
             (topics.RANGE_RAW, raw),
@@ -164,6 +183,10 @@ class Viewer(ManagedNode):
 
     def _discover_topics(self) -> None:
         """Subscribe to topics that have become available or necessary."""
+        # Publishers count their messages separately.
+        self._has_single_publisher = (
+            self.count_publishers(self.resolve_topic_name(topics.RANGE_CORRECTED)) == 1
+        )
         if self._view is not None:
             self._view.missing = self._missing()
         # Subscribe to CIRs on demand: they are most of the traffic, and a pipeline publishes them only if subscribed.

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 from uwb_mitigation.types.measurement import Status
 
-BLUE, VERMILLION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
-GREY = "#767676"
+BLUE, VERMILLION, GREEN, PURPLE = "#0072b2", "#d55e00", "#14a46c", "#c080a2"
+GREY = "#6c6c6c"
 PAPER, NIGHT = "#ffffff", "#111827"
 """Backgrounds of the light and of the dark page; each is also the ink on the other one."""
 

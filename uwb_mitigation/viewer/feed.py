@@ -15,11 +15,12 @@ import numpy as np
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_ellipse
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
+from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
@@ -101,7 +102,7 @@ class SceneUpdater:
             self._adders[topic](tag, message)
 
     def measurement(self, measurement: RangeMeasurement) -> None:
-        trace = Trace.of(measurement.cir)
+        trace = Trace.from_cir(measurement.cir)
         if trace is not None:
             with self.lock:
                 self.scene.add_trace((measurement.anchor_id, measurement.tag_id), trace)
@@ -115,7 +116,7 @@ class SceneUpdater:
 
     def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
-        sample = Sample.of(key.stamp_ns / 1e9, corrected, truth)
+        sample = Sample.from_corrected(key.stamp_ns / 1e9, corrected, truth)
         with self.lock:
             pair = key.anchor_id, key.tag_id
             self.scene.add_sample(pair, sample)
@@ -133,21 +134,24 @@ class SceneUpdater:
         q, heading_rad = message.pose.pose.orientation, math.nan
         if 0.0 < covariance[5, 5] < MAX_HEADING_VARIANCE:
             heading_rad = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-        pose = Pose(position.x, position.y, position.z, *_bounds(covariance), heading_rad)
+        stamp_s = to_ns(message.header.stamp) / NS_PER_S
+        shape = (*_bounds(covariance), heading_rad, stamp_s, _horizontal_sd_m(covariance))
+        pose = Pose(position.x, position.y, position.z, *shape)
         with self.lock:
             self.scene.add_pose(tag, pose)
 
-    def estimate(self, tag: str, estimate: Estimate) -> None:
+    def estimate(self, tag: str, estimate: Estimate, received_s: float) -> None:
         """Add a position that the viewer itself estimated."""
         x, y, z = estimate.position.tolist()
         with self.lock:
-            self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance)))
+            self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance)), received_s)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position
         if math.isfinite(position.x + position.y):
+            stamp_s, sd_m = to_ns(message.header.stamp) / NS_PER_S, _horizontal_sd_m(message.pose.covariance)
             with self.lock:
-                self.scene.add_position(tag, kind, position.x, position.y)
+                self.scene.add_position(tag, kind, (stamp_s, position.x, position.y, position.z, sd_m))
 
     def markers(self, message: Any) -> None:
         """Add the anchors of a visualization_msgs/MarkerArray.
@@ -174,12 +178,28 @@ class SceneUpdater:
         with self.lock:
             self.scene.set_anchors(places)
 
+    @property
+    def anchor_map(self) -> AnchorMap | None:
+        """The anchors of the scene; None: it has none."""
+        anchors = [
+            Anchor(id_, (p.x, p.y, p.z), name=p.name)
+            for id_, p in self.scene.anchors.items()
+            if math.isfinite(p.z)
+        ]
+        return AnchorMap(anchors) if anchors else None
+
     def _diagnostics(self, message: Any) -> None:
         """Add a diagnostic_msgs/DiagnosticArray."""
         for status in message.status:
             # An octet is bytes in rclpy and int in rosbags.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             self.report(str(status.name), NodeStatus(level, str(status.message), self.scene.clock()))
+
+
+def _horizontal_sd_m(covariance: Any) -> float:
+    """Return the root of the sum of the variances of x and y; NaN: unknown."""
+    variance = float(np.trace(np.asarray(covariance, np.float64).reshape(6, 6)[:2, :2]))
+    return math.sqrt(variance) if 0.0 < variance < math.inf else math.nan
 
 
 def _bounds(covariance: np.ndarray[Any, Any]) -> tuple[tuple[float, float, float], float]:

@@ -9,7 +9,6 @@ import math
 from collections import defaultdict
 from typing import Any
 
-import numpy as np
 from bokeh.core.properties import Any as AnyValue
 from bokeh.model import DataModel
 from bokeh.models import (
@@ -55,7 +54,7 @@ COLUMNS = {
     "not_ok": ("not OK, %", "share of ranges whose status is not OK"),
     "nlos": ("NLOS, %", "no line of sight: share of CIRs with the first path 6 dB or more below the total"),
     "rate": ("rate, Hz", "ranges per second"),
-    "lost": ("lost", "missing sequence numbers"),
+    "lost": ("lost", "missing sequence numbers: of the whole recording, or since the viewer started"),
     "rx": ("RX, dBm", "mean receive level"),
     "fp": ("FP, dBm", "mean level of the first path"),
 }
@@ -82,6 +81,8 @@ _STROKES = {
 
 _LIVE = TrackKind.RAW, TrackKind.CORRECTED, TrackKind.SECOND
 
+FADING = (1.0, 0.5, 0.2)
+"""Opacity of the newest, the middle and the oldest third of a track."""
 
 HEADING_M = 1.0
 """Length of the line that shows the heading of a tag."""
@@ -92,10 +93,16 @@ class Controls(DataModel):  # type: ignore[misc]
 
     Attributes:
         command: set by the script: name, arguments, and a number that makes it unique.
-        summary, notice, nodes, player, selected, marks: set by the server.
+        update: set by the server after each update: its number, and how long the previous one took, s.
+        acknowledged: set by the script to the number of the last update that it has drawn.
+        summary, notice, nodes, health, cards, player, selected, marks: set by the server.
     """
 
     command = AnyValue(default=None)
+    update = AnyValue(default=None)
+    acknowledged = AnyValue(default=0)
+    health = AnyValue(default=[])
+    cards = AnyValue(default=[])
     summary = AnyValue(default="")
     notice = AnyValue(default=[])
     nodes = AnyValue(default=[])
@@ -129,11 +136,12 @@ class Models:
         self.pairs = _source("pairs", "anchor", "tag", "no_data", *COLUMNS)
         self.anchors = _source("anchors", "x", "y", "name", "id")
         self.selected = _source("", "x", "y")
-        self.tags = _source("tags", "x", "y", "name", "status")
+        self.tags = _source("tags", "x", "y", "name", "status", "label_y")
         self.headings = _source("headings", "x", "y", "heading")
         self.ellipses = _source("ellipses", "x", "y", "width", "height", "angle", "status")
         self.protection = _source("protection levels", "x", "y", "protection")
-        self.tracks = {kind: _source(kind.value, "x", "y") for kind in _STROKES}
+        self.tracks = {kind: [_source(kind.value, "x", "y") for _ in FADING] for kind in _STROKES}
+        self.accuracy = _source("predicted accuracy", "image", "x", "y", "dw", "dh")
         self.heat = _source("heat map", "x", "y", "mean")
         # The map shows these corners until the user changes the view; it must not follow the data.
         self.extent = _source("", "x", "y")
@@ -143,13 +151,13 @@ class Models:
         self.bad = _source("not OK", "age", "corrected", "status")
         self.trace = _source("CIR", "sample", "magnitude")
         self.marks = _source("marks", "noise", "first", "from", "to")
-        self.waterfall = ColumnDataSource({"image": [blank_waterfall()]})
+        self.waterfall = _source("", "image")
         self.errors = _source("histogram", "left", "right", "raw", "corrected", "second")
         self.timeline = _source("mean errors", "time", "raw", "corrected")
         self.second_timeline = _source("mean errors of the second recording", "time", "second")
         self.position = _source("", "time")
         # A figure without data has no axis ranges: invisible corners define them until data arrives.
-        self.corners = {name: _source("", "corner_x", "corner_y") for name in ("cir", "strip")}
+        self.corners = {name: _source("", "corner_x", "corner_y") for name in ("cir", "strip", "errors")}
         self.layers: dict[str, list[Any]] = {}
         self.figures = {"map": self._map(plan), "strip": self._strip(), "cir": self._cir()}
         self.figures |= {"waterfall": self._waterfall(), "errors": self._errors()}
@@ -173,7 +181,9 @@ class Models:
     def update_legend(self) -> None:
         """Show the entries of the map's legend that the map contains."""
         for item in self._legend.items:
-            shown = any(part.visible and len(part.data_source.data["x"]) for part in item.renderers)
+            shown = any(
+                renderer.visible and len(renderer.data_source.data["x"]) for renderer in item.renderers
+            )
             if item.visible != shown:
                 item.visible = shown
 
@@ -188,13 +198,28 @@ class Models:
                 url=[plan.url], x=plan.x, y=plan.y, w=plan.width, h=plan.height, angle=plan.yaw, anchor="bottom_left"
             )  # fmt: skip
         walls = ColumnDataSource({name: [math.nan] * (plan is not None) for name in "xy"})
-        self.heat_levels = LinearColorMapper("Viridis256", low=0.0, high=1.0)
-        bar = _colour_bar(self.heat_levels, title="mean correction, m", visible=False)
-        plot.add_layout(bar, "right")
+        self.heat_levels, self.accuracy_levels = (
+            LinearColorMapper(palette, low=0.0, high=1.0, nan_color="#00000000")
+            for palette in ("Viridis256", "Cividis256")
+        )
+        bars = [
+            _colour_bar(mapper, title=title, visible=False)
+            for mapper, title in (
+                (self.heat_levels, "mean correction, m"),
+                (self.accuracy_levels, "predicted \u03c3, m"),
+            )
+        ]
+        for bar in bars:
+            plot.add_layout(bar, "right")
+        self.layers["accuracy"] = [
+            plot.image(
+                "image", "x", "y", "dw", "dh", source=self.accuracy, color_mapper=self.accuracy_levels, alpha=0.6, visible=False
+            ), bars[1],
+        ]  # fmt: skip
         tag = CategoricalColorMapper(factors=["OK"], palette=[BLUE], nan_color=GREY)
         on_request: dict[str, Any] = {"fill_color": None, "visible": False}
         label = {
-            "text": "name", "x_offset": 11, "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "text": "name", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
             "background_fill_color": PAPER, "background_fill_alpha": 0.8,
         }  # fmt: skip
         layers: list[tuple[str, str, ColumnDataSource, dict[str, Any]]] = [
@@ -208,8 +233,10 @@ class Models:
                 "radius": "corrected", "line_color": self._colour, "line_width": 2.5,
             }),
             ("", "segment", self.rays, {"x1": "x1", "y1": "y1", "line_color": self._colour, "line_alpha": 0.8}),
-            *((kind.value, "line", source, _stroke(kind)) for kind, source in self.tracks.items()),
-            ("raw", "scatter", self.tracks[TrackKind.RAW], {"marker": "cross", "size": 5, "color": VERMILLION}),
+            *(
+                (kind.value, "line", source, _stroke(kind) | {"line_alpha": alpha})
+                for kind, sources in self.tracks.items() for source, alpha in zip(sources, FADING, strict=True)
+            ),
             ("95 % ellipse", "ellipse", self.ellipses, {
                 "width": "width", "height": "height", "angle": "angle", "color": BLUE, "fill_alpha": 0.25,
             }),
@@ -225,15 +252,15 @@ class Models:
             ("selected anchor", "scatter", self.selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
             }),
-            ("", "text", self.anchors, label | {"x_offset": 0, "y_offset": -13, "text_align": "center"}),
-            ("", "text", self.tags, label | {"y_offset": 18}),
+            ("", "text", self.anchors, label | {"y_offset": -13}),
+            ("", "text", self.tags, label | {"y": "label_y", "y_offset": -4}),
         ]  # fmt: skip
         items = defaultdict[str, list[Any]](list)
         for name, glyph, source, style in layers:
-            items[name].append(getattr(plot, glyph)("x", "y", source=source, **style))
+            items[name].append(getattr(plot, glyph)("x", style.pop("y", "y"), source=source, **style))
         del items[""]
         self.layers["circles"] = items["raw range"] + items["corrected range"]
-        self.layers["heat"] = [*items["mean correction"], bar]
+        self.layers["heat"] = [*items["mean correction"], bars[0]]
         labels: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
         self._legend = Legend(items=[LegendItem(label=labels[name], renderers=items[name]) for name in items])
         return _with_legend(plot, self._legend, "below")
@@ -295,11 +322,6 @@ class Models:
 
 
 _SAMPLES = "samples (1 ns) from the first path"
-
-
-def blank_waterfall() -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Return the image without any CIR, uint8 (WATERFALL, samples shown)."""
-    return np.zeros((WATERFALL, TRACE_BEFORE + TRACE_AFTER), np.uint8)
 
 
 def _trace_range() -> Range1d:

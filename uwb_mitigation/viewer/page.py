@@ -15,27 +15,35 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.events import Reset
 from bokeh.models import ColumnDataSource
+from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.palette import STATUS_LOOKS, TrackKind
 from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.models import COLUMNS, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models, blank_waterfall
+from uwb_mitigation.viewer.headline import RECENT, WHOLE, Card, live_cards, recorded_cards
+from uwb_mitigation.viewer.health import anchor_health, predicted_accuracy
+from uwb_mitigation.viewer.models import COLUMNS, FADING, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models
 from uwb_mitigation.viewer.scene import (
     CELL_M,
     ERROR_EDGES_M,
     HISTORY_S,
     MAX_RANGE_M,
+    NO_DATA_INTERVALS,
     NO_DATA_S,
     SPEEDS,
+    WATERFALL,
     History,
     MissingData,
     Pair,
+    Pose,
     Sample,
     Scene,
     Trace,
+    count_errors,
     finite_or_zero,
+    with_gaps,
 )
 
 if TYPE_CHECKING:
@@ -53,6 +61,21 @@ TABLE_S = 0.5
 
 MARGIN_M = 5.0
 """Margin around a tag on a map without anchors."""
+
+HEARTBEAT_S = 1.0
+"""Maximum interval of updates: a page without an update shows old data."""
+
+TRAILS_S = (10.0, 60.0, math.inf)
+"""Durations of the tracks that a page can show."""
+
+MAX_POINTS = 400
+"""Maximum number of displayed points of each third of a track, and of a strip."""
+
+RANGE_SD_M = 0.1
+"""Standard deviation for the map of the predicted accuracy if the ranges have none."""
+
+LIGHTS = ("\u25cf good", "\u25b2 check", "\u2716 bad")
+"""Texts of the traffic lights of anchors."""
 
 _TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
 
@@ -94,6 +117,8 @@ class Page:
         self._view, self._player = view, view.player
         self._fitted = False, False, False
         self._selected: Pair | None = None
+        self._window, self._trail_s = WHOLE if self._player else RECENT, 60.0
+        self._sent, self._sent_s, self._took_s, self._redraw = 0, 0.0, 0.0, False
         self._due_s = self._table_due_s = 0.0
         self._drawn: dict[str, object] = {}
         self._paused = False
@@ -115,50 +140,71 @@ class Page:
             figures={name: FIGURES[name] for name in FIGURES if name in models.figures},
             looks=STATUS_LOOKS,
             speeds=SPEEDS,
+            trails={
+                f"{seconds:g}": "all" if math.isinf(seconds) else f"{seconds:g} s" for seconds in TRAILS_S
+            },
+            windows=(WHOLE, RECENT),
         )
         document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
         models.controls.on_change("command", self._on_command)
+        models.controls.on_change("acknowledged", self._on_acknowledged)
         document.add_periodic_callback(self.tick, int(1000 * REFRESH_S))
         self.draw()
         # Register last: a session that could not be opened does not report its end.
         document.on_session_destroyed(self._on_closed)
         view.pages += 1
 
+    @property
+    def _is_waiting(self) -> bool:
+        """Whether the page has not drawn the last update: another one would queue behind it and show old data."""
+        return bool(self._sent > self._models.controls.acknowledged)
+
     def tick(self) -> None:
-        """Draw if it is time and the page is not paused."""
+        """Draw if it is time, the page is not paused, and it has drawn the last update."""
         now_s = time.monotonic()
         if self._player is not None:
             self._player.advance()
         elif self._paused:
             return
-        if now_s < self._due_s:
+        if now_s < self._due_s or self._is_waiting:
             return
         self.draw()
         self._due_s = now_s + REFRESH_S * (max(1.0, self._view.pages / FAST_PAGES) - 0.5)
 
     def draw(self) -> None:
-        """Update every model from the scene."""
+        """Update every model from the scene, and number the update if anything has changed."""
         self._draw_player()
         with self._view.lock:
             scene = self._view.scene
             # Ages change without data; drawing them once a second is enough.
-            if not self._changed("scene", (scene.revision, self._selected, math.floor(scene.clock()))):
-                return
-            self._draw_pairs(scene)
-            self._draw_summary(scene)
-            self._draw_map(scene)
-            history = None if self._selected is None else scene.pairs.get(self._selected)
-            self._draw_strip(scene, history)
-            self._draw_trace(() if history is None else tuple(history.traces))
-            reports = sorted((name, report.at(scene.clock())) for name, report in scene.node_statuses.items())
-            self._set(
-                nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports]
+            state = (
+                scene.revision,
+                self._selected,
+                math.floor(scene.clock()),
+                self._player and self._player.timeline,
             )
-            self._draw_errors(scene)
+            is_changed = self._changed("scene", state)
+            if is_changed:
+                self._draw_scene(scene)
+        now_s = time.monotonic()
+        if is_changed or now_s > self._sent_s + HEARTBEAT_S:
+            self._sent, self._sent_s, self._redraw = self._sent + 1, now_s, False
+            self._models.controls.update = [self._sent, round(self._took_s, 3)]
+
+    def _draw_scene(self, scene: Scene) -> None:
+        self._draw_pairs(scene)
+        self._draw_summary(scene)
+        self._draw_map(scene)
+        history = None if self._selected is None else scene.pairs.get(self._selected)
+        self._draw_strip(scene, history)
+        self._draw_trace(() if history is None else tuple(history.traces))
+        reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
+        self._set(nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports])
+        self._draw_errors(scene)
 
     def select(self, pair: Pair | None) -> None:
-        """Show the CIR and the ranges of a pair."""
-        if pair in self._view.scene.pairs:
+        """Show the CIR and the ranges of a pair, which may have no ranges yet."""
+        if pair is not None and all(0 <= identity < 1 << 64 for identity in pair):
             self._selected = pair
 
     # Drawing --------------------------------------------------------------------------------------------------
@@ -171,20 +217,21 @@ class Page:
         position_s = round(player.position_s, 3)
         self._set(
             player={
-                "playing": player.playing, "position": position_s, "seconds": player.seconds, "speed": player.speed
+                "playing": player.playing, "position": position_s, "seconds": player.seconds, "speed": player.speed,
+                "behind": player.is_behind,
             }
         )  # fmt: skip
         if self._changed("position", position_s):
             models.position.data = {"time": [position_s]}
         if (timeline := player.timeline) is not None and self._changed("timeline", True):
             models.timeline.data = timeline.mean_errors(player.seconds)
-            share = timeline.time_s / max(player.seconds, 1e-9)
+            relative = timeline.log_s / max(player.seconds, 1e-9)
             largest = timeline.largest_error()
             self._set(
                 marks={
-                    "bad": np.unique(share[timeline.bad].round(3)).tolist(),
+                    "bad": np.unique(relative[timeline.bad].round(3)).tolist(),
                     "count": int(timeline.bad.sum()),
-                    "largest": None if largest is None else float(share[largest]),
+                    "largest": None if largest is None else float(relative[largest]),
                     "truth": bool(np.isfinite(timeline.true_m).any()),
                 }
             )
@@ -201,38 +248,60 @@ class Page:
             self._drawn.pop("scene", None)
             return
         self._table_due_s = time.monotonic() + TABLE_S
-        rows = []
+        timeline = None if self._player is None else self._player.timeline
+        losses = {} if timeline is None else timeline.losses
+        rows, statistics = [], {}
         for pair, history, sample in scene.latest():
             no_data = _no_data(scene, history)
-            other = None if self._view.second is None else self._view.second.pairs.get(pair)
+            second = None if self._view.second is None else self._view.second.pairs.get(pair)
+            statistics[pair] = history.statistics()
             rows.append(
-                history.statistics()
+                statistics[pair]
                 | {
                     "anchor": format_id(pair[0]),
                     "tag": format_id(pair[1]),
                     "rate": 0.0 if no_data else history.rate_hz(scene.age_s(history)),
                     "raw": sample.raw_m,
                     "corrected": sample.range_m,
-                    "second": other.latest.range_m if other and other.latest else math.nan,
+                    "second": second.latest.range_m if second and second.latest else math.nan,
+                    "lost": float(losses.get(pair, (history.lost, 0))[0]),
                     "sigma": sample.sigma_m,
                     "status": no_data or sample.status.name,
                     "no_data": bool(no_data),
                 }
             )
         _set_rows(self._models.pairs, rows)
+        health = []
+        for anchor in anchor_health(scene, statistics, losses):
+            level, advice = anchor.verdict()
+            values = (anchor.rate_hz, anchor.nlos, anchor.residual_m, anchor.lost)
+            texts = [f"{value:.{digits}f}" for value, digits in zip(values, (1, 0, 2, 0), strict=True)]
+            health.append([LIGHTS[level], format_id(anchor.anchor_id), *texts, advice])
+        self._set(
+            health=[[text.replace("nan", "-") for text in row] for row in health], cards=self._cards(scene)
+        )
+
+    def _cards(self, scene: Scene) -> list[Card]:
+        """Return the large figures."""
+        tag_id = None if self._selected is None else self._selected[1]
+        if (player := self._player) is None:
+            return live_cards(scene, tag_id)
+        if player.timeline is None:
+            return [["Reading the recording ...", "", ""]]
+        second = None if player.companion is None else player.companion.timeline
+        return recorded_cards(player.timeline, second, tag_id, self._window, player.position_s)
 
     def _draw_summary(self, scene: Scene) -> None:
         """Show counts, the reason for an empty page, and the pairs and tags that have stopped."""
         histories = [history for _, history, _ in scene.latest()]
-        parts = [f"{len(histories)} pair{'' if len(histories) == 1 else 's'}", f"{scene.ranges} ranges"]
-        if math.isfinite(scene.now_s):
-            parts.insert(0, _utc(scene.now_s))
-        if scene.errors:
-            raw_m, corrected_m = scene.error_sums_m / scene.errors
-            parts.append(f"mean absolute error {raw_m:.3f} m raw, {corrected_m:.3f} m corrected")
-            if (other := self._view.second) is not None and other.errors:
-                parts[-1] += f", {other.error_sums_m[1] / other.errors:.3f} m {TrackKind.SECOND.value}"
+        parts = [f"{len(histories)} pair{'' if len(histories) == 1 else 's'}"]
+        timeline = None if self._player is None else self._player.timeline
+        parts.append(f"{scene.ranges if timeline is None else len(timeline.bad)} ranges")
         missing, ranges = self._view.missing, ""
+        if scene.dropped:
+            parts.append(f"{scene.dropped} dropped by the viewer")
+        if math.isfinite(now_s := scene.now_s(None if self._selected is None else self._selected[1])):
+            parts.insert(0, _utc(now_s))
         if not histories:
             ranges = missing.ranges
         elif all(_no_data(scene, history) for history in histories):
@@ -241,6 +310,7 @@ class Page:
             ranges,
             "" if scene.anchors else missing.anchors,
             "" if scene.tags or scene.tracks else missing.positions,
+            *(() if self._player is None or self._player.timeline is None else self._player.timeline.notices),
         )
         self._set(summary=" \u00b7 ".join(parts), notice=[line for line in lines if line])
 
@@ -268,6 +338,7 @@ class Page:
                         "status": "no data" if age_s > NO_DATA_S else "OK",
                         "width": 2 * major,
                         "height": 2 * minor,
+                        "label_y": pose.y + finite_or_zero(_half_height(pose)),
                         "angle": angle,
                         "protection": _drawable(pose.protection_m),
                         "heading": pose.heading_rad,
@@ -278,6 +349,7 @@ class Page:
         _set_rows(models.protection, [row for row in tags if row["protection"] > 0.0])
         _set_rows(models.headings, [row for row in tags if math.isfinite(row["heading"])])
         self._draw_tracks(scene)
+        self._draw_accuracy(scene, [sample for _, _, sample in scene.latest()])
         fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
         # The view is set for the first content and for the first anchors, and then only by the user.
         if fitted > self._fitted or not models.extent.data["x"]:
@@ -288,16 +360,20 @@ class Page:
 
     def _draw_tracks(self, scene: Scene) -> None:
         models, second = self._models, self._view.second
-        for kind, source in models.tracks.items():
-            of, wanted = (second, TrackKind.CORRECTED) if kind is TrackKind.SECOND else (scene, kind)
-            tracks = {} if of is None else of.tracks
-            found = [tuple(track) for (_, own), track in tracks.items() if own is wanted and track]
-            if not self._changed(kind.value, [(len(track), track[-1]) for track in found]):
+        for kind, sources in models.tracks.items():
+            origin, origin_kind = (second, TrackKind.CORRECTED) if kind is TrackKind.SECOND else (scene, kind)
+            tracks = [] if origin is None else [
+                view for (_, track_kind), view in origin.tracks.items() if track_kind is origin_kind and len(view.points)
+            ]  # fmt: skip
+            state = [(len(view.points), view.points[-1][0], math.floor(scene.age_s(view))) for view in tracks]
+            if not self._changed(kind.value, (self._trail_s, state)):
                 continue
-            # A NaN separates the tracks of two tags.
-            points = [point for track in found for point in (*track, (math.nan, math.nan))]
-            columns = np.array(points, np.float32).reshape(-1, 2)
-            source.data = {"x": columns[:, 0], "y": columns[:, 1]}
+            thirds = [self._fading(view.columns(), scene.age_s(view)) for view in tracks]
+            for third, source in enumerate(sources):
+                # A NaN separates the tracks of two tags.
+                rows = [row for points in thirds for row in (points[third], [(math.nan, math.nan)])]
+                columns = np.concatenate(rows).astype(np.float32) if rows else np.zeros((0, 2), np.float32)
+                source.data = {"x": columns[:, 0], "y": columns[:, 1]}
         shown = models.layers["heat"][0].visible
         if shown and self._changed("heat", sum(entry[1] for entry in scene.heat.values())):
             cells = np.array([(*cell, entry[0] / entry[1]) for cell, entry in scene.heat.items()], np.float32)
@@ -307,14 +383,49 @@ class Page:
                 low, high = np.percentile(mean, (5, 95)).tolist()
                 models.heat_levels.update(low=low, high=high + 1e-6)
 
+    def _fading(self, track: NDArray[np.float64], age_s: float) -> list[NDArray[np.float64]]:
+        """Return x and y of the newest, middle and oldest third of the displayed time of a track, float64 (k, 2)."""
+        now_s = track[-1, 0] + age_s
+        duration_s = min(self._trail_s, now_s - track[0, 0])
+        ages = (now_s - track[:, 0]) / max(duration_s, 1e-9) * len(FADING)
+        thirds = []
+        for third in range(len(FADING)):
+            # The first point of the next third belongs to both, so that the line is continuous.
+            rows = np.flatnonzero((ages >= third) & (ages <= third + 1))
+            if len(rows) and rows[-1] + 1 < len(track):
+                rows = np.append(rows, rows[-1] + 1)
+            thirds.append(with_gaps(_thin(track[rows, :3]), NO_DATA_S)[:, 1:])
+        return thirds
+
+    def _draw_accuracy(self, scene: Scene, shown: list[Sample]) -> None:
+        """Draw the map of the predicted accuracy if it is visible."""
+        models, tag = self._models, next(iter(scene.tags.values()), None)
+        if not models.layers["accuracy"][0].visible or len(scene.anchors) < 2:
+            return
+        anchors = np.array([(place.x, place.y, finite_or_zero(place.z)) for place in scene.anchors.values()])
+        height_m = finite_or_zero(tag.pose.z if tag and tag.pose else math.nan)
+        sds_m = [sample.sigma_m for sample in shown if sample.sigma_m > 0.0]
+        sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
+        if self._changed("accuracy", (anchors.tobytes(), round(height_m, 1), sd_m)):
+            image, low, size = predicted_accuracy(anchors, height_m, sd_m)
+            models.accuracy.data = {
+                "image": [image], "x": [low[0]], "y": [low[1]], "dw": [size[0]], "dh": [size[1]]
+            }  # fmt: skip
+            low_m, high_m = (
+                np.nanpercentile(image, (0, 90)).tolist() if np.isfinite(image).any() else (0.0, 1.0)
+            )
+            models.accuracy_levels.update(low=low_m, high=high_m)
+
     def _fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
         places = [(place.x, place.y) for place in scene.anchors.values()]
-        for track in scene.tracks.values():
-            places += track
-        if self._player is not None and self._player.timeline is not None:
-            for _, position in self._player.timeline.tracks.values():
-                places += np.percentile(position[:, :2], (2, 98), axis=0).tolist() if len(position) else []
+        places += [(tag.pose.x, tag.pose.y) for tag in scene.tags.values() if tag.pose is not None]
+        timeline = None if self._player is None else self._player.timeline
+        tracks = [view.columns() for view in scene.tracks.values()]
+        if timeline is not None and timeline.is_complete:
+            tracks = list(timeline.tracks.values())
+        for track in tracks:
+            places += np.percentile(track[:, 1:3], (2, 98), axis=0).tolist() if len(track) else []
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         # Without anchors, leave a margin in which the tag can move.
         margin = 0.0 if scene.anchors or not places else MARGIN_M
@@ -347,11 +458,11 @@ class Page:
 
     def _draw_strip(self, scene: Scene, history: History | None) -> None:
         # Also draw a pair without new data, because its ranges age.
-        now_s = scene.now_s
+        now_s = scene.now_s(None if self._selected is None else self._selected[1])
         if not self._changed("strip", (self._selected, now_s, scene.ranges)):
             return
-        kept = () if history is None else tuple(history.samples)
-        samples = [sample for sample in kept if sample.time_s >= now_s - HISTORY_S]
+        history_samples = () if history is None else tuple(history.samples)
+        samples = [sample for sample in history_samples if sample.time_s >= now_s - HISTORY_S]
         values = {
             "age": [sample.time_s - now_s for sample in samples],
             "raw": [_drawable(sample.raw_m) for sample in samples],
@@ -360,7 +471,10 @@ class Page:
             "second": self._second_ranges(samples),
         }
         self._models.show_empty("strip", not np.isfinite(values["raw"]).any())
-        self._models.strip.data = {name: np.array(column, np.float32) for name, column in values.items()}
+        rate_hz = 0.0 if history is None else finite_or_zero(history.rate_hz())
+        table = _thin(np.array(list(values.values()), np.float64).reshape(len(values), -1).T, 3 * MAX_POINTS)
+        table = with_gaps(table, max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0.0 else 0.0))
+        self._models.strip.data = dict(zip(values, table.T.astype(np.float32), strict=True))
         bad = [
             {
                 "age": sample.time_s - now_s,
@@ -376,8 +490,8 @@ class Page:
         """Return the ranges of the second recording at the stamps of the first one."""
         scene, pair = self._view.second, self._selected
         history = None if scene is None or pair is None else scene.pairs.get(pair)
-        found = {round(sample.time_s, 6): sample.range_m for sample in history.samples} if history else {}
-        return [_drawable(found.get(round(sample.time_s, 6), math.nan)) for sample in samples]
+        ranges = {round(sample.time_s, 6): sample.range_m for sample in history.samples} if history else {}
+        return [_drawable(ranges.get(round(sample.time_s, 6), math.nan)) for sample in samples]
 
     def _draw_trace(self, traces: tuple[Trace, ...]) -> None:
         models = self._models
@@ -385,7 +499,7 @@ class Page:
         if not self._changed("traces", (self._selected, traces[-1] if traces else None)):
             return
         models.show_empty("cir", not traces)
-        models.waterfall.data = {"image": [_waterfall_image(traces)]}
+        models.waterfall.data = {"image": [_waterfall_image(traces)] if traces else []}
         if not traces:
             _set_rows(models.trace, [])
             _set_rows(models.marks, [])
@@ -404,13 +518,23 @@ class Page:
         _set_rows(models.marks, [marks])
 
     def _draw_errors(self, scene: Scene) -> None:
-        second = self._view.second
-        if self._changed("errors", (scene.errors, None if second is None else second.errors)):
-            counts = [
-                *scene.error_counts,
-                scene.error_counts[1] if second is None else second.error_counts[1],
-            ]
-            columns = dict(zip(("raw", "corrected", "second"), np.array(counts, float), strict=True))
+        player, second = self._player, None
+        if player is None:
+            counts = scene.error_counts
+        elif player.timeline is None:
+            return
+        else:
+            end_s = math.inf if self._window == WHOLE else player.position_s
+            second = None if player.companion is None else player.companion.timeline
+            counts = count_errors(
+                player.timeline.range_errors(end_s - HISTORY_S if end_s < math.inf else -math.inf, end_s)
+            )
+        compared = counts[1] if second is None else count_errors(second.range_errors(-math.inf, math.inf))[1]
+        if self._changed("errors", counts.tobytes() + compared.tobytes()):
+            columns = dict(
+                zip(("raw", "corrected", "second"), [*counts.astype(float), compared], strict=True)
+            )
+            self._models.show_empty("errors", not counts.any())
             self._models.errors.data = columns | {"left": ERROR_EDGES_M[:-1], "right": ERROR_EDGES_M[1:]}
 
     def _changed(self, name: str, value: object) -> bool:
@@ -436,6 +560,10 @@ class Page:
                     renderer.visible = bool(arguments[1])
             elif name == "select":
                 self.select((int(str(arguments[0]), 0), int(str(arguments[1]), 0)))
+            elif name == "trail" and float(arguments[0]) in TRAILS_S:
+                self._trail_s = float(arguments[0])
+            elif name == "window" and arguments[0] in (WHOLE, RECENT):
+                self._window = arguments[0]
             elif name == "select_anchor":
                 self._select_anchor(int(arguments[0]))
             elif self._player is not None:
@@ -446,7 +574,15 @@ class Page:
             return
         self._drawn.pop("scene", None)
         self._table_due_s = 0.0
-        self.draw()
+        self._redraw = True
+        if not self._is_waiting:
+            self.draw()
+
+    def _on_acknowledged(self, _attribute: str, _old: object, _number: Any) -> None:
+        """Draw what changed by a command while the page was busy."""
+        self._took_s = time.monotonic() - self._sent_s
+        if self._redraw and not self._is_waiting:
+            self.draw()
 
     def _select_anchor(self, anchor: int) -> None:
         """Select the pair of an anchor with the selected tag, else its first pair."""
@@ -476,15 +612,26 @@ def _set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:
 
 def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """Return one exchange per row, newest first, levels from -40 dB to its peak; uint8 (WATERFALL, width)."""
-    image = blank_waterfall()
+    image = np.zeros((WATERFALL, TRACE_BEFORE + TRACE_AFTER), np.uint8)
     for row, trace in enumerate(reversed(traces)):
         begin = trace.origin - TRACE_BEFORE - trace.cir.start_index
         low, high = max(begin, 0), min(begin + image.shape[1], len(trace.magnitude))
-        part = trace.magnitude[low:high]
-        if low < high and (peak := float(part.max())) > 0.0:
-            level = 1.0 + np.log10(np.maximum(part / peak, 1e-2)) / 2.0
+        magnitude = trace.magnitude[low:high]
+        if low < high and (peak := float(magnitude.max())) > 0.0:
+            level = 1.0 + np.log10(np.maximum(magnitude / peak, 1e-2)) / 2.0
             image[row, low - begin : high - begin] = (255.0 * level).astype(np.uint8)
     return image
+
+
+def _thin(rows: NDArray[np.float64], limit: int = MAX_POINTS) -> NDArray[np.float64]:
+    """Return at most about `limit` rows, at equal steps from the last one backwards."""
+    return rows[:: -max(1, -(-len(rows) // limit))][::-1]
+
+
+def _half_height(pose: Pose) -> float:
+    """Return the extent of the ellipse of a pose in y, m."""
+    major, minor, angle = pose.ellipse
+    return math.hypot(_drawable(major) * math.sin(angle), _drawable(minor) * math.cos(angle))
 
 
 def _utc(time_s: float) -> str:

@@ -24,18 +24,21 @@ from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording
 from uwb_mitigation.viewer.scene import (
     HISTORY_S,
     MAX_MESSAGES,
-    MAX_TRACK,
     SPEEDS,
     MissingData,
     NodeStatus,
     Pair,
 )
 from uwb_mitigation.viewer.timeline import BATCH, Timeline, index_recording
+
+READ_S = 0.15
+"""Maximum duration of one read, so that the page reacts to commands; playing continues at the position that was reached."""
 
 MAX_STEP_S = 1.0
 """If no page was open for longer than this, playing continues from the last position."""
@@ -61,6 +64,7 @@ class BagPlayer:
         speed: recorded seconds per second.
         corrects: whether the bag contains raw ranges only.
         timeline: index of the recording; None: not ready.
+        is_behind: whether the messages up to the position have not been read yet.
         companion: player of another recording of the same drive, which follows this one.
         missing: messages for the page on data that the bag does not contain.
     """
@@ -72,6 +76,7 @@ class BagPlayer:
         self._recording = recording = Recording(path, namespace)
         self.seconds, self.corrects = recording.seconds, recording.corrects
         self.position_s, self.speed, self.playing = 0.0, 1.0, False
+        self.is_behind = False
         self.timeline: Timeline | None = None
         self.companion: BagPlayer | None = None
         no_positions = "No tag positions: they need anchors, and --height if all anchors have one height."
@@ -87,6 +92,7 @@ class BagPlayer:
         self._next: Event | None = None
         self._advanced_s = time.monotonic()
         self._clock_s, self._posed_s = 0.0, -math.inf
+        self._posed: dict[str, int] = {}
         feed.scene.clock = lambda: self._clock_s
         self._window_s = min(HISTORY_S, MAX_MESSAGES / max(recording.rate_hz, 1e-9))
         # Anchors are published once at the beginning.
@@ -100,10 +106,15 @@ class BagPlayer:
         def run() -> None:
             recording = Recording(self._recording.path, self._recording.prefix)
             backend = self._new_backend() if self.corrects else None
-            self.timeline = index_recording(recording, anchors, height, backend)
+
+            def publish(timeline: Timeline) -> None:
+                self.timeline = timeline
+
+            timeline = index_recording(recording, anchors, height, backend, publish)
             with self._feed.lock:
-                self._feed.scene.heat = self.timeline.heat
+                self._feed.scene.heat = timeline.heat
                 self._feed.scene.is_indexed = True
+                self._feed.scene.revision += 1
 
         thread = threading.Thread(target=run, name="index", daemon=True)
         thread.start()
@@ -121,6 +132,8 @@ class BagPlayer:
             self.step()
         elif name == "next_bad" and self.timeline is not None:
             return self.jump(self.timeline.next_bad(self.position_s))
+        elif name == "previous_bad" and self.timeline is not None:
+            return self.jump(self.timeline.previous_bad(self.position_s))
         elif name == "largest" and self.timeline is not None:
             return self.jump(self.timeline.largest_error())
         return None
@@ -128,18 +141,18 @@ class BagPlayer:
     def step(self) -> None:
         """Advance to the next range."""
         if self.timeline is not None:
-            row = int(np.searchsorted(self.timeline.time_s, self.position_s + 1e-6))
-            if row < len(self.timeline.time_s):
+            row = int(np.searchsorted(self.timeline.log_s, self.position_s + 1e-6))
+            if row < len(self.timeline.log_s):
                 self.playing = False
-                self._move(float(self.timeline.time_s[row]))
+                self._move(float(self.timeline.log_s[row]))
 
     def jump(self, row: int | None) -> Pair | None:
         """Pause at a row of the timeline, and return its pair."""
         if self.timeline is None or row is None:
             return None
         self.playing = False
-        self.seek(float(self.timeline.time_s[row]) + 1e-6)
-        return self.timeline.pairs[row]
+        self.seek(float(self.timeline.log_s[row]) + 1e-6)
+        return self.timeline.pair(row)
 
     def play(self, on: bool) -> None:
         """Play or pause; at the end, the recording starts again."""
@@ -152,8 +165,9 @@ class BagPlayer:
         """Show a position, with the minute before it."""
         self._feed.clear()
         self._shown: dict[tuple[str, TrackKind], int] = {}
+        self._posed = {}
         position_s = min(max(position_s, 0.0), self.seconds)
-        start_ns = max(int((position_s - self._window_s) * 1e9), 0)
+        start_ns = max(int((position_s - self._window_s) * NS_PER_S), 0)
         self._next = None
         self._events: Iterator[Event] = self._recording.events(self._recording.contents, start_ns)
         self._advanced_s = time.monotonic()
@@ -163,7 +177,9 @@ class BagPlayer:
         """Advance by the time since the last call."""
         now_s = time.monotonic()
         passed_s, self._advanced_s = min(now_s - self._advanced_s, MAX_STEP_S), now_s
-        if self.playing:
+        if self.is_behind:
+            self._read()
+        elif self.playing:
             self.playing = self.position_s + self.speed * passed_s < self.seconds
             self._move(self.position_s + self.speed * passed_s)
         else:
@@ -173,14 +189,15 @@ class BagPlayer:
         self.position_s = min(max(position_s, 0.0), self.seconds)
         self._read()
         if (other := self.companion) is not None:
-            at_s = self.position_s + (self._recording.start_ns - other._recording.start_ns) / 1e9
-            (other.seek if seek else other._move)(at_s)
+            position_s = self.position_s + (self._recording.start_ns - other._recording.start_ns) / NS_PER_S
+            (other.seek if seek else other._move)(position_s)
 
     def _read(self) -> None:
-        """Read up to the current position; at most `MAX_MESSAGES`, the rest at the next call."""
-        stop_ns = round(self.position_s * 1e9)
+        """Read up to the current position for at most `READ_S`; the next call continues."""
+        stop_ns, end_s = round(self.position_s * NS_PER_S), time.monotonic() + READ_S
+        self.is_behind = False
         try:
-            for _ in range(MAX_MESSAGES):
+            while not self.is_behind:
                 event = self._next or next(self._events, None)
                 self._next = None
                 if event is None:
@@ -188,42 +205,52 @@ class BagPlayer:
                 if event.time_ns > stop_ns:
                     self._next = event
                     break
-                self._clock_s = event.time_ns / 1e9
+                self._clock_s = event.time_ns / NS_PER_S
                 self._show_poses()
                 self._feed.add(event.topic, event.message, event.tag)
                 if self.corrects and event.topic == RANGE_RAW and event.message is not None:
                     self._uncorrected.append((self._clock_s, event.message))
                     if len(self._uncorrected) == BATCH:
                         self._correct()
+                self.is_behind = time.monotonic() >= end_s
         except RecordingError as error:
             self._events = iter(())
             self._feed.report("recording", NodeStatus(2, f"{error.what}: nothing beyond can be shown"))
         self._correct()
-        self._clock_s = self.position_s
+        if not self.is_behind:
+            self._clock_s = self.position_s
         self._posed_s = -math.inf
         self._show_poses()
-        if self.timeline is not None:
+        if self.timeline is not None and self.timeline.is_complete:
             self._show_tracks(self.timeline)
 
     def _show_poses(self) -> None:
         """Show the estimates of the index at the time of the message that is read."""
-        if self.timeline is None or 0.0 <= self._clock_s - self._posed_s < POSE_PERIOD_S:
+        timeline = self.timeline
+        if (
+            timeline is None
+            or not timeline.is_complete
+            or 0.0 <= self._clock_s - self._posed_s < POSE_PERIOD_S
+        ):
             return
         self._posed_s = self._clock_s
-        for tag, estimates in self.timeline.estimates.items():
-            time_s, _ = self.timeline.tracks[tag, TrackKind.CORRECTED]
-            if count := int(np.searchsorted(time_s, self._clock_s, side="right")):
-                self._feed.estimate(tag, estimates[count - 1])
+        for tag, estimates in timeline.estimates.items():
+            time_s = timeline.tracks[tag, TrackKind.CORRECTED][:, 0]
+            count = int(np.searchsorted(time_s, self._clock_s, side="right"))
+            # A tag without new ranges has no new position: its age increases.
+            if count and self._posed.get(tag) != count:
+                self._posed[tag] = count
+                estimate = next(iter(estimates.take(slice(count - 1, count))))
+                self._feed.estimate(tag, estimate, float(time_s[count - 1]))
 
     def _show_tracks(self, timeline: Timeline) -> None:
         """Show the tracks up to the current position."""
-        for key, (time_s, position) in timeline.tracks.items():
-            count = int(np.searchsorted(time_s, self.position_s, side="right"))
+        for key, track in timeline.tracks.items():
+            count = int(np.searchsorted(track[:, 0], self._clock_s, side="right"))
             if self._shown.get(key) != count:
                 self._shown[key] = count
-                step = max(1, math.ceil(count / MAX_TRACK))
                 with self._feed.lock:
-                    self._feed.scene.set_track(*key, position[:count:step, :2].tolist())
+                    self._feed.scene.set_track(*key, track[:count])
 
     def _correct(self) -> None:
         if self._backend is None:

@@ -30,7 +30,7 @@ MAX_TRUTHS, MAX_WITHOUT_TRUTH = (
 )  # truths without corrected ranges, corrected ranges without truths
 MAX_SAMPLES, MAX_TRACK = (
     6000,
-    1200,
+    3000,
 )  # points of a strip chart (100 ranges per second for a minute), of a track
 MAX_CELLS = 4000  # of the heat map
 WATERFALL = 50  # CIRs of each pair
@@ -39,7 +39,7 @@ MAX_TEXT = 400  # characters of a name or a message
 MAX_ID_DIGITS = 20  # decimal digits of a 64-bit id
 MAX_RANGE_M = 10_000.0  # a longer range is shown in the table only; a larger error is not counted
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
-MAX_MESSAGES = 40_000  # read at a seek; older ones are skipped
+MAX_MESSAGES = 20_000  # read at a seek; older ones are skipped
 
 HISTORY_S = 60.0
 """Length of the strip chart of a pair."""
@@ -51,8 +51,8 @@ ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
 """Bins of the error histogram; larger errors count in the outermost bins."""
 SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 50.0)
 """Speeds of a player, recorded seconds per second."""
-STEP_M, CELL_M = 0.02, 0.5
-"""Minimum distance of the points of a track; width of a cell of the heat map."""
+STEP_M, STEP_S, CELL_M = 0.02, 0.09, 0.5
+"""Distance and time between points of a live track: closer points are skipped, unless a point is 0.5 s old; cell of the heat map."""
 RAW_FIX_S, RAW_AGE_S = 0.2, 0.5
 """Interval of the positions from raw ranges, and maximum age of their ranges."""
 STATISTICS = 100
@@ -104,7 +104,7 @@ class Sample:
     innovation_m: float = math.nan
 
     @classmethod
-    def of(cls, time_s: float, corrected: CorrectedRange, truth: Truth | None) -> Sample:
+    def from_corrected(cls, time_s: float, corrected: CorrectedRange, truth: Truth | None) -> Sample:
         sigma_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0 else math.nan
         sample = cls(time_s, corrected.range_raw_m, corrected.range_m, sigma_m, corrected.status)
         if truth is not None:
@@ -119,7 +119,7 @@ class Trace:
     cir: Cir
 
     @classmethod
-    def of(cls, cir: Cir) -> Trace | None:
+    def from_cir(cls, cir: Cir) -> Trace | None:
         """Return the trace of a CIR; None if it is empty, too long or implausible."""
         odd = cir.encoding is Encoding.COMPLEX_INT16 and len(cir.samples) % 2
         if odd or not 0 < len(cir.samples) <= MAX_VALUES:
@@ -154,11 +154,12 @@ class History:
 
     Attributes:
         received_s: time of the last range on the scene's clock.
-        lost: number of missing sequence numbers.
+        lost, received: number of missing sequence numbers, and of ranges.
     """
 
     received_s: float = math.nan
     lost: int = 0
+    received: int = 0
     _sequence: int = -1
     _steps: deque[int] = field(default_factory=lambda: deque(maxlen=20))
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
@@ -167,6 +168,7 @@ class History:
     def add(self, sample: Sample, now_s: float) -> None:
         """Add a range, and remove ranges that are older than a minute."""
         self.samples.append(sample)
+        self.received += 1
         while self.samples[0].time_s < now_s - HISTORY_S:
             self.samples.popleft()
 
@@ -178,21 +180,25 @@ class History:
             self.lost += max(round(step / sorted(self._steps)[len(self._steps) // 2]) - 1, 0)
         self._sequence = sequence
 
+    def restart_count(self) -> None:
+        """Do not count the ranges until the next one as lost, because the viewer itself has dropped ranges."""
+        self._sequence = -1
+
     def statistics(self) -> dict[str, float]:
         """Return means and shares (%) of the latest ranges and CIRs; NaN: unknown."""
         samples = list(islice(reversed(self.samples), STATISTICS))
         cirs = [trace.cir for trace in self.traces]
-        gap_db = _known([cir.power_gap_db for cir in cirs])
-        correction_m = _known([sample.raw_m - sample.range_m for sample in samples])
+        gap_db = _plausible_values([cir.power_gap_db for cir in cirs])
+        correction_m = _plausible_values([sample.raw_m - sample.range_m for sample in samples])
         return {
             "lost": float(self.lost),
             "not_ok": _mean(np.array([100.0 * (sample.status is not Status.OK) for sample in samples])),
             "nlos": _mean(100.0 * (gap_db >= LINE_OF_SIGHT_DB)),
             "correction": _mean(correction_m),
             "spread": float(correction_m.std()) if len(correction_m) else math.nan,
-            "innovation": _mean(_known([sample.innovation_m for sample in samples])),
-            "rx": _mean(_known([cir.rx_power_dbm for cir in cirs])),
-            "fp": _mean(_known([cir.first_path_power_dbm for cir in cirs])),
+            "innovation": _mean(_plausible_values([sample.innovation_m for sample in samples])),
+            "rx": _mean(_plausible_values([cir.rx_power_dbm for cir in cirs])),
+            "fp": _mean(_plausible_values([cir.first_path_power_dbm for cir in cirs])),
         }
 
     @property
@@ -227,6 +233,7 @@ class Pose:
         ellipse: horizontal 95 % ellipse: half axes (m) and angle of the major axis (rad); NaN: unknown.
         protection_m: horizontal protection level; NaN: unknown.
         heading_rad: NaN: unknown.
+        stamp_s, sd_m: time of the estimate, s, and horizontal standard deviation; NaN: unknown.
     """
 
     x: float
@@ -235,6 +242,8 @@ class Pose:
     ellipse: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     protection_m: float = math.nan
     heading_rad: float = math.nan
+    stamp_s: float = math.nan
+    sd_m: float = math.nan
 
 
 @dataclass(slots=True)
@@ -244,6 +253,22 @@ class TagView:
     pose: Pose | None = None
     received_s: float = math.nan
     raw_fix_s: float = -math.inf
+
+
+TrackPoint = tuple[float, float, float, float, float]
+"""Stamp (s), x, y, z and horizontal standard deviation (m)."""
+
+
+@dataclass(slots=True)
+class TrackView:
+    """Positions of a tag: rows like `TrackPoint`, and the time of the last one on the scene's clock."""
+
+    points: deque[TrackPoint] | NDArray[np.float64] = field(default_factory=lambda: deque(maxlen=MAX_TRACK))
+    received_s: float = math.nan
+
+    def columns(self) -> NDArray[np.float64]:
+        """Return the points as float64 (k, 5)."""
+        return np.array(self.points, np.float64).reshape(-1, 5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +293,7 @@ class NodeStatus:
     message: str
     received_s: float = math.nan
 
-    def at(self, now_s: float) -> NodeStatus:
+    def aged(self, now_s: float) -> NodeStatus:
         """Return the report at a time: STALE with the age if the node has stopped reporting."""
         age_s = now_s - self.received_s
         if not age_s > STALE_S:
@@ -291,8 +316,8 @@ class Scene:
     Attributes:
         clock: returns the time for ages, s: a steady clock live, the recording's time in a replay. Stamps are not
             compared with it, because they may come from another computer.
-        now_s: the latest stamp plus the time since then; NaN before any.
-        ranges: number of ranges.
+        ranges, not_ok: number of ranges, and of those whose status is not OK.
+        dropped: number of ranges that the viewer could not read in time.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
         tracks: {(name, kind): positions}.
@@ -303,13 +328,12 @@ class Scene:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
-        self._latest_s = self._received_s = math.nan
-        self.ranges = 0
+        # {tag: (latest stamp, its time of reception)}: stamps of different tags may come from different clocks.
+        self._latest: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
+        self.ranges = self.not_ok = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
         self.tags: BoundedDict[str, TagView] = BoundedDict(MAX_TAGS)
-        self.tracks: BoundedDict[tuple[str, TrackKind], deque[tuple[float, float]]] = BoundedDict(
-            4 * MAX_TAGS
-        )
+        self.tracks: BoundedDict[tuple[str, TrackKind], TrackView] = BoundedDict(4 * MAX_TAGS)
         self.is_indexed = False
         self.heat: BoundedDict[tuple[int, int], list[float]] = BoundedDict(MAX_CELLS)
         self.anchors: dict[int, AnchorPosition] = {}
@@ -319,12 +343,14 @@ class Scene:
         self.errors = 0
         self.revision = 0
 
-    @property
-    def now_s(self) -> float:
-        return self._latest_s + max(self.clock() - self._received_s, 0.0)
+    def now_s(self, tag_id: int | None = None) -> float:
+        """Return the latest stamp of a tag (None: of the latest range) plus the time since then; NaN before any."""
+        entry = next(reversed(self._latest.values()), None) if tag_id is None else self._latest.get(tag_id)
+        latest_s, received_s = entry or (math.nan, math.nan)
+        return latest_s + max(self.clock() - received_s, 0.0)
 
-    def age_s(self, entry: History | TagView) -> float:
-        """Return the time since the last data of a pair or tag."""
+    def age_s(self, entry: History | TagView | TrackView) -> float:
+        """Return the time since the last data of a pair, tag or track."""
         return max(self.clock() - entry.received_s, 0.0)
 
     def history(self, pair: Pair) -> History:
@@ -335,18 +361,19 @@ class Scene:
     def add_sample(self, pair: Pair, sample: Sample) -> None:
         """Add a corrected range.
 
-        If the time of a pair jumps back by more than a second (a replay in a loop), the strips start again. Clocks of
-        different pairs may differ by less than a strip.
+        If the time of a pair jumps back by more than a second (a replay in a loop), the strips of its tag start again.
         """
-        known = self.pairs.get(pair)
-        latest = None if known is None else known.latest
-        if sample.time_s < self._latest_s - HISTORY_S or (latest and sample.time_s < latest.time_s - 1.0):
-            self.clear_history()
-        if not sample.time_s < self._latest_s:
-            self._latest_s, self._received_s = sample.time_s, self.clock()
-        self.ranges += 1
+        tag_id = pair[1]
         history = self.history(pair)
-        history.add(sample, self._latest_s)
+        latest, (tag_latest_s, _) = history.latest, self._latest.get(tag_id, (-math.inf, 0.0))
+        if sample.time_s < tag_latest_s - HISTORY_S or (latest and sample.time_s < latest.time_s - 1.0):
+            self.clear_history(tag_id)
+            tag_latest_s = -math.inf
+        if not sample.time_s < tag_latest_s:
+            tag_latest_s = self._latest.add(tag_id, (sample.time_s, self.clock()))[0]
+        self.ranges += 1
+        self.not_ok += sample.status is not Status.OK
+        history.add(sample, tag_latest_s)
         history.received_s = self.clock()
         self._compare_with_position(pair, sample)
 
@@ -355,8 +382,7 @@ class Scene:
         errors_m = np.array([sample.raw_m - sample.true_m, sample.range_m - sample.true_m])
         if not (np.abs(errors_m) <= MAX_RANGE_M).all():
             return
-        bins = np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1
-        self.error_counts[[0, 1], np.clip(bins, 0, self.error_counts.shape[1] - 1)] += 1
+        self.error_counts += count_errors(errors_m[:, None])
         self.error_sums_m += np.abs(errors_m)
         self.errors += 1
 
@@ -369,27 +395,35 @@ class Scene:
     def add_trace(self, pair: Pair, trace: Trace) -> None:
         self.history(pair).traces.append(trace)
 
-    def add_pose(self, tag: str, pose: Pose) -> None:
+    def add_pose(self, tag: str, pose: Pose, received_s: float | None = None) -> None:
+        """Set the pose of a tag; `received_s` is on the scene's clock, None: now."""
         if _is_plausible(pose.x, pose.y):
             entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or TagView())
-            entry.pose, entry.received_s = pose, self.clock()
-            self.add_position(tag, TrackKind.CORRECTED, pose.x, pose.y)
+            entry.pose, entry.received_s = pose, self.clock() if received_s is None else received_s
+            point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
+            self.add_position(tag, TrackKind.CORRECTED, point)
 
-    def add_position(self, tag: str, kind: TrackKind, x: float, y: float) -> None:
+    def add_position(self, tag: str, kind: TrackKind, point: TrackPoint) -> None:
         """Append a position to a track; `tag` is its name."""
-        if self.is_indexed:
-            self.revision += 1
+        self.revision += 1
+        stamp_s, x, y, *_ = point
+        if self.is_indexed or not (_is_plausible(x, y) and math.isfinite(stamp_s)):
             return
         key = tag[:MAX_TEXT], kind
-        track = self.tracks.get(key)
-        if not _is_plausible(x, y) or (track and math.dist(track[-1], (x, y)) < STEP_M):
-            return
-        self.tracks.add(key, deque(maxlen=MAX_TRACK) if track is None else track).append((x, y))
-        self.revision += 1
+        track = self.tracks.add(key, self.tracks.get(key) or TrackView())
+        track.received_s = self.clock()
+        if isinstance(track.points, deque):
+            if track.points and stamp_s < track.points[-1][0] - 1.0:
+                track.points.clear()
+            step_s = stamp_s - track.points[-1][0] if track.points else math.inf
+            step_m = math.dist(track.points[-1][1:3], (x, y)) if track.points else math.inf
+            if step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S):
+                track.points.append(point)
 
-    def set_track(self, tag: str, kind: TrackKind, points: list[tuple[float, float]]) -> None:
-        """Replace a track."""
-        self.tracks.add((tag[:MAX_TEXT], kind), deque(points, maxlen=MAX_TRACK))
+    def set_track(self, tag: str, kind: TrackKind, points: NDArray[np.float64]) -> None:
+        """Replace a track, float64 (k, 5), on the scene's clock."""
+        received_s = float(points[-1, 0]) if len(points) else math.nan
+        self.tracks.add((tag[:MAX_TEXT], kind), TrackView(points, received_s))
         self.revision += 1
 
     def _compare_with_position(self, pair: Pair, sample: Sample) -> None:
@@ -410,22 +444,23 @@ class Scene:
 
     def _add_raw_fix(self, tag_id: int, pose: Pose, time_s: float) -> None:
         rows = []
-        for (anchor_id, other), history in self.pairs.items():
+        for (anchor_id, pair_tag), history in self.pairs.items():
             anchor, latest = self.anchors.get(anchor_id), history.latest
-            if other == tag_id and anchor and latest and abs(time_s - latest.time_s) <= RAW_AGE_S:
+            if pair_tag == tag_id and anchor and latest and abs(time_s - latest.time_s) <= RAW_AGE_S:
                 height_m = finite_or_zero(pose.z - anchor.z)
                 rows.append((anchor.x, anchor.y, height_m, latest.raw_m))
-        known = np.array([row for row in rows if 0.0 <= row[3] < MAX_RANGE_M])
-        if len(known) < 3:
+        fixes = np.array([row for row in rows if 0.0 <= row[3] < MAX_RANGE_M])
+        if len(fixes) < 3:
             return
         x = np.array([pose.x, pose.y])
         for _ in range(5):
-            offset = x - known[:, :2]
-            distance = np.maximum(np.hypot(np.hypot(*offset.T), known[:, 2]), 1e-6)
-            step = np.linalg.lstsq(offset / distance[:, None], known[:, 3] - distance, rcond=0.05)[0]
+            offset = x - fixes[:, :2]
+            distance = np.maximum(np.hypot(np.hypot(*offset.T), fixes[:, 2]), 1e-6)
+            step = np.linalg.lstsq(offset / distance[:, None], fixes[:, 3] - distance, rcond=0.05)[0]
             x = x + step
         name = tag_frame(tag_id)
-        self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, *x.tolist())
+        point = (time_s, float(x[0]), float(x[1]), math.nan, math.nan)
+        self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
 
     def set_anchors(self, anchors: dict[int, AnchorPosition]) -> None:
         plausible = ((id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y))
@@ -436,22 +471,29 @@ class Scene:
         self.node_statuses.add(name[:MAX_TEXT], replace(report, message=report.message[:MAX_TEXT]))
         self.revision += 1
 
-    def clear_history(self) -> None:
-        """Remove the last minute, but not the counts, the anchors and the diagnostics."""
-        self._latest_s = self._received_s = math.nan
+    def count_dropped(self, number: int) -> None:
+        """Count ranges that the viewer itself has dropped; they do not count as lost."""
+        self.dropped += number
         for history in self.pairs.values():
-            history.samples.clear()
-            history.traces.clear()
+            history.restart_count()
+
+    def clear_history(self, tag_id: int) -> None:
+        """Remove the last minute of the pairs of a tag, but not the counts."""
+        self._latest.pop(tag_id, None)
+        for (_, pair_tag), history in self.pairs.items():
+            if pair_tag == tag_id:
+                history.samples.clear()
+                history.traces.clear()
+
+    def clear(self) -> None:
+        """Remove everything except the anchors."""
+        self._latest.clear()
         self.tags.clear()
         self.tracks.clear()
         if not self.is_indexed:
             self.heat.clear()
-
-    def clear(self) -> None:
-        """Remove everything except the anchors."""
-        self.clear_history()
         self.pairs.clear()
-        self.ranges = 0
+        self.ranges = self.not_ok = self.dropped = 0
         self.node_statuses.clear()
         self.error_counts[:] = 0
         self.error_sums_m[:] = 0
@@ -466,9 +508,17 @@ class Scene:
 
     def tag_of(self, tag_id: int) -> TagView | None:
         """Return the tag of a range: the tag of that name, else the plain tag if it is the only one without a name."""
-        own = self.tags.get(tag_frame(tag_id))
-        nameless = {tag for _, tag in self.pairs if tag_frame(tag) not in self.tags}
-        return self.tags.get(DEFAULT_TAG) if own is None and nameless == {tag_id} else own
+        tag = self.tags.get(tag_frame(tag_id))
+        if tag is not None or DEFAULT_TAG not in self.tags:
+            return tag
+        nameless = {pair_tag for _, pair_tag in self.pairs if tag_frame(pair_tag) not in self.tags}
+        return self.tags[DEFAULT_TAG] if nameless == {tag_id} else None
+
+
+def count_errors(errors_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the numbers of raw and corrected errors float64 (2, n) in each bin, int64 (2, bins)."""
+    clipped = np.clip(errors_m, ERROR_EDGES_M[0], ERROR_EDGES_M[-1])
+    return np.stack([np.histogram(row, ERROR_EDGES_M)[0] for row in clipped])
 
 
 def add_heat(
@@ -481,7 +531,12 @@ def add_heat(
     entry[1] += 1.0
 
 
-def _known(values: list[float]) -> NDArray[np.float64]:
+def with_gaps(columns: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:
+    """Insert a row of NaN into float64 (n, k) wherever the first column, the time, increases by more than `gap_s`."""
+    return np.insert(columns, np.flatnonzero(np.diff(columns[:, 0]) > gap_s) + 1, np.nan, axis=0)
+
+
+def _plausible_values(values: list[float]) -> NDArray[np.float64]:
     """Return the finite values, float64 (n,)."""
     array = np.array(values, np.float64)
     return array[np.abs(array) < MAX_RANGE_M]

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import hmac
 import logging
 import secrets
 import socket
 import threading
 from concurrent.futures import Future
 from typing import Any
+from urllib.parse import quote, unquote
 
 import psutil
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
-from bokeh.server.util import bind_sockets, check_allowlist, create_hosts_allowlist
+from bokeh.server.util import bind_sockets, check_allowlist
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.ioloop import IOLoop
@@ -24,10 +26,11 @@ from tornado.web import GZipContentEncoding, OutputTransform, RequestHandler
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.viewer.page import Page, View
 
-ALL_ADDRESSES = ("0.0.0.0", "*")
+ALL_ADDRESSES = ("0.0.0.0", "::", "*")
+LOCAL_ADDRESSES = ("localhost", "127.0.0.1", "::1")
 
-_NONCE = "X-Nonce"
-"""Header that passes the nonce of a response to the page; a value from the client is replaced."""
+_NONCE, _COOKIE = "X-Nonce", "X-Set-Cookie"
+"""Headers that pass the nonce and the cookie of a response; values from the client are replaced."""
 
 
 class ViewerServer:
@@ -37,18 +40,27 @@ class ViewerServer:
         view: the view that the pages show.
         host, port: address to bind; port 0 selects a free port, and the attribute `port` has its number.
         origins: further `host:port` that are accepted in the headers Host and Origin, for a proxy or a host name.
+        token: the URL must contain `?token=` and this text; the page then stores it as a cookie. Empty: no protection.
+
+    Attributes:
+        url: URL of the page. warning: why other computers could use it; empty: they cannot.
 
     Raises:
         ParameterError: the address cannot be used.
     """
 
     def __init__(
-        self, view: View, host: str = "localhost", port: int = 5006, origins: tuple[str, ...] = ()
+        self,
+        view: View,
+        host: str = "localhost",
+        port: int = 5006,
+        origins: tuple[str, ...] = (),
+        token: str = "",
     ) -> None:
         self._loop: IOLoop | None = None
         outcome: Future[int] = Future()
         self._thread = threading.Thread(
-            target=self._run, args=(outcome, view, host, port, origins), name="viewer", daemon=True
+            target=self._run, args=(outcome, view, host, port, origins, token), name="viewer", daemon=True
         )
         self._thread.start()
         try:
@@ -56,9 +68,16 @@ class ViewerServer:
         except (OSError, ValueError) as error:
             raise ParameterError(
                 f"the page cannot be served at {host}:{port}: {error}",
-                valid="a free port, and a name or an IPv4 address of this machine",
+                valid="a free port, and a name or an address of this machine",
             ) from error
-        self.url = f"http://{'localhost' if host in ALL_ADDRESSES else host}:{self.port}/"
+        name = _bracketed("localhost" if host in ALL_ADDRESSES else host)
+        self.url = f"http://{name}:{self.port}/" + (f"?token={quote(token)}" if token else "")
+        self.warning = ""
+        if host not in LOCAL_ADDRESSES and not token:
+            self.warning = (
+                f"everyone in the network can read the data and control the page at {host}, port {self.port}: "
+                "set a token, or use an SSH tunnel"
+            )
 
     def close(self) -> None:
         """Stop serving; may be called twice."""
@@ -73,7 +92,9 @@ class ViewerServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _run(self, outcome: Future[int], view: View, host: str, port: int, origins: tuple[str, ...]) -> None:
+    def _run(
+        self, outcome: Future[int], view: View, host: str, port: int, origins: tuple[str, ...], token: str
+    ) -> None:
         asyncio.set_event_loop(asyncio.new_event_loop())
         # Bokeh warns if a tab is closed while data is sent to it.
         logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
@@ -81,7 +102,7 @@ class ViewerServer:
         sockets = []
         try:
             sockets, port = bind_sockets("" if host in ALL_ADDRESSES else host, port)
-            application = _Application(view, accepted_hosts(host, port, origins))
+            application = _Application(view, accepted_hosts(host, port, origins), token)
             http = HTTPServer(application)
             http.add_sockets(sockets)
             server = BaseServer(loop, application, http)
@@ -109,8 +130,8 @@ class _Application(BokehTornado):  # type: ignore[misc]
     (DNS rebinding).
     """
 
-    def __init__(self, view: View, hosts: list[str]) -> None:
-        self._hosts = create_hosts_allowlist(hosts, None)
+    def __init__(self, view: View, hosts: list[str], token: str) -> None:
+        self._hosts, self._token = hosts, token
 
         def open_page(document: Any) -> None:
             Page(document, view, document.session_context.request.headers.get(_NONCE, ""))
@@ -127,9 +148,24 @@ class _Application(BokehTornado):  # type: ignore[misc]
 
     def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
         request.headers[_NONCE] = secrets.token_urlsafe(16)
-        if check_allowlist(request.host.lower(), self._hosts):
-            return super().find_handler(request, **kwargs)
-        return self.get_handler_delegate(request, _UnknownHost)
+        request.headers.pop(_COOKIE, None)
+        if not check_allowlist(request.host.lower(), self._hosts):
+            return self.get_handler_delegate(request, _UnknownHost)
+        if self._token and not self._is_authorised(request):
+            return self.get_handler_delegate(request, _WrongToken)
+        return super().find_handler(request, **kwargs)
+
+    def _is_authorised(self, request: HTTPServerRequest) -> bool:
+        """Return whether a request has the token in its URL or in its cookie; the cookie belongs to this port."""
+        name = f"uwb_token_{request.host.rpartition(':')[2]}"
+        tokens = [value.decode("utf-8", "replace") for value in request.query_arguments.get("token", [])]
+        if any(hmac.compare_digest(text.encode(), self._token.encode()) for text in tokens):
+            request.headers[_COOKIE] = f"{name}={quote(self._token)}; HttpOnly; SameSite=Strict; Path=/"
+            return True
+        cookie = request.cookies.get(name)
+        return cookie is not None and hmac.compare_digest(
+            unquote(cookie.value).encode(), self._token.encode()
+        )
 
 
 class _SecurityPolicy(OutputTransform):  # type: ignore[misc]
@@ -140,6 +176,7 @@ class _SecurityPolicy(OutputTransform):  # type: ignore[misc]
 
     def __init__(self, request: HTTPServerRequest) -> None:
         # Some browsers do not count a websocket as 'self'.
+        self._cookie = request.headers.get(_COOKIE, "")
         self._policy = (
             f"default-src 'none'; script-src 'self' 'nonce-{request.headers[_NONCE]}'; style-src 'self' 'unsafe-inline'; "
             f"img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' ws://{request.host} "
@@ -151,6 +188,9 @@ class _SecurityPolicy(OutputTransform):  # type: ignore[misc]
     ) -> tuple[int, HTTPHeaders, bytes]:
         headers["Content-Security-Policy"] = self._policy
         headers["X-Content-Type-Options"] = "nosniff"
+        headers["Referrer-Policy"] = "no-referrer"
+        if self._cookie:
+            headers["Set-Cookie"] = self._cookie
         return status_code, headers, chunk
 
 
@@ -165,6 +205,14 @@ class _UnknownHost(RequestHandler):  # type: ignore[misc]
         )
 
 
+class _WrongToken(RequestHandler):  # type: ignore[misc]
+    """Answers requests without the token."""
+
+    def prepare(self) -> None:
+        self.set_status(403)
+        self.finish("Open the URL that the viewer has printed: it contains a token.\n")
+
+
 def accepted_hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
     """Return the `host:port` that requests may name as Host and as Origin.
 
@@ -175,12 +223,18 @@ def accepted_hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
         names |= _machine_names()
     else:
         names.add(host.lower())
-    return [*(f"{name}:{port}" for name in sorted(names)), *(origin.lower() for origin in more)]
+    return [*(f"{_bracketed(name)}:{port}" for name in sorted(names)), *(origin.lower() for origin in more)]
 
 
 def _machine_names() -> set[str]:
-    """Return the name and the IPv4 addresses of this machine."""
+    """Return the name and the addresses of this machine; a browser omits the zone of an IPv6 address."""
     name = socket.gethostname().lower()
     entries = [entry for interface in psutil.net_if_addrs().values() for entry in interface]
-    addresses = {entry.address for entry in entries if entry.family == socket.AF_INET}
+    families = socket.AF_INET, socket.AF_INET6
+    addresses = {entry.address.partition("%")[0] for entry in entries if entry.family in families}
     return {name, f"{name}.local"} | addresses
+
+
+def _bracketed(name: str) -> str:
+    """Return a name or an address as in a URL."""
+    return f"[{name}]" if ":" in name else name

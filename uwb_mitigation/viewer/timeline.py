@@ -1,19 +1,24 @@
-"""Index of a recording: the status and error of every range, and the complete tracks of the tags."""
+"""Index of a recording: the status and error of every range, and the complete tracks of the tags.
+
+The time of a message is its stamp, or its log time if they differ by more than `MAX_STAMP_S`. The player and its marks use
+the log time, because it is the time at which a subscriber received the message.
+"""
 
 from __future__ import annotations
 
 import contextlib
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, RecordingError
+from uwb_mitigation.errors import DatasetError, RecordingError, format_id
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.online.initialization import snapshot
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Status
@@ -27,18 +32,33 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_RAW,
     RANGE_TRUTH,
 )
-from uwb_mitigation.types.stamps import to_ns
-from uwb_mitigation.types.tracks import Estimate, Ranges
+from uwb_mitigation.types.stamps import NS_PER_S, to_ns
+from uwb_mitigation.types.tracks import Ranges, Track
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
-from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_RANGE_M, MAX_TAGS, BoundedDict, Pair, add_heat
+from uwb_mitigation.viewer.scene import (
+    MAX_CELLS,
+    MAX_RANGE_M,
+    MAX_TAGS,
+    BoundedDict,
+    Pair,
+    add_heat,
+    with_gaps,
+)
 
-MAX_RANGES = 500_000
-"""Maximum number of indexed ranges; the rest of the recording has no marks."""
+MAX_STAMP_S = 1.0
+"""If stamp and log time of a message differ by more, its time is the log time."""
 BINS = 300
 """Maximum number of points of the error over time."""
 BATCH = 256
-"""Number of raw ranges that are corrected at once."""
+"""Number of raw ranges that are corrected in one call."""
+CHUNK = 50_000
+"""Number of rows that are collected before they are stored compactly."""
 _KINDS = {ODOMETRY_TRUTH: TrackKind.TRUE, POSE_SMOOTHED: TrackKind.SMOOTHED}
+_KEY = [("stamp_ns", "i8"), ("tag", "u8"), ("anchor", "u8"), ("sequence", "u4")]
+_TRUTH = np.dtype([*_KEY, ("true_m", "f8")])
+_RANGE = np.dtype(
+    [*_KEY, ("log_ns", "i8"), ("bad", "?"), ("raw_m", "f8"), ("corrected_m", "f8"), ("variance_m2", "f8")]
+)
 
 
 @dataclass(slots=True)
@@ -46,63 +66,90 @@ class Timeline:
     """Everything about a recording that does not depend on the position of the player.
 
     Attributes:
-        time_s: time of each range from the beginning, float64 (n,), increasing.
-        pairs: pair of each range. bad: bool (n,), whether the status is not OK.
+        log_s: log time of each range from the beginning, float64 (n,), increasing.
+        time_s: time of each range from the beginning, float64 (n,).
+        anchor, tag: ids of each range, uint64 (n,). bad: bool (n,), whether the status is not OK.
         raw_m, corrected_m, true_m: float64 (n,); NaN: unknown.
-        tracks: {(tag, kind): (time_s (k,), positions (k, 3))}.
-        estimates: {tag: estimates of the filter}, if the recording contains no positions.
+        losses: {pair: (missing sequence numbers, ranges)}.
+        notices: messages for the page.
+        tracks: {(tag, kind): float64 (k, 5), time (s), x, y, z and horizontal standard deviation (m)}.
+        estimates: {tag: track of the filter}, if the recording contains no positions.
         heat: see `Scene`.
+        is_complete: whether tracks and heat map have been added.
     """
 
+    log_s: NDArray[np.float64]
     time_s: NDArray[np.float64]
-    pairs: list[Pair]
+    anchor: NDArray[np.uint64]
+    tag: NDArray[np.uint64]
     bad: NDArray[np.bool_]
     raw_m: NDArray[np.float64]
     corrected_m: NDArray[np.float64]
     true_m: NDArray[np.float64]
-    tracks: dict[tuple[str, TrackKind], tuple[NDArray[np.float64], NDArray[np.float64]]] = field(
-        default_factory=dict
-    )
-    estimates: dict[str, list[Estimate]] = field(default_factory=dict)
+    losses: dict[Pair, tuple[int, int]] = field(default_factory=dict)
+    notices: list[str] = field(default_factory=list)
+    tracks: dict[tuple[str, TrackKind], NDArray[np.float64]] = field(default_factory=dict)
+    estimates: dict[str, Track] = field(default_factory=dict)
     heat: BoundedDict[tuple[int, int], list[float]] = field(default_factory=lambda: BoundedDict(MAX_CELLS))
+    is_complete: bool = False
 
     @property
     def deviation_m(self) -> NDArray[np.float64]:
         """Absolute error of each corrected range; without any truth, the absolute correction. NaN: unknown."""
-        known = np.isfinite(self.true_m).any()
-        deviation: NDArray[np.float64] = np.abs(self.corrected_m - (self.true_m if known else self.raw_m))
+        reference_m = self.true_m if np.isfinite(self.true_m).any() else self.raw_m
+        deviation: NDArray[np.float64] = np.abs(self.corrected_m - reference_m)
         deviation[~(deviation < MAX_RANGE_M)] = np.nan
         return deviation
 
+    def pair(self, row: int) -> Pair:
+        return int(self.anchor[row]), int(self.tag[row])
+
     def next_bad(self, position_s: float) -> int | None:
         """Return the row of the first range after a position whose status is not OK."""
-        rows = np.flatnonzero(self.bad & (self.time_s > position_s + 1e-6))
+        rows = np.flatnonzero(self.bad & (self.log_s > position_s + 1e-6))
         return int(rows[0]) if len(rows) else None
+
+    def previous_bad(self, position_s: float) -> int | None:
+        """Return the row of the last range before a position whose status is not OK."""
+        rows = np.flatnonzero(self.bad & (self.log_s < position_s - 2e-6))
+        return int(rows[-1]) if len(rows) else None
 
     def largest_error(self) -> int | None:
         """Return the row of the range with the largest `deviation_m`."""
         deviation = self.deviation_m
         return int(np.nanargmax(deviation)) if np.isfinite(deviation).any() else None
 
+    def range_errors(self, begin_s: float, end_s: float) -> NDArray[np.float64]:
+        """Return raw and corrected errors of the ranges with known truth in an interval, float64 (2, k)."""
+        rows = slice(*np.searchsorted(self.log_s, (begin_s, end_s), side="right"))
+        errors = np.stack([self.raw_m[rows], self.corrected_m[rows]]) - self.true_m[rows]
+        return errors[:, (np.abs(errors) <= MAX_RANGE_M).all(axis=0)]
+
     def mean_errors(self, seconds: float) -> dict[str, NDArray[np.float32]]:
-        """Return the mean absolute errors over time: `time`, `raw` and `corrected`, float32 (k,)."""
+        """Return the mean absolute errors over time: `time`, `raw` and `corrected`, float32 (k,); NaN: a gap."""
         errors = np.abs(np.stack([self.raw_m - self.true_m, self.corrected_m - self.true_m]))
-        known = (errors < MAX_RANGE_M).all(axis=0)
-        if not known.any():
+        is_valid = (errors < MAX_RANGE_M).all(axis=0)
+        if not is_valid.any():
             # Without truth, only the size of the corrections is known.
             errors = np.stack([np.full(len(self.time_s), np.nan), self.deviation_m])
-            known = np.isfinite(errors[1])
+            is_valid = np.isfinite(errors[1])
         width_s = max(seconds / BINS, 1.0)
-        row = (self.time_s[known] // width_s).astype(np.intp)
+        row = (np.maximum(self.time_s[is_valid], 0.0) // width_s).astype(np.intp)
         count = np.bincount(row)
         filled = count > 0
-        raw, corrected = (np.bincount(row, values)[filled] / count[filled] for values in errors[:, known])
-        columns = {"time": (np.flatnonzero(filled) + 0.5) * width_s, "raw": raw, "corrected": corrected}
-        return {name: column.astype(np.float32) for name, column in columns.items()}
+        means = [np.bincount(row, values)[filled] / count[filled] for values in errors[:, is_valid]]
+        columns = with_gaps(
+            np.stack([(np.flatnonzero(filled) + 0.5) * width_s, *means], axis=1), 1.5 * width_s
+        )
+        return dict(zip(("time", "raw", "corrected"), columns.T.astype(np.float32), strict=True))
 
 
 def index_recording(
-    recording: Recording, anchors: AnchorMap | None, height: Height | None, backend: Corrector | None
+    recording: Recording,
+    anchors: AnchorMap | None,
+    height: Height | None,
+    backend: Corrector | None,
+    publish: Callable[[Timeline], None],
 ) -> Timeline:
     """Read a recording.
 
@@ -111,104 +158,214 @@ def index_recording(
         anchors: for tracks; None: unknown.
         height: of the tags; None: the median of the true heights, or unknown.
         backend: corrects raw ranges; None: the recording contains corrected ranges.
+        publish: called with the timeline as soon as the ranges have been read; the estimation of tracks takes longer.
     """
-    ranges: list[tuple[MeasurementKey, CorrectedRange]] = []
-    batch: list[RangeMeasurement] = []
-    truths: dict[MeasurementKey, float] = {}
-    points: dict[tuple[str, TrackKind], list[tuple[float, float, float, float]]] = {}
-
-    def seconds(stamp_ns: Any) -> Any:
-        return (stamp_ns - recording.start_ns) / 1e9
-
-    def flush() -> None:
-        if backend is not None and batch:
-            ranges.extend(zip(map(measurement_key, batch), backend.correct(batch), strict=True))
-            batch.clear()
-
-    wanted = {RANGE_CORRECTED if backend is None else RANGE_RAW, RANGE_TRUTH, ODOMETRY_TRUTH, *POSITIONS}
+    reader = _Reader(recording, backend)
     # The player reports the damage of a bag when it reaches it.
     with contextlib.suppress(RecordingError):
-        for _, topic, message, tag in recording.events(wanted):
-            if len(ranges) >= MAX_RANGES:
-                break
-            if message is None:
-                continue
-            if topic == RANGE_CORRECTED:
-                ranges.append(message)
-            elif topic == RANGE_RAW:
-                batch.append(message)
-                if len(batch) == BATCH:
-                    flush()
-            elif topic == RANGE_TRUTH:
-                truths[message[0]] = message[1].range_m
-            else:
-                kind = _KINDS.get(topic, TrackKind.CORRECTED)
-                name = str(message.child_frame_id) if kind is TrackKind.TRUE else tag
-                at, stamp = message.pose.pose.position, message.header.stamp
-                if np.isfinite([at.x, at.y]).all() and (len(points) < 4 * MAX_TAGS or (name, kind) in points):
-                    time_s = seconds(to_ns(stamp))
-                    points.setdefault((name, kind), []).append((time_s, at.x, at.y, at.z))
-    flush()
-    ranges.sort(key=lambda row: row[0].stamp_ns)
-    keys = [key for key, _ in ranges]
-    timeline = Timeline(
-        seconds(np.array([key.stamp_ns for key in keys], np.int64)),
-        [(key.anchor_id, key.tag_id) for key in keys],
-        np.array([corrected.status is not Status.OK for _, corrected in ranges], bool),
-        np.array([corrected.range_raw_m for _, corrected in ranges], np.float64),
-        np.array([corrected.range_m for _, corrected in ranges], np.float64),
-        np.array([truths.get(key, np.nan) for key in keys], np.float64),
-    )
-    for one, rows in points.items():
-        columns = np.array(sorted(rows))
-        timeline.tracks[one] = columns[:, 0], columns[:, 1:]
-    if anchors is None or not ranges:
+        reader.read()
+    ranges = reader.ranges.array()
+    timeline = reader.timeline(ranges)
+    publish(timeline)
+    if anchors is not None and len(ranges):
+        _estimate_tracks(
+            timeline, ranges, anchors, height, has_positions=bool(recording.contents & POSITIONS)
+        )
+        _add_heat(timeline)
+    timeline.is_complete = True
+    return timeline
+
+
+class _Table:
+    """Rows of a structured array that grows."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._dtype, self._rows = dtype, list[tuple[Any, ...]]()
+        self._chunks: list[NDArray[Any]] = []
+
+    def add(self, *row: Any) -> None:
+        self._rows.append(row)
+        if len(self._rows) == CHUNK:
+            self._chunks.append(np.array(self._rows, self._dtype))
+            self._rows.clear()
+
+    def array(self) -> NDArray[Any]:
+        return np.concatenate([*self._chunks, np.array(self._rows, self._dtype)])
+
+
+class _Reader:
+    """Reads ranges, truths and positions of a recording."""
+
+    def __init__(self, recording: Recording, backend: Corrector | None) -> None:
+        self._recording, self._backend = recording, backend
+        self._batch: list[tuple[int, RangeMeasurement]] = []
+        self._truths = _Table(_TRUTH)
+        self._points = defaultdict[tuple[str, TrackKind], list[tuple[float, ...]]](list)
+        self._late = Counter[str]()
+        self._delays_s: dict[str, float] = {}
+        self.ranges = _Table(_RANGE)
+
+    def read(self) -> None:
+        range_topic = RANGE_CORRECTED if self._backend is None else RANGE_RAW
+        try:
+            for log_ns, topic, message, tag in self._recording.events(
+                {range_topic, RANGE_TRUTH, ODOMETRY_TRUTH, *POSITIONS}
+            ):
+                if message is None:
+                    continue
+                if topic == RANGE_CORRECTED:
+                    self._add_range(log_ns, *message)
+                elif topic == RANGE_RAW:
+                    self._batch.append((log_ns, message))
+                    if len(self._batch) == BATCH:
+                        self._correct()
+                elif topic == RANGE_TRUTH:
+                    self._truths.add(*message[0], message[1].range_m)
+                else:
+                    self._add_position(log_ns, topic, message, tag)
+        finally:
+            self._correct()
+
+    def _correct(self) -> None:
+        if self._backend is not None and self._batch:
+            corrected = self._backend.correct([measurement for _, measurement in self._batch])
+            for (log_ns, measurement), result in zip(self._batch, corrected, strict=True):
+                self._add_range(log_ns, measurement_key(measurement), result)
+            self._batch.clear()
+
+    def _add_range(self, log_ns: int, key: MeasurementKey, corrected: CorrectedRange) -> None:
+        is_bad = corrected.status is not Status.OK
+        self.ranges.add(*key, log_ns, is_bad, corrected.range_raw_m, corrected.range_m, corrected.variance_m2)
+
+    def _add_position(self, log_ns: int, topic: str, message: Any, tag: str) -> None:
+        kind = _KINDS.get(topic, TrackKind.CORRECTED)
+        name = str(message.child_frame_id) if kind is TrackKind.TRUE else tag
+        point, covariance = message.pose.pose.position, message.pose.covariance
+        is_new = (name, kind) not in self._points
+        if not np.isfinite([point.x, point.y]).all() or (is_new and len(self._points) >= 4 * MAX_TAGS):
+            return
+        time_s, log_s = (to_ns(message.header.stamp) - self._recording.start_ns) / NS_PER_S, log_ns / NS_PER_S
+        if abs(time_s - log_s) > MAX_STAMP_S:
+            self._note_delay(f"the positions of {name}", time_s - log_s)
+            time_s = log_s
+        variance = covariance[0] + covariance[7]
+        sd_m = np.sqrt(variance) if variance > 0.0 else np.nan
+        self._points[name, kind].append((time_s, point.x, point.y, point.z, sd_m))
+
+    def _note_delay(self, name: str, delay_s: float) -> None:
+        self._late[name] += 1
+        self._delays_s.setdefault(name, delay_s)
+
+    def timeline(self, ranges: NDArray[Any]) -> Timeline:
+        """Return the timeline without estimated tracks."""
+        stamp_s = (ranges["stamp_ns"] - self._recording.start_ns) / NS_PER_S
+        log_s = ranges["log_ns"] / NS_PER_S
+        delay_s = stamp_s - log_s
+        is_late = np.abs(delay_s) > MAX_STAMP_S
+        for tag in np.unique(ranges["tag"][is_late]):
+            rows = is_late & (ranges["tag"] == tag)
+            name = f"the ranges of tag {format_id(int(tag))}"
+            self._late[name], self._delays_s[name] = int(rows.sum()), float(np.median(delay_s[rows]))
+        names = ", ".join(f"{name} by {self._delays_s[name]:+.1f} s" for name in self._late)
+        notice = f"Stamps differ from the log time, and the log time is used: {names[:300]}." if names else ""
+        timeline = Timeline(
+            log_s=log_s,
+            time_s=np.where(is_late, log_s, stamp_s),
+            true_m=_join_truths(ranges, self._truths.array()),
+            losses={
+                pair: (_lost(ranges["sequence"][rows]), len(rows)) for pair, rows in _rows_by_pair(ranges)
+            },
+            notices=[notice] if notice else [],
+            **{name: ranges[name].copy() for name in ("anchor", "tag", "bad", "raw_m", "corrected_m")},
+        )
+        for key, points in self._points.items():
+            columns = np.array(points)
+            timeline.tracks[key] = columns[np.argsort(columns[:, 0], kind="stable")]
         return timeline
+
+
+def _rows_by_pair(ranges: NDArray[Any]) -> Iterator[tuple[Pair, NDArray[np.intp]]]:
+    order = np.lexsort((ranges["tag"], ranges["anchor"]))
+    anchor, tag = ranges["anchor"][order], ranges["tag"][order]
+    begins = np.flatnonzero((np.diff(anchor) != 0) | (np.diff(tag) != 0)) + 1
+    for rows in np.split(order, begins) if len(order) else ():
+        yield (int(ranges["anchor"][rows[0]]), int(ranges["tag"][rows[0]])), rows
+
+
+def _lost(sequence: NDArray[np.uint32]) -> int:
+    """Return the number of missing sequence numbers of a pair, relative to its median step; see `History.count_lost`."""
+    step = np.diff(sequence)
+    step = step[(step > 0) & (step < 1000)]
+    return int(np.maximum(np.rint(step / np.median(step)) - 1.0, 0.0).sum()) if len(step) else 0
+
+
+def _join_truths(ranges: NDArray[Any], truths: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the true range of each range, float64 (n,); NaN: unknown."""
+    columns = [np.concatenate([ranges[name], truths[name]]) for name, _ in _KEY]
+    order = np.lexsort(columns)
+    is_new = np.zeros(len(order), bool)
+    for column in columns:
+        is_new[1:] |= np.diff(column[order]) != 0
+    group = np.empty(len(order), np.intp)
+    group[order] = np.cumsum(is_new)
+    true_m = np.full(len(order), np.nan)
+    true_m[group[len(ranges) :]] = truths["true_m"]
+    return true_m[group[: len(ranges)]]
+
+
+def _estimate_tracks(
+    timeline: Timeline, ranges: NDArray[Any], anchors: AnchorMap, height: Height | None, has_positions: bool
+) -> None:
+    """Add the tracks of the filter on raw ranges, and if the recording has no positions, on corrected ranges."""
     true_z = [
-        z for (_, kind), (_, xyz) in timeline.tracks.items() if kind is TrackKind.TRUE for z in xyz[:, 2]
+        z for (_, kind), track in timeline.tracks.items() if kind is TrackKind.TRUE for z in track[:, 3]
     ]
     if height is None and np.isfinite(true_z).any():
         height = Height(float(np.nanmedian(true_z)))
     config = EstimatorConfig(anchors, height=height)
-    for tag_id in sorted({key.tag_id for key in keys})[:MAX_TAGS]:
-        own = [row for row in ranges if row[0].tag_id == tag_id and row[0].anchor_id in anchors.index]
-        raw = _ranges([(key, found.range_raw_m, np.nan) for key, found in own], anchors)
-        corrected = _ranges([(key, found.range_m, found.variance_m2) for key, found in own], anchors)
-        name, tracks = tag_frame(tag_id), {}
+    row_of_anchor = np.array([anchors.index.get(int(anchor), -1) for anchor in np.unique(ranges["anchor"])])
+    anchor_row = row_of_anchor[np.unique(ranges["anchor"], return_inverse=True)[1]]
+    for tag_id in np.unique(ranges["tag"])[:MAX_TAGS]:
+        rows = np.flatnonzero((ranges["tag"] == tag_id) & (anchor_row >= 0))
+        rows = rows[np.argsort(ranges["stamp_ns"][rows], kind="stable")]
+        stamp_ns, time_s = ranges["stamp_ns"][rows], timeline.time_s[rows]
+        name, selected = tag_frame(int(tag_id)), (ranges[rows], anchor_row[rows])
+        tracks: dict[TrackKind, Track] = {}
         # There may be too few ranges for a track of this tag.
         with contextlib.suppress(DatasetError, IndexError, ValueError):
-            tracks[TrackKind.RAW] = snapshot(anchors, raw, height)
-            if not recording.contents & POSITIONS:
+            tracks[TrackKind.RAW] = TagEstimator(config).run(_ranges(*selected, "raw_m"))
+            if not has_positions:
+                corrected = _ranges(*selected, "corrected_m")
                 tracks[TrackKind.CORRECTED] = live = TagEstimator(config).run(corrected)
-                timeline.estimates[name] = list(live)
+                timeline.estimates[name] = live
                 tracks[TrackKind.SMOOTHED] = smooth(config, corrected, live)
         for kind, track in tracks.items():
-            timeline.tracks[name, kind] = seconds(track.stamp_ns), track.position
-    _add_heat(timeline)
-    return timeline
+            if len(track):
+                # Relative stamps: a float64 resolves nanoseconds since 1970 only to a fraction of a microsecond.
+                track_s = np.interp(track.stamp_ns - stamp_ns[0], stamp_ns - stamp_ns[0], time_s)
+                sd_m = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
+                timeline.tracks[name, kind] = np.column_stack([track_s, track.position, sd_m])
+
+
+def _ranges(rows: NDArray[Any], anchor_row: NDArray[np.intp], column: str) -> Ranges:
+    """Return the usable raw or corrected ranges of one tag; the variances of raw ranges are unknown."""
+    unknown = np.full(len(rows), np.nan)
+    variance_m2 = unknown if column == "raw_m" else rows["variance_m2"]
+    usable = (rows[column] >= 0.0) & (rows[column] < MAX_RANGE_M) & (variance_m2 != np.inf)
+    columns = (rows["stamp_ns"], anchor_row, rows[column], variance_m2, unknown)
+    return Ranges(*(values[usable].copy() for values in columns))
 
 
 def _add_heat(timeline: Timeline) -> None:
     """Add the mean correction along the tracks."""
     tracks = {name: track for (name, kind), track in timeline.tracks.items() if kind is TrackKind.CORRECTED}
-    only = next(iter(tracks.values())) if len(tracks) == 1 else None
-    for tag_id in {tag_id for _, tag_id in timeline.pairs}:
-        track = tracks.get(tag_frame(tag_id)) or only
-        if track is None or not len(track[0]):
+    single = next(iter(tracks.values())) if len(tracks) == 1 else None
+    for tag_id in np.unique(timeline.tag):
+        track = tracks.get(tag_frame(int(tag_id)), single)
+        if track is None or not len(track):
             continue
-        rows = [row for row, pair in enumerate(timeline.pairs) if pair[1] == tag_id]
-        x, y = (np.interp(timeline.time_s[rows], track[0], axis) for axis in track[1][:, :2].T)
+        rows = np.flatnonzero(timeline.tag == tag_id)
+        x, y = (np.interp(timeline.time_s[rows], track[:, 0], axis) for axis in track[:, 1:3].T)
         correction = timeline.raw_m[rows] - timeline.corrected_m[rows]
         for row in np.flatnonzero(np.abs(correction) < MAX_RANGE_M):
             add_heat(timeline.heat, float(x[row]), float(y[row]), float(correction[row]))
-
-
-def _ranges(rows: list[tuple[MeasurementKey, float, float]], anchors: AnchorMap) -> Ranges:
-    kept = [row for row in rows if 0.0 <= row[1] < MAX_RANGE_M and row[2] != np.inf]
-    return Ranges(
-        np.array([key.stamp_ns for key, _, _ in kept], np.int64),
-        np.array([anchors.index[key.anchor_id] for key, _, _ in kept], np.intp),
-        np.array([range_m for _, range_m, _ in kept], np.float64),
-        np.array([variance for _, _, variance in kept], np.float64),
-        np.full(len(kept), np.nan),
-    )

@@ -248,6 +248,8 @@ VIEWER = (
     Parameter("host", "localhost", "Address of the web server; 0.0.0.0: all addresses of this machine."),
     Parameter("port", 5006, "Port of the web server; 0: a free port, which is logged.", low=0, high=65535),
     Parameter("origins", "", "Additional HOST:PORT that are accepted in the HTTP headers Host and Origin, separated by commas."),
+    Parameter("token", "", "The URL of the page must end with ?token= and this text; generate: a random token, which is logged "
+              "with the URL. Empty: no protection."),
     Parameter("anchors", "", "Anchors file for a map without a locator; the anchors are also published as "
               "markers for RViz and Foxglove. Empty: markers of a locator."),
     Parameter("floor_plan", "", "Floor plan of the page: YAML file of a map of map_server. Empty: none."),

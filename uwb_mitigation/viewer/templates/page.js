@@ -13,7 +13,7 @@ const setText = (element, text) => { if (element.textContent !== text) element.t
 
 function start(doc) {
   const model = (name) => doc.get_model_by_name(name);
-  const controls = model("controls"), source = model("pairs");
+  const controls = model("controls"), source = model("pairs"), position = $("position");
   let commands = 0;
   const send = (name, ...args) => { controls.command = [name, args, ++commands]; };
   const on = (name, show) => { controls.properties[name].change.connect(show); show(); };
@@ -28,18 +28,40 @@ function start(doc) {
     else if (property.attr === "palette" && value.length < 10) model.setv({palette: value.map(invert)}, {sync: false});
   }
 
+  // The next update comes after this one has been drawn: a slow page skips updates instead of showing old ones.
+  let received = performance.now();
+  const showAge = () => {
+    const player = controls.player, age = (performance.now() - received) / 1000 + (controls.update?.[1] ?? 0);
+    const late = player?.behind ? "Reading ..." : age > 2 && (player?.playing ?? true) ? `${age.toFixed(0)} s behind` : "";
+    $("age").className = late ? "late" : "";
+    setText($("age"), late || (player?.playing ? `${position ? "PLAYING" : "LIVE"} ${age.toFixed(1)} s` : "PAUSED"));
+  };
+  on("update", () => {
+    received = performance.now();
+    const [update] = controls.update;
+    requestAnimationFrame(() => setTimeout(() => { controls.acknowledged = update; }));
+  });
+  setInterval(showAge, 200);
+
   // Texts.
+  const tableRows = (rows) => rows.map((texts) => {
+    const row = document.createElement("tr");
+    for (const text of texts) row.insertCell().textContent = text;
+    return row;
+  });
+  on("cards", () => $("cards").replaceChildren(...controls.cards.map((texts) => {
+    const card = document.createElement("div");
+    texts.forEach((text, i) => { card.append(document.createElement(["span", "strong", "span"][i])); card.children[i].textContent = text; });
+    return card;
+  })));
+  on("health", () => $("health").replaceChildren(...tableRows(controls.health)));
   on("summary", () => setText($("summary"), controls.summary));
   on("notice", () => $("notice").replaceChildren(...controls.notice.map((line) => {
     const div = document.createElement("div");
     div.textContent = line;
     return div;
   })));
-  on("nodes", () => $("nodes").replaceChildren(...controls.nodes.map((texts) => {
-    const row = document.createElement("tr");
-    for (const text of texts) row.insertCell().textContent = text;
-    return row;
-  })));
+  on("nodes", () => $("nodes").replaceChildren(...tableRows(controls.nodes)));
 
   // Pairs: rows are kept, so that a click or the focus survives an update.
   const body = $("pairs").tBodies[0], rows = new Map();
@@ -132,7 +154,8 @@ function start(doc) {
   $("fit").addEventListener("click", fit);
   $("follow").addEventListener("click", (event) =>
     event.target.setAttribute("aria-pressed", event.target.getAttribute("aria-pressed") !== "true"));
-  for (const name of ["circles", "heat"]) $(name).addEventListener("change", (event) => send("show", name, event.target.checked));
+  for (const name of ["circles", "heat", "accuracy"]) $(name).addEventListener("change", (event) => send("show", name, event.target.checked));
+  $("trail").addEventListener("change", (event) => send("trail", event.target.value));
   const keys = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1], "+": [0, 0, 0.8], "-": [0, 0, 1.25]};
   $("map").addEventListener("keydown", (event) => {
     if (event.key === "0") fit(); else if (keys[event.key]) pan(...keys[event.key]); else return;
@@ -174,17 +197,16 @@ function start(doc) {
   });
 
   const counts = model("errors").renderers[0].data_source;
-  const titleErrors = () => setText($("errors-title"), `Error histogram${counts.data.raw.some(Boolean) ? "" : ": no true ranges"}`);
+  const titleErrors = () => setText($("errors-title"), `Range errors, ${$("window")?.value ?? "since the start"}${counts.data.raw.some(Boolean) ? "" : ": no true ranges"}`);
   counts.properties.data.change.connect(titleErrors);
   titleErrors();
 
   // Recording.
-  const position = $("position");
   let held = false, saved_s = 0;
   const saveUrl = () => {
     const [anchor, tag] = controls.selected ?? [], at = controls.player?.position;
-    const parts = {anchor, tag, t: position && at != null ? at.toFixed(2) : undefined};
-    const text = Object.entries(parts).filter(([, value]) => value !== undefined).map(([name, value]) => `${name}=${value}`);
+    const parts = {anchor, tag, t: position && at != null ? at.toFixed(2) : undefined, window: $("window")?.selectedIndex ? $("window").value : undefined};
+    const text = Object.entries(parts).filter(([, value]) => value !== undefined).map(([name, value]) => `${name}=${encodeURIComponent(value)}`);
     if (performance.now() > saved_s + 500 || !controls.player?.playing) history.replaceState(null, "", "#" + text.join("&"));
     else return;
     saved_s = performance.now();
@@ -192,11 +214,26 @@ function start(doc) {
   const wanted = new URLSearchParams(location.hash.slice(1));
   if (wanted.has("t") && position) { send("play", false); send("seek", Number(wanted.get("t"))); }
   if (wanted.has("anchor")) send("select", wanted.get("anchor"), wanted.get("tag"));
-  $("play").addEventListener("click", () => send("play", !controls.player.playing));
+  const toggle = () => send("play", !controls.player.playing);
+  $("play").addEventListener("click", toggle);
+  addEventListener("keydown", (event) => {
+    if (event.key !== " " || event.target.matches("button, input:not([type=range]), select, summary")) return;
+    event.preventDefault();
+    toggle();
+  });
   if (position) {
     position.addEventListener("input", () => { held = true; $("time").textContent = `${Number(position.value).toFixed(1)} s`; });
     position.addEventListener("change", () => { held = false; send("seek", Number(position.value)); });
-    for (const name of ["step", "next_bad", "largest"]) $(name).addEventListener("click", () => send(name));
+    const steps = {ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1, PageDown: -10, PageUp: 10};
+    position.addEventListener("keydown", (event) => {
+      if (!steps[event.key]) return;
+      event.preventDefault();
+      position.value = Number(position.value) + steps[event.key];
+      send("seek", Number(position.value));
+    });
+    for (const name of ["step", "previous_bad", "next_bad", "largest"]) $(name).addEventListener("click", () => send(name));
+    $("window").addEventListener("change", (event) => { send("window", event.target.value); saveUrl(); });
+    if (wanted.has("window")) { $("window").value = wanted.get("window"); send("window", wanted.get("window")); }
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
@@ -246,6 +283,7 @@ function start(doc) {
   // A session ends with the viewer: the page reloads when the viewer is back.
   doc.on_event("connection_lost", () => {
     $("lost").style.display = "block";
+    $("age").hidden = true;
     const wait = setInterval(async () => {
       try { if ((await fetch(location.href, {cache: "no-store"})).ok) { clearInterval(wait); location.reload(); } }
       catch { /* not yet */ }
