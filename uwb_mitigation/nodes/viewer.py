@@ -168,7 +168,7 @@ class Viewer(ManagedNode):
         if corrected:
             # The gaps are messages that did not reach the viewer: their ranges are not lost by the radio.
             numbers = np.array([self._last_sequence, *(number for _, number in corrected)], np.int64)
-            dropped = int((np.diff(numbers)[numbers[0] == 0 :] - 1).clip(0).sum())
+            dropped = int((np.diff(numbers)[int(self._last_sequence == 0) :] - 1).clip(0).sum())
             self._last_sequence = int(numbers[-1])
             if dropped and self._has_single_publisher:
                 with self._lock:
