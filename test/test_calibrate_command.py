@@ -474,6 +474,6 @@ def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps
     assert {each.status for each in corrected} == {0}
     error = np.abs([each.range_m for each in corrected] - true_m).mean()
     only_offsets = np.array(
-        [each.range_m - offsets.of(np.array([7]), np.array([each.anchor_id]))[0] for each in held_out]
+        [each.range_m - offsets.lookup(np.array([7]), np.array([each.anchor_id]))[0] for each in held_out]
     )
     assert error < (0.7 if slope else 1.05) * np.abs(only_offsets - true_m).mean()

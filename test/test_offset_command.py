@@ -150,7 +150,7 @@ def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment: Path, tm
     assert not {"12", "14", "5"} & refused
     assert result["ranges"] == sum(pair["ranges"] for pair in result["pairs"])
     offsets = parse_offsets((tmp_path / "o.yaml").read_text(), "o.yaml")
-    assert offsets.of([5], [6])[0] == pytest.approx(result["offset_m"], abs=1e-6)
+    assert offsets.lookup([5], [6])[0] == pytest.approx(result["offset_m"], abs=1e-6)
     assert not offsets.pairs
 
 

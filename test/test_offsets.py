@@ -33,9 +33,9 @@ pairs:
 
 def test_most_specific_offset_applies_and_radio_offsets_add_up():
     offsets = parse_offsets(TEXT, "x")
-    assert offsets.of([7, 7, 8, 7, 8], [1, 31, 1, 9, 9]).tolist() == [1.5, 0.0625, 0.25, -0.0625, 0.5]
+    assert offsets.lookup([7, 7, 8, 7, 8], [1, 31, 1, 9, 9]).tolist() == [1.5, 0.0625, 0.25, -0.0625, 0.5]
     unknown = np.array([8, 2**64 - 1], np.uint64)
-    assert offsets.of(unknown, unknown).tolist() == [0.5, 0.5]
+    assert offsets.lookup(unknown, unknown).tolist() == [0.5, 0.5]
 
 
 def test_written_offsets_are_read_back():
@@ -142,7 +142,7 @@ class Echo:
 
     def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
         (asked,) = measurements
-        offset_m = float(self.offsets.of([asked.tag_id], [asked.anchor_id])[0])
+        offset_m = float(self.offsets.lookup([asked.tag_id], [asked.anchor_id])[0])
         plain = messages.decode(*messages.encode(CORRECTION))
         assert isinstance(plain, Correction)
         return [replace(plain.corrected, range_m=asked.range_m - offset_m, correction_m=offset_m)]

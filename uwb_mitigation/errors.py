@@ -73,27 +73,29 @@ class MissingDependencyError(UwbMitigationError):
     """An optional dependency is not installed."""
 
 
-def did_you_mean(name: object, known: Iterable[object]) -> str:
-    """Return a did-you-mean question with the most similar known names; empty if none is similar."""
-    by_lower_case = {str(each).lower(): str(each) for each in known}
+def did_you_mean(name: object, valid_names: Iterable[object]) -> str:
+    """Return a did-you-mean question with the most similar valid names; empty if none is similar."""
+    by_lower_case = {str(candidate).lower(): str(candidate) for candidate in valid_names}
     close = difflib.get_close_matches(str(name)[:100].lower(), by_lower_case, n=2)
-    return f"did you mean {' or '.join(repr(by_lower_case[each]) for each in close)}?" if close else ""
+    return f"did you mean {' or '.join(repr(by_lower_case[match]) for match in close)}?" if close else ""
 
 
-def check_name(what: str, name: object, known: Iterable[object], where: str = "", valid: str = "") -> None:
-    """Check that `name` is one of the known names.
+def check_name(
+    what: str, name: object, valid_names: Iterable[object], where: str = "", valid: str = ""
+) -> None:
+    """Check that `name` is one of the valid names.
 
     Args:
         what: what has the name, such as "split".
         name: the name, which may be an untrusted value of any type.
-        known: the known names.
+        valid_names: the valid names.
         where: location in the input.
-        valid: text for `valid` of the error; default: the known names.
+        valid: text for `valid` of the error; default: the valid names.
 
     Raises:
         ParameterError: the name is unknown; it suggests similar names.
     """
-    names = list(known)
+    names = list(valid_names)
     if name not in names:
         valid = valid or f"one of {', '.join(map(str, names))}"
         raise ParameterError(

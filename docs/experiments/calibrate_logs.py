@@ -70,7 +70,7 @@ def hanyang(folder: Path, name: str) -> None:
         drive = hanyang_run(other)
         anchors, ranges, truth = drive.anchors, drive.ranges, drive.truth
         ids = np.array([anchor.id for anchor in anchors.anchors], np.uint64)
-        off = found.offsets.of(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
+        off = found.offsets.lookup(np.full(len(ranges), ranges.tag_id), ids[ranges.anchor]).astype(float)
         first = np.array([record.measurement.cir.first_path_power_dbm for record in test])
         line = found.model.linear_bias.predict_m(ranges.rx_power_dbm, first).astype(float)
         less = off + np.where(np.isfinite(line), line, 0.0)

@@ -241,7 +241,7 @@ class Mitigation(Corrector):
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """See `Corrector`."""
         linear_bias, n = self.bundle.linear_bias, len(ranges)
-        offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
+        offset = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
         if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
             return passed
         range_m = _subtract_offset(ranges.range_m, offset)

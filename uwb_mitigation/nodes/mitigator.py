@@ -165,7 +165,7 @@ class Mitigator(ManagedNode):
             ):
                 self.health.other_source = cir.source
             if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
-                (offset_m,) = offsets.of([measurement.tag_id], [measurement.anchor_id])
+                (offset_m,) = offsets.lookup([measurement.tag_id], [measurement.anchor_id])
                 self.health.los_m.append(corrected.correction_m - float(offset_m))
             self._meter.add(now_ns - measurement.stamp_ns)
 

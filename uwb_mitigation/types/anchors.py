@@ -119,15 +119,15 @@ def parse_anchors(text: str, where: str) -> AnchorMap:
     entries = document.get("anchors") if isinstance(document, dict) else None
     if not isinstance(entries, list) or not isinstance(document, dict) or len(document) != 1:
         raise ParameterError("not a list of anchors", where=where, valid=SCHEMA)
-    found = AnchorMap([_anchor(entry, f"{where}: entry {n}") for n, entry in enumerate(entries, 1)], where)
-    spread = np.ptp(found.position, axis=0).max() if len(found) > 1 else 0.0
-    if spread > MILLIMETRES and np.all(found.position == np.rint(found.position)):
+    anchors = AnchorMap([_anchor(entry, f"{where}: entry {n}") for n, entry in enumerate(entries, 1)], where)
+    spread = np.ptp(anchors.position, axis=0).max() if len(anchors) > 1 else 0.0
+    if spread > MILLIMETRES and np.all(anchors.position == np.rint(anchors.position)):
         raise ParameterError(
             f"anchors {spread:g} m apart, all at whole numbers: these look like millimetres",
             where=where,
             valid="metres",
         )
-    return found
+    return anchors
 
 
 def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:

@@ -84,8 +84,8 @@ class Offsets:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Offsets):
             return NotImplemented
-        own_fields, other_fields = ((o.default, o.anchors, o.tags, o.pairs) for o in (self, other))
-        return own_fields == other_fields
+        left, right = ((o.default, o.anchors, o.tags, o.pairs) for o in (self, other))
+        return left == right
 
     def __hash__(self) -> int:
         return hash((self.default, *(frozenset(o.items()) for o in (self.anchors, self.tags, self.pairs))))
@@ -101,7 +101,7 @@ class Offsets:
     def __str__(self) -> str:
         return f"{self.default:g} m" + (f", and {len(self)} of anchors, tags and pairs" if len(self) else "")
 
-    def of(
+    def lookup(
         self, tag_ids: Sequence[int] | NDArray[Any], anchor_ids: Sequence[int] | NDArray[Any]
     ) -> NDArray[np.float32]:
         """Return the offsets of pairs, m: n ids each to float32 (n,)."""

@@ -138,7 +138,7 @@ def share_bar(name: str) -> Iterator[Callable[[float], None]]:
     """Show a progress bar with remaining time; yield a function that sets the completed fraction."""
     with progress() as bar:
         task = bar.add_task(name, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+        yield lambda fraction: bar.update(task, completed=fraction)
 
 
 @contextlib.contextmanager
@@ -155,10 +155,10 @@ def stage_bars() -> Iterator[Callable[[str, float], None]]:
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
 
-        def on_progress(stage: str, share: float) -> None:
+        def on_progress(stage: str, fraction: float) -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=1.0)
-            bar.update(tasks[stage], completed=share)
+            bar.update(tasks[stage], completed=fraction)
 
         yield on_progress
 

@@ -162,7 +162,7 @@ class FirmwareMitigation(Corrector):
 
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """See `Corrector`."""
-        offset = self.offsets.of(ranges.tag_id, ranges.anchor_id)
+        offset = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
         if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
             return passed
         *values, status = zip(

@@ -245,7 +245,7 @@ def _select_model(
     )
     assert raw.tags is not None
     assert raw.anchors is not None
-    data = raw.shifted(-solution.offsets.of(raw.tags, raw.anchors).astype(np.float64))
+    data = raw.shifted(-solution.offsets.lookup(raw.tags, raw.anchors).astype(np.float64))
     data, candidates, notes = site_models(data, site.has_cirs, universal)
     if without_cir := int((~usable_ranges(site)).sum()):
         notes = [f"{without_cir} ranges without a usable CIR are only used for track and offsets", *notes]

@@ -67,7 +67,7 @@ def live_errors(
     Returns:
         {`RAW` or name: error}. Errors are compared at the times at which all have a position.
     """
-    pair_offset = solution.offsets.of(
+    pair_offset = solution.offsets.lookup(
         np.array([tag.tag_id for tag in site.tags], np.uint64)[site.tag],
         np.array([anchor.id for anchor in site.anchors.anchors], np.uint64)[site.ranges.anchor],
     ).astype(np.float64)

@@ -187,7 +187,7 @@ def _predicted_m(mitigation: Mitigation, measured: RangeMeasurement, result: Cor
         return 0.0
     if result.status is not Status.OK:
         return math.nan
-    return result.correction_m - float(mitigation.offsets.of([measured.tag_id], [measured.anchor_id])[0])
+    return result.correction_m - float(mitigation.offsets.lookup([measured.tag_id], [measured.anchor_id])[0])
 
 
 def _is_los(gap_db: float, label: str | None) -> float:
