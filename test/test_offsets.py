@@ -47,7 +47,7 @@ def test_written_offsets_are_read_back():
 
 def test_parameter_is_a_number_or_a_file(tmp_path: Path):
     assert read_offsets("") is NO_OFFSETS
-    assert read_offsets(" 0.22 ").of([1], [2]) == np.float32(0.22)
+    assert read_offsets(" 0.22 ").lookup([1], [2]) == np.float32(0.22)
     path = tmp_path / "offsets.yaml"
     path.write_text(TEXT, encoding="utf-8")
     assert read_offsets(str(path)) == parse_offsets(TEXT, "x")
