@@ -10,6 +10,7 @@ import select
 import sys
 import threading
 import time
+import tty
 import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -112,6 +113,34 @@ def test_modem_manager_ignores_the_boards():
         assert any(all(match in line for match in wanted) for line in ignored), vendor
 
 
+@pytest.mark.parametrize("damage", [b"\x55", b"\x02", b"\x55" * 9])
+@pytest.mark.parametrize("position", [0, 3, 100])
+def test_stray_octets_in_an_answer_repeat_the_request(damage: bytes, position: int):
+    controller, port = os.openpty()
+    tty.setraw(port)
+    answers = {b"deca?": b"yEVB1000 USB2SPI 2.0\0"}
+    remaining = [2]
+
+    def answer(request: bytes) -> bytes:
+        good = answers.get(request, b"\x02\x00" + bytes.fromhex("3001cade") + b"\x03")
+        if request in answers or not remaining[0]:
+            return good
+        remaining[0] -= 1
+        return good[:position] + damage + good[position:]
+
+    with answering(controller, answer):
+        board = bus(os.ttyname(port))()
+        assert board.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade")
+        assert board.repeated == 2
+        assert board.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade")
+        remaining[0] = 3
+        with pytest.raises(LinkError, match=r"the board answered|received"):
+            board.transfer(b"\x00", None, 4)
+        board.close()
+    os.close(controller)
+    os.close(port)
+
+
 def test_board_in_standalone_mode_is_reported_with_the_switch_to_change():
     with (
         EmulatedEvb1000s(None, boards=2, ranging=frozenset({0})) as emulated,
@@ -130,7 +159,10 @@ def test_other_usb_device_is_reported(tmp_path: Path):
     try:
         with pytest.raises(LinkError, match="does not answer deca"):
             bus(os.ttyname(port))()
-        with answering(controller, b"\x02\x05\0"), pytest.raises(LinkError, match=r"answers .* to deca"):
+        with (
+            answering(controller, lambda _: b"\x02\x05\0"),
+            pytest.raises(LinkError, match=r"answers .* to deca"),
+        ):
             bus(os.ttyname(port))()
     finally:
         os.close(controller)
@@ -138,15 +170,14 @@ def test_other_usb_device_is_reported(tmp_path: Path):
 
 
 @contextlib.contextmanager
-def answering(controller: int, answer: bytes) -> Iterator[None]:
-    """A terminal that answers everything with the same bytes."""
+def answering(controller: int, answer: Callable[[bytes], bytes]) -> Iterator[None]:
+    """A terminal that answers each request."""
     stop = threading.Event()
 
     def run() -> None:
         while not stop.is_set():
             if select.select([controller], [], [], 0.05)[0]:
-                os.read(controller, 100)
-                os.write(controller, answer)
+                os.write(controller, answer(os.read(controller, 100)))
 
     thread = threading.Thread(target=run)
     thread.start()

@@ -16,7 +16,7 @@ from benchmarks.equipment.uci_board import FIRST_PATH, UciBoardModel, UciFaults,
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, ParameterError, RecordingError
 from uwb_mitigation.radios.fira import codes, messages
 from uwb_mitigation.radios.fira.capture import FIRST_LINE, CaptureWriter, UciCapture
-from uwb_mitigation.radios.fira.cir import read_cir
+from uwb_mitigation.radios.fira.cir import PositionUnit, read_cir
 from uwb_mitigation.radios.fira.codes import PacketType
 from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher
 from uwb_mitigation.radios.fira.messages import Diagnostics
@@ -274,6 +274,195 @@ def test_a_board_that_restarts_by_itself_ranges_again():
     run.exchange(1)
     assert run.session.starts == 2
     assert run.found
+
+
+class Ending(UciBoardModel):
+    """Ends each session 50 ms after its start, with a reason."""
+
+    reason = 0x02
+    set_calibrations = 0
+
+    def _command(self, name, payload, now_s):
+        self.set_calibrations += name == codes.SET_CALIBRATION
+        answer = super()._command(name, payload, now_s)
+        if name == codes.RANGE_START:
+            self.end_s, self.ending = now_s + 0.05, struct.unpack_from("<I", payload)[0]
+        return answer
+
+    def receive(self, data, now_s):
+        ended = b""
+        if getattr(self, "ending", None) in self.sessions and now_s >= self.end_s:
+            self.sessions[self.ending].active = False
+            status = struct.pack("<IBB", self.ending, 3, self.reason)
+            self.ending, ended = None, self._notify(codes.SESSION_STATUS, status)
+        return ended + super().receive(data, now_s)
+
+
+def test_a_session_that_ends_by_itself_is_started_again_with_growing_pauses_and_without_writes():
+    run = Bench(Ending(), window=157).start()
+    assert run.board.set_calibrations == 2
+    texts = set()
+    for _ in range(int(60 / 0.005)):
+        run.step()
+        texts.add(run.session.state)
+    # After 0.5, 1, 2, 4, 8, 16 and 30 s.
+    assert run.session.counts["restarts"] == 6
+    assert run.board.set_calibrations == run.session.counts["calibration_writes"] == 2
+    (waiting,) = [text for text in texts if text.endswith("after 16 s")]
+    assert "the session with 2: maximum number of measurements (reason 0x02)" in waiting
+    assert not any("no answer to the reset" in text for text in texts)
+
+
+def test_a_refused_start_is_repeated_with_growing_pauses():
+    class Refusing(UciBoardModel):
+        starts = 0
+
+        def _command(self, name, payload, now_s):
+            if name == codes.SESSION_INIT:
+                self.starts += 1
+                return self._respond(name, b"\x14")
+            return super()._command(name, payload, now_s)
+
+    run = Bench(Refusing())
+    for _ in range(int(20 / 0.005)):
+        run.step()
+    assert run.board.starts <= 2 * 6
+    assert "the board refuses SESSION_INIT: too many sessions (status 0x14)" in run.session.state
+
+
+def test_one_session_that_ends_does_not_stop_the_others():
+    run = Bench(peers=(2, 3)).start()
+    first, second = run.board.sessions
+    run.board.sessions[first].active = False
+    run.step(run.board._state(first, 3))
+    assert run.session.state
+    for sequence in range(1, 60):
+        run.step(run.board.exchange(second, sequence, 3.0), 18.0)
+        assert second in run.board.sessions
+    assert run.session.state == ""
+    assert len(run.found) >= 58
+
+
+@pytest.mark.parametrize(
+    ("reason", "text"), [(0x42, "initiation time"), (0x9F, "manufacturer"), (0x77, "unknown")]
+)
+def test_reasons_are_shown_in_words(reason: int, text: str):
+    assert text in codes.reason_text(reason)
+    assert f"0x{reason:02x}" in codes.reason_text(reason)
+
+
+def test_calibration_is_written_only_if_it_differs_and_restored_at_the_end():
+    run = Bench(window=157).start()
+    assert run.session.counts["calibration_writes"] == 2
+    run.session.closed()
+    run.session.opened(run.now_ns)
+    run.start()
+    assert run.session.counts["calibration_writes"] == 2
+    run.session.stop(run.now_ns)
+    while not run.session.stopped:
+        run.step()
+    assert run.board._calibration == UciBoardModel()._calibration
+    assert not run.board.sessions
+    # A board that cannot report a key is not written to.
+    unreadable = UciBoardModel()
+    unreadable._get_calibration = lambda payload: b"\x01"
+    assert Bench(unreadable, window=157).start().session.counts["calibration_writes"] == 0
+
+
+def test_a_window_that_the_board_does_not_accept_is_not_written_again():
+    run = Bench(UciBoardModel(max_taps=64), window=157).start()
+    for _ in range(3):
+        run.session.closed()
+        run.session.opened(run.now_ns)
+        run.start()
+    assert run.session.counts["calibration_writes"] == 2
+    assert run.session.window == (64, 5)
+
+
+def test_a_mandatory_parameter_that_is_refused_is_named():
+    class Strict(UciBoardModel):
+        def _command(self, name, payload, now_s):
+            if name == codes.SET_APP_CONFIG:
+                return self._respond(name, bytes([0x04, 1, 0x06, 0x05]))
+            return super()._command(name, payload, now_s)
+
+    run = Bench(Strict())
+    for _ in range(200):
+        run.step()
+    assert "DEVICE_MAC_ADDRESS (0x06): value out of range (status 0x05)" in run.session.state
+
+
+def test_ranges_are_published_in_order_and_soon_after_a_lost_cir():
+    run = Bench().start()
+    (handle,) = run.board.sessions
+    for sequence in range(1, 41):
+        run.exchange(sequence)
+    run.step(run.board.range_packet(handle, 41, 3.0), 18)
+    run.step(run.board.exchange(handle, 42, 3.0), 2.0)
+    arrived_ns = run.now_ns
+    while run.found[-1].sequence < 42:
+        run.step(ms=1.0)
+    assert run.now_ns - arrived_ns <= 6 * MS
+    assert [m.sequence for m in run.found] == sorted(m.sequence for m in run.found)
+    assert [len(m.cir) for m in run.found[-2:]] == [0, 16]
+
+
+def test_repeated_notifications_are_published_once():
+    run = Bench().start()
+    (handle,) = run.board.sessions
+    for sequence in range(1, 101):
+        packets = (
+            run.board.range_packet(handle, sequence, 3.0),
+            run.board.diagnostics_packet(handle, sequence),
+        )
+        run.step(2 * packets[0] + 2 * packets[1], 18)
+    assert [m.sequence for m in run.found] == list(range(1, 101))
+    assert all(len(m.cir) == 16 for m in run.found)
+    assert run.session.counts["duplicates"] == 200
+
+
+def test_of_two_primary_segments_the_sts_is_used():
+    blocks = [messages.CirBlock(0, segment, True, -5, taps_of(segment + 1, 16, 5)) for segment in (0, 1)]
+    metrics = [
+        messages.SegmentMetrics(0, segment, True, -80.0 - segment, -84.0, index, index + 0.5, index + 1)
+        for segment, index in ((0, 739), (1, 362))
+    ]
+    frame = messages.FrameReport(1, True, None, 0.0, tuple(metrics), tuple(blocks), False)
+    cir = read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan).cir
+    assert (cir.segment, cir.start_index, cir.rx_power_dbm) == (Segment.STS, 357, -81.0)
+    assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 16, 5))
+
+
+@pytest.mark.parametrize(
+    ("index", "scale", "unit"),
+    [
+        (362, 1.0, "taps"),
+        (362, 1.0016, "nanoseconds"),
+        (739, 1.0016, "nanoseconds"),
+        (739, 1.0, "taps"),
+        (362, 1.02, "contradictory"),
+    ],
+)
+def test_first_path_positions_are_in_taps_or_nanoseconds(index: int, scale: float, unit: str):
+    position_unit, errors = PositionUnit(), []
+    for number in range(64):
+        first_path = index + number * 37 % 64 / 64
+        reported = round(64 * first_path * scale) / 64
+        block = messages.CirBlock(0, 1, True, -5, taps_of(number, 16, 5))
+        metrics = messages.SegmentMetrics(0, 1, True, -80.0, -84.0, index, reported, index + 1)
+        frame = messages.FrameReport(1, True, None, 0.0, (metrics,), (block,), False)
+        report = read_cir(Diagnostics(1, number, (frame,)), 9, np.nan, position_unit)
+        errors.append(report.cir.first_path_index - first_path)
+    assert position_unit.name == unit
+    assert np.abs(errors[8:]).max() < (0.02 if unit != "contradictory" else 1.0)
+
+
+def test_a_first_path_before_which_the_signal_rises_is_a_contradiction():
+    taps = taps_of(1, 64, 5)
+    for offset, consistent in ((-5, True), (-8, False), (-3, False), (-40, False)):
+        block = messages.CirBlock(0, 1, True, offset, taps)
+        frame = messages.FrameReport(2, True, None, 0.0, (), (block,), False)
+        assert read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan).consistent is consistent, offset
 
 
 def test_a_silent_board_is_started_again_but_a_waiting_anchor_is_not():

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import signal
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import ros_harness
+from port_events import PortEvents, wait_until
 from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import Cir, RangeCir, RangeCorrected
 
@@ -16,8 +18,12 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.radios import uci
+from uwb_mitigation.radios.fira.session import UciSettings
+from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import Role
-from uwb_mitigation.radios.uci import read_settings
+from uwb_mitigation.radios.uci import UciPortSettings, read_settings
+from uwb_mitigation.types.measurement import RangeMeasurement
 
 DEFAULTS = {row.name: row.default for row in DRIVER}
 
@@ -37,11 +43,14 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     ros.start("mitigator", "offsets:=0.5")
     ports = ",".join(str(tmp_path / f"uci{number}") for number in range(3))
     capture = tmp_path / "capture.txt"
-    node = ros.start("driver", "source:=uci", f"port:={ports}", "radio.window:=16", f"capture:={capture}")
+    options = ("radio.window:=16", "radio.anchors:=[2, 3]", f"capture:={capture}")
+    node = ros.start("driver", "source:=uci", f"port:={ports}", *options)
     ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in raw} and len(raw) > 20, 60.0)
     assert {len(message.cir.samples) for message in raw} == {32}
     assert all(abs(message.range - 3.0) < 0.2 for message in raw)
 
+    node.wait_for_output("only with model:=dw3000_sts")
+    assert node.output.count("model:=dw3000_sts") == 1
     status = ros.diagnosis("driver", lambda status: "ranging" in status.message)
     assert diagnostic_values(status)["radio 0: CIR taps"] == "16"
 
@@ -75,6 +84,41 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
 
 
+def open_pair(links: Path) -> list[PortEvents]:
+    boards = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
+    return [
+        PortEvents(uci, UciPortSettings(PortAddress(f"{links}{number}"), board))
+        for number, board in enumerate(boards)
+    ]
+
+
+def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(boards: EmulatedUciBoards, tmp_path: Path):
+    tag, anchor = open_pair(tmp_path / "uci")
+    with tag:
+        with anchor:
+            tag.wait_for(RangeMeasurement, 5)
+            assert tag.port.report().warning == ""
+            boards.set_faults(UciFaults(offset_m=-3.0))
+            wait_until(lambda: "negative distance" in tag.port.report().warning)
+            assert "antenna delay" in tag.port.report().warning
+            boards.set_faults(UciFaults())
+            wait_until(lambda: tag.port.report().warning == "")
+        wait_until(lambda: tag.port.report().warning.startswith("no range for 3."))
+        assert "reception timeout: are the other boards on" in tag.port.report().warning
+
+
+def test_the_calibration_of_a_board_is_restored_when_its_port_is_closed(
+    boards: EmulatedUciBoards, tmp_path: Path
+):
+    before = [dict(model._calibration) for model in boards._models]
+    tag, anchor = open_pair(tmp_path / "uci")
+    with tag, anchor:
+        tag.wait_for(RangeMeasurement, 3)
+        assert boards._models[0]._calibration != before[0]
+    assert [model._calibration for model in boards._models] == before
+    assert not boards._models[0].sessions
+
+
 def value_of(**changes: object):
     values = DEFAULTS | {name.replace("__", "."): value for name, value in changes.items()}
     return values.__getitem__
@@ -90,6 +134,14 @@ def test_the_first_board_is_the_tag_of_the_others():
     assert (other.role, other.address, other.peers) == (Role.ANCHOR, 3, (1,))
     assert tag.effective_interval_ms == anchor.effective_interval_ms == 100
     assert tag.session_id(3) == other.session_id(1)
+
+
+@pytest.mark.parametrize("anchors", [[3, 4], ["3", "0x4"], "3,4", array("q", [3, 4])])
+def test_anchors_are_a_list_or_a_text(anchors: object):
+    row = next(row for row in DRIVER if row.name == "radio.anchors")
+    row.check(anchors)
+    (tag,) = uci_settings(value_of(port="/dev/a", radio__anchors=anchors))
+    assert tag.peers == (3, 4)
 
 
 def test_boards_at_two_computers_have_matching_settings():

@@ -137,7 +137,7 @@ def _read(frame: FrameReport, cir: Cir, unit: PositionUnit) -> CirReport:
 
 def _edge_fits(amplitude: NDArray[np.float64], lead: int) -> bool:
     """Return whether the amplitude rises at the reported first path, and not before; True without taps before it."""
-    before, edge = amplitude[: max(lead - 1, 0)], amplitude[max(lead - 1, 0) : lead + 3]
+    before, edge = amplitude[: max(lead - 1, 0)], amplitude[max(lead - 1, 0) : lead + 2]
     if not len(before):
         return True
     noise = float(np.sqrt(np.mean(before**2)))
