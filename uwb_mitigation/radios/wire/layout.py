@@ -1,6 +1,6 @@
 """Tables of the wire protocol: frame header, message types, fields, limits.
 
-`messages` encodes and decodes with these tables; `docs/generated.py` generates the protocol's page and the C header
+`messages` packs and unpacks the fields in their order; `docs/generated.py` generates the protocol's page and the C header
 `firmware/src/uwb_protocol.h` from them. All integers and floats are little-endian. Every field is aligned to its own
 size and every fixed part is a multiple of 8 bytes long, so that a microcontroller can read a decoded frame in place.
 """
@@ -10,12 +10,7 @@ from __future__ import annotations
 import enum
 import itertools
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
-
-from uwb_mitigation.radios.settings import RadioState, Role
-from uwb_mitigation.types.measurement import DEVICE_TIME_WRAP, Encoding, Status
 
 PROTOCOL_VERSION = 1
 """First byte of every frame. Its position and that of the CRC are the same in all versions."""
@@ -91,22 +86,11 @@ class Field:
         name: name in the protocol and in C.
         code: format of `struct`; reserved bytes are `nx`.
         description: description, with the unit.
-        attribute: attribute of the message or of an object in it, such as a CIR; empty = `name`.
-        convert: converter of the decoded number, such as an enumeration; raises ValueError for invalid numbers.
-        computed: the field describes the tail (a length or a position) and is no attribute.
     """
 
     name: str
     code: str
     description: str
-    attribute: str = ""
-    convert: Callable[[int], Any] | None = None
-    computed: bool = False
-
-    @property
-    def is_text(self) -> bool:
-        """Whether the field is UTF-8 of fixed length, padded with zeros."""
-        return self.code.endswith("s")
 
 
 class Layout:
@@ -125,31 +109,15 @@ class Layout:
         """Return the fixed part as a `struct.Struct`; reserved bytes have no value."""
         return struct.Struct("<" + "".join(field.code for field in self.fields))
 
-    @property
-    def value_fields(self) -> tuple[Field, ...]:
-        """The fields without reserved bytes: those with a value in `as_struct`."""
-        return tuple(field for field in self.fields if not field.code.endswith("x"))
-
     def offsets(self) -> dict[str, int]:
         """Return {field name: byte offset}, without reserved bytes."""
         sizes = [struct.calcsize("<" + field.code) for field in self.fields]
         starts = itertools.accumulate(sizes, initial=0)
         return {
-            field.name: at
-            for field, at in zip(self.fields, starts, strict=False)
-            if field in self.value_fields
+            field.name: start
+            for field, start in zip(self.fields, starts, strict=False)
+            if not field.code.endswith("x")
         }
-
-
-def device_time(ticks: int) -> int:
-    """Return `ticks` unchanged.
-
-    Raises:
-        ValueError: it has more than 40 bits.
-    """
-    if ticks >= DEVICE_TIME_WRAP:
-        raise ValueError("40 bits")
-    return ticks
 
 
 HEADER = Layout(
@@ -173,17 +141,17 @@ _RADIO_SETTINGS = (
     ),
     Field("interval_us", "I", "minimum time between the starts of two exchanges"),
     Field("pan", "H", "network; frames of other networks are ignored"),
-    Field("rate", "H", "kbit/s: 110, 850, 6800", "rate_kbps"),
+    Field("rate", "H", "kbit/s: 110, 850, 6800"),
     Field("preamble", "H", "symbols: 64 to 4096"),
     Field("window", "H", "complex samples per measurement; 0 = none, 1016 and more = all"),
     Field("channel", "B", "1 to 5, 7"),
-    Field("prf", "B", "MHz: 16, 64", "prf_mhz"),
+    Field("prf", "B", "MHz: 16, 64"),
     Field("preamble_code", "B", "0 = the first for channel and PRF"),
-    Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's", convert=bool),
-    Field("role", "B", "Role", convert=Role),
-    Field("report", "B", "1 = an anchor also sends its ranges to its host", convert=bool),
-    Field("bias_correction", "B", "1 = ranges are corrected for the received power (APS011)", convert=bool),
-    Field("anchor_count", "B", "anchors that a tag polls; 0 = anchors found by broadcast", computed=True),
+    Field("decawave_sfd", "B", "0 = the standard's start-of-frame delimiter, 1 = Decawave's"),
+    Field("role", "B", "Role"),
+    Field("report", "B", "1 = an anchor also sends its ranges to its host"),
+    Field("bias_correction", "B", "1 = ranges are corrected for the received power (APS011)"),
+    Field("anchor_count", "B", "anchors that a tag polls; 0 = anchors found by broadcast"),
     Field("reserved_2", "4x", ""),
 )
 """Common fields of RADIO and SET_RADIO."""
@@ -224,7 +192,7 @@ _TABLES = (
         Field("firmware_major", "B", "firmware version"),
         Field("firmware_minor", "B", ""),
         Field("firmware_patch", "B", ""),
-        Field("mode", "B", "active Mode", convert=Mode),
+        Field("mode", "B", "active Mode"),
         Field("reserved", "4x", ""),
         Field("firmware_name", "16s", "UTF-8, padded with zeros"),
     ),
@@ -236,23 +204,22 @@ _TABLES = (
             "device_time",
             "Q",
             "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits",
-            convert=device_time,
         ),
         Field("sequence", "I", "number of the exchange; wraps"),
-        Field("range", "f", "m, measured; NaN = no range", "range_m"),
-        Field("sample_period", "f", "s", "sample_period_s"),
+        Field("range", "f", "m, measured; NaN = no range"),
+        Field("sample_period", "f", "s"),
         Field("first_path_index", "f", "accumulator index; NaN = unknown"),
         Field("scale", "f", "accumulator units per count of samples"),
-        Field("rx_power", "f", "dBm; NaN = unknown", "rx_power_dbm"),
-        Field("first_path_power", "f", "dBm; NaN = unknown", "first_path_power_dbm"),
+        Field("rx_power", "f", "dBm; NaN = unknown"),
+        Field("first_path_power", "f", "dBm; NaN = unknown"),
         Field("start_index", "i", "accumulator index of the first sample"),
         Field("preamble_count", "H", "RXPACC; 0 = unknown"),
         Field("noise_threshold", "H", "LDE_THRESH, accumulator units; 0 = unknown"),
-        Field("samples_offset", "H", "bytes from the payload's start to the samples; even", computed=True),
-        Field("sample_count", "H", "int16 values: two per complex sample", computed=True),
-        Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude", convert=Encoding),
+        Field("samples_offset", "H", "bytes from the payload's start to the samples; even"),
+        Field("sample_count", "H", "int16 values: two per complex sample"),
+        Field("encoding", "B", "0 = complex, interleaved re, im; 1 = magnitude"),
         Field("channel", "B", "UWB channel; 0 = unknown"),
-        Field("prf", "B", "MHz: 16 or 64; 0 = unknown", "prf_mhz"),
+        Field("prf", "B", "MHz: 16 or 64; 0 = unknown"),
         Field("reserved", "5x", ""),
         tail="samples, int16, from samples_offset",
     ),
@@ -260,27 +227,22 @@ _TABLES = (
         "RANGE_CORRECTED",
         Field("tag_id", "Q", "as in the measurement"),
         Field("anchor_id", "Q", "as in the measurement"),
-        Field("device_time", "Q", "as in the measurement, 40 bits", convert=device_time),
+        Field("device_time", "Q", "as in the measurement, 40 bits"),
         Field("sequence", "I", "as in the measurement"),
         Field("model_id", "I", "identity of the model that corrected; 0 = none"),
-        Field("range", "f", "m, corrected; NaN = no valid range", "range_m"),
-        Field("range_raw", "f", "m, as measured", "range_raw_m"),
+        Field("range", "f", "m, corrected; NaN = no valid range"),
+        Field("range_raw", "f", "m, as measured"),
         Field(
-            "correction",
-            "f",
-            "m, offset + predicted error; only the offset if the range is passed through",
-            "correction_m",
+            "correction", "f", "m, offset + predicted error; only the offset if the range is passed through"
         ),
-        Field("variance", "f", "m^2; infinite if the range is invalid", "variance_m2"),
+        Field("variance", "f", "m^2; infinite if the range is invalid"),
         Field("compute_us", "I", "time that the correction took on the board"),
-        Field(
-            "status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR", convert=Status
-        ),
+        Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR"),
         Field("reserved", "3x", ""),
     ),
     Layout(
         "LOG",
-        Field("level", "B", "LogLevel", convert=LogLevel),
+        Field("level", "B", "LogLevel"),
         Field("reserved", "7x", ""),
         tail="text, UTF-8, to the payload's end",
     ),
@@ -290,8 +252,8 @@ _TABLES = (
         Field("frames_dropped", "I", "damaged or unknown frames from the host since the start"),
         Field("measurements", "I", "exchanges since the start"),
         Field("measurements_lost", "I", "exchanges not sent because the link was full"),
-        Field("temperature", "f", "degrees Celsius; NaN = not measured", "temperature_c"),
-        Field("mode", "B", "active Mode", convert=Mode),
+        Field("temperature", "f", "degrees Celsius; NaN = not measured"),
+        Field("mode", "B", "active Mode"),
         Field("reserved", "3x", ""),
     ),
     Layout(
@@ -303,7 +265,7 @@ _TABLES = (
     Layout(
         "RADIO",
         Field("request_sequence", "I", "with ANSWER: sequence of the host's frame answered"),
-        Field("accepted", "B", "0 = SET_RADIO was refused; the text contains the reason", convert=bool),
+        Field("accepted", "B", "0 = SET_RADIO was refused; the text contains the reason"),
         Field("reserved", "3x", ""),
         *_RADIO_SETTINGS,
         tail="anchor_count addresses, u64, then text, UTF-8, to the payload's end",
@@ -320,10 +282,10 @@ _TABLES = (
         Field("broken", "I", "lost: the chip was reset, or its bus failed"),
         Field("refused", "I", "frames that do not belong to an exchange of this radio"),
         Field("restarts", "I", "restarts of the chip after the first"),
-        Field("temperature", "f", "degrees Celsius, in the chip; NaN = not measured", "temperature_c"),
+        Field("temperature", "f", "degrees Celsius, in the chip; NaN = not measured"),
         Field("voltage", "f", "V, supply of the chip; NaN = not measured"),
-        Field("state", "B", "RadioState", convert=RadioState),
-        Field("anchor_count", "B", "anchors in the tail", computed=True),
+        Field("state", "B", "RadioState"),
+        Field("anchor_count", "B", "anchors in the tail"),
         Field("reserved", "6x", ""),
         tail="anchor_count times RADIO_ANCHOR",
     ),
@@ -331,24 +293,27 @@ _TABLES = (
         "OFFSETS",
         Field("request_sequence", "I", "sequence of the SET_OFFSETS answered"),
         Field("slots", "H", "offsets that the board can store in addition to the default"),
-        Field("accepted", "B", "0 = too many: the previous offsets stay in use", convert=bool),
+        Field("accepted", "B", "0 = too many: the previous offsets stay in use"),
         Field("reserved", "1x", ""),
     ),
     Layout("GET_INFO"),
-    Layout("SET_MODE", Field("mode", "B", "requested Mode", convert=Mode), Field("reserved", "7x", "")),
+    Layout("SET_MODE", Field("mode", "B", "requested Mode"), Field("reserved", "7x", "")),
     Layout("TIME_SYNC"),
     Layout("GET_RADIO"),
     Layout("SET_RADIO", *_RADIO_SETTINGS, tail="anchor_count addresses, u64"),
     Layout(
         "SET_OFFSETS",
-        Field("default_offset", "f", "m, for pairs without an offset in the tail, -10 to 10", "default"),
-        Field("count", "H", "offsets in the tail", computed=True),
+        Field("default_offset", "f", "m, for pairs without an offset in the tail, -10 to 10"),
+        Field("count", "H", "offsets in the tail"),
         Field("reserved", "2x", ""),
         tail="count times OFFSET",
     ),
 )
 PAYLOADS = {MessageType[table.name]: table for table in _TABLES}
 """Every message type and its payload. A payload may be longer than its layout, never shorter."""
+
+STRUCTS = {int(kind): table.as_struct() for kind, table in PAYLOADS.items()}
+"""The fixed part of every payload."""
 
 HEADER_BYTES = HEADER.as_struct().size
 MAX_FRAME_BYTES = HEADER_BYTES + MAX_PAYLOAD_BYTES + CRC_BYTES

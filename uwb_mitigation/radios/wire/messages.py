@@ -1,28 +1,40 @@
-"""Messages, and the encoding and decoding of their payloads with the tables of `layout`. No I/O.
+"""Messages, and the encoding and decoding of their payloads, whose fields are declared in `layout`. No I/O.
 
-A measurement is sent as `RangeMeasurement` itself. Floats are IEEE-754 binary32 on the wire, as in the ROS messages:
+Each function packs or unpacks the fields in the order of its table. A measurement is sent as `RangeMeasurement` itself. Floats are IEEE-754 binary32 on the wire, as in the ROS messages:
 a correction computed on either side of the link starts from the same bits.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import math
 import struct
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from functools import partial
-from operator import attrgetter
-from typing import Any
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from uwb_mitigation.errors import LinkError, ParameterError
-from uwb_mitigation.radios.settings import MAX_ANCHORS, AnchorStatus, RadioSettings, RadioStatus
+from uwb_mitigation.radios.settings import (
+    MAX_ANCHORS,
+    AnchorStatus,
+    RadioSettings,
+    RadioState,
+    RadioStatus,
+    Role,
+)
 from uwb_mitigation.radios.wire import layout
-from uwb_mitigation.radios.wire.layout import Field, LogLevel, MessageType, Mode, OffsetScope
-from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement
+from uwb_mitigation.radios.wire.layout import LogLevel, MessageType, Mode, OffsetScope
+from uwb_mitigation.types.measurement import (
+    DEVICE_TIME_WRAP,
+    Cir,
+    CorrectedBy,
+    CorrectedRange,
+    Encoding,
+    RangeMeasurement,
+    Status,
+)
 from uwb_mitigation.types.offsets import Offsets
 
 
@@ -181,8 +193,6 @@ Message = (
     | SetOffsets
 )
 
-Values = dict[str, Any]
-
 
 def encode(message: Message) -> tuple[MessageType, bytes]:
     """Return the message's type and payload.
@@ -192,12 +202,12 @@ def encode(message: Message) -> tuple[MessageType, bytes]:
     Raises:
         ParameterError: a value does not fit its field.
     """
-    codec = _by_class[type(message)]
+    kind, pack = _ENCODERS[type(message)]
     try:
-        return codec.kind, codec.encode(message)
+        return kind, pack(message)
     except (struct.error, OverflowError) as error:
-        kind = type(message).__name__
-        raise ParameterError(f"a value of {kind} does not fit its field: {error}") from error
+        name = type(message).__name__
+        raise ParameterError(f"a value of {name} does not fit its field: {error}") from error
 
 
 def decode(kind: int, payload: bytes, *, stamp_ns: int = 0) -> Message | None:
@@ -209,231 +219,238 @@ def decode(kind: int, payload: bytes, *, stamp_ns: int = 0) -> Message | None:
     Raises:
         LinkError: the payload is too short for its type, or a field has a value outside its range.
     """
-    codec = _by_type.get(kind)
-    return None if codec is None else codec.decode(payload, stamp_ns)
+    if kind not in _DECODERS:
+        return None
+    name, size = MessageType(kind).name, layout.STRUCTS[kind].size
+    if len(payload) < size:
+        raise LinkError(f"a payload of {len(payload)} bytes", where=name, valid=f"at least {size}")
+    try:
+        message = _DECODERS[kind](layout.STRUCTS[kind].unpack_from(payload), payload, stamp_ns)
+    except (LinkError, ParameterError) as error:
+        raise LinkError(error.what, where=name, valid=error.valid) from error
+    return message
 
 
-class _Tail:
-    """Tail after the fixed part: rows of equal size, then text; empty by default.
-
-    Args:
-        row: format of a row for `struct`; empty = no rows.
-        count: name of the field with the number of rows.
-        max_rows: a larger number is invalid.
-        rows: returns the rows of a message.
-        attributes: returns the attributes in decoded rows.
-        has_text: the rest of the payload is the attribute `text`.
-    """
-
-    def __init__(
-        self,
-        row: struct.Struct | None = None,
-        count: str = "anchor_count",
-        max_rows: int = MAX_ANCHORS,
-        rows: Callable[[Any], Iterable[tuple[Any, ...]]] = lambda _: (),
-        attributes: Callable[[Iterable[tuple[Any, ...]]], Values] = lambda _: {},
-        has_text: bool = False,
-    ) -> None:
-        self._row, self._count, self._max_rows = row, count, max_rows
-        self._rows, self._attributes, self._has_text = rows, attributes, has_text
-
-    def encode(self, message: Any) -> tuple[Values, bytes]:
-        """Return the computed fields of the fixed part, and the bytes of the tail."""
-        rows = [self._row.pack(*row) for row in self._rows(message)] if self._row else []
-        text = message.text.encode("utf-8", "replace") if self._has_text else b""
-        return {self._count: len(rows)}, b"".join(rows) + text
-
-    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
-        """Return the attributes in the tail, which begins at byte `start`; raise LinkError if it is invalid."""
-        values: Values = {}
-        if self._row is not None:
-            count = computed[self._count]
-            end = start + count * self._row.size
-            if count > self._max_rows or end > len(payload):
-                raise LinkError(
-                    f"{count} rows of {self._row.size} bytes in a payload of {len(payload)} bytes",
-                    valid=f"at most {self._max_rows}, from byte {start}",
-                )
-            values = self._attributes(self._row.iter_unpack(payload[start:end]))
-            start = end
-        if self._has_text:
-            values["text"] = payload[start:].decode("utf-8", "replace")
-        return values
+_Member = TypeVar("_Member", bound=enum.IntEnum)
 
 
-class _Samples(_Tail):
-    def encode(self, message: RangeMeasurement) -> tuple[Values, bytes]:
-        samples = message.cir.samples
-        if len(samples) > layout.MAX_SAMPLES:
-            raise ParameterError(
-                f"a CIR of {len(samples)} values", where="RANGE_CIR", valid=f"at most {layout.MAX_SAMPLES}"
-            )
-        computed = {"samples_offset": _by_type[MessageType.RANGE_CIR].size, "sample_count": len(samples)}
-        return computed, np.asarray(samples, dtype="<i2").tobytes()
-
-    def decode(self, payload: bytes, start: int, computed: Values) -> Values:
-        at, count = computed["samples_offset"], computed["sample_count"]
-        if count > layout.MAX_SAMPLES or at < start or at % 2 or at + 2 * count > len(payload):
-            raise LinkError(
-                f"{count} samples at byte {at} of a payload of {len(payload)} bytes",
-                where="RANGE_CIR",
-                valid=f"at most {layout.MAX_SAMPLES}, inside the payload, at an even byte from {start}",
-            )
-        return {"samples": np.frombuffer(payload, "<i2", count, at)}
+def _member(kind: type[_Member], value: int) -> _Member:
+    """Return a member of an enumeration; raise LinkError for an invalid value."""
+    try:
+        return kind(value)
+    except ValueError:
+        valid = ", ".join(f"{member.value} {member.name}" for member in kind)
+        raise LinkError(f"the value {value} of {kind.__name__}", valid=valid) from None
 
 
-def _anchors_tail(has_text: bool) -> _Tail:
-    return _Tail(
-        struct.Struct("<Q"),
-        rows=lambda message: ((address,) for address in message.settings.anchors),
-        attributes=lambda rows: {"anchors": tuple(address for (address,) in rows)},
-        has_text=has_text,
-    )
-
-
-def _offsets_to_rows(message: SetOffsets) -> Iterator[tuple[int, int, float, OffsetScope]]:
-    offsets = message.offsets
-    yield from ((tag, anchor, m, OffsetScope.PAIR) for (tag, anchor), m in offsets.pairs.items())
-    yield from ((0, anchor, m, OffsetScope.ANCHOR) for anchor, m in offsets.anchors.items())
-    yield from ((tag, 0, m, OffsetScope.TAG) for tag, m in offsets.tags.items())
-
-
-def _decode_offsets(rows: Iterable[tuple[Any, ...]]) -> Values:
-    found: dict[str, dict[Any, float]] = {"anchors": {}, "tags": {}, "pairs": {}}
-    for tag, anchor, offset_m, kind in rows:
-        if kind not in set(OffsetScope):
-            raise LinkError(f"an offset of {kind}", where="SET_OFFSETS", valid="0 to 2")
-        name = f"{OffsetScope(kind).name.lower()}s"
-        found[name].setdefault({"anchors": anchor, "tags": tag}.get(name, (tag, anchor)), offset_m)
-    return found
-
-
-class _Codec:
-    """Encodes and decodes the payloads of one type of message.
-
-    Args:
-        kind: type of the message.
-        message_class: class of the message.
-        inner: name and class of an attribute whose own attributes are fields of the payload.
-        tail: tail after the fixed part.
-
-    Attributes:
-        size: bytes of the fixed part.
-    """
-
-    def __init__(
-        self,
-        kind: MessageType,
-        message_class: type,
-        inner: tuple[str, Callable[..., Any]] = ("", dict),
-        tail: _Tail | None = None,
-    ) -> None:
-        table = layout.PAYLOADS[kind]
-        self.kind = kind
-        self.message_class, self._inner, self._tail = message_class, inner, tail or _Tail()
-        self._class_attributes = {attribute.name for attribute in dataclasses.fields(message_class)}
-        self._struct = table.as_struct()
-        self.size = self._struct.size
-        self._names = [field.attribute or field.name for field in table.value_fields]
-        self._getters = [(field.name, self._getter(field)) for field in table.value_fields]
-        self._converted = [
-            (field.attribute or field.name, field)
-            for field in table.value_fields
-            if field.convert is not None or field.is_text
-        ]
-        self._computed = [field.name for field in table.value_fields if field.computed]
-        self._inner_names = [
-            name for name in self._names if name not in (*self._class_attributes, *self._computed)
-        ]
-
-    def _getter(self, field: Field) -> Callable[[Any], Any] | None:
-        if field.computed:
-            return None
-        name = field.attribute or field.name
-        get = attrgetter(name if name in self._class_attributes else f"{self._inner[0]}.{name}")
-        return (lambda message: _truncate_utf8(get(message), int(field.code[:-1]))) if field.is_text else get
-
-    def encode(self, message: Any) -> bytes:
-        """Return the payload; raise struct.error or OverflowError if a value does not fit its field."""
-        computed, tail = self._tail.encode(message)
-        values = [computed[name] if get is None else get(message) for name, get in self._getters]
-        return self._struct.pack(*values) + tail
-
-    def decode(self, payload: bytes, stamp_ns: int) -> Message:
-        """Return the message in `payload`; raise LinkError if it contains none."""
-        if len(payload) < self.size:
-            raise LinkError(
-                f"a payload of {len(payload)} bytes", where=self.kind.name, valid=f"at least {self.size}"
-            )
-        values: Values = dict(zip(self._names, self._struct.unpack_from(payload), strict=True))
-        for name, field in self._converted:
-            values[name] = self._convert(field, values[name])
-        computed = {name: values.pop(name) for name in self._computed}
-        if "stamp_ns" in self._class_attributes:
-            values["stamp_ns"] = stamp_ns
-        try:
-            tail = self._tail.decode(payload, self.size, computed)
-            attribute, inner_class = self._inner
-            if attribute:
-                inner = {name: values.pop(name) for name in self._inner_names}
-                inner |= {name: tail.pop(name) for name in [*tail] if name not in self._class_attributes}
-                values[attribute] = inner_class(**inner)
-            message: Message = self.message_class(**values, **tail)
-        except (LinkError, ParameterError) as error:
-            raise LinkError(error.what, where=self.kind.name, valid=error.valid) from error
-        return message
-
-    def _convert(self, field: Field, value: Any) -> Any:
-        if field.convert is None:
-            return value.rstrip(b"\0").decode("utf-8", "replace")
-        try:
-            return field.convert(value)
-        except ValueError as error:
-            valid = str(error)
-            if isinstance(field.convert, type(enum.IntEnum)):
-                valid = ", ".join(f"{number} {name}" for name, number in field.convert.__members__.items())
-            where = f"{self.kind.name} {field.name}"
-            raise LinkError(f"the value {value}", where=where, valid=valid) from None
-
-
-_CODECS = (
-    _Codec(MessageType.HELLO, Hello),
-    _Codec(MessageType.RANGE_CIR, RangeMeasurement, ("cir", Cir), _Samples()),
-    _Codec(
-        MessageType.RANGE_CORRECTED,
-        Correction,
-        ("corrected", partial(CorrectedRange, origin=CorrectedBy.DEVICE)),
-    ),
-    _Codec(MessageType.LOG, Log, tail=_Tail(has_text=True)),
-    _Codec(MessageType.STATUS, BoardStatus),
-    _Codec(MessageType.TIME_SYNC_REPLY, TimeSyncReply),
-    _Codec(MessageType.RADIO, RadioConfigured, ("settings", RadioSettings), _anchors_tail(has_text=True)),
-    _Codec(
-        MessageType.RADIO_STATUS,
-        RadioStatus,
-        tail=_Tail(
-            layout.RADIO_ANCHOR.as_struct(),
-            rows=lambda status: map(dataclasses.astuple, status.anchors),
-            attributes=lambda rows: {"anchors": tuple(AnchorStatus(*row) for row in rows)},
-        ),
-    ),
-    _Codec(MessageType.OFFSETS, OffsetsAnswer),
-    _Codec(MessageType.GET_INFO, GetInfo),
-    _Codec(MessageType.SET_MODE, SetMode),
-    _Codec(MessageType.TIME_SYNC, TimeSync),
-    _Codec(MessageType.GET_RADIO, GetRadio),
-    _Codec(MessageType.SET_RADIO, SetRadio, ("settings", RadioSettings), _anchors_tail(has_text=False)),
-    _Codec(
-        MessageType.SET_OFFSETS,
-        SetOffsets,
-        ("offsets", Offsets),
-        _Tail(layout.OFFSET.as_struct(), "count", 0xFFFF, _offsets_to_rows, _decode_offsets),
-    ),
-)
-_by_type: dict[int, _Codec] = {codec.kind: codec for codec in _CODECS}
-_by_class = {codec.message_class: codec for codec in _CODECS}
+def _device_time(ticks: int) -> int:
+    if ticks >= DEVICE_TIME_WRAP:
+        raise LinkError(f"a device time of {ticks}", valid="40 bits")
+    return ticks
 
 
 def _truncate_utf8(text: str, size: int) -> bytes:
     """Return at most `size` bytes of UTF-8, without a partial character at the end."""
     return text.encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()
+
+
+def _rows(row: struct.Struct, count: int, maximum: int, payload: bytes, start: int) -> list[tuple[Any, ...]]:
+    """Return the rows of a tail; raise LinkError if it does not contain them."""
+    end = start + count * row.size
+    if count > maximum or end > len(payload):
+        raise LinkError(
+            f"{count} rows of {row.size} bytes in a payload of {len(payload)} bytes",
+            valid=f"at most {maximum}, from byte {start}",
+        )
+    return list(row.iter_unpack(payload[start:end]))
+
+
+_HELLO, _RANGE_CIR, _CORRECTED, _LOG, _STATUS, _SYNC, _RADIO, _RADIO_STATUS, _OFFSETS = (
+    layout.STRUCTS[kind] for kind in list(MessageType)[:9]
+)
+_SET_MODE, _SET_RADIO, _SET_OFFSETS = (
+    layout.STRUCTS[kind] for kind in (MessageType.SET_MODE, MessageType.SET_RADIO, MessageType.SET_OFFSETS)
+)
+_ANCHOR_ROW, _OFFSET_ROW, _ADDRESS = (
+    layout.RADIO_ANCHOR.as_struct(),
+    layout.OFFSET.as_struct(),
+    struct.Struct("<Q"),
+)
+
+
+def _pack_hello(m: Hello) -> bytes:
+    version = m.firmware_major, m.firmware_minor, m.firmware_patch
+    identity = m.board_id, m.model_id, m.boot_id, m.request_sequence, m.window, m.max_payload
+    return _HELLO.pack(*identity, *version, m.mode, _truncate_utf8(m.firmware_name, 16))
+
+
+def _unpack_hello(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Hello:
+    board, model, boot, request, window, max_payload, major, minor, patch, mode, name = values
+    version = major, minor, patch
+    text = name.rstrip(b"\0").decode("utf-8", "replace")
+    return Hello(board, model, window, _member(Mode, mode), boot, request, max_payload, *version, text)
+
+
+def _pack_range(m: RangeMeasurement) -> bytes:
+    cir, samples = m.cir, m.cir.samples
+    if len(samples) > layout.MAX_SAMPLES:
+        raise ParameterError(
+            f"a CIR of {len(samples)} values", where="RANGE_CIR", valid=f"at most {layout.MAX_SAMPLES}"
+        )
+    exchange = m.tag_id, m.anchor_id, m.device_time, m.sequence, m.range_m
+    shape = cir.sample_period_s, cir.first_path_index, cir.scale
+    levels = cir.rx_power_dbm, cir.first_path_power_dbm, cir.start_index
+    counts = cir.preamble_count, cir.noise_threshold, _RANGE_CIR.size, len(samples)
+    fixed = _RANGE_CIR.pack(*exchange, *shape, *levels, *counts, cir.encoding, cir.channel, cir.prf_mhz)
+    return fixed + np.asarray(samples, dtype="<i2").tobytes()
+
+
+def _unpack_range(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RangeMeasurement:
+    tag, anchor, ticks, sequence, range_m, period_s, first_path, scale, rx_dbm, first_path_dbm = values[:10]
+    first_index, preambles, threshold, offset, count, encoding, channel, prf_mhz = values[10:]
+    if (
+        count > layout.MAX_SAMPLES
+        or offset < _RANGE_CIR.size
+        or offset % 2
+        or offset + 2 * count > len(payload)
+    ):
+        raise LinkError(
+            f"{count} samples at byte {offset} of a payload of {len(payload)} bytes",
+            valid=f"at most {layout.MAX_SAMPLES}, inside the payload, at an even byte from {_RANGE_CIR.size}",
+        )
+    samples = np.frombuffer(payload, "<i2", count, offset)
+    shape = _member(Encoding, encoding), first_index, first_path, period_s, scale
+    cir = Cir(samples, *shape, preambles, threshold, rx_dbm, first_path_dbm, channel, prf_mhz)
+    return RangeMeasurement(stamp_ns, tag, anchor, sequence, _device_time(ticks), range_m, cir)
+
+
+def _pack_corrected(m: Correction) -> bytes:
+    c = m.corrected
+    exchange = m.tag_id, m.anchor_id, m.device_time, m.sequence, c.model_id
+    ranges = c.range_m, c.range_raw_m, c.correction_m, c.variance_m2
+    return _CORRECTED.pack(*exchange, *ranges, m.compute_us, c.status)
+
+
+def _unpack_corrected(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Correction:
+    tag, anchor, ticks, sequence, model_id, range_m, raw_m, correction_m, variance_m2, us, status = values
+    ranges = range_m, raw_m, correction_m, variance_m2
+    corrected = CorrectedRange(*ranges, _member(Status, status), CorrectedBy.DEVICE, model_id)
+    return Correction(stamp_ns, tag, anchor, sequence, _device_time(ticks), corrected, us)
+
+
+def _pack_status(m: BoardStatus) -> bytes:
+    counts = m.frames_received, m.frames_dropped, m.measurements, m.measurements_lost
+    return _STATUS.pack(*counts, m.temperature_c, m.mode)
+
+
+def _unpack_status(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> BoardStatus:
+    received, dropped, measurements, lost, temperature_c, mode = values
+    return BoardStatus(received, dropped, measurements, lost, _member(Mode, mode), temperature_c)
+
+
+def _settings_values(s: RadioSettings) -> tuple[Any, ...]:
+    """Return the common fields of RADIO and SET_RADIO."""
+    chip = s.address, s.antenna_delay, s.tx_power
+    times = s.reply_us, s.timeout_us, s.interval_us
+    channel = s.pan, s.rate_kbps, s.preamble, s.window, s.channel, s.prf_mhz, s.preamble_code
+    return (*chip, *times, *channel, s.decawave_sfd, s.role, s.report, s.bias_correction, len(s.anchors))
+
+
+def _settings(values: tuple[Any, ...], payload: bytes, start: int) -> tuple[RadioSettings, bytes]:
+    """Return the settings in the common fields and the tail, and the bytes after them."""
+    address, delay, power, reply_us, timeout_us, interval_us, pan, rate, preamble, window = values[:10]
+    channel, prf, code, decawave_sfd, role, report, bias_correction, count = values[10:]
+    anchors = tuple(anchor for (anchor,) in _rows(_ADDRESS, count, MAX_ANCHORS, payload, start))
+    settings = RadioSettings(
+        _member(Role, role), address, pan, channel, prf, preamble, code, rate, bool(decawave_sfd), power, delay, window,
+        anchors, reply_us, timeout_us, interval_us, bool(report), bool(bias_correction),
+    )  # fmt: skip
+    return settings, payload[start + 8 * count :]
+
+
+def _pack_radio(m: RadioConfigured) -> bytes:
+    fixed = _RADIO.pack(m.request_sequence, m.accepted, *_settings_values(m.settings))
+    return fixed + b"".join(map(_ADDRESS.pack, m.settings.anchors)) + m.text.encode("utf-8", "replace")
+
+
+def _unpack_radio(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RadioConfigured:
+    settings, text = _settings(values[2:], payload, _RADIO.size)
+    return RadioConfigured(settings, values[0], bool(values[1]), text.decode("utf-8", "replace"))
+
+
+def _pack_radio_status(m: RadioStatus) -> bytes:
+    *fixed, state, anchors = (getattr(m, name) for name in RadioStatus.__slots__)
+    rows = b"".join(_ANCHOR_ROW.pack(*astuple(anchor)) for anchor in anchors)
+    return _RADIO_STATUS.pack(*fixed, state, len(anchors)) + rows
+
+
+def _unpack_radio_status(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RadioStatus:
+    rows = _rows(_ANCHOR_ROW, values[13], MAX_ANCHORS, payload, _RADIO_STATUS.size)
+    anchors = tuple(AnchorStatus(*row) for row in rows)
+    fields: tuple[Any, ...] = (*values[:12], _member(RadioState, values[12]), anchors)
+    return RadioStatus(*fields)
+
+
+def _pack_offsets(m: SetOffsets) -> bytes:
+    o = m.offsets
+    rows = [(tag, anchor, offset_m, OffsetScope.PAIR) for (tag, anchor), offset_m in o.pairs.items()]
+    rows += [(0, anchor, offset_m, OffsetScope.ANCHOR) for anchor, offset_m in o.anchors.items()]
+    rows += [(tag, 0, offset_m, OffsetScope.TAG) for tag, offset_m in o.tags.items()]
+    return _SET_OFFSETS.pack(o.default, len(rows)) + b"".join(_OFFSET_ROW.pack(*row) for row in rows)
+
+
+def _unpack_offsets(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> SetOffsets:
+    anchors: dict[int, float] = {}
+    tags: dict[int, float] = {}
+    pairs: dict[tuple[int, int], float] = {}
+    for tag, anchor, offset_m, scope in _rows(_OFFSET_ROW, values[1], 0xFFFF, payload, _SET_OFFSETS.size):
+        if _member(OffsetScope, scope) is OffsetScope.ANCHOR:
+            anchors.setdefault(anchor, offset_m)
+        elif scope == OffsetScope.TAG:
+            tags.setdefault(tag, offset_m)
+        else:
+            pairs.setdefault((tag, anchor), offset_m)
+    return SetOffsets(Offsets(default=values[0], anchors=anchors, tags=tags, pairs=pairs))
+
+
+_ENCODERS: dict[type, tuple[MessageType, Callable[[Any], bytes]]] = {
+    Hello: (MessageType.HELLO, _pack_hello),
+    RangeMeasurement: (MessageType.RANGE_CIR, _pack_range),
+    Correction: (MessageType.RANGE_CORRECTED, _pack_corrected),
+    Log: (MessageType.LOG, lambda m: _LOG.pack(m.level) + m.text.encode("utf-8", "replace")),
+    BoardStatus: (MessageType.STATUS, _pack_status),
+    TimeSyncReply: (MessageType.TIME_SYNC_REPLY, lambda m: _SYNC.pack(m.request_sequence, m.received_us)),
+    RadioConfigured: (MessageType.RADIO, _pack_radio),
+    RadioStatus: (MessageType.RADIO_STATUS, _pack_radio_status),
+    OffsetsAnswer: (MessageType.OFFSETS, lambda m: _OFFSETS.pack(m.request_sequence, m.slots, m.accepted)),
+    GetInfo: (MessageType.GET_INFO, lambda m: b""),
+    SetMode: (MessageType.SET_MODE, lambda m: _SET_MODE.pack(m.mode)),
+    TimeSync: (MessageType.TIME_SYNC, lambda m: b""),
+    GetRadio: (MessageType.GET_RADIO, lambda m: b""),
+    SetRadio: (
+        MessageType.SET_RADIO,
+        lambda m: (
+            _SET_RADIO.pack(*_settings_values(m.settings)) + b"".join(map(_ADDRESS.pack, m.settings.anchors))
+        ),
+    ),
+    SetOffsets: (MessageType.SET_OFFSETS, _pack_offsets),
+}
+_DECODERS: dict[int, Callable[[tuple[Any, ...], bytes, int], Message]] = {
+    MessageType.HELLO: _unpack_hello,
+    MessageType.RANGE_CIR: _unpack_range,
+    MessageType.RANGE_CORRECTED: _unpack_corrected,
+    MessageType.LOG: lambda v, payload, _: Log(
+        _member(LogLevel, v[0]), payload[_LOG.size :].decode("utf-8", "replace")
+    ),
+    MessageType.STATUS: _unpack_status,
+    MessageType.TIME_SYNC_REPLY: lambda v, payload, _: TimeSyncReply(*v),
+    MessageType.RADIO: _unpack_radio,
+    MessageType.RADIO_STATUS: _unpack_radio_status,
+    MessageType.OFFSETS: lambda v, payload, _: OffsetsAnswer(v[0], v[1], bool(v[2])),
+    MessageType.GET_INFO: lambda v, payload, _: GetInfo(),
+    MessageType.SET_MODE: lambda v, payload, _: SetMode(_member(Mode, v[0])),
+    MessageType.TIME_SYNC: lambda v, payload, _: TimeSync(),
+    MessageType.GET_RADIO: lambda v, payload, _: GetRadio(),
+    MessageType.SET_RADIO: lambda v, payload, _: SetRadio(_settings(v, payload, _SET_RADIO.size)[0]),
+    MessageType.SET_OFFSETS: _unpack_offsets,
+}
