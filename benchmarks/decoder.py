@@ -82,25 +82,25 @@ def loopback(
         body_is_intact = _is_unchanged(arrived, starts + 1, ends - 1)
 
         received: list[WireFrame] = []
-        at = 0
-        while at < len(arrived.data):
+        offset = 0
+        while offset < len(arrived.data):
             size = int(random.integers(1, _LARGEST_READ + 1))
-            chunk = arrived.data[at : at + size]
+            chunk = arrived.data[offset : offset + size]
             began = time.thread_time()
             received += decoder.feed(chunk)
             decoder_s += time.thread_time() - began
-            at += size
+            offset += size
 
-        seen = np.zeros(count, dtype=bool)
+        delivered_mask = np.zeros(count, dtype=bool)
         for frame in received:
             i = frame.sequence - first
-            if 0 <= i < count and frame == sent[i] and body_is_intact[i] and not seen[i]:
-                seen[i] = True
+            if 0 <= i < count and frame == sent[i] and body_is_intact[i] and not delivered_mask[i]:
+                delivered_mask[i] = True
             else:
                 corrupt += 1
         intact += int(is_intact.sum())
-        delivered += int(seen.sum())
-        intact_lost += int((is_intact & ~seen).sum())
+        delivered += int(delivered_mask.sum())
+        intact_lost += int((is_intact & ~delivered_mask).sum())
         advance(first + count)
     return LoopbackResult(
         sent=frames,

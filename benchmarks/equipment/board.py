@@ -89,9 +89,9 @@ class Board:
         if self.mode is Mode.HOST:
             return self._encoder.encode(kind, payload, time_us=now_us)
         # A board computes with the same binary32 values that it would send.
-        held = messages.decode(kind, payload)
-        assert isinstance(held, RangeMeasurement)
-        return self._correct(held, now_us, _UNSOLICITED)
+        decoded = messages.decode(kind, payload)
+        assert isinstance(decoded, RangeMeasurement)
+        return self._correct(decoded, now_us, _UNSOLICITED)
 
     def tick(self, now_us: int) -> bytes:
         """Return the STATUS if it is due."""

@@ -127,14 +127,14 @@ class EmulatedFirmware:
         output = b""
         deadline = time.monotonic() + _START_TIMEOUT_S
         os.set_blocking(self._process.stdout.fileno(), False)
-        while not (found := _PORT.search(output)):
+        while not (match := _PORT.search(output)):
             output += self._process.stdout.read() or b""
             if self._process.poll() is not None or time.monotonic() > deadline:
                 raise UwbMitigationError(
                     f"the emulator did not start: {output.decode(errors='replace').strip()[-300:]}"
                 )
             time.sleep(0.02)
-        self.port = found.group(1).decode()
+        self.port = match.group(1).decode()
         self._radio = socket.socket(socket.AF_UNIX)
         while True:
             with suppress(OSError):

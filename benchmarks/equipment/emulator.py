@@ -184,13 +184,13 @@ def count_executed(image: Image, window: NDArray[np.float32]) -> Counter[tuple[i
 
 def _symbols(image: Image) -> dict[str, tuple[int, int]]:
     """Return {function: (first address, one past the last)}."""
-    found = {}
+    functions = {}
     for line in run_tool(["arm-none-eabi-nm", "--print-size", "--defined-only", str(image.elf)]).splitlines():
         fields = line.split()
         if len(fields) == 4:
             start = int(fields[0], 16)
-            found[fields[3]] = (start, start + int(fields[1], 16))
-    return found
+            functions[fields[3]] = (start, start + int(fields[1], 16))
+    return functions
 
 
 def _command(image: Image) -> list[str]:
@@ -287,8 +287,8 @@ def _registers(operands: str) -> int:
     """Return the number of registers in a list such as {r4-r11, lr}."""
     inside = operands[operands.index("{") + 1 : operands.index("}")]
     total = 0
-    for part in inside.split(","):
-        ends = re.findall(r"\d+", part)
-        words = 2 if part.strip().startswith("d") else 1
-        total += words * (int(ends[1]) - int(ends[0]) + 1 if "-" in part and len(ends) == 2 else 1)
+    for names in inside.split(","):
+        ends = re.findall(r"\d+", names)
+        words = 2 if names.strip().startswith("d") else 1
+        total += words * (int(ends[1]) - int(ends[0]) + 1 if "-" in names and len(ends) == 2 else 1)
     return total

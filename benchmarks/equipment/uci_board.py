@@ -119,7 +119,7 @@ class UciBoardModel:
         self._max_taps, self._tap_bytes, self._count_bytes = max_taps, tap_bytes, count_bytes
         self._random = np.random.default_rng(seed)
         self._buffer = bytearray()
-        self._parts = bytearray()
+        self._fragments = bytearray()
         self._late = b""
         self.boot()
 
@@ -127,7 +127,7 @@ class UciBoardModel:
         """Power the board on."""
         self._calibration = {TAPS: 16, LEAD: 8}
         self._buffer.clear()
-        self._parts.clear()
+        self._fragments.clear()
         self.sessions: dict[int, _Session] = {}
         self._handles = 0
         return self._notify(codes.BOOT, b"\0") + self._notify(codes.DEVICE_STATUS, b"\1")
@@ -138,13 +138,13 @@ class UciBoardModel:
         sent = b""
         while len(self._buffer) >= 4 and len(self._buffer) >= 4 + self._buffer[3]:
             first, opcode, _, length = self._buffer[:4]
-            self._parts += self._buffer[4 : 4 + length]
+            self._fragments += self._buffer[4 : 4 + length]
             del self._buffer[: 4 + length]
             if first >> 5 != PacketType.COMMAND:
-                self._parts.clear()
+                self._fragments.clear()
             elif not first & 0x10:
-                payload = bytes(self._parts)
-                self._parts.clear()
+                payload = bytes(self._fragments)
+                self._fragments.clear()
                 sent += self._command((first & 0xF, opcode), payload, now_s)
         return sent
 
@@ -170,10 +170,10 @@ class UciBoardModel:
         if session is None:
             return self._respond(name, bytes([_NO_SESSION]))
         if name == codes.SET_APP_CONFIG:
-            at = 5
-            while at + 1 < len(payload):
-                session.config[payload[at]] = payload[at + 2 : at + 2 + payload[at + 1]]
-                at += 2 + payload[at + 1]
+            offset = 5
+            while offset + 1 < len(payload):
+                session.config[payload[offset]] = payload[offset + 2 : offset + 2 + payload[offset + 1]]
+                offset += 2 + payload[offset + 1]
             return self._respond(name, b"\0\0") + self._state(handle, SessionState.IDLE)
         if name == codes.GET_SESSION_STATE:
             return self._respond(
@@ -196,24 +196,26 @@ class UciBoardModel:
         """Return the notifications of an exchange; NaN: the peer did not answer."""
         self.exchanges += 1
         failed = distance_m != distance_m
-        parts = [
+        notifications = [
             b""
             if self._random.random() < self.faults.lose
             else self.range_packet(handle, sequence, distance_m)
         ]
         if not failed:
             lost = self._random.random() < self.faults.lose
-            parts.append(b"" if lost else self.diagnostics_packet(handle, sequence))
+            notifications.append(b"" if lost else self.diagnostics_packet(handle, sequence))
         if self._random.random() < self.faults.swap:
-            parts.reverse()
-        parts = [
-            self._random.bytes(5) + part if part and self._random.random() < self.faults.garbage else part
-            for part in parts
+            notifications.reverse()
+        notifications = [
+            self._random.bytes(5) + packet
+            if packet and self._random.random() < self.faults.garbage
+            else packet
+            for packet in notifications
         ]
         late, self._late = self._late, b""
         if not failed and self._random.random() < self.faults.late:
-            self._late = parts.pop()
-        return parts[0] + late + b"".join(parts[1:])
+            self._late = notifications.pop()
+        return notifications[0] + late + b"".join(notifications[1:])
 
     def range_packet(self, handle: int, sequence: int, distance_m: float) -> bytes:
         """Return a range notification."""
@@ -262,28 +264,28 @@ class UciBoardModel:
         return struct.pack("<BbBB", 9, -lead, count, self._tap_bytes) + octets.tobytes()
 
     def _set_calibration(self, payload: bytes) -> bool:
-        at, values = self._count_bytes, dict(self._calibration)
+        offset, values = self._count_bytes, dict(self._calibration)
         with contextlib.suppress(IndexError):
-            for _ in range(int.from_bytes(payload[:at], "little")):
-                key = payload[at + 1 : at + 1 + payload[at]].decode("ascii", "replace")
-                at += 1 + payload[at]
+            for _ in range(int.from_bytes(payload[:offset], "little")):
+                key = payload[offset + 1 : offset + 1 + payload[offset]].decode("ascii", "replace")
+                offset += 1 + payload[offset]
                 if key not in values:
                     return False
-                values[key] = int.from_bytes(payload[at + 1 : at + 1 + payload[at]], "little")
-                at += 1 + payload[at]
+                values[key] = int.from_bytes(payload[offset + 1 : offset + 1 + payload[offset]], "little")
+                offset += 1 + payload[offset]
             values[TAPS] = min(values[TAPS], self._max_taps)
             self._calibration = values
             return True
         return False
 
     def _get_calibration(self, payload: bytes) -> bytes:
-        at, answer = 2, b""
+        offset, answer = 2, b""
         for _ in range(int.from_bytes(payload[:2], "little")):
-            key = payload[at + 1 : at + 1 + payload[at]]
-            at += 1 + len(key)
+            key = payload[offset + 1 : offset + 1 + payload[offset]]
+            offset += 1 + len(key)
             value = self._calibration.get(key.decode("ascii", "replace"))
-            found = b"\0\2" + value.to_bytes(2, "little") if value is not None else b"\1\0"
-            answer += bytes([len(key)]) + key + found
+            entry = b"\0\2" + value.to_bytes(2, "little") if value is not None else b"\1\0"
+            answer += bytes([len(key)]) + key + entry
         return b"\0" + payload[:2] + answer
 
     def _state(self, handle: int, state: int) -> bytes:
@@ -420,8 +422,8 @@ class EmulatedUciBoards:
                 distance_m = float("nan")
                 if partner is not None:
                     distance_m = self._distance_m + float(self._random.normal(0.0, 0.02))
-                    other, peer_handle = partner
-                    self._send(other, peer_handle, session.sequence, distance_m)
+                    peer, peer_handle = partner
+                    self._send(peer, peer_handle, session.sequence, distance_m)
                 self._send(number, handle, session.sequence, distance_m)
 
     def _send(self, number: int, handle: int, sequence: int, distance_m: float) -> None:
@@ -430,10 +432,10 @@ class EmulatedUciBoards:
             self._backlogs[number] += sent
 
     def _partner(self, number: int, session: _Session) -> tuple[int, int] | None:
-        for other, model in enumerate(self._models):
+        for peer, model in enumerate(self._models):
             for handle, theirs in model.sessions.items():
                 if (
-                    other != number
+                    peer != number
                     and theirs.active
                     and theirs.number == session.number
                     and theirs.value(0x00) == 0
@@ -441,5 +443,5 @@ class EmulatedUciBoards:
                     and theirs.config[0x07] == session.config[0x06]
                     and all(theirs.config[tag] == session.config[tag] for tag in (0x04, 0x14, 0x12, 0x35))
                 ):
-                    return other, handle
+                    return peer, handle
         return None

@@ -57,7 +57,7 @@ typedef struct {
     uint16_t preamble;       /* symbols: 64, 128, 256, 512, 1024, 1536, 2048, 4096 */
     uint32_t tx_power;       /* TX_POWER in smart-power format, as in the OTP memory: from the lowest octet on for frames
                               * of any length, up to 500, 250 and 125 us; below 6.8 Mbit/s the lowest octet is used for
-                              * all. 0 = the OTP memory's value, or the manual's if not is_programmed */
+                              * all. 0 = the OTP memory's value, or the manual's if it is not programmed */
     uint32_t antenna_delay;  /* ticks of transmitter and receiver together; 0 = as in the OTP memory, else nominal */
     uint8_t anchor;          /* take a TREK1000 board's antenna delay as an anchor, not as a tag */
 } uwb_dw1000_settings;

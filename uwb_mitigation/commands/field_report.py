@@ -62,7 +62,7 @@ def field_report(
         raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")
     if output.suffix != ".zip" or output.is_dir() or not output.absolute().parent.is_dir():
         raise ParameterError(f"-o {output}", valid="a file .zip in a folder that exists")
-    ports = [part.strip() for part in port.split(",") if part.strip()]
+    ports = [name.strip() for name in port.split(",") if name.strip()]
     observation = Observation(distance, seconds)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -152,15 +152,15 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
 def _pack(folder: Path, output: Path) -> None:
     """Write the zip file."""
     with tempfile.NamedTemporaryFile(dir=output.absolute().parent, suffix=".part", delete=False) as file:
-        part = Path(file.name)
+        partial_file = Path(file.name)
     try:
-        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(partial_file, "w", zipfile.ZIP_DEFLATED) as archive:
             for path in sorted(folder.iterdir()):
                 # Without the times and owners of files.
                 archive.writestr(zipfile.ZipInfo(path.name), path.read_bytes(), zipfile.ZIP_DEFLATED)
-        part.replace(output)
+        partial_file.replace(output)
     finally:
-        part.unlink(missing_ok=True)
+        partial_file.unlink(missing_ok=True)
 
 
 def anonymise(text: str, ports: Sequence[str] = ()) -> str:

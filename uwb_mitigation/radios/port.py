@@ -368,12 +368,12 @@ class PortAddress:
         """
         if text.startswith("/"):
             return cls(device=text)
-        kind, *parts = text.split(":", 3)
+        kind, *ids = text.split(":", 3)
         try:
-            if kind == "usb" and len(parts) in (2, 3):
-                vendor, product = int(parts[0], 16), int(parts[1], 16)
+            if kind == "usb" and len(ids) in (2, 3):
+                vendor, product = int(ids[0], 16), int(ids[1], 16)
                 if 0 <= vendor <= 0xFFFF and 0 <= product <= 0xFFFF:
-                    return cls("", vendor, product, parts[2] if len(parts) == 3 else "")
+                    return cls("", vendor, product, ids[2] if len(ids) == 3 else "")
         except ValueError:
             pass
         raise ParameterError(

@@ -162,10 +162,10 @@ class ModelledAir:
         rows, store = c_void_p(), c_void_p()
         count = self._library.radio_air_results(self._air, ctypes.byref(rows), ctypes.byref(store))
         # RANGE contains no pointers, so the bytes can be copied.
-        taken = np.frombuffer(ctypes.string_at(rows.value or 0, count * RANGE.itemsize), RANGE)
+        ranges = np.frombuffer(ctypes.string_at(rows.value or 0, count * RANGE.itemsize), RANGE)
         values = np.frombuffer(ctypes.string_at(store.value or 0, 2 * _STORE_VALUES), "<i2")
         self._library.radio_air_clear_results(self._air)
-        return taken, values
+        return ranges, values
 
     def counts(self, board: int) -> dict[str, int]:
         """Return the counts of exchanges; see `uwb_twr_counts`."""

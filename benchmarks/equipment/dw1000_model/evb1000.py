@@ -130,8 +130,8 @@ class EmulatedEvb1000s:
                     link = port_links.with_name(f"{port_links.name}{number}")
                 self._boards.append(_Board(chip, Bridge(chip.spi, ranging=number in ranging), link))
             clean_pair = Pair(distance_m, loss=loss, damage=damage)
-            for one, other in itertools.combinations(self._boards, 2):
-                self._air.set_pair(one.chip, other.chip, clean_pair)
+            for first, second in itertools.combinations(self._boards, 2):
+                self._air.set_pair(first.chip, second.chip, clean_pair)
             self._distances_m = [distance_m] * boards
             # Read the source before the ports exist: the caller gets the error of an empty source.
             records = self._read_pairs(source)

@@ -100,7 +100,7 @@ def _accumulator(cir: Cir) -> NDArray[np.int16]:
     if not 0 < cir.scale < math.inf:
         raise ParameterError(f"scale = {cir.scale}", where="CIR", valid="above 0, finite")
     counts = np.clip(np.rint(cir.samples * np.float64(cir.scale)), -32768, 32767).astype(np.int16)
-    whole = np.zeros(2 * SAMPLES, np.int16)
+    accumulator = np.zeros(2 * SAMPLES, np.int16)
     step = 1 if cir.encoding is Encoding.COMPLEX_INT16 else 2
-    whole[2 * first : 2 * (first + n) : step] = counts
-    return whole
+    accumulator[2 * first : 2 * (first + n) : step] = counts
+    return accumulator

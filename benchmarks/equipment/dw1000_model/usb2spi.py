@@ -50,7 +50,7 @@ class Bridge:
 
     def receive(self, data: bytes) -> list[bytes]:
         """Return the answers to `data`, which arrives in packets of at most 64 octets."""
-        packets = (data[at : at + _PACKET] for at in range(0, len(data), _PACKET))
+        packets = (data[start : start + _PACKET] for start in range(0, len(data), _PACKET))
         return [answer for packet in packets if (answer := self._receive(packet))]
 
     def _receive(self, packet: bytes) -> bytes:

@@ -142,12 +142,12 @@ class NativeRadio:
         """
         temperature, voltage = c_float(), c_float()
         self._failure = None
-        done = self._library.native_radio_sensors(
+        error = self._library.native_radio_sensors(
             self._radio, ctypes.byref(temperature), ctypes.byref(voltage)
         )
         if self._failure is not None:
             raise self._failure
-        if not done:
+        if not error:
             self._temperature_c, self._voltage = temperature.value, voltage.value
 
     def status(self) -> RadioStatus:

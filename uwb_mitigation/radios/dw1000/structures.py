@@ -34,7 +34,7 @@ def _fields(**names: type) -> tuple[tuple[str, type], ...]:
     return tuple(names.items())
 
 
-def _of(kind: type, names: str) -> dict[str, type]:
+def _same_type(kind: type, names: str) -> dict[str, type]:
     """Return fields of one type, {name: type}."""
     return dict.fromkeys(names.split(), kind)
 
@@ -43,9 +43,9 @@ class ChipSettings(ctypes.Structure):
     """`uwb_dw1000_settings`."""
 
     _fields_ = _fields(
-        **_of(c_uint8, "channel prf_mhz preamble_code decawave_sfd"),
-        **_of(c_uint16, "rate_kbps preamble"),
-        **_of(c_uint32, "tx_power antenna_delay"),
+        **_same_type(c_uint8, "channel prf_mhz preamble_code decawave_sfd"),
+        **_same_type(c_uint16, "rate_kbps preamble"),
+        **_same_type(c_uint32, "tx_power antenna_delay"),
         anchor=c_uint8,
     )
 
@@ -57,9 +57,9 @@ class Config(ctypes.Structure):
         radio=ChipSettings,
         address=c_uint64,
         pan=c_uint16,
-        **_of(c_uint8, "role report bias_correction anchor_count"),
+        **_same_type(c_uint8, "role report bias_correction anchor_count"),
         window=c_uint16,
-        **_of(c_uint32, "reply_us timeout_us interval_us"),
+        **_same_type(c_uint32, "reply_us timeout_us interval_us"),
         anchors=c_uint64 * MAX_ANCHORS,
     )
 
@@ -68,7 +68,9 @@ class TwrCounts(ctypes.Structure):
     """`uwb_twr_counts`."""
 
     _fields_ = _fields(
-        **_of(c_uint32, "tried ranged no_answer late timeout damaged implausible broken refused restarts")
+        **_same_type(
+            c_uint32, "tried ranged no_answer late timeout damaged implausible broken refused restarts"
+        )
     )
 
     def as_dict(self) -> dict[str, int]:
@@ -80,8 +82,8 @@ class TwrAnchor(ctypes.Structure):
     """`uwb_twr_anchor`."""
 
     _fields_ = _fields(
-        **_of(c_uint64, "address last_seen_us next_poll_us"),
-        **_of(c_uint32, "tried ranged answer_us misses"),
+        **_same_type(c_uint64, "address last_seen_us next_poll_us"),
+        **_same_type(c_uint32, "tried ranged answer_us misses"),
         rx_power_dbm=c_float,
     )
 

@@ -96,105 +96,64 @@ def exchange_cause(status: int) -> str:
     return cause.name if cause is not None else f"status 0x{status:02x}"
 
 
-_STATUSES = {
-    0x01: "rejected",
-    0x02: "failed",
-    0x03: "syntax error",
-    0x04: "invalid parameter",
-    0x05: "value out of range",
-    0x06: "invalid message size",
-    0x07: "unknown group",
-    0x08: "unknown command",
-    0x09: "read-only parameter",
-    0x0A: "to be repeated",
-    0x11: "the session does not exist",
-    0x12: "the session exists already",
-    0x13: "the session is active",
-    0x14: "too many sessions",
-    0x15: "the session is not configured: a parameter is missing",
-    0x16: "other sessions are active",
-}
+_STATUS_TEXTS = (
+    "rejected; failed; syntax error; invalid parameter; value out of range; invalid message size; unknown group; "
+    "unknown command; read-only parameter; to be repeated; the session does not exist; the session exists already; "
+    "the session is active; too many sessions; the session is not configured: a parameter is missing; "
+    "other sessions are active"
+)
+_STATUSES = dict(
+    zip(
+        (*range(0x01, 0x0B), *range(0x11, 0x17)),
+        _STATUS_TEXTS.split("; "),
+        strict=True,
+    )
+)
 
 _REASONS = {
-    0x00: "a command of the host",
     0x01: "maximum number of unanswered rounds",
     0x02: "maximum number of measurements",
-    0x03: "suspended by the other board",
-    0x04: "resumed by the other board",
-    0x05: "stopped by the other board",
-    0x1D: "invalid UL-TDoA random window",
-    0x1E: "too few frames per round",
-    0x1F: "unsupported transmit delay or frame interval",
-    0x20: "unsupported slot length",
-    0x21: "too few slots per round",
-    0x22: "unsupported address mode",
-    0x23: "invalid ranging interval",
-    0x24: "invalid STS configuration",
-    0x25: "invalid frame configuration",
-    0x26: "hybrid: too few slots",
-    0x27: "hybrid: contention-free phase too short",
-    0x28: "hybrid: contention access phase too short",
-    0x29: "hybrid: other error",
-    0x2A: "session key not found",
-    0x2B: "sub-session key not found",
-    0x2C: "invalid preamble code",
-    0x2D: "invalid SFD",
-    0x2E: "invalid PSDU data rate",
-    0x2F: "invalid PHR data rate",
-    0x30: "invalid preamble duration",
-    0x31: "invalid STS length",
-    0x32: "invalid number of STS segments",
-    0x33: "invalid number of controlees",
-    0x34: "reply time exceeded",
-    0x35: "invalid list of destination addresses",
-    0x36: "sub-session not found",
-    0x37: "invalid result report",
-    0x38: "invalid round control",
-    0x39: "invalid round usage",
-    0x3A: "invalid multi-node mode",
-    0x3B: "secure element not readable",
-    0x3C: "reference session does not exist",
-    0x3D: "reference session with another interval",
-    0x3E: "reference session with an invalid offset",
-    0x3F: "reference session lost",
-    0x40: "DT-anchor: rounds not configured",
-    0x41: "DT-tag: rounds not configured",
-    0x42: "initiation time has passed",
     0xA1: "vendor: ranging key expired",
     0xA2: "vendor: maximum STS index",
 }
+_REASON_TEXTS = (
+    "a command of the host; suspended by the other board; resumed by the other board; stopped by the other board; "
+    "invalid UL-TDoA random window; too few frames per round; unsupported transmit delay; unsupported slot length; "
+    "too few slots per round; unsupported address mode; invalid ranging interval; invalid STS configuration; "
+    "invalid frame configuration; hybrid: too few slots; hybrid: contention-free phase too short; "
+    "hybrid: contention access phase too short; hybrid: other error; session key not found; "
+    "sub-session key not found; invalid preamble code; invalid SFD; invalid PSDU data rate; invalid PHR data rate; "
+    "invalid preamble duration; invalid STS length; invalid number of STS segments; invalid number of controlees; "
+    "reply time exceeded; invalid list of destination addresses; sub-session not found; invalid result report; "
+    "invalid round control; invalid round usage; invalid multi-node mode; secure element not readable; "
+    "reference session does not exist; reference session with another interval; "
+    "reference session with an invalid offset; reference session lost; DT-anchor: rounds not configured; "
+    "DT-tag: rounds not configured; initiation time has passed"
+)
+_REASONS |= dict(
+    zip(
+        (0x00, 0x03, 0x04, 0x05, *range(0x1D, 0x43)),
+        _REASON_TEXTS.split("; "),
+        strict=True,
+    )
+)
 
-PARAMETERS = {
-    0x00: "DEVICE_TYPE",
-    0x01: "RANGING_ROUND_USAGE",
-    0x02: "STS_CONFIG",
-    0x03: "MULTI_NODE_MODE",
-    0x04: "CHANNEL_NUMBER",
-    0x05: "NUMBER_OF_CONTROLEES",
-    0x06: "DEVICE_MAC_ADDRESS",
-    0x07: "DST_MAC_ADDRESS",
-    0x08: "SLOT_DURATION",
-    0x09: "RANGING_INTERVAL",
-    0x0D: "AOA_RESULT_REQ",
-    0x11: "DEVICE_ROLE",
-    0x12: "RFRAME_CONFIG",
-    0x13: "RSSI_REPORTING",
-    0x14: "PREAMBLE_CODE_INDEX",
-    0x15: "SFD_ID",
-    0x1B: "SLOTS_PER_RR",
-    0x22: "SCHEDULED_MODE",
-    0x24: "KEY_ROTATION_RATE",
-    0x27: "VENDOR_ID",
-    0x28: "STATIC_STS_IV",
-    0x2B: "UWB_INITIATION_TIME",
-    0x2C: "HOPPING_MODE",
-    0x2D: "BLOCK_STRIDE_LENGTH",
-    0x2E: "RESULT_REPORT_CONFIG",
-    0x32: "MAX_NUMBER_OF_MEASUREMENTS",
-    0x35: "STS_LENGTH",
-    0xE8: "ENABLE_DIAGNOSTICS",
-    0xE9: "DIAGS_FRAME_REPORTS_FIELDS",
-}
+_PARAMETER_NAMES = (
+    "DEVICE_TYPE RANGING_ROUND_USAGE STS_CONFIG MULTI_NODE_MODE CHANNEL_NUMBER NUMBER_OF_CONTROLEES "
+    "DEVICE_MAC_ADDRESS DST_MAC_ADDRESS SLOT_DURATION RANGING_INTERVAL AOA_RESULT_REQ DEVICE_ROLE RFRAME_CONFIG "
+    "RSSI_REPORTING PREAMBLE_CODE_INDEX SFD_ID SLOTS_PER_RR SCHEDULED_MODE KEY_ROTATION_RATE VENDOR_ID "
+    "STATIC_STS_IV UWB_INITIATION_TIME HOPPING_MODE BLOCK_STRIDE_LENGTH RESULT_REPORT_CONFIG "
+    "MAX_NUMBER_OF_MEASUREMENTS STS_LENGTH ENABLE_DIAGNOSTICS DIAGS_FRAME_REPORTS_FIELDS"
+)
+PARAMETERS = dict(
+    zip(
+        bytes.fromhex(
+            "00 01 02 03 04 05 06 07 08 09 0d 11 12 13 14 15 1b 22 24 27 28 2b 2c 2d 2e 32 35 e8 e9"
+        ),
+        _PARAMETER_NAMES.split(),
+        strict=True,
+    )
+)
 """{tag: name} of the parameters of a session."""
 
 

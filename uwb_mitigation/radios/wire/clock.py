@@ -58,9 +58,9 @@ class DeviceClock:
         self._restart()
 
     def _restart(self) -> None:
-        # Host time = board time + origin + offset, at board time `_at` (ns).
+        # Host time = board time + origin + offset, at board time `_updated_ns`.
         self._origin: int | None = None
-        self._at = 0
+        self._updated_ns = 0
         self._offset = 0.0
         self._drift = 0.0
         self._p_offset = 0.0
@@ -107,14 +107,14 @@ class DeviceClock:
             return
         if self._origin is None:
             self._origin = (earliest + latest) // 2
-            self._at = received_ns
+            self._updated_ns = received_ns
             self._p_offset = _LATE_ARRIVAL_NS**2
-        at = (received_ns + replied_ns) // 2
+        board_ns = (received_ns + replied_ns) // 2
         low, high = float(earliest - self._origin), float(latest - self._origin)
         variance = (high - low) ** 2 / 12 + _FLOOR_NS**2
-        self._update(at, (low + high) / 2, variance)
+        self._update(board_ns, (low + high) / 2, variance)
         self._is_bounded = True
-        self._clip(at, low, high)
+        self._clip(board_ns, low, high)
 
     def stamp(self, ticks: int, arrived_ns: int) -> int:
         """Return the host's time, ns, at `ticks`, the event time of a frame that arrived at `arrived_ns`.
@@ -149,7 +149,7 @@ class DeviceClock:
 
     def _predict_ns(self, board_ns: int) -> int:
         origin = self._origin or 0
-        return board_ns + origin + round(self._offset + self._drift * (board_ns - self._at))
+        return board_ns + origin + round(self._offset + self._drift * (board_ns - self._updated_ns))
 
     def _arrival(self, board_ns: int, arrived_ns: int) -> None:
         late_ns = 0 if self._origin is None else arrived_ns - self._predict_ns(board_ns)
@@ -157,7 +157,7 @@ class DeviceClock:
             self._restart()
         if self._origin is None:
             self._origin = arrived_ns - board_ns
-            self._at = board_ns
+            self._updated_ns = board_ns
             self._p_offset = _FIRST_ARRIVAL_NS**2
             return
         high = float(arrived_ns - board_ns - self._origin)
@@ -168,23 +168,23 @@ class DeviceClock:
             # A late arrival has a small weight, so that a stall of seconds does not change the offset.
             self._update(board_ns, high, _LATE_ARRIVAL_NS**2 + late_ns**2)
 
-    def _update(self, at: int, offset: float, variance: float) -> None:
-        """Update the filter with a measured `offset` at board time `at`."""
-        ahead = at - self._at
-        if ahead > 0:
-            ahead_s = ahead / 1e9
-            self._offset += self._drift * ahead
-            self._p_offset += ahead * (2 * self._p_cross + ahead * self._p_drift)
-            self._p_offset += _OFFSET_WALK_NS2_PER_S * ahead_s
-            self._p_cross += ahead * self._p_drift
-            self._p_drift = min(self._p_drift + _DRIFT_WALK_PER_S * ahead_s, _INITIAL_DRIFT_SD**2)
-            self._at = at
-            ahead = 0
-        # The sample may be older than the last update: the measurement matrix is H = [1, ahead].
-        cross_offset = self._p_offset + ahead * self._p_cross
-        cross_drift = self._p_cross + ahead * self._p_drift
-        total = cross_offset + ahead * cross_drift + variance
-        innovation = offset - (self._offset + self._drift * ahead)
+    def _update(self, board_ns: int, offset: float, variance: float) -> None:
+        """Update the filter with a measured `offset` at board time `board_ns`."""
+        dt_ns = board_ns - self._updated_ns
+        if dt_ns > 0:
+            dt_s = dt_ns / 1e9
+            self._offset += self._drift * dt_ns
+            self._p_offset += dt_ns * (2 * self._p_cross + dt_ns * self._p_drift)
+            self._p_offset += _OFFSET_WALK_NS2_PER_S * dt_s
+            self._p_cross += dt_ns * self._p_drift
+            self._p_drift = min(self._p_drift + _DRIFT_WALK_PER_S * dt_s, _INITIAL_DRIFT_SD**2)
+            self._updated_ns = board_ns
+            dt_ns = 0
+        # The sample may be older than the last update: the measurement matrix is H = [1, dt_ns].
+        cross_offset = self._p_offset + dt_ns * self._p_cross
+        cross_drift = self._p_cross + dt_ns * self._p_drift
+        total = cross_offset + dt_ns * cross_drift + variance
+        innovation = offset - (self._offset + self._drift * dt_ns)
         gain_offset, gain_drift = cross_offset / total, cross_drift / total
         self._offset += gain_offset * innovation
         self._drift += gain_drift * innovation
@@ -192,9 +192,9 @@ class DeviceClock:
         self._p_cross -= gain_offset * cross_drift
         self._p_drift -= gain_drift * cross_drift
 
-    def _clip(self, at: int, low: float, high: float) -> None:
+    def _clip(self, board_ns: int, low: float, high: float) -> None:
         """Clip the estimate to its bounds; restart the filter if the correction is a clock step."""
-        predicted = self._offset + self._drift * (at - self._at)
+        predicted = self._offset + self._drift * (board_ns - self._updated_ns)
         nearest = min(max(predicted, low), high)
         if nearest == predicted:
             return
@@ -202,7 +202,7 @@ class DeviceClock:
             origin = (self._origin or 0) + round(nearest)
             enclosed = self._is_bounded
             self._restart()
-            self._origin, self._at, self._is_bounded = origin, at, enclosed
+            self._origin, self._updated_ns, self._is_bounded = origin, board_ns, enclosed
             self._p_offset = _LATE_ARRIVAL_NS**2
             return
         self._offset += nearest - predicted

@@ -396,10 +396,10 @@ class BoardSession:
 
     def _check_foreign_versions(self, now_ns: int) -> list[Event]:
         counts = self._decoder.counts
-        seen = counts.foreign_versions.total()
-        if seen == self._foreign_frames:
+        count = counts.foreign_versions.total()
+        if count == self._foreign_frames:
             return []
-        self._foreign_frames = seen
+        self._foreign_frames = count
         version = counts.last_foreign_version
         # The buffers may still contain frames of firmware that ran before the connected board was restarted.
         if self.state is LinkState.READY or version is None:
