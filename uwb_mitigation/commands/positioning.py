@@ -20,17 +20,25 @@ if TYPE_CHECKING:
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap
 
-_COLUMNS = {
-    "rmse": ("RMSE", "{:.3f}"),
-    "median": ("median", "{:.3f}"),
-    "p95": ("p95", "{:.3f}"),
-    "coverage95": ("in ellipse", "{:.1%}"),
-    "nees_per_dof": ("NEES", "{:.2f}"),
-    "exceeded": ("beyond", "{:.2%}"),
-    "height_rmse": ("height", "{:.3f}"),
-    "heading_rmse_deg": ("heading", "{:.1f}"),
+TRACK_NAMES = {
+    "snapshot": "least squares, raw",
+    "raw_live": "live, raw",
+    "live": "live, corrected",
+    "smoothed": "smoothed, corrected",
 }
-"""{field of `TrackErrors`: title and format of its column}."""
+"""{kind of track: its name in the table}. The two live tracks are from the same filter."""
+
+TRACK_COLUMNS = {
+    "track": "name",
+    "RMSE, m": "errors.rmse:.3f",
+    "95 %, m": "errors.p95:.3f",
+    "in ellipse": "errors.coverage95:.0%",
+    "NEES": "errors.nees_per_dof:.2f",
+    "height, m": "errors.height_rmse:.3f",
+    "beyond": "errors.exceeded:.1%",
+    "median, m": "errors.median:.3f",
+    "epochs": "epochs:d",
+}
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
@@ -165,15 +173,13 @@ def track(
         warn(f"{failure}.")
     if force or not anchors_path(output).exists():
         save_anchors(anchors_path(output), config.anchors, f"anchors of the track of {bag.name}", force=True)
-    _show_tracks(tracks, config.anchors)
+    _show_tracks(tracks)
     residuals = held_out(tracks, config)
     _show_residuals(residuals, config.anchors)
     print_line(f"Wrote {out.counts.total()} messages to {out.file}.")
-    for one in tracks if tum is not None else []:
-        write_atomically(tum_files[one.recording.tag_id], tum_text(one.smoothed))
-    console.write_json(
-        json, _result(tracks, recorded, config.anchors) | {"held_out": [one.as_json() for one in residuals]}
-    )
+    for tracked in tracks if tum is not None else []:
+        write_atomically(tum_files[tracked.recording.tag_id], tum_text(tracked.smoothed))
+    console.write_json(json, _result(tracks, recorded), {"held_out": residuals})
 
 
 def survey(
@@ -218,7 +224,7 @@ def survey(
         valid = f"one of {', '.join(map(format_id, index))}"
         check_name("anchor of --fixed:", text.lower(), ids, valid=valid)
     rows = [ids[text.lower()] for text in fixed or []]
-    tag = max(recorded.tags, key=lambda one: len(one.ranges))
+    tag = max(recorded.tags, key=lambda recording: len(recording.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
         result = find(config, tag.ranges, off_m=off, fixed=frozenset(rows))
@@ -227,7 +233,7 @@ def survey(
     )
     _show_survey(result)
     print_line(f"Wrote {len(index)} anchors to {output}.")
-    console.write_json(json, {"output": str(output)} | result.as_json())
+    console.write_json(json, {"output": output}, result)
 
 
 def _read(
@@ -255,10 +261,10 @@ def _read(
     prior, box, model = Height(height or 0.0, height_sd), Area.parse(area), NoiseModel(acceleration)
     if not bag.exists():
         raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
-    known = load_anchors(anchors or anchors_path(bag))
+    anchor_map = load_anchors(anchors or anchors_path(bag))
     with console.progress() as bar:
         bar.add_task("reading", total=None)
-        recorded = read_ranges(bag, known, stamp_offset)
+        recorded = read_ranges(bag, anchor_map, stamp_offset)
     for identity, count in recorded.unknown_anchors.items():
         warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():
@@ -267,7 +273,7 @@ def _read(
     if height_topic is not None:
         _check_one_tag("--height-topic", recorded)
         heights = read_heights(bag, height_topic, height_sd)
-    return EstimatorConfig(known, model, None if height is None else prior, box, heights), recorded
+    return EstimatorConfig(anchor_map, model, None if height is None else prior, box, heights), recorded
 
 
 def _check_one_tag(option: str, recorded: RecordedRanges) -> None:
@@ -298,67 +304,71 @@ def _robot_of(
     return RobotData(motion, None if imu is None else read_imu(bag, imu), arm)
 
 
-def _show_tracks(tracks: list[TagTracks], anchors: AnchorMap) -> None:
-    rows = []
-    with_heading = any(
-        math.isfinite(error.heading_rmse_deg) for one in tracks for error in one.errors.values()
-    )
-    fields = {field: form for field, form in _COLUMNS.items() if with_heading or field != "heading_rmse_deg"}
-    for one in tracks:
-        kind = "corrected" if one.recording.corrected else "raw"
-        names = {"snapshot": "snapshots, raw", "live": f"live, {kind}", "smoothed": f"smoothed, {kind}"}
-        for key, name in names.items():
-            errors, track = one.errors[key], getattr(one, key)
-            cells = [_number(getattr(errors, field), form) for field, (_, form) in fields.items()]
-            rows.append([format_id(one.recording.tag_id), name, errors.epochs or len(track), *cells])
-    columns = ("tag", "track", "epochs", *(title for title, _ in fields.values()))
-    show_table("Horizontal errors, m", columns, rows, left=2, max_rows=len(rows))
+def _show_tracks(tracks: list[TagTracks]) -> None:
+    rows: list[dict[str, object]] = []
+    for tag in tracks:
+        for kind, name in TRACK_NAMES.items():
+            if tag.recording.corrected or kind != "raw_live":
+                shown = name if tag.recording.corrected else name.replace("corrected", "raw")
+                errors = tag.errors[kind]
+                epochs = errors.epochs or len(getattr(tag, kind))
+                rows.append({"tag": tag.recording.tag_id, "name": shown, "errors": errors, "epochs": epochs})
+    columns = TRACK_COLUMNS if len(tracks) == 1 else {"tag": "tag:id", **TRACK_COLUMNS}
+    optional = ["height, m", "beyond", "median, m", "epochs"]
+    if any(math.isfinite(error.heading_rmse_deg) for tag in tracks for error in tag.errors.values()):
+        columns = columns | {"heading, deg": "errors.heading_rmse_deg:.1f"}
+    show_table("Horizontal errors", columns, rows, max_rows=len(rows), optional=optional)
     console.out.print(
-        "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. "
-        "Beyond: errors beyond the protection levels. Height: RMSE of z."
-        + " Heading: RMSE of the yaw, degrees."
-        * with_heading,
+        "In ellipse: true positions inside the 95 % ellipses. NEES: 1 is consistent, more is overconfident. Height and "
+        "heading: RMSE. Beyond: errors beyond the protection levels.",
         style="dim",
     )
-    for one in tracks:
-        name = f"tag {format_id(one.recording.tag_id)}"
-        if not one.errors["live"].epochs:
+    for tag in tracks:
+        name = f"tag {format_id(tag.recording.tag_id)}"
+        if not tag.errors["live"].epochs:
             print_line(f"{name}: no truth in the bag, so no errors")
-        for warning in one.warnings:
+        for warning in tag.warnings:
             warn(f"{name}: {warning}.")
-        for row in one.disagreeing:
-            warn(
-                f"anchor {anchors.anchors[row]}: its ranges contradict those of the other anchors. Check its position in "
-                "the anchors file."
-            )
 
 
 def _show_residuals(residuals: list[HoldoutErrors], anchors: AnchorMap) -> None:
-    rows = [
-        [
-            "all" if one.anchor_id is None else anchors.anchors[anchors.index[one.anchor_id]],
-            one.ranges,
-            *(_number(value, "{:.3f}") for value in (one.raw_m, one.corrected_m)),
-        ]
-        for one in residuals
+    rows: list[dict[str, Any]] = [
+        {
+            "anchor": "all"
+            if residual.anchor_id is None
+            else anchors.anchors[anchors.index[residual.anchor_id]],
+            "residual": residual,
+        }
+        for residual in residuals
     ]
-    show_table(
-        "Residuals of held-out ranges, m", ("anchor", "ranges", "raw", "corrected"), rows, max_rows=len(rows)
-    )
+    columns = {
+        "anchor": "anchor",
+        "ranges": "residual.ranges:d",
+        "raw, m": "residual.raw_m:.3f",
+        "corrected, m": "residual.corrected_m:.3f",
+    }
+    show_table("Residuals of held-out ranges", columns, rows, max_rows=len(rows))
     console.out.print(
         "Median absolute residuals. The ranges of each anchor are compared with a track of the other anchors' ranges.",
         style="dim",
     )
+    for row in rows:
+        if row["residual"].is_displaced:
+            warn(
+                f"anchor {row['anchor']}: its ranges fit another position of the anchor. Check its position in the anchors "
+                "file."
+            )
 
 
 def _show_survey(result: SurveyResult) -> None:
     anchors = result.anchors.anchors
     rows = [
-        [anchor, *(f"{value:.2f}" for value in (*anchor.position, anchor.sd, moved_m))]
+        {"anchor": anchor, "xyz": dict(zip("xyz", anchor.position, strict=True)), "moved_m": moved_m}
         for anchor, moved_m in zip(anchors, result.moved_m.tolist(), strict=True)
     ]
-    columns = ("anchor", "x", "y", "z", "standard deviation", "distance from guess")
-    show_table("Anchors, m", columns, rows, max_rows=len(rows))
+    columns = {f"{axis}, m": f"xyz.{axis}:.2f" for axis in "xyz"}
+    columns = {"anchor": "anchor", **columns, "sd, m": "anchor.sd:.2f", "from guess, m": "moved_m:.2f"}
+    show_table("Anchors", columns, rows, max_rows=len(rows))
     if not result.explained:
         warn(
             f"these anchors do not explain the ranges: the mean loss is {result.loss:.1f}, but 0.5 or less if they do. Do "
@@ -386,21 +396,17 @@ def _show_survey(result: SurveyResult) -> None:
         warn(f"anchor {anchors[row]} is {result.moved_m[row]:.2f} m from its position in the file")
 
 
-def _result(tracks: list[TagTracks], recorded: RecordedRanges, anchors: AnchorMap) -> dict[str, Any]:
+def _result(tracks: list[TagTracks], recorded: RecordedRanges) -> dict[str, Any]:
     from uwb_mitigation.commands.offline.track import KINDS, pooled
 
-    known = any(one.errors["live"].epochs for one in tracks)
-    hdops = [one.hdop for one in tracks if math.isfinite(one.hdop)]
-    overall = {kind: pooled([one.errors[kind] for one in tracks]).as_json() for kind in KINDS}
+    has_truth = any(tag.errors["live"].epochs for tag in tracks)
+    hdops = [tag.hdop for tag in tracks if math.isfinite(tag.hdop)]
+    overall = {kind: pooled([tag.errors[kind] for tag in tracks]) for kind in KINDS}
     return {
-        "tags": [one.as_json(anchors) for one in tracks],
-        **(overall if known else dict.fromkeys(KINDS)),
+        "tags": [tag.as_json() for tag in tracks],
+        **(overall if has_truth else dict.fromkeys(KINDS)),
         "hdop_median": max(hdops) if hdops else None,
-        "corrected": all(one.recording.corrected for one in tracks),
-        "unknown_anchors": {str(identity): count for identity, count in recorded.unknown_anchors.items()},
-        "skipped": dict(recorded.skipped),
+        "corrected": all(tag.recording.corrected for tag in tracks),
+        "unknown_anchors": recorded.unknown_anchors,
+        "skipped": recorded.skipped,
     }
-
-
-def _number(value: float, form: str) -> str:
-    return form.format(value) if math.isfinite(value) else "-"

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, format_id
+from uwb_mitigation.positioning.batch.anchor_errors import is_displaced
 from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, dop
 from uwb_mitigation.positioning.online.initialization import snapshot
-from uwb_mitigation.positioning.online.robot_estimator import make_estimator
+from uwb_mitigation.positioning.online.robot_estimator import live_track, make_estimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.recorded_ranges import TagRecording
-from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.ros.poses import (
     BodyTwist,
     encode_odometry,
@@ -31,19 +31,18 @@ from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, ODOMETRY_T
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Ranges, Track, TruePath
 
-KINDS = ("live", "smoothed", "snapshot")
+KINDS = ("snapshot", "raw_live", "live", "smoothed")
 POOR_HDOP = 10.0
+MAX_WITHOUT_POSITION = 0.1
 MIN_OTHERS = 3
 """Other anchors that a track without an anchor needs."""
-
-CONTRADICTION_M = 0.4
-"""NLOS errors of the other anchors move their track by up to about this much."""
 
 WORSE = 1.1
 MIN_COVERAGE = 0.85
 MIN_HEIGHT_RMSE_M = 0.1
-"""If the truth is known, smoothing has failed if its horizontal RMSE or that of the height exceeds `WORSE` times the live one
-(heights: and this minimum), or its 95 % ellipses contain a smaller share of the true positions than `MIN_COVERAGE`."""
+"""If the truth is known, a warning is given if the RMSE of the smoothed track, horizontal or of the height, exceeds `WORSE`
+times the live one (heights: and this minimum); another one if its 95 % ellipses contain a smaller share of the true positions
+than `MIN_COVERAGE`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,24 +51,23 @@ class TagTracks:
 
     Attributes:
         recording: the input.
-        live: an estimate for each range, from this and earlier ranges. smoothed: ten per second, from all ranges.
-        snapshot: least squares on raw ranges.
+        live: an estimate for each range, from this and earlier ranges. raw_live: the same filter on raw ranges.
+        smoothed: ten per second, from all ranges. snapshot: least squares on raw ranges.
         errors: errors of each of the `KINDS`.
         hdop: median horizontal dilution of precision along the track.
-        disagreeing: rows of anchors whose ranges contradict the track of the other anchors.
         warnings: reasons why the tracks may be unreliable; empty = none.
     """
 
     recording: TagRecording
     live: Track
+    raw_live: Track
     smoothed: Track
     snapshot: Track
     errors: dict[str, TrackErrors]
     hdop: float
-    disagreeing: list[int]
     warnings: list[str]
 
-    def as_json(self, anchors: AnchorMap) -> dict[str, object]:
+    def as_json(self) -> dict[str, object]:
         """Return the entry of a tag in `track --json`; it contains errors only if the truth is known."""
         errors = {kind: self.errors[kind].as_json() for kind in KINDS}
         return {
@@ -78,7 +76,6 @@ class TagTracks:
             **errors["smoothed"],
             "epochs": self.errors["smoothed"].epochs or len(self.smoothed),
             "warnings": self.warnings,
-            "disagreeing": [anchors.anchors[row].id for row in self.disagreeing],
             **(errors if self.errors["live"].epochs else {}),
         }
 
@@ -94,13 +91,14 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     live = locator.run(ranges)
     if len(live) < 2:
         raise _no_position(recording, config, locator)
-    smoothed = smooth(config, ranges, live)
-    snapshots = snapshot(anchors, recording.raw, config.height)
-    truth = recording.truth
-    tracks = zip(KINDS, (live, smoothed, snapshots), strict=True)
-    errors = {kind: track_errors(track, truth) for kind, track in tracks}
-    of_live, of_smoothed = errors["live"], errors["smoothed"]
-    sample = smoothed.position[:: max(len(smoothed) // 200, 1)]
+    tracks = {
+        "snapshot": snapshot(anchors, recording.raw, config.height),
+        "raw_live": live_track(config, recording.raw) if recording.corrected else live,
+        "live": live,
+        "smoothed": smooth(config, ranges, live),
+    }
+    errors = {kind: track_errors(track, recording.truth) for kind, track in tracks.items()}
+    sample = tracks["smoothed"].position[:: max(len(tracks["smoothed"]) // 200, 1)]
     used = anchors.position[np.unique(ranges.anchor)]
     level = config.height is not None or config.heights is not None
     hdop = float(np.median([dop(used, position, level=level).hdop for position in sample]))
@@ -110,47 +108,33 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
             f"poor geometry: median HDOP {hdop:.0f}. The anchors are {anchor_rank(used).value}. "
             "Place anchors on more sides of the tag"
         )
-    share = len(live) / len(ranges)
-    if share < 0.9:
+    without_position = 1.0 - len(live) / len(ranges)
+    if without_position > MAX_WITHOUT_POSITION:
         warnings.append(
-            f"no position for {1.0 - share:.0%} of the ranges, because several positions explain them or too few anchors "
+            f"no position for {without_position:.0%} of the ranges, because several positions explain them or too few anchors "
             "were received. Give a height or an area"
         )
-    if (
-        of_smoothed.rmse > WORSE * of_live.rmse
-        or of_smoothed.height_rmse > WORSE * max(of_live.height_rmse, MIN_HEIGHT_RMSE_M)
-        or of_smoothed.coverage95 < MIN_COVERAGE
-    ):
+    warnings += _smoothing_warnings(errors["live"], errors["smoothed"])
+    return TagTracks(recording, **tracks, errors=errors, hdop=hdop, warnings=warnings)
+
+
+def _smoothing_warnings(live: TrackErrors, smoothed: TrackErrors) -> list[str]:
+    warnings = []
+    if smoothed.rmse > WORSE * live.rmse:
         warnings.append(
-            f"smoothing failed: RMSE {of_smoothed.rmse:.3f} m (live {of_live.rmse:.3f} m), height "
-            f"{of_smoothed.height_rmse:.3f} m (live {of_live.height_rmse:.3f} m), {of_smoothed.coverage95:.0%} of the true "
-            "positions in the 95 % ellipses. Use the live track"
+            f"smoothing increases the RMSE from {live.rmse:.3f} m to {smoothed.rmse:.3f} m. Use the live track"
         )
-
-    # The locator judges by its last ranges only: use the whole recording.
-    contradicting = [
-        row
-        for row in locator.disagreeing()
-        if contradicts(anchors, ranges, row, TagEstimator(config).run(ranges.take(ranges.anchor != row)))
-    ]
-    return TagTracks(recording, live, smoothed, snapshots, errors, hdop, contradicting, warnings)
-
-
-def contradicts(anchors: AnchorMap, ranges: Ranges, row: int, others: Track) -> bool:
-    """Whether an anchor's ranges contradict the track that was estimated without them.
-
-    A blocked line of sight makes some ranges too long, which is a long tail: the shortest residuals still fit. A wrong
-    anchor position or offset shifts all residuals, or makes many ranges too short, which no obstacle does.
-    """
-    own = ranges.anchor == row
-    if len(others) < 2 or not own.any() or own.all():
-        return False
-    position = np.stack(
-        [np.interp(ranges.stamp_ns, others.stamp_ns, axis) for axis in others.position.T], axis=1
-    )
-    residual = ranges.range_m - np.linalg.norm(position - anchors.position[ranges.anchor], axis=1)
-    low = float(np.percentile(residual[own], 20.0) - np.median(residual[~own]))
-    return abs(low) > CONTRADICTION_M
+    if smoothed.height_rmse > WORSE * max(live.height_rmse, MIN_HEIGHT_RMSE_M):
+        warnings.append(
+            f"smoothing increases the RMSE of the height from {live.height_rmse:.3f} m to {smoothed.height_rmse:.3f} m. Use "
+            "the live track"
+        )
+    if smoothed.coverage95 < MIN_COVERAGE:
+        warnings.append(
+            f"the covariances of the smoothed track are too small: its 95 % ellipses contain {smoothed.coverage95:.0%} of the "
+            "true positions"
+        )
+    return warnings
 
 
 def _no_position(recording: TagRecording, config: EstimatorConfig, locator: TagEstimator) -> DatasetError:
@@ -177,19 +161,14 @@ class HoldoutErrors:
         anchor_id: None = all anchors.
         ranges: the number of residuals.
         raw_m, corrected_m: of measured and of corrected ranges; corrected NaN if the bag has none.
+        is_displaced: whether another position of the anchor explains the ranges much better.
     """
 
     anchor_id: int | None
     ranges: int
     raw_m: float
     corrected_m: float
-
-    def as_json(self) -> dict[str, float | int | None]:
-        """Return the values for JSON; values that are not finite become null."""
-        values = {"raw_m": self.raw_m, "corrected_m": self.corrected_m}
-        return {"anchor_id": self.anchor_id, "ranges": self.ranges} | {
-            name: value if np.isfinite(value) else None for name, value in values.items()
-        }
+    is_displaced: bool = False
 
 
 def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[HoldoutErrors]:
@@ -198,32 +177,43 @@ def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[Holdo
     The ranges of each anchor are compared with a track that was estimated without this anchor. This needs no ground truth,
     and a wrong offset of an anchor cannot hide, because its own ranges do not move the track.
     """
-    raw = [(one.live, one.recording.raw) for one in tracks]
-    corrected = [(one.live, one.recording.ranges) for one in tracks if one.recording.corrected]
+    raw = [(tag.live, tag.recording.raw) for tag in tracks]
+    corrected = [(tag.live, tag.recording.ranges) for tag in tracks if tag.recording.corrected]
+    rows, of_all = [], (np.zeros(0), np.zeros(0))
+    for row, anchor in enumerate(config.anchors.anchors):
+        before, displaced = _residuals(raw, row, config)
+        after, displaced_after = _residuals(corrected, row, config)
+        rows.append(
+            HoldoutErrors(
+                anchor.id,
+                len(before),
+                _median(before),
+                _median(after),
+                displaced_after if corrected else displaced,
+            )
+        )
+        of_all = np.append(of_all[0], before), np.append(of_all[1], after)
+    return [*rows, HoldoutErrors(None, len(of_all[0]), _median(of_all[0]), _median(of_all[1]))]
 
-    def of(row: int, kind: list[tuple[Track, Ranges]]) -> NDArray[np.float64]:
-        parts = [_residuals(live, ranges, row, config) for live, ranges in kind]
-        return np.concatenate([np.zeros(0), *parts])
 
-    by_anchor = [(of(row, raw), of(row, corrected)) for row in range(len(config.anchors))]
-    every = [np.concatenate(kind) for kind in zip(*by_anchor, strict=True)]
-    identities = [*(anchor.id for anchor in config.anchors.anchors), None]
-    return [
-        HoldoutErrors(identity, len(before), _median(before), _median(after))
-        for identity, (before, after) in zip(identities, [*by_anchor, every], strict=True)
-    ]
+def _residuals(
+    recorded: list[tuple[Track, Ranges]], row: int, config: EstimatorConfig
+) -> tuple[NDArray[np.float64], bool]:
+    """Return range minus distance of an anchor's ranges, where the track of the others is known.
 
-
-def _residuals(initial: Track, ranges: Ranges, row: int, config: EstimatorConfig) -> NDArray[np.float64]:
-    """Return range minus distance of an anchor's ranges, where the track of the others is known."""
-    own = ranges.anchor == row
-    if len(np.unique(ranges.anchor[~own])) < MIN_OTHERS or not own.any():
-        return np.zeros(0)
-    track = Smoother(config, ranges.take(~own)).fit(initial).track
-    position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[own])
-    residual = ranges.range_m[own] - np.linalg.norm(position - config.anchors.position[row], axis=1)
-    known: NDArray[np.float64] = residual[np.isfinite(residual)]
-    return known
+    Also return whether another position of the anchor explains the ranges of a tag much better.
+    """
+    residuals, displaced = [np.zeros(0)], False
+    for initial, ranges in recorded:
+        mask = ranges.anchor == row
+        if len(np.unique(ranges.anchor[~mask])) < MIN_OTHERS or not mask.any():
+            continue
+        track = Smoother(config, ranges.take(~mask)).fit(initial).track
+        position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[mask])
+        residual = ranges.range_m[mask] - np.linalg.norm(position - config.anchors.position[row], axis=1)
+        residuals.append(residual[np.isfinite(residual)])
+        displaced |= is_displaced(config.anchors, ranges, row, track)
+    return np.concatenate(residuals), displaced
 
 
 def _median(residual: NDArray[np.float64]) -> float:
@@ -232,10 +222,10 @@ def _median(residual: NDArray[np.float64]) -> float:
 
 def pooled(errors: list[TrackErrors]) -> TrackErrors:
     """Return the errors of all tags, weighted by epochs; medians and percentiles are means."""
-    known = [one for one in errors if one.epochs]
-    if not known:
+    with_truth = [error for error in errors if error.epochs]
+    if not with_truth:
         return NO_ERRORS
-    epochs, *columns = np.array([astuple(one) for one in known]).T
+    epochs, *columns = np.array([astuple(error) for error in with_truth]).T
     columns[0] = columns[0] ** 2
     rmse, *means = (float(epochs @ column / epochs.sum()) for column in columns)
     return TrackErrors(int(epochs.sum()), float(np.sqrt(rmse)), *means)
@@ -250,22 +240,22 @@ def write_tracks(bag: BagWriter, tracks: list[TagTracks]) -> None:
         RecordingError: the bag cannot be written.
     """
     messages = sorted(
-        (message for one in tracks for message in _messages(one, several=len(tracks) > 1)),
+        (message for track in tracks for message in _messages(track, several=len(tracks) > 1)),
         key=lambda message: message[0],
     )
     for stamp, topic, kind, data in messages:
         bag.write_message(topic, kind, data, stamp)
 
 
-def _messages(one: TagTracks, several: bool) -> Iterator[tuple[int, str, str, bytes]]:
-    tag = one.recording.tag_id
+def _messages(tracks: TagTracks, several: bool) -> Iterator[tuple[int, str, str, bytes]]:
+    tag = tracks.recording.tag_id
     name, frame = (tag if several else None), tag_frame(tag)
-    for estimate in one.live:
+    for estimate in tracks.live:
         data = encode_odometry(estimate, child_frame_id=frame, twist=_body_twist(estimate))
         yield estimate.stamp_ns, tag_topic(ODOMETRY, name), ODOMETRY_TYPE, data
-    for estimate in one.smoothed:
+    for estimate in tracks.smoothed:
         yield estimate.stamp_ns, tag_topic(POSE_SMOOTHED, name), POSE_TYPE, encode_pose(estimate)
-    truth = one.recording.truth
+    truth = tracks.recording.truth
     yaws = truth.yaw_at(truth.stamp_ns).tolist()
     for stamp, position, yaw in zip(truth.stamp_ns.tolist(), truth.position.tolist(), yaws, strict=True):
         data = encode_true_position(position, tag, stamp, yaw if np.isfinite(yaw) else None)

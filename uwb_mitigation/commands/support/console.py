@@ -91,8 +91,10 @@ def show_table(
         return table
 
     num_omitted = 0
+    # Rich limits the measured width to that of the options.
+    unlimited = out.options.update_width(10_000)
     while num_omitted < len(optional) and (
-        out.measure(build(optional[len(optional) - num_omitted :])).maximum > out.width
+        out.measure(build(optional[len(optional) - num_omitted :]), options=unlimited).maximum > out.width
     ):
         num_omitted += 1
     omitted = optional[len(optional) - num_omitted :]

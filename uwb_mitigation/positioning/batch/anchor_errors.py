@@ -29,7 +29,7 @@ from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor
 from uwb_mitigation.positioning.noise_model import MAD_TO_SD, Regressors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.tracks import Ranges
+from uwb_mitigation.types.tracks import Ranges, Track, TruePath
 
 MISPLACED_M = 0.4
 """A smaller displacement looks like reflections."""
@@ -366,6 +366,31 @@ class AnchorRanges:
             f_scale=sd_m,
         )
         return np.append(solution.x, 0.0)
+
+
+def is_displaced(anchors: AnchorMap, ranges: Ranges, row: int, track: Track) -> bool:
+    """Return whether another position of an anchor explains its ranges to the track of the other anchors much better.
+
+    An offset, or obstacles that lengthen some ranges, do not depend on the direction to the tag as a wrong position does.
+
+    Args:
+        anchors: anchors of the file.
+        ranges: ranges of one tag.
+        row: row of the anchor.
+        track: track of the tag, estimated without this anchor.
+    """
+    path = TruePath(track.stamp_ns, track.position)
+    antenna = path.at(ranges.stamp_ns)
+    is_used = np.isfinite(antenna).all(axis=1) & (ranges.anchor == row)
+    by_anchor = _by_anchor(ranges, np.zeros(len(ranges), np.intp), antenna, is_used)
+    if row not in by_anchor:
+        return False
+    anchor_ranges, position = by_anchor[row], anchors.position[row]
+    sd_m = max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(anchor_ranges.residual_m(position)))))
+    loss = anchor_ranges.loss(position, sd_m)
+    shift = anchor_ranges.best_displacement(position, sd_m)
+    gain = loss - anchor_ranges.loss(position + shift, sd_m)
+    return float(np.linalg.norm(shift)) > MISPLACED_M and _is_better(gain, loss)
 
 
 def validate_anchor_map(
