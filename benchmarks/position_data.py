@@ -227,10 +227,10 @@ def _open(path: str, mapping: str) -> MappedRecording:
         recording.anchors = load_anchors(anchors_file)
     if not hasattr(recording, "anchors"):
         raise RecordingError("the positions of the anchors are unknown", where=path)
-    if mapping == "miluv" and table.anchors is not None:
+    if mapping == "miluv":
         candidates = [recording]
         for group in range(1, _GROUPS):
-            anchors = table.anchors.model_copy(update={"group": str(group)})
+            anchors = [source.model_copy(update={"group": str(group)}) for source in table.anchors]
             try:
                 candidates.append(MappedRecording(table.model_copy(update={"anchors": anchors}), Path(path)))
             except (UwbMitigationError, KeyError, ValueError):

@@ -18,6 +18,8 @@ from uwb_mitigation.errors import DamagedRecordingError, ParameterError, Recordi
 from uwb_mitigation.types.stamps import NS_PER_S
 
 if TYPE_CHECKING:
+    from uwb_mitigation.recordings.bag.writer import BagWriter
+    from uwb_mitigation.recordings.summary import PauseShortener, RecordingSummary
     from uwb_mitigation.types.source import Source
     from uwb_mitigation.types.tracks import Imu, Odometry
 
@@ -90,12 +92,16 @@ def import_recordings(
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
     from uwb_mitigation.commands.support import mapped_report
+    from uwb_mitigation.recordings.bag.writer import check_output
     from uwb_mitigation.recordings.formats import open_mapped
 
     if dry_run and not mapping:
         raise ParameterError("--dry-run needs --map", valid="--map FILE")
     if output is None and not dry_run:
         raise ParameterError("no output", valid="-o OUT, or --dry-run with --map")
+    if output is not None and not dry_run:
+        # Before a long recording is read.
+        check_output(output, force=force)
     opened: Sequence[Source]
     extra: dict[str, Any] = {}
     if mapping:
@@ -165,21 +171,62 @@ def _write(
     Raises:
         RecordingError: there are no ranges; or a source is damaged, after the bag was written.
     """
-    from uwb_mitigation.recordings.bag.odometry import write_robot
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.recordings.summary import PauseShortener, RecordingSummary
 
+    console.exit_on_sigterm()
     summary = RecordingSummary()
     kinds = {source.simulated for source in sources}
     simulated = "true" if True in kinds else "unknown" if None in kinds else "false"
     origin = {"source": "; ".join(source.name for source in sources), "simulated": simulated}
-    pauses = PauseShortener(longest_pause, int(time.time() // 86_400) * 86_400 * NS_PER_S)
+    # Simulated ranges start today.
+    start_ns = None if total is None else int(time.time() // 86_400) * 86_400 * NS_PER_S
+    pauses = PauseShortener(longest_pause, start_ns)
+    with BagWriter(output, origin, force=force) as bag:
+        damage = _copy(sources, bag, pauses, summary, total)
+        if summary.ranges == 0:
+            raise damage or RecordingError("the recording contains no ranges", where=origin["source"])
+    result = summary.as_json()
+    for source in sources:
+        _show_source(source)
+    if total is None:
+        _show_summary(result)
+    if pauses.cut:
+        print_line(
+            f"Shortened {pauses.cut} pauses to {pauses.longest_s:g} s, {pauses.cut_s:.0f} s in total; "
+            "--longest-pause inf keeps them."
+        )
+    for shift_s in pauses.shifts_s:
+        print_line(f"{shift_s:+.0f} s were added to the stamps of a recording without a date.")
+    if len(sources) == 1:
+        _save_anchors(sources[0], output)
+    messages = bag.counts.total()
+    lost = ", ".join(f"{count} x {reason}" for reason, count in summary.skipped.items())
+    print_line(
+        f"Wrote {messages} messages, {summary.ranges} ranges of {_pairs(result)}, to {bag.file}"
+        + (f"; skipped: {lost}." if lost and total is not None else ".")
+    )
+    console.write_json(json, {"messages": messages, "output": str(bag.file), **result, **(extra or {})})
+    if damage:
+        raise damage
+
+
+def _copy(
+    sources: Sequence[Source],
+    bag: BagWriter,
+    pauses: PauseShortener,
+    summary: RecordingSummary,
+    total: int | None,
+) -> DamagedRecordingError | None:
+    """Write the records of all sources to a bag; return the first damage."""
+    from uwb_mitigation.recordings.bag.odometry import write_robot
+
     damage: list[DamagedRecordingError] = []
-    robot = _motion_of(sources[0], pauses.start_ns)
-    row = 0
-    with BagWriter(output, origin, force=force) as bag, console.progress() as bar:
+    robot, row = _motion_of(sources[0], pauses.start_ns or 0), 0
+    with console.progress() as bar:
         task = bar.add_task("writing", total=total)
         for source in sources:
+            pauses.is_new_source = True
             try:
                 with source:
                     for record in summary.watch(source):
@@ -187,51 +234,20 @@ def _write(
                         if robot is not None:
                             row = write_robot(bag, *robot, row, record.measurement.stamp_ns)
                         bag.write(record)
-                        if summary.ranges % _STRIDE == 0:
-                            done = summary.ranges
-                            bar.update(task, completed=done, description=f"writing: {done} ranges")
-            except DamagedRecordingError as error:  # noqa: PERF203 - once a source
+                        if (count := summary.ranges) % _STRIDE == 0:
+                            bar.update(task, completed=count, description=f"writing: {count} ranges")
+            except DamagedRecordingError as error:
                 damage.append(error)
-        if summary.ranges == 0:
-            raise (
-                damage[0]
-                if damage
-                else RecordingError("the recording contains no ranges", where=origin["source"])
-            )
-    found = summary.as_json()
-    for source in sources:
-        _show_source(source)
-    if total is None:
-        _show_summary(found)
-    if pauses.cut:
-        print_line(
-            f"Shortened {pauses.cut} pauses to {pauses.longest_s:g} s, {pauses.cut_s:.0f} s in total; "
-            "--longest-pause inf keeps them."
-        )
-    if len(sources) == 1:
-        _save_anchors(sources[0], output)
-    messages = bag.counts.total()
-    lost = ", ".join(f"{count} x {reason}" for reason, count in summary.skipped.items())
-    print_line(
-        f"Wrote {messages} messages, {summary.ranges} ranges of {_pairs(found)}, to {bag.file}"
-        + (f"; skipped: {lost}." if lost and total is not None else ".")
-    )
-    console.write_json(json, {"messages": messages, "output": str(bag.file), **found, **(extra or {})})
-    if damage:
-        raise damage[0]
+    return damage[0] if damage else None
 
 
 def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu | None] | None:
     """Return odometry and IMU data of a simulated drive that starts at `start_ns`, or the odometry of a mapping."""
     from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-    from uwb_mitigation.recordings.summary import FIRST_DATE_NS
     from uwb_mitigation.simulation.simulated import SimulatedSource
 
-    if isinstance(source, MappedRecording) and (odometry := source.motion) is not None:
-        # Without a date, the first range starts at `start_ns`.
-        first_ns = int(source.values["stamp"][0])
-        shift_ns = start_ns - first_ns if first_ns < FIRST_DATE_NS else 0
-        return replace(odometry, stamp_ns=odometry.stamp_ns + shift_ns), None
+    if isinstance(source, MappedRecording) and source.motion is not None:
+        return source.motion, None
     if not isinstance(source, SimulatedSource):
         return None
     motion = source.motion()
@@ -291,13 +307,13 @@ def info(
                 on_record()
     finally:
         # Show the readable part before an error of the rest is raised.
-        found = summary.as_json()
+        result = summary.as_json()
         if summary.ranges or summary.skipped:
             _show_source(source)
-            _show_summary(found)
+            _show_summary(result)
     messages = source.message_count if isinstance(source, McapRecording) else summary.ranges
     about = {"messages": messages, "source": source.name, "simulated": source.simulated}
-    console.write_json(json, {**about, **found})
+    console.write_json(json, {**about, **result})
 
 
 def _save_anchors(source: Source, bag: Path) -> None:
@@ -322,28 +338,28 @@ def _show_source(source: Source) -> None:
     console.out.print(_KINDS[source.simulated])
 
 
-def _show_summary(found: dict[str, Any]) -> None:
+def _show_summary(result: dict[str, Any]) -> None:
     console.out.print(
-        f"{found['ranges']} ranges, {found['with_truth']} with truth, {_pairs(found)}, {found['duration_s']:.1f} s"
+        f"{result['ranges']} ranges, {result['with_truth']} with truth, {_pairs(result)}, {result['duration_s']:.1f} s"
     )
     pairs = ConsoleTable("anchor", "tag", "label", title="Pairs", title_justify="left")
     for column in ("ranges", "rate (Hz)", "mean range (m)", "mean true (m)"):
         pairs.add_column(column, justify="right")
-    for pair in found["by_pair"]:
+    for pair in result["by_pair"]:
         means = (_number(pair[name], 3) for name in ("mean_range_m", "mean_true_range_m"))
         ids = (format_id(pair[name]) for name in ("anchor_id", "tag_id"))
         pairs.add_row(*ids, pair["label"], str(pair["ranges"]), _number(pair["rate_hz"], 1), *means)
     console.out.print(pairs)
-    if found["skipped"]:
+    if result["skipped"]:
         oddities = ConsoleTable("warning", title="Warnings", title_justify="left")
         oddities.add_column("count", justify="right")
-        for kind, count in sorted(found["skipped"].items(), key=lambda item: -item[1]):
+        for kind, count in sorted(result["skipped"].items(), key=lambda item: -item[1]):
             oddities.add_row(kind, str(count))
         console.out.print(oddities)
 
 
-def _pairs(found: dict[str, Any]) -> str:
-    return f"{found['pairs']} pair{'' if found['pairs'] == 1 else 's'}"
+def _pairs(result: dict[str, Any]) -> str:
+    return f"{result['pairs']} pair{'' if result['pairs'] == 1 else 's'}"
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -62,12 +62,12 @@ def process(
     bags = parallel.plan(sources, output)
     # Load the model first: an invalid model would give the same error for every bag.
     bundle = bundle_for(model, bags[0].source)
-    known = read_offsets(offsets or "")
+    radio_offsets = read_offsets(offsets or "")
     jobs = []
     for planned in bags:
         # Absolute paths, since a worker of a cluster has another working directory.
         source, place, path = planned.source.absolute(), planned.output.absolute(), bundle.path.absolute()
-        jobs.append(Job(source, place, path, force, known))
+        jobs.append(Job(source, place, path, force, radio_offsets))
         if not planned.alone:
             _make_folder(place.parent)
 
@@ -98,19 +98,20 @@ def _make_folder(path: Path) -> None:
 def _process_one(job: Job) -> Outcome:
     from uwb_mitigation.commands.offline.process import try_process
 
+    console.exit_on_sigterm()
     with console.progress() as bar:
         task = bar.add_task(escape(job.source.name), total=None)
-        return try_process(job, lambda done, total: bar.update(task, completed=done, total=total))
+        return try_process(job, lambda count, total: bar.update(task, completed=count, total=total))
 
 
 def _follow(jobs: list[Job], outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Show the progress; return the outcomes in the order of the jobs."""
-    found: dict[Job, Outcome] = {}
+    by_job: dict[Job, Outcome] = {}
     with console.step_bar("bags", len(jobs)) as advance:
         for outcome in outcomes:
-            found[outcome.job] = outcome
+            by_job[outcome.job] = outcome
             advance()
-    return [found[job] for job in jobs]
+    return [by_job[job] for job in jobs]
 
 
 def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str, Any]:

@@ -94,15 +94,19 @@ class PauseShortener:
 
     Attributes:
         longest_s: longer pauses are shortened to this; infinite = never.
-        start_ns: first stamp of records without a date.
+        start_ns: first stamp, if records start without a date; None: their stamps are kept.
         cut: number of shortened pauses.
         cut_s: total time removed.
+        shifts_s: shifts of records without a date that follow others.
+        is_new_source: the next record is the first one of another recording.
     """
 
     longest_s: float
-    start_ns: int
+    start_ns: int | None = None
     cut: int = 0
     cut_s: float = 0.0
+    shifts_s: list[float] = field(default_factory=list)
+    is_new_source: bool = False
     _last_ns: int | None = field(default=None, init=False)
     _shift_ns: int = field(default=0, init=False)
 
@@ -114,11 +118,17 @@ class PauseShortener:
         """Return the record with its new stamp."""
         stamp_ns = record.measurement.stamp_ns
         last_ns, self._last_ns = self._last_ns, stamp_ns
-        if stamp_ns < FIRST_DATE_NS and (last_ns is None or last_ns >= FIRST_DATE_NS):
-            # Records without a date continue after those with one.
-            start_ns = self.start_ns if last_ns is None else last_ns + self._shift_ns
-            self._shift_ns = start_ns - stamp_ns
-        elif last_ns is not None and stamp_ns - last_ns > self.longest_s * 1e9:
+        is_new_source, self.is_new_source = self.is_new_source, False
+        if last_ns is None:
+            if stamp_ns < FIRST_DATE_NS and self.start_ns is not None:
+                self._shift_ns = self.start_ns - stamp_ns
+        elif stamp_ns < FIRST_DATE_NS and (
+            last_ns >= FIRST_DATE_NS or (is_new_source and stamp_ns < last_ns)
+        ):
+            # Records without a date continue after the others.
+            self._shift_ns += last_ns - stamp_ns
+            self.shifts_s.append(self._shift_ns / 1e9)
+        elif stamp_ns - last_ns > self.longest_s * 1e9:
             excess_ns = stamp_ns - last_ns - round(self.longest_s * 1e9)
             self._shift_ns -= excess_ns
             self.cut += 1

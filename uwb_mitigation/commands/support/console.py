@@ -8,6 +8,8 @@ import enum
 import itertools
 import json
 import math
+import signal
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,6 +38,11 @@ class ConsoleTable(RichTable):
 # rich omits colours and cursor movement if a stream is not a terminal.
 out = Console()
 err = Console(stderr=True)
+
+
+def exit_on_sigterm() -> None:
+    """Let SIGTERM raise SystemExit, so that unfinished output is removed."""
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
 
 def print_line(text: str) -> None:

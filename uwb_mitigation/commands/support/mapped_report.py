@@ -1,4 +1,4 @@
-"""Tables of `data import --map`: the first converted ranges, errors, and what is missing for a model."""
+"""Report of `data import --map`: ids, the first converted ranges, errors, and what is missing for a model."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 
 _ROWS = 5
+_LARGE_M, _LARGE_ERROR_M = 100.0, 5.0
+"""Larger ranges and errors are counted."""
+
 _BAR = 40
 _FIELDS = (
     ("range, m", "range", 3),
@@ -33,6 +36,14 @@ def show(sources: Sequence[MappedRecording], *, preview: bool) -> dict[str, Any]
     warnings = [warning for source in sources for warning in source.warnings]
     for rule, count in dropped.items():
         print_line(f"Dropped {count} rows: {rule}")
+    for source in sources:
+        for note in source.notes:
+            print_line(note)
+        for kind, names in source.names.items():
+            if names:
+                show_table(
+                    "", (f"{kind} name", "id"), [[name, str(number)] for name, number in names.items()]
+                )
     for warning in warnings:
         console.warn(f"warning: {warning}")
     for source in sources if preview else ():
@@ -48,6 +59,7 @@ def show(sources: Sequence[MappedRecording], *, preview: bool) -> dict[str, Any]
         "anchors": distinct("anchor"),
         "tags": distinct("tag"),
         "dropped": dict(dropped),
+        "notes": [note for source in sources for note in source.notes],
         "warnings": warnings,
     }
 
@@ -72,11 +84,31 @@ def show_preview(source: MappedRecording) -> None:
         ["label", *(values["label"][row] or "-" for row in shown)],
         ["placement", *(values["configuration"][row] or "-" for row in shown)],
     ]
+    print_line(_extent(source))
     title = f"The first of {len(source)} ranges, from {np.datetime64(first // 1_000_000, 'ms')} UTC"
     show_table(title, ("", *(str(row + 1) for row in shown)), rows)
     _show_errors(source.errors_m)
     for line in missing(source):
         print_line(line)
+
+
+def _extent(source: MappedRecording) -> str:
+    """Return the duration, the rates of pairs, and the number of outliers."""
+    from uwb_mitigation.recordings.mapping.checks import median
+
+    values = source.values
+    duration_s = int(values["stamp"].max() - values["stamp"].min()) / 1e9
+    counts = np.unique(np.stack([values["tag"], values["anchor"]]), axis=1, return_counts=True)[1]
+    text = f"{duration_s:.1f} s, {len(counts)} pairs with {counts.min()} to {counts.max()} ranges"
+    if duration_s > 0:
+        text += f" ({counts.min() / duration_s:.2g} to {counts.max() / duration_s:.2g} Hz)"
+    for name, numbers, limit in (
+        ("ranges", values["range"], max(_LARGE_M, 5 * median(values["range"]))),
+        ("errors", np.abs(source.errors_m), _LARGE_ERROR_M),
+    ):
+        if count := int(np.count_nonzero(numbers > limit)):
+            text += f"; {count} {name} above {limit:.0f} m"
+    return text
 
 
 def missing(source: MappedRecording) -> list[str]:
@@ -94,10 +126,8 @@ def missing(source: MappedRecording) -> list[str]:
         ),
         (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
         (with_cir and unknown("preamble_count"), "no preamble count: use the model `universal_amplitude`"),
-        (
-            unknown("rx_power") or unknown("first_path_power"),
-            "no receive or first-path level: no linear model",
-        ),
+        (unknown("rx_power"), "no receive level: no linear model"),
+        (unknown("first_path_power"), "no first-path level: no linear model of the power gap"),
         (not len(source.errors_m), "no true range: `evaluate`, `train` and `offset` cannot use it"),
         (
             len(source.errors_m) and len(set(source.values["configuration"].tolist())) < 3,

@@ -15,7 +15,13 @@ from rclpy.subscription import Subscription
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
-from uwb_mitigation.recordings.mapping.conversion import NO_CIR, Converter, kept_rows, measurement, samples_of
+from uwb_mitigation.recordings.mapping.conversion import (
+    NO_CIR,
+    Converter,
+    filter_rows,
+    measurement,
+    samples_of,
+)
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows
 from uwb_mitigation.recordings.mapping.tables import LOG_TIME, TOPIC, UNREADABLE, Chunk
@@ -146,7 +152,7 @@ class TopicFeed:
         chunk = Chunk(
             {column: _array(values) for column, values in rows.items()}, count, name, np.arange(count)
         )
-        chunk = chunk.take(kept_rows(self._mapping.drop, chunk, self.counts))
+        chunk = chunk.take(filter_rows(self._mapping.drop, chunk, self.counts))
         if not chunk.count:
             return []
         values = self._converter.convert(chunk)
@@ -165,7 +171,7 @@ class TopicFeed:
         if source is None or source.files:
             return NO_CIR
         samples, encoding, scale = samples_of(chunk.columns[source.column][row], source.samples)
-        return Cir(samples, encoding, source.start_index, scale=scale)
+        return Cir(samples, encoding, scale=scale)
 
 
 def _array(values: Any) -> Any:

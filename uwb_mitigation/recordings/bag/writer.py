@@ -63,6 +63,23 @@ def _bag_file(path: Path) -> Path:
     return path if path.suffix == ".mcap" else path / f"{path.name}_0.mcap"
 
 
+def check_output(path: Path, *, force: bool = False) -> None:
+    """Check that a bag can be created at `path`.
+
+    Raises:
+        RecordingError: the bag exists and `force` is not given, or its folder does not exist.
+    """
+    is_file, folder = path.suffix == ".mcap", path.absolute().parent
+    if is_file and not folder.is_dir():
+        raise RecordingError("the folder of the output does not exist", where=str(path), valid=str(folder))
+    if not is_file and path.exists() and not path.is_dir():
+        raise RecordingError("a file instead of a bag folder", where=str(path))
+    # Without `force`, a broken link is not replaced either.
+    occupied = os.path.lexists(_bag_file(path)) or (not is_file and path.is_dir() and any(path.iterdir()))
+    if occupied and not force:
+        raise RecordingError("exists already", where=str(path), valid="--force replaces it")
+
+
 class BagWriter:
     """Writes one bag; a context manager that completes the bag or, on any exception, removes it.
 
@@ -91,14 +108,7 @@ class BagWriter:
         self._schemas: dict[Schema, int] = {}
         self._stream: BinaryIO | None = None
 
-        if self._folder is not None and path.exists() and not path.is_dir():
-            raise RecordingError("a file instead of a bag folder", where=str(path))
-        # Without `force`, a broken link is not replaced either.
-        occupied = os.path.lexists(self.file) or (
-            self._folder is not None and path.is_dir() and any(path.iterdir())
-        )
-        if occupied and not force:
-            raise RecordingError("exists already", where=str(path), valid="--force replaces it")
+        check_output(path, force=force)
         with self._translate_os_errors():
             self._created_folder = self._folder is not None and not self._folder.exists()
             if self._folder is not None:

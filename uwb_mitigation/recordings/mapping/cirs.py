@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.mapping.conversion import ColumnDict, samples_of
-from uwb_mitigation.recordings.mapping.mapping import CirSource, series
+from uwb_mitigation.recordings.mapping.mapping import CirSource, Join, series
 from uwb_mitigation.recordings.mapping.tables import UNREADABLE, Chunk
 from uwb_mitigation.types.measurement import Cir, Encoding
+
+MAX_DELAY_S = 1.0
+"""Largest delay of a CIR that is searched."""
+
+_MAX_SEARCHED = 5000
+"""Number of CIRs whose delay is computed."""
 
 
 class CirFile:
@@ -20,7 +26,7 @@ class CirFile:
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
-        self._rows: list[tuple[int, int, Encoding, int, float]] = []
+        self._rows: list[tuple[int, int, Encoding, float]] = []
 
     def add(self, source: CirSource, chunk: Chunk) -> NDArray[np.int64]:
         """Store the CIRs of rows; return their numbers, -1 if a row has none.
@@ -32,7 +38,7 @@ class CirFile:
         lists: Any = chunk.columns[names[0]]
         if len(names) > 1:
             lists = np.stack([np.asarray(chunk.columns[name], np.float64) for name in names], axis=1)
-        found = np.full(chunk.count, -1)
+        numbers = np.full(chunk.count, -1)
         for row in range(chunk.count):
             values = lists[row]
             if values is None or isinstance(values, float):
@@ -44,18 +50,17 @@ class CirFile:
                     f"not a CIR: {error}", where=chunk.where(row), valid=source.samples
                 ) from error
             if len(samples):
-                found[row] = len(self._rows)
+                numbers[row] = len(self._rows)
                 start = self._file.seek(0, 2)
                 self._file.write(samples.tobytes())
-                self._rows.append((start, len(samples), encoding, source.start_index, scale))
-        return found
+                self._rows.append((start, len(samples), encoding, scale))
+        return numbers
 
     def read(self, number: int) -> Cir:
         """Return the samples of a CIR."""
-        start, length, encoding, start_index, scale = self._rows[number]
+        start, length, encoding, scale = self._rows[number]
         self._file.seek(start)
-        samples = np.frombuffer(self._file.read(2 * length), np.int16)
-        return Cir(samples, encoding, start_index, scale=scale)
+        return Cir(np.frombuffer(self._file.read(2 * length), np.int16), encoding, scale=scale)
 
     def close(self) -> None:
         """Delete the file."""
@@ -64,24 +69,61 @@ class CirFile:
 
 def join_by_row(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, where: str) -> None:
     """Give the ranges at `rows` the CIRs of the same rows in another file."""
-    known = int(cirs["row"].max(initial=-1)) + 1
-    if ranges["row"][rows].max(initial=-1) >= known:
-        raise RecordingError(f"{known} CIRs for more ranges", where=where, valid="one row for each range")
-    by_row = np.full(known, -1)
+    count = int(cirs["row"].max(initial=-1)) + 1
+    if ranges["row"][rows].max(initial=-1) >= count:
+        raise RecordingError(f"{count} CIRs for more ranges", where=where, valid="one row for each range")
+    by_row = np.full(count, -1)
     by_row[cirs["row"]] = cirs["cir"]
     ranges["cir"][rows] = by_row[ranges["row"][rows]]
 
 
-def join_by_time(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, tolerance_s: float) -> None:
-    """Give the ranges at `rows` the CIRs of their pairs that are nearest in time, within the tolerance."""
+def join_by_time(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, join: Join) -> tuple[str, bool]:
+    """Give the ranges at `rows` the CIRs of their pairs that are nearest in time, within the tolerance.
+
+    Returns:
+        A sentence for the user, and whether it is a warning.
+    """
     import pandas as pd
 
     keys = ("stamp", "tag", "anchor")
-    left = pd.DataFrame({name: ranges[name][rows] for name in keys} | {"to": rows})
+    left = pd.DataFrame({name: ranges[name][rows] for name in keys} | {"target": rows})
     right = pd.DataFrame({name: cirs[name] for name in (*keys, "cir", "first_path_index")})
+    right = right[right["cir"] >= 0].assign(cir_stamp=right["stamp"])
     left, right = (frame.sort_values("stamp", kind="stable") for frame in (left, right))
-    within = {"direction": "nearest", "tolerance": round(tolerance_s * 1e9)}
-    found = pd.merge_asof(left, right, on="stamp", by=["tag", "anchor"], **within).dropna(subset="cir")
-    ranges["cir"][found["to"]] = found["cir"]
-    index = found["first_path_index"]
-    ranges["first_path_index"][found["to"][index.notna()]] = index.dropna()
+    tolerance = {"direction": "nearest", "tolerance": round(join.tolerance_s * 1e9)}
+    pairs = pd.merge_asof(left, right, on="stamp", by=["tag", "anchor"], **tolerance).dropna(subset="cir")
+    # A CIR belongs to one range only.
+    distance = (pairs["cir_stamp"] - pairs["stamp"]).abs()
+    pairs = pairs.loc[distance.sort_values(kind="stable").index].drop_duplicates("cir")
+    ranges["cir"][pairs["target"]] = pairs["cir"]
+    index = pairs["first_path_index"]
+    ranges["first_path_index"][pairs["target"][index.notna()]] = index.dropna()
+    return _summary(left, right, len(pairs), join)
+
+
+def _summary(ranges: Any, cirs: Any, attached: int, join: Join) -> tuple[str, bool]:
+    """Return how many CIRs were attached, their typical delay, and the offset that would attach more."""
+    text = f"CIRs attached: {attached} of {len(cirs)}"
+    stamps = {key: group["stamp"].to_numpy() for key, group in ranges.groupby(["tag", "anchor"])}
+    delays = []
+    for key, group in cirs.iloc[:_MAX_SEARCHED].groupby(["tag", "anchor"]):
+        if key in stamps:
+            times, limit = group["stamp"].to_numpy(), round(MAX_DELAY_S * 1e9)
+            first, last = (np.searchsorted(stamps[key], times + shift) for shift in (-limit, limit))
+            delays += [time - stamps[key][i:j] for time, i, j in zip(times, first, last, strict=True)]
+    sorted_s = np.sort(np.concatenate(delays) / 1e9) if delays else np.zeros(0)
+    if not len(sorted_s):
+        return f"{text}; no CIR has the tag, anchor and time of a range: compare the keys of cir.join", True
+    counts = np.searchsorted(sorted_s, sorted_s + 2 * join.tolerance_s, "right") - np.arange(len(sorted_s))
+    # Ranges at a constant rate give several delays: the smallest one is meant.
+    starts = np.flatnonzero(counts >= 0.9 * counts.max())
+    medians = np.array([np.median(sorted_s[start : start + counts[start]]) for start in starts[:10_000]])
+    best = int(np.argmin(np.abs(medians)))
+    delay_s, count = float(medians[best]), int(counts[starts[best]])
+    text += f"; typical delay {delay_s:+.2f} s"
+    if count > 1.1 * min(attached, _MAX_SEARCHED) + 1:
+        return (
+            f"{text}; cir.join.stamp with offset: {join.stamp.offset - delay_s:.3f} would attach more",
+            True,
+        )
+    return text, attached < len(cirs) / 2

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter, TableFormat
-from uwb_mitigation.recordings.mapping.tables import CHUNK_ROWS, LOG_TIME, TOPIC, Chunk, read_chunks
+from uwb_mitigation.recordings.mapping.tables import (
+    CHUNK_ROWS,
+    LOG_TIME,
+    TOPIC,
+    UNREADABLE,
+    Chunk,
+    read_chunks,
+)
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
@@ -38,15 +45,30 @@ ColumnDict = dict[str, NDArray[Any]]
 as `range`, `true range` and `tag x`: float64, NaN: unknown."""
 
 
-def joined(parts: list[ColumnDict]) -> ColumnDict:
-    """Concatenate parts with the same columns."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+def concat(tables: list[ColumnDict]) -> ColumnDict:
+    """Concatenate tables with the same columns, and empty them to save memory."""
+    count = sum(len(table["stamp"]) if "stamp" in table else len(table["row"]) for table in tables)
+    columns = {}
+    for name in list(tables[0]):
+        arrays = [table.pop(name) for table in tables]
+        is_constant = all(array.strides == (0,) for array in arrays)
+        columns[name] = (
+            np.broadcast_to(arrays[0][:1], count) if is_constant and count else np.concatenate(arrays)
+        )
+    return columns
 
 
 def take(columns: ColumnDict, rows: NDArray[Any]) -> ColumnDict:
-    """Return the chosen rows."""
-    everything = rows.dtype == bool and rows.all()
-    return columns if everything else {name: values[rows] for name, values in columns.items()}
+    """Return the rows of a mask or of indices, and empty `columns` to save memory."""
+    if rows.dtype == bool and rows.all():
+        return columns
+    count = int(np.count_nonzero(rows)) if rows.dtype == bool else len(rows)
+    return {
+        name: np.broadcast_to(columns.pop(name)[:1], count)
+        if columns[name].strides == (0,)
+        else columns.pop(name)[rows]
+        for name in list(columns)
+    }
 
 
 def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
@@ -55,30 +77,29 @@ def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> Range
     def number(name: str) -> float:
         return float(columns[name][row])
 
-    given = number("sequence")
+    count = number("sequence")
     return RangeMeasurement(
         int(columns["stamp"][row]),
         int(columns["tag"][row]),
         int(columns["anchor"][row]),
-        (int(given) if math.isfinite(given) else sequence) & 0xFFFFFFFF,
+        (int(count) if math.isfinite(count) else sequence) & 0xFFFFFFFF,
         0,
         number("range"),
         Cir(
             cir.samples,
             cir.encoding,
-            cir.start_index,
-            number("first_path_index"),
+            first_path_index=number("first_path_index"),
             scale=cir.scale,
-            preamble_count=_whole(number("preamble_count"), 65535),
+            preamble_count=_integer(number("preamble_count"), 65535),
             rx_power_dbm=number("rx_power"),
             first_path_power_dbm=number("first_path_power"),
-            channel=_whole(number("channel"), 255),
+            channel=_integer(number("channel"), 255),
         ),
     )
 
 
-def _whole(value: float, most: int) -> int:
-    return int(value) if 0 <= value <= most else 0
+def _integer(value: float, limit: int) -> int:
+    return int(value) if 0 <= value <= limit else 0
 
 
 @dataclass(slots=True)
@@ -96,10 +117,10 @@ class Converter:
     @property
     def columns(self) -> dict[str, bool]:
         """Return the columns of the table that are needed, and whether they may be missing."""
-        found: dict[str, bool] = {}
+        columns: dict[str, bool] = {}
         for value in filter(None, self.values.values()):
-            found |= {name: value.optional and found.get(name, True) for name in value.columns}
-        return found
+            columns |= {name: value.optional and columns.get(name, True) for name in value.columns}
+        return columns
 
     def convert(self, chunk: Chunk, file: str = "") -> ColumnDict:
         """Return the values of all rows of a chunk; `file`: its path for `file_name`.
@@ -107,19 +128,23 @@ class Converter:
         Raises:
             RecordingError: an id or a number cannot be read; `where` names the row.
         """
-        found: ColumnDict = {}
-        for name, value in self.values.items():
-            if name == "stamp":
-                found[name] = read_stamps(value, chunk, file)
-            elif name in self.names:
-                found[name] = _read_ids(value or FieldRule(constant=1), chunk, name, file, self.names[name])
-            elif name in ("label", "configuration"):
-                found[name] = _read_texts(value, chunk, name, file)
-            else:
-                found[name] = read_numbers(value, chunk, name, file)
-        if "cir_power" in found:
-            _add_levels(found)
-        return found
+        columns: ColumnDict = {}
+        try:
+            for name, value in self.values.items():
+                if name == "stamp":
+                    columns[name] = read_stamps(value, chunk, file)
+                elif name in self.names:
+                    ids = value or FieldRule(constant=1)
+                    columns[name] = _read_ids(ids, chunk, name, file, self.names[name])
+                elif name in ("label", "configuration"):
+                    columns[name] = _read_texts(value, chunk, name, file)
+                else:
+                    columns[name] = read_numbers(value, chunk, name, file)
+        except UNREADABLE as error:
+            raise RecordingError(f"{name} cannot be read: {error!s:.200}", where=str(chunk.path)) from error
+        if "cir_power" in columns:
+            _add_levels(columns)
+        return columns
 
 
 def _add_levels(columns: ColumnDict) -> None:
@@ -137,15 +162,15 @@ def _read_texts(value: FieldRule | None, chunk: Chunk, name: str, file: str) -> 
     """Return a value as texts (n,), after `pattern` and `values`; empty: unknown."""
     raw = None if value is None else _raw(value, chunk, file)
     if value is None or raw is None:
-        return np.full(chunk.count, "", object)
+        return np.broadcast_to(np.array([""], object), chunk.count)
     # None and NaN are missing values.
-    given = ["" if each is None or each != each else each for each in raw.tolist()]
-    texts = {each: _text(value, each, name) if each != "" else "" for each in dict.fromkeys(given)}
-    return np.array([texts[each] for each in given], object)
+    cells = ["" if cell is None or cell != cell else cell for cell in raw.tolist()]
+    texts = {cell: _text(value, cell, name) if cell != "" else "" for cell in dict.fromkeys(cells)}
+    return np.array([texts[cell] for cell in cells], object)
 
 
-def _text(value: FieldRule, given: Any, name: str) -> str:
-    text = str(int(given)) if isinstance(given, float) and given.is_integer() else str(given).strip()
+def _text(value: FieldRule, cell: Any, name: str) -> str:
+    text = str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
     if value.pattern:
         match = re.search(value.pattern, text)
         if match is None:
@@ -162,13 +187,14 @@ def read_numbers(value: FieldRule | None, chunk: Chunk, name: str, file: str = "
     """
     raw = None if value is None else _raw(value, chunk, file)
     if value is None or raw is None:
-        return np.full(chunk.count, np.nan)
+        return np.broadcast_to(np.nan, chunk.count)
     if value.pattern or value.values:
         raw = _read_texts(value, chunk, name, file)
     numbers = _floats(raw, chunk, name, value.column)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = numbers * SCALES.get(value.unit, 1.0) * value.scale + value.offset
-    return np.where(np.isfinite(found), found, np.nan)
+        numbers = numbers * SCALES.get(value.unit, 1.0) * value.scale + value.offset
+    numbers[~np.isfinite(numbers)] = np.nan
+    return numbers
 
 
 def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[np.float64]:
@@ -180,8 +206,8 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
     import pandas as pd
 
     texts = pd.Series([str(item).strip() for item in raw.tolist()], dtype=object)
-    found = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
-    for row in np.flatnonzero(np.isnan(found) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
+    numbers = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
+    for row in np.flatnonzero(np.isnan(numbers) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
         comma, date = (re.match(form, texts[row]) for form in (r"[-+]?\d+,\d+$", r"\d{4}-\d\d-\d\d"))
         number = "dates: set unit: iso8601" if date else f"a number in column {column}"
         raise RecordingError(
@@ -189,17 +215,17 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
             where=chunk.where(row),
             valid="decimal commas: set decimal: ','" if comma else number,
         )
-    return found
+    return numbers
 
 
 def _raw(value: FieldRule, chunk: Chunk, file: str) -> NDArray[Any] | None:
     """Return the unconverted values of the rows; None: the column is optional and missing."""
     if rule := value.file_name or value.topic_name:
-        source = [file] * chunk.count if value.file_name else chunk.columns.get(TOPIC, [""] * chunk.count)
-        found = {text: re.search(rule, text) for text in set(source)}
-        if missing := [text for text, match in found.items() if match is None]:
+        texts = [file] * chunk.count if value.file_name else chunk.columns.get(TOPIC, [""] * chunk.count)
+        matches = {text: re.search(rule, text) for text in set(texts)}
+        if missing := [text for text, match in matches.items() if match is None]:
             raise RecordingError(f"{missing[0]!r} does not match {rule!r}", where=str(chunk.path))
-        return np.array([found[text][1] for text in source], object)  # type: ignore[index]
+        return np.array([matches[text][1] for text in texts], object)  # type: ignore[index]
     if value.rate_hz:
         return np.asarray((chunk.before + chunk.rows) / value.rate_hz)
     if value.constant is not None:
@@ -210,12 +236,13 @@ def _raw(value: FieldRule, chunk: Chunk, file: str) -> NDArray[Any] | None:
             return None
         raise RecordingError(f"no column {missing[0]}", where=str(chunk.path))
     arrays = {name: np.asarray(chunk.columns[name]) for name in needed}
-    if bad := [name for name, array in arrays.items() if array.ndim > 1]:
-        raise RecordingError(f"column {bad[0]} contains lists", where=str(chunk.path), valid="single values")
+    for name, array in arrays.items():
+        if array.ndim > 1 or (array.dtype == object and len(array) and np.ndim(array[0])):
+            raise RecordingError(f"column {name} contains lists", where=str(chunk.path), valid=f"{name}[]")
     if value.sum:
-        parts = [factor * _floats(arrays[name], chunk, name, name) for name, factor in value.sum.items()]
-        return np.asarray(np.sum(parts, axis=0))
-    return arrays[value.column]
+        terms = [factor * _floats(arrays[name], chunk, name, name) for name, factor in value.sum.items()]
+        return np.asarray(np.sum(terms, axis=0))
+    return np.asarray(arrays[value.column])
 
 
 def read_stamps(value: FieldRule | None, chunk: Chunk, file: str) -> NDArray[np.int64]:
@@ -229,49 +256,47 @@ def read_stamps(value: FieldRule | None, chunk: Chunk, file: str) -> NDArray[np.
         if LOG_TIME in chunk.columns:
             return np.asarray(chunk.columns[LOG_TIME], np.int64)
         raise RecordingError("no stamp", where=str(chunk.path), valid="fields.stamp: a column, or rate_hz")
-    if raw.dtype.kind == "M":
-        raw, value = raw.astype("datetime64[ns]").astype(np.int64), value.model_copy(update={"unit": "ns"})
     if value.unit == "iso8601":
         import pandas as pd
 
         times = pd.to_datetime(pd.Series(raw).astype(str), utc=True, errors="coerce", format="ISO8601")
-        given = times.notna().to_numpy()
-        for row in np.flatnonzero(~given).tolist():
+        is_known = times.notna().to_numpy()
+        for row in np.flatnonzero(~is_known).tolist():
             if str(raw[row]).strip().lower() not in _MISSING:
                 raise RecordingError(
                     f"stamp = {raw[row]!r:.40} is not a date",
                     where=chunk.where(row),
                     valid="2024-06-09T19:39:13.4387",
                 )
-        found = times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64)
-        possible = given & (np.abs(found / 1e9) < MAX_STAMP_S)
+        stamps = times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64)
+        possible = is_known & (np.abs(stamps / 1e9) < MAX_STAMP_S)
     else:
         # Without a unit: seconds; the stamp of a message is an integer in nanoseconds.
         is_stamp = LOG_TIME in chunk.columns and raw.dtype.kind in "iu"
         factor = TIME[value.unit or ("ns" if is_stamp else "s")]
         scaled = _floats(raw, chunk, "stamp", value.column) * value.scale
-        given = np.isfinite(scaled)
-        possible = given & (np.abs(scaled) < MAX_STAMP_S * 1e9 / factor)
+        is_known = np.isfinite(scaled)
+        possible = is_known & (np.abs(scaled) < MAX_STAMP_S * 1e9 / factor)
         if raw.dtype.kind in "iu" and value.scale == 1.0:
             # As integers, because a float64 resolves nanoseconds since 1970 to 256 ns only.
-            found = np.where(possible, raw, 0).astype(np.int64) * factor
+            stamps = np.where(possible, raw, 0).astype(np.int64) * factor
         else:
             scaled = np.where(possible, scaled, 0.0)
-            whole = np.floor(scaled)
+            seconds = np.floor(scaled)
             # A float64 resolves seconds since 1970 to 0.2 us only: round them to 1 us.
-            step = np.where((np.abs(whole) > 1e8) & (factor == TIME["s"]), 1000, 1)
-            rest = np.rint((scaled - whole) * factor / step).astype(np.int64) * step
-            found = whole.astype(np.int64) * factor + rest
-    if 2 * np.count_nonzero(possible) < np.count_nonzero(given):
-        first = raw[np.flatnonzero(given & ~possible)[0]]
+            step = np.where((np.abs(seconds) > 1e8) & (factor == TIME["s"]), 1000, 1)
+            fraction = np.rint((scaled - seconds) * factor / step).astype(np.int64) * step
+            stamps = seconds.astype(np.int64) * factor + fraction
+    if 2 * np.count_nonzero(possible) < np.count_nonzero(is_known):
+        first = raw[np.flatnonzero(is_known & ~possible)[0]]
         raise RecordingError(
             f"stamp = {first} is outside of the years 1824 to 2115",
             where=str(chunk.path),
             valid="unit: ms, us or ns",
         )
-    possible &= np.abs(found / 1e9 + value.offset) < MAX_STAMP_S
+    possible &= np.abs(stamps / 1e9 + value.offset) < MAX_STAMP_S
     offset = round(min(max(value.offset, -MAX_STAMP_S), MAX_STAMP_S) * 1e9)
-    return np.where(possible, found + offset, UNKNOWN_STAMP)
+    return np.where(possible, stamps + offset, UNKNOWN_STAMP)
 
 
 def _read_ids(
@@ -284,22 +309,22 @@ def _read_ids(
     plain = not (value.pattern or value.values or value.names or value.offset)
     if plain and (raw.dtype.kind == "u" or (raw.dtype.kind == "i" and (len(raw) == 0 or raw.min() >= 0))):
         return np.asarray(raw, np.uint64)
-    found: dict[Any, int] = {}
+    numbers: dict[Any, int] = {}
     items = raw.tolist()
     for row, item in enumerate(items):
-        if item in found:
+        if item in numbers:
             continue
         try:
             if str(item).strip().lower() in _MISSING:
-                found[item] = UNKNOWN_ID
+                numbers[item] = UNKNOWN_ID
                 continue
             # Tables read whole numbers in a column with missing values as float64, which merges larger ids.
             if isinstance(item, float) and abs(item) >= 2**53:
                 raise ValueError(item)
             text = _text(value, item, name)
             number = names.setdefault(text, len(names) + 1) if value.names else _id(text)
-            found[item] = number + round(value.offset)
-            if not 0 <= found[item] < UNKNOWN_ID:
+            numbers[item] = number + round(value.offset)
+            if not 0 <= numbers[item] < UNKNOWN_ID:
                 raise ValueError(text)
         except (ValueError, UwbMitigationError) as error:
             raise RecordingError(
@@ -309,7 +334,7 @@ def _read_ids(
                 where=chunk.where(row),
                 valid="a whole number such as 3 or 0x1f; `pattern` takes a number from a text, `names: true` numbers texts",
             ) from error
-    return np.array([found[item] for item in items], np.uint64)
+    return np.array([numbers[item] for item in items], np.uint64)
 
 
 def _id(text: str) -> int:
@@ -333,7 +358,7 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
         values = [parse(item.replace("i", "j")) for item in items if item]
     array = np.asarray(values)
     if array.dtype == object and array.ndim:
-        array = np.stack(list(array))  # Parquet gives pairs as arrays in an array.
+        array = np.stack(list(array))
     encoding = Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
     if form == "complex":
         pairs = array if array.ndim == 2 else np.stack([array.real, array.imag], axis=1)
@@ -349,28 +374,28 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
     return np.rint(flat / scale).astype(np.int16), encoding, scale
 
 
-def kept_rows(
+def filter_rows(
     rules: list[RowFilter], chunk: Chunk, dropped: Counter[str], prefix: str = ""
 ) -> NDArray[np.bool_]:
     """Return which rows no rule drops, and count the others by rule; `from_median` needs all files and is ignored."""
-    kept = np.ones(chunk.count, bool)
+    mask = np.ones(chunk.count, bool)
     for rule in rules:
         raw = np.asarray(chunk.columns[rule.column])
         bad = np.zeros(chunk.count, bool)
-        for wanted, is_bad in ((rule.equals, True), (rule.differs, False)):
-            if wanted is not None:
-                listed = wanted if isinstance(wanted, list) else [wanted]
-                texts = [f"{each:g}" if isinstance(each, float) else each for each in listed]
+        for values, is_bad in ((rule.equals, True), (rule.differs, False)):
+            if values is not None:
+                listed = values if isinstance(values, list) else [values]
+                texts = [f"{value:g}" if isinstance(value, float) else value for value in listed]
                 same = np.isin(raw.astype(str), texts)
                 if raw.dtype.kind in "iuf":
-                    same |= np.isin(raw, [each for each in listed if isinstance(each, float)])
+                    same |= np.isin(raw, [value for value in listed if isinstance(value, float)])
                 bad |= same == is_bad
         if rule.below is not None or rule.above is not None:
-            found = _floats(raw, chunk, rule.column, rule.column)
-            bad |= found < (-np.inf if rule.below is None else rule.below)
-            bad |= found > (np.inf if rule.above is None else rule.above)
-        kept &= ~count_bad(bad & kept, dropped, f"{prefix}{rule}")
-    return kept
+            numbers = _floats(raw, chunk, rule.column, rule.column)
+            bad |= numbers < (-np.inf if rule.below is None else rule.below)
+            bad |= numbers > (np.inf if rule.above is None else rule.above)
+        mask &= ~count_bad(bad & mask, dropped, f"{prefix}{rule}")
+    return mask
 
 
 def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDArray[np.bool_]:
@@ -399,10 +424,10 @@ def read_csv(
     chunks = list(islice(read_chunks(TableFormat(format="csv"), path, converter.columns), 2))
     if len(chunks) != 1 or not chunks[0].count:
         raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
-    found = converter.convert(chunks[0])
+    columns = converter.convert(chunks[0])
     for name, (low, high) in [*((name, (0, UNKNOWN_ID - 1)) for name in ids), *numbers.items()]:
-        bad = ~((found[name] >= low) & (found[name] <= high))
-        for row in np.flatnonzero(bad & ~(np.isnan(found[name]) & (name in optional)))[:1].tolist():
-            what, where = f"{name} = {found[name][row]}", chunks[0].where(row)
+        bad = ~((columns[name] >= low) & (columns[name] <= high))
+        for row in np.flatnonzero(bad & ~(np.isnan(columns[name]) & (name in optional)))[:1].tolist():
+            what, where = f"{name} = {columns[name][row]}", chunks[0].where(row)
             raise RecordingError(what, where=where, valid=f"{low:g} to {high:g}")
-    return found
+    return columns

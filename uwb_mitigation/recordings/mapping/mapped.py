@@ -7,12 +7,20 @@ import math
 import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, format_id
+from uwb_mitigation.recordings.mapping.checks import (
+    anchor_warnings,
+    check_rate,
+    check_units,
+    median,
+    value_warnings,
+)
 from uwb_mitigation.recordings.mapping.cirs import CirFile, join_by_row, join_by_time
 from uwb_mitigation.recordings.mapping.conversion import (
     NO_CIR,
@@ -20,9 +28,9 @@ from uwb_mitigation.recordings.mapping.conversion import (
     UNKNOWN_STAMP,
     ColumnDict,
     Converter,
+    concat,
     count_bad,
-    joined,
-    kept_rows,
+    filter_rows,
     measurement,
     take,
 )
@@ -39,22 +47,19 @@ from uwb_mitigation.recordings.mapping.tables import find_files, read_chunks
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Record, Truth
 from uwb_mitigation.types.source import Source
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Odometry, TruePath
 
 MAX_RANGES = 20_000_000
-MAX_PLAUSIBLE_M, MIN_PLAUSIBLE_M = 300.0, 0.03
-"""A median range outside of these limits shows a wrong unit: UWB reaches 300 m."""
+MAX_STAMP_NS = 2**31 * NS_PER_S
+"""Stamps of ROS are from 1970 to 2038."""
+
+PLACEMENT_PAUSE_S = 5.0
+"""Time between the ranges of two placements of a recording without stamps."""
 
 MAX_POSSIBLE = 10_000.0
 """Rows with a larger range (m), level (dBm) or first-path index are not used."""
 
-MAX_DIFFERENCE_M = 0.3
-"""Largest plausible median difference of true ranges and the distances of true positions."""
-
-MAX_ERROR_M = 20.0
-"""Largest plausible median error of ranges."""
-
-MAX_INDEX = 1016
 _LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 _TAG, _ANCHOR, _POSE = (tuple(axes(name, None)) for name in ("tag", "anchor", "pose"))
 
@@ -70,6 +75,8 @@ class MappedRecording(Source):
 
     Attributes:
         values: the ranges in SI units, and `cir` (-1: none).
+        names: {tag or anchor: {text: number}}, of ids with `names: true`.
+        notes: how the recording was understood, for the user.
         warnings: implausible values, for the user.
         dropped: {rule: number of rows that are not used}.
         anchors: positions of the anchors; only if known.
@@ -88,10 +95,11 @@ class MappedRecording(Source):
         self.in_motion = mapping.moving
         self.skipped: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.notes: list[str] = []
         self.warnings: list[str] = []
         self.truth = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
+        self.names: dict[str, dict[str, int]] = {"tag": {}, "anchor": {}}
         self._folder = path if path.is_dir() else path.parent
-        self._names: dict[str, dict[str, int]] = {"tag": {}, "anchor": {}}
         self._cirs = CirFile()
         self._damage: DamagedRecordingError | None = None
         self._files = find_files(mapping, path)
@@ -104,18 +112,25 @@ class MappedRecording(Source):
                 "tag or anchor is unknown": (values["tag"] != UNKNOWN_ID) & (values["anchor"] != UNKNOWN_ID),
             }
         )
+        del values
         if mapping.cir and mapping.cir.files:
             self._add_other_cirs(mapping.cir)
+        if is_numbered := bool(mapping.fields.stamp and mapping.fields.stamp.rate_hz):
+            self._separate_placements(mapping.fields.stamp.rate_hz if mapping.fields.stamp else 1.0)
         late = int(np.count_nonzero(np.diff(self.values["stamp"]) < 0))
-        if late and len(self._files) == 1:
+        if late and len(self._files) == 1 and not is_numbered:
             self.warnings.append(f"{late} stamps are earlier than the one before; the ranges were sorted")
-        self.values = take(self.values, np.argsort(self.values["stamp"], kind="stable"))
+        if late:
+            self.values = take(self.values, np.argsort(self.values["stamp"], kind="stable"))
+        if not is_numbered and not mapping.topics:
+            check_rate(self.values, self.name, moving=mapping.moving)
         self._add_truth(self._anchor_positions())
-        self._check_units()
+        check_units(self.values, self.name)
         limited = {f"{name} is above {MAX_POSSIBLE:g}": np.abs(self.values[name]) for name in _LIMITED}
         self._keep({what: ~(numbers > MAX_POSSIBLE) for what, numbers in limited.items()})
         self._warn()
         self.motion = self._read_motion()
+        self._shift_stamps()
 
     def __len__(self) -> int:
         return len(self.values["stamp"])
@@ -134,14 +149,14 @@ class MappedRecording(Source):
     def __iter__(self) -> Iterator[Record]:
         self.skipped = Counter({f"dropped: {rule}": count for rule, count in self.dropped.items()})
         self.skipped.update(self.warnings)
-        values, places = self.values, _stacked(self.values, _TAG)
-        placed, labels = np.asarray(np.isfinite(places).all(axis=1)), values["label"].tolist()
+        values, positions = self.values, _stacked(self.values, _TAG)
+        has_position, labels = np.asarray(np.isfinite(positions).all(axis=1)), values["label"].tolist()
         for row in range(len(self)):
             true_m, label = float(values["true range"][row]), labels[row]
-            known = label or math.isfinite(true_m)
-            truth = Truth(true_m, label, values["configuration"][row]) if known else None
-            place = tuple(places[row].tolist()) if placed[row] else None
-            yield Record(measurement(values, row, self.cir(row), row), truth, place)
+            has_truth = label or math.isfinite(true_m)
+            truth = Truth(true_m, label, values["configuration"][row]) if has_truth else None
+            position = tuple(positions[row].tolist()) if has_position[row] else None
+            yield Record(measurement(values, row, self.cir(row), row), truth, position)
         if self._damage:
             raise self._damage
 
@@ -160,31 +175,32 @@ class MappedRecording(Source):
         """Return the rows of files that no rule drops: `values`, `cir`, `row`, `file`; `what` names them in counts."""
         medians = {f"{what}{rule}": rule for rule in table.drop if rule.from_median is not None}
         values = values | {name: FieldRule(column=rule.column) for name, rule in medians.items()}
-        converter, parts, before = Converter(values, self._names), [], 0
+        converter, tables, before = Converter(values, self.names), list[ColumnDict](), 0
         columns = converter.columns | dict.fromkeys(series(cir.column) if cir else (), False)
         for number, path in enumerate(paths):
             name = Path(os.path.relpath(path, self._folder)).as_posix()
             try:
-                for chunk in read_chunks(table, path, columns, before):
+                for chunk in read_chunks(table, path, columns, before, self.warnings.append):
                     before += chunk.count
                     if before > MAX_RANGES:
                         raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
-                    chunk = chunk.take(kept_rows(table.drop, chunk, self.dropped, what))
+                    chunk = chunk.take(filter_rows(table.drop, chunk, self.dropped, what))
                     part = converter.convert(chunk, name)
                     part["cir"] = self._cirs.add(cir, chunk) if cir else np.full(chunk.count, -1)
-                    parts.append(part | {"row": chunk.rows, "file": np.full(chunk.count, number)})
+                    tables.append(part | {"row": chunk.rows, "file": np.full(chunk.count, number, np.int32)})
             except DamagedRecordingError as error:
                 self._damage = error
-        if not parts:
+                self.warnings.append(f"{error}: only the rows before are used")
+        if not tables:
             raise self._damage or RecordingError("no rows", where=str(paths[0]))
-        found = joined(parts)
-        kept = np.ones(len(found["row"]), bool)
+        rows = concat(tables)
+        mask = np.ones(len(rows["row"]), bool)
         for name, rule in medians.items():
-            numbers = found.pop(name)
-            kept &= ~count_bad(np.abs(numbers - _median(numbers)) > rule.from_median, self.dropped, name)
-        return take(found, kept)
+            numbers = rows.pop(name)
+            mask &= ~count_bad(np.abs(numbers - median(numbers)) > rule.from_median, self.dropped, name)
+        return take(rows, mask)
 
-    def _beside(self, table: TableFormat, file: Path, *, optional: bool = False) -> list[Path]:
+    def _files_of(self, table: TableFormat, file: Path, *, optional: bool = False) -> list[Path]:
         """Return the files of a table in the folder of the ranges; topics are in the same bag."""
         if table.topics or not table.files:
             return [file]
@@ -194,13 +210,13 @@ class MappedRecording(Source):
 
     def _keep(self, rules: dict[str, NDArray[np.bool_]]) -> None:
         """Drop and count the ranges that do not satisfy all rules."""
-        kept = np.ones(len(self), bool)
+        mask = np.ones(len(self), bool)
         for what, good in rules.items():
-            kept &= ~count_bad(~good & kept, self.dropped, what)
-        if not kept.any():
+            mask &= ~count_bad(~good & mask, self.dropped, what)
+        if not mask.any():
             where, valid = str(self._files[0]), f"dropped: {dict(self.dropped) or 'none'}"
             raise self._damage or RecordingError("no ranges", where=where, valid=valid)
-        self.values = take(self.values, kept)
+        self.values = take(self.values, mask)
 
     def _add_other_cirs(self, source: CirSource) -> None:
         """Join the CIRs of other files, by row or by time and ids."""
@@ -208,44 +224,67 @@ class MappedRecording(Source):
         keys: dict[str, FieldRule | None] = {"first_path_index": source.first_path_index}
         if join:
             keys |= {"stamp": join.stamp, "tag": join.tag, "anchor": join.anchor}
+        self.values["first_path_index"] = self.values["first_path_index"].copy()
         for number, file in enumerate(self._files):
-            if paths := self._beside(source, file, optional=source.optional):
+            if paths := self._files_of(source, file, optional=source.optional):
                 rows = np.flatnonzero(self.values["file"] == number)
-                found = self._read(source, paths, keys, "CIR ", source)
+                cirs = self._read(source, paths, keys, "CIR ", source)
                 if join:
-                    join_by_time(self.values, rows, found, join.tolerance_s)
-                    if (self.values["cir"][rows] < 0).all():
-                        self.warnings.append("no CIR belongs to a range: compare stamps and ids of cir.join")
+                    text, is_warning = join_by_time(self.values, rows, cirs, join)
+                    name = f"{file.parent.name}/{paths[0].name}: " if len(self._files) > 1 else ""
+                    (self.warnings if is_warning else self.notes).append(f"{name}{text}")
                 else:
-                    join_by_row(self.values, rows, found, str(file))
+                    join_by_row(self.values, rows, cirs, str(file))
+
+    def _separate_placements(self, rate_hz: float) -> None:
+        """Put the ranges of each placement one after the other, with pauses between placements."""
+        import pandas as pd
+
+        values = self.values
+        names = ["tag", *_TAG] if np.isfinite(_stacked(values, _TAG)).all() else ["tag", "configuration"]
+        groups = pd.DataFrame({name: values[name] for name in names}).groupby(names, sort=False).ngroup()
+        group = groups.to_numpy()
+        if (count := int(group.max()) + 1) > 1 and not self._mapping.moving:
+            self.values = values = take(values, np.argsort(group, kind="stable"))
+            pause_s = max(PLACEMENT_PAUSE_S - 1 / rate_hz, 0.0)
+            times = np.arange(len(group)) / rate_hz + np.sort(group) * pause_s
+            values["stamp"] = np.rint(times * 1e9).astype(np.int64)
+            self.notes.append(f"{count} placements, with pauses of {PLACEMENT_PAUSE_S:g} s between them")
 
     def _anchor_positions(self) -> dict[int, NDArray[np.float64]]:
         """Return the positions from the ranges or from another file, and set `anchors`."""
-        source, found, where = self._mapping.anchors, self.values, str(self._files[0])
-        if source and source.files:
-            columns = {"anchor": source.id} | axes("anchor", source.position)
-            if paths := self._beside(source, self._files[0], optional=source.optional):
-                found = self._read(source, paths[:1], columns, "anchor ")
-        place = _stacked(found, _ANCHOR)
-        good = np.isfinite(place).all(axis=1) & (found["anchor"] != UNKNOWN_ID)
-        ids, first, index = np.unique(found["anchor"][good], return_index=True, return_inverse=True)
-        place = place[good]
-        moved = np.abs(place - place[first][index]).max(axis=1, initial=0.0) > 1e-3
-        if moved.any():
-            what = f"anchor {format_id(int(ids[index[moved][0]]))} has two positions"
-            raise RecordingError(what, where=where, valid="one for each anchor")
+        rows, sd = self.values, 0.02
+        for source in self._mapping.anchors:
+            sd = source.sd
+            if not source.files:
+                break
+            optional = source.optional or len(self._mapping.anchors) > 1
+            if paths := self._files_of(source, self._files[0], optional=optional):
+                rows = self._read(
+                    source, paths[:1], {"anchor": source.id} | axes("anchor", source.position), "anchor "
+                )
+                break
+        position, where = _stacked(rows, _ANCHOR), str(self._files[0])
+        good = np.isfinite(position).all(axis=1) & (rows["anchor"] != UNKNOWN_ID)
+        ids, first, index = np.unique(rows["anchor"][good], return_index=True, return_inverse=True)
+        position = position[good]
+        differs = np.abs(position - position[first][index]).max(axis=1, initial=0.0) > 1e-3
+        if differs.any():
+            what = f"anchor {format_id(int(ids[index[differs][0]]))} has two positions"
+            valid = "one for each anchor; are tag and anchor exchanged?"
+            raise RecordingError(what, where=where, valid=valid)
         if len(ids) > MAX_ANCHORS:
             self.warnings.append(f"{len(ids)} anchors, of which none is written: at most {MAX_ANCHORS}")
-        elif len(ids) and source:
-            names = {number: text for text, number in self._names["anchor"].items()}
+        elif len(ids) and self._mapping.anchors:
+            names = {number: text for text, number in self.names["anchor"].items()}
             self.anchors = AnchorMap(
                 [
-                    Anchor(key, (x, y, z), source.sd, names.get(key, "")[:100])
-                    for key, (x, y, z) in zip(ids.tolist(), place[first].tolist(), strict=True)
+                    Anchor(key, (x, y, z), sd, names.get(key, "")[:100])
+                    for key, (x, y, z) in zip(ids.tolist(), position[first].tolist(), strict=True)
                 ],
                 where,
             )
-        return dict(zip(ids.tolist(), place[first], strict=True))
+        return dict(zip(ids.tolist(), position[first], strict=True))
 
     def _add_truth(self, positions: dict[int, NDArray[np.float64]]) -> None:
         values, truth = self.values, self._mapping.truth
@@ -267,93 +306,67 @@ class MappedRecording(Source):
             values["true range"] = values["range"] - values["error"]
         elif truth.error:
             same, opposite = (
-                _median(np.abs(values["range"] - sign * values["error"] - values["true range"]))
+                median(np.abs(values["range"] - sign * values["error"] - values["true range"]))
                 for sign in (1, -1)
             )
             if 2 * opposite < same:
                 raise RecordingError(
                     "the error is true - measured", where=self.name, valid="truth.error: scale: -1"
                 )
-        differs = _median(np.abs(distance - values["true range"]))
-        if differs > MAX_DIFFERENCE_M:
-            self.warnings.append(
-                f"true ranges and positions differ by {differs:.2f} m: wrong anchors, lever arm or frame?"
-            )
+        self.warnings += anchor_warnings(values, positions, distance - values["true range"])
 
     def _add_poses(self, poses: Poses) -> None:
         """Interpolate the true positions of the antennas of all tags."""
         from scipy.spatial.transform import Rotation
 
         values, files_by_poses = self.values, defaultdict[tuple[Path, ...], list[int]](list)
+        values |= {name: values[name].copy() for name in _TAG}
         for number, file in enumerate(self._files):
-            files_by_poses[tuple(self._beside(poses, file))].append(number)
+            files_by_poses[tuple(self._files_of(poses, file))].append(number)
         turns: dict[str, FieldRule | None] = {
             f"turn {n}": value for n, value in enumerate(poses.orientation or ())
         }
         for paths, numbers in files_by_poses.items():
-            found = self._read(
+            rows = self._read(
                 poses, paths, {"stamp": poses.stamp} | axes("pose", poses.position) | turns, "pose "
             )
-            place = _stacked(found, _POSE)
-            good = np.isfinite(place).all(axis=1) & (found["stamp"] != UNKNOWN_STAMP)
+            position = _stacked(rows, _POSE)
+            good = np.isfinite(position).all(axis=1) & (rows["stamp"] != UNKNOWN_STAMP)
             if turns:
-                turn = _stacked(found, tuple(turns))
+                turn = _stacked(rows, tuple(turns))
                 good &= np.isfinite(turn).all(axis=1) & (np.linalg.norm(turn, axis=1) > 0.5)
-            order = np.flatnonzero(good)[np.argsort(found["stamp"][good], kind="stable")]
-            here = np.isin(values["file"], numbers)
-            for tag in np.unique(values["tag"][here]).tolist():
+            order = np.flatnonzero(good)[np.argsort(rows["stamp"][good], kind="stable")]
+            in_files = np.isin(values["file"], numbers)
+            for tag in np.unique(values["tag"][in_files]).tolist():
                 arm = poses.lever_arm
                 offset = np.array(arm.get(tag, (0.0, 0.0, 0.0)) if isinstance(arm, dict) else arm)
-                antenna = place[order] + (Rotation.from_quat(turn[order]).apply(offset) if turns else offset)
-                path = TruePath(found["stamp"][order], antenna)
+                offset = Rotation.from_quat(turn[order]).apply(offset) if turns else offset
+                path = TruePath(rows["stamp"][order], position[order] + offset)
                 self.truth = path if len(self.truth) == 0 else self.truth
-                rows = np.flatnonzero(here & (values["tag"] == tag))
-                for name, numbers_of_axis in zip(_TAG, path.at(values["stamp"][rows]).T, strict=True):
-                    values[name][rows] = numbers_of_axis
-
-    def _check_units(self) -> None:
-        """Raise RecordingError for wrong units."""
-        for name, low, high, unit, other in (
-            ("range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
-            ("true range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
-            ("first_path_index", 0.0, MAX_INDEX, "samples", "'10.6'"),
-        ):
-            median = _median(np.abs(self.values[name]))
-            if median > high or 0 < median < low:
-                raise RecordingError(
-                    f"the median {name} is {median:,.{0 if median > high else 4}f} {unit}",
-                    where=self.name,
-                    valid=f"{low:g} to {high:g}; probably set unit: {other if median > high else unit}",
-                )
+                selected = np.flatnonzero(in_files & (values["tag"] == tag))
+                for name, coordinate in zip(_TAG, path.at(values["stamp"][selected]).T, strict=True):
+                    values[name][selected] = coordinate
 
     def _warn(self) -> None:
         """Collect warnings of implausible values."""
-        import pandas as pd
-
-        values, truth = self.values, self._mapping.truth
-        keys = pd.DataFrame({name: values[name] for name in ("stamp", "tag", "anchor")})
-        if repeated := int(keys.duplicated().sum()):
-            self.warnings.append(f"{repeated} ranges repeat the stamp of another range of the same pair")
-        if truth.poses and not np.isfinite(values["tag x"]).any():
+        truth = self._mapping.truth
+        self.warnings += value_warnings(self.values, errors_measured=bool(truth.error and not truth.range))
+        if truth.poses and not np.isfinite(self.values["tag x"]).any():
             self.warnings.append("no range is within the times of the true poses: compare the stamps")
-        if hasattr(self, "anchors") and not np.isin(values["anchor"], list(self.anchors.index)).any():
-            self.warnings.append("no anchor of a range has a position: compare the ids")
-        errors = self.errors_m
-        if (error := _median(np.abs(errors))) > MAX_ERROR_M:
-            self.warnings.append(f"the median error is {error:.0f} m: do range and truth have the same unit?")
-        if truth.error and not truth.range and len(errors) >= 20:
-            # Errors of UWB have a tail of late first paths, which are positive.
-            low, middle, high = np.percentile(errors, (5, 50, 95))
-            if middle - low > 2 * max(high - middle, 0.0) and low < -0.3 and middle < 0:
-                self.warnings.append(
-                    f"most errors are negative (median {middle:.2f} m, 5 % below {low:.2f} m): probably the error column is "
-                    "true - measured (set scale: -1), if not many ranges are too short; estimated from the distribution"
-                )
-        if negative := int(np.count_nonzero(values["range"] < 0)):
-            self.warnings.append(f"{negative} ranges are negative")
-        level = _median(values["rx_power"])
-        if level and not -140 < level < -20:
-            self.warnings.append(f"the median receive level is {level:.0f}, which is not in dBm")
+
+    def _shift_stamps(self) -> None:
+        """Shift all stamps if ROS cannot represent them."""
+        first, last = int(self.values["stamp"][0]), int(self.values["stamp"][-1])
+        if first >= 0 and last < MAX_STAMP_NS:
+            return
+        shift_ns = -(first // NS_PER_S) * NS_PER_S
+        self.values["stamp"] = self.values["stamp"] + shift_ns
+        self.truth = TruePath(self.truth.stamp_ns + shift_ns, self.truth.position)
+        if self.motion:
+            self.motion = replace(self.motion, stamp_ns=self.motion.stamp_ns + shift_ns)
+        self.warnings.append(
+            f"{shift_ns / 1e9:+.0f} s were added to all stamps, because those of ROS are from 1970 to 2038"
+        )
 
     def _read_motion(self) -> Odometry | None:
         """Read speeds, and integrate the poses from them."""
@@ -361,12 +374,11 @@ class MappedRecording(Source):
         if source is None:
             return None
         speeds = {"forward": source.forward, "left": source.left, "yaw_rate": source.yaw_rate}
-        found = self._read(
-            source, self._beside(source, self._files[0]), {"stamp": source.stamp, **speeds}, "odometry "
-        )
-        twist = _stacked(found, tuple(speeds))
-        good = np.isfinite(twist).all(axis=1) & (found["stamp"] != UNKNOWN_STAMP)
-        stamp, first = np.unique(found["stamp"][good], return_index=True)
+        paths = self._files_of(source, self._files[0])
+        rows = self._read(source, paths, {"stamp": source.stamp, **speeds}, "odometry ")
+        twist = _stacked(rows, tuple(speeds))
+        good = np.isfinite(twist).all(axis=1) & (rows["stamp"] != UNKNOWN_STAMP)
+        stamp, first = np.unique(rows["stamp"][good], return_index=True)
         twist = twist[good][first]
         step = np.diff(stamp, prepend=stamp[:1]) / 1e9
         yaw = np.cumsum(twist[:, 2] * step)
@@ -375,12 +387,6 @@ class MappedRecording(Source):
         y = np.cumsum((twist[:, 0] * np.sin(middle) + twist[:, 1] * np.cos(middle)) * step)
         unknown = np.zeros((len(stamp), 3, 3))
         return Odometry(stamp, np.stack([x, y, yaw], axis=1), unknown, twist, unknown)
-
-
-def _median(numbers: NDArray[np.float64]) -> float:
-    """Return the median of the finite numbers; 0 without any."""
-    known = numbers[np.isfinite(numbers)]
-    return float(np.median(known)) if len(known) else 0.0
 
 
 def _stacked(columns: ColumnDict, names: Sequence[str]) -> NDArray[np.float64]:

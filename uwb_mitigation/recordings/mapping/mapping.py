@@ -31,11 +31,17 @@ _FOLDER = Path(__file__).parents[1] / "mappings"
 TIME = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_S, "iso8601": 1}
 """Nanoseconds per unit of time."""
 
-SCALES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "samples": 1.0, "10.6": 1 / 64, "dBm": 1.0}
-"""SI units per unit; 10.6 is the fixed-point first-path index of the DW1000."""
+LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
+"""Metres per unit of length."""
+
+SCALES = LENGTHS | {"samples": 1.0, "10.6": 1 / 64, "dBm": 1.0}
+"""SI units per unit that is not of time; 10.6 is the fixed-point first-path index of the DW1000."""
 
 LIST_INDEX = "#"
-"""Column with the index of an element in the list of a message."""
+"""Column with the index of an element in the innermost list of a message."""
+
+VARIABLE = "variable"
+"""Column with the key of a column of `unpivot`."""
 
 
 class _Strict(BaseModel):
@@ -43,17 +49,28 @@ class _Strict(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _check_names(cls, given: Any) -> Any:
-        for name in given if isinstance(given, dict) else ():
+    def _check_names(cls, value: Any) -> Any:
+        for name in value if isinstance(value, dict) else ():
             if name not in cls.model_fields:
                 valid, suggestion = ", ".join(cls.model_fields), did_you_mean(str(name), cls.model_fields)
                 raise ValueError(f"unknown field {name!r:.40}; {suggestion or f'valid: {valid}'}")
-        return given
+        return value
 
 
-def _texts(given: Any) -> Any:
+def _listed(value: Any) -> Any:
+    return value if isinstance(value, list) else [value] if value else []
+
+
+def _texts(values: Any) -> Any:
     """YAML reads the keys 0 and 1 as numbers."""
-    return {str(key): str(value) for key, value in given.items()} if isinstance(given, dict) else given
+    return {str(key): str(value) for key, value in values.items()} if isinstance(values, dict) else values
+
+
+def _compiled(text: str) -> re.Pattern[str]:
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise ValueError(f"not a regular expression: {text!r}: {error}") from error
 
 
 class FieldRule(_Strict):
@@ -93,11 +110,7 @@ class FieldRule(_Strict):
         if sum(map(bool, sources)) + (self.constant is not None) != 1:
             raise ValueError("give one of column, constant, sum, file_name, topic_name, rate_hz")
         for text in filter(None, (self.pattern, self.file_name, self.topic_name)):
-            try:
-                groups = re.compile(text).groups
-            except re.error as error:
-                raise ValueError(f"not a regular expression: {text!r}: {error}") from error
-            if not groups:
+            if not _compiled(text).groups:
                 raise ValueError(f"the pattern {text!r} has no group (...)")
         if self.unit == "iso8601" and self.scale != 1:
             raise ValueError("a date has no scale")
@@ -110,20 +123,20 @@ class FieldRule(_Strict):
 
 
 def _value(*units: str) -> WrapValidator:
-    def read(given: Any, validate: Any) -> Any:
-        if isinstance(given, str | int | float):
-            given = {"column" if isinstance(given, str) else "constant": given}
-        value = validate(given)
-        if value.unit and value.unit not in units:
-            raise ValueError(f"unit {value.unit!r}; valid: {', '.join(units) or 'none'}")
-        return value
+    def read(value: Any, validate: Any) -> Any:
+        if isinstance(value, str | int | float):
+            value = {"column" if isinstance(value, str) else "constant": value}
+        rule = validate(value)
+        if rule.unit and rule.unit not in units:
+            raise ValueError(f"unit {rule.unit!r}; valid: {', '.join(units) or 'none'}")
+        return rule
 
     return WrapValidator(read)
 
 
 Number = Annotated[FieldRule, _value()]
 Time = Annotated[FieldRule, _value(*TIME)]
-Length = Annotated[FieldRule, _value("m", "cm", "mm")]
+Length = Annotated[FieldRule, _value(*LENGTHS)]
 Level = Annotated[FieldRule, _value("dBm")]
 Index = Annotated[FieldRule, _value("samples", "10.6")]
 Point = tuple[Length, Length, Length]
@@ -165,14 +178,16 @@ class TableFormat(_Strict):
             the first is used whose regular expression is found in the path of the recording.
         separator, decimal: of CSV; the separator may be a regular expression, such as `\\s+`.
         columns: names of the columns of files without header.
-        group: name of the array, variable or group (NumPy, MATLAB, HDF5), or key of the mapping (YAML).
+        group: name of the array, variable or group (MATLAB, HDF5), or key of the mapping (YAML).
         topics, type: topics of messages, and their type.
-        text, text_field: the field of the message contains JSON, or `key:value` pairs.
-        definitions: {type: text of its .msg file}, for bags that contain no definitions.
+        text: the field `data` of the message contains JSON, or `key:value` pairs.
+        unpivot: {new column: regular expression}: one row for each column that matches, such as {value: 'r(\\d+)'} for
+            r1 to r24. The column `variable` contains the first group, or without one the name of the column; columns of
+            several expressions with the same `variable` are in the same row.
         drop: rules for rows that are not used.
     """
 
-    format: Literal["", "csv", "parquet", "numpy", "matlab", "hdf5", "messages", "yaml"] = ""
+    format: Literal["", "csv", "matlab", "hdf5", "messages", "yaml"] = ""
     files: str | dict[str, str] = "*"
     separator: str = ","
     decimal: Literal[".", ","] = "."
@@ -181,9 +196,14 @@ class TableFormat(_Strict):
     topics: list[str] = []
     type: str = ""
     text: Literal["", "json", "pairs"] = ""
-    text_field: str = "data"
-    definitions: dict[str, str] = {}
+    unpivot: dict[str, str] = {}
     drop: list[RowFilter] = []
+
+    @model_validator(mode="after")
+    def _check_unpivot(self) -> TableFormat:
+        for text in self.unpivot.values():
+            _compiled(text)
+        return self
 
 
 class Fields(_Strict):
@@ -224,7 +244,6 @@ class CirSource(TableFormat):
     Attributes:
         column: a column with lists, an array, or `NAME{0..1015}` for one column a sample.
         samples: magnitude, complex (complex numbers or pairs), or interleaved (real, imaginary, real, ...).
-        start_index: accumulator index of the first sample.
         join: of another file; without it, its rows are those of the ranges.
         first_path_index: in the other file.
         optional: the files may be absent.
@@ -233,7 +252,6 @@ class CirSource(TableFormat):
     files: str | dict[str, str] = ""
     column: str = ""
     samples: Literal["magnitude", "complex", "interleaved"] = "magnitude"
-    start_index: int = Field(default=0, ge=0, le=65535)
     join: Join | None = None
     first_path_index: Index | None = None
     optional: bool = False
@@ -267,7 +285,10 @@ class TruthSource(_Strict):
 
 
 class AnchorSource(TableFormat):
-    """Positions of the anchors, and `sd` of each coordinate in m: columns of the ranges, or of other `files` with `id`."""
+    """Positions of the anchors, and `sd` of each coordinate in m: columns of the ranges, or of other `files` with `id`.
+
+    In a list of sources, the first one is used whose files exist; all are then optional.
+    """
 
     files: str | dict[str, str] = ""
     id: Number | None = None
@@ -304,14 +325,14 @@ class Mapping(TableFormat):
     registers: Registers | None = None
     cir: CirSource | None = None
     truth: TruthSource = TruthSource()
-    anchors: AnchorSource | None = None
+    anchors: Annotated[list[AnchorSource], BeforeValidator(_listed)] = []
     odometry: OdometryTable | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Mapping:
         if self.registers and not self.fields.preamble_count:
             raise ValueError("registers: needs fields.preamble_count")
-        if self.anchors and self.anchors.files and not (self.anchors.id and self.anchors.position):
+        if any(source.files and not (source.id and source.position) for source in self.anchors):
             raise ValueError("anchors: id and position are needed with files")
         return self
 
@@ -319,14 +340,14 @@ class Mapping(TableFormat):
     def values(self) -> dict[str, FieldRule | None]:
         """Return everything that is in a row of the ranges, by the names of `conversion.Columns`."""
         truth, registers = self.truth, self.registers
-        found: dict[str, FieldRule | None] = dict(self.fields)
-        found |= {"true range": truth.range, "error": truth.error}
-        found |= {"label": truth.label, "configuration": truth.configuration}
+        rules: dict[str, FieldRule | None] = dict(self.fields)
+        rules |= {"true range": truth.range, "error": truth.error}
+        rules |= {"label": truth.label, "configuration": truth.configuration}
         if registers:
-            found |= {"cir_power": registers.cir_power, "prf": registers.prf}
-            found |= {f"amplitude {n}": value for n, value in enumerate(registers.amplitudes, 1)}
-        own_anchors = self.anchors.position if self.anchors and not self.anchors.files else None
-        return found | axes("tag", truth.tag_position) | axes("anchor", own_anchors)
+            rules |= {"cir_power": registers.cir_power, "prf": registers.prf}
+            rules |= {f"amplitude {n}": value for n, value in enumerate(registers.amplitudes, 1)}
+        anchors = next((source.position for source in self.anchors if not source.files), None)
+        return rules | axes("tag", truth.tag_position) | axes("anchor", anchors)
 
     @property
     def cir_columns(self) -> list[str]:
@@ -356,11 +377,11 @@ def load_mapping(name: str) -> Mapping:
     Raises:
         ParameterError: it cannot be read, or is not a mapping; the message names the field and what is valid.
     """
-    path, known = Path(name).expanduser(), shipped_mappings()
-    if name in known:
+    path, shipped = Path(name).expanduser(), shipped_mappings()
+    if name in shipped:
         path = _FOLDER / f"{name}.yaml"
     elif not path.exists():
-        valid, suggestion = f"a file, or one of {', '.join(known)}", did_you_mean(name, known)
+        valid, suggestion = f"a file, or one of {', '.join(shipped)}", did_you_mean(name, shipped)
         raise ParameterError(f"no mapping {name!r}", valid=valid, suggestion=suggestion)
     try:
         document = yaml.safe_load(read_bounded(path, MAX_BYTES, ParameterError))
@@ -371,5 +392,5 @@ def load_mapping(name: str) -> Mapping:
         return Mapping.model_validate(document)
     except ValidationError as error:
         problem = error.errors()[0]
-        parts = [".".join(map(str, problem["loc"])), problem["msg"].removeprefix("Value error, ")]
-        raise ParameterError(": ".join(filter(None, parts)), where=str(path)) from error
+        texts = [".".join(map(str, problem["loc"])), problem["msg"].removeprefix("Value error, ")]
+        raise ParameterError(": ".join(filter(None, texts)), where=str(path)) from error

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TableFormat
@@ -23,7 +20,7 @@ _PAIRS = re.compile(r"(\w+)\s*[:=]\s*(\([^()]*\)|\[[^\[\]]*\]|[^,\s()\[\]]+)")
 
 
 class MessageRows:
-    """Reads the columns of a table from messages; a path with `[]` gives one row per element of the list.
+    """Reads the columns of a table from messages; a path with `[]` gives one row per element of the list, also of lists in lists.
 
     Args:
         table: the mapping.
@@ -33,35 +30,34 @@ class MessageRows:
     def __init__(self, table: TableFormat, columns: Mapping[str, bool]) -> None:
         self._table, self._columns = table, columns
         self._paths = {
-            column: [part for part in re.split(r"\.|(\[\])", column) if part]
+            column: [step for step in re.split(r"\.|(\[\])", column) if step]
             for column in columns
             if column != LIST_INDEX
         }
 
-    def rows(self, message: Any) -> dict[str, Any]:
-        """Return {column: array or list} of the rows of a message; all have the same length.
+    def rows(self, message: Any) -> dict[str, list[Any]]:
+        """Return {column: list} of the rows of a message; all have the same length.
 
         Raises:
             RecordingError: a field is missing, or a text is not in the format of the mapping.
         """
         if self._table.text:
-            message = self._parsed(_step(message, self._table.text_field, self._table.text_field))
-        found = {}
+            message = self._parsed(_step(message, "data", "data"))
+        values: dict[str, tuple[Any, int]] = {}
         for column, path in self._paths.items():
-            with contextlib.suppress(*([RecordingError] if self._columns[column] else [])):
-                found[column] = _walk(message, path, column)
-        many = [column for column in found if "[]" in self._paths[column]]
-        count = min((len(found[column]) for column in many), default=1)
-        if count > MAX_ROWS:
-            raise RecordingError(f"{count} ranges in one message", valid=f"at most {MAX_ROWS}")
-        rows: dict[str, Any] = {LIST_INDEX: np.arange(count)}
-        for column, value in found.items():
-            rows[column] = value[:count] if column in many else [value] * count
+            try:
+                values[column] = _walk(message, path, column), path.count("[]")
+            except RecordingError:  # noqa: PERF203
+                if not self._columns[column]:
+                    raise
+                values[column] = None, 0
+        rows: dict[str, list[Any]] = {name: [] for name in (LIST_INDEX, *values)}
+        _append_rows(rows, values, 0)
         return rows
 
     def _parsed(self, text: Any) -> Any:
         if not isinstance(text, str) or len(text) > MAX_TEXT:
-            raise RecordingError(f"{self._table.text_field} is not a text", valid="a field of type string")
+            raise RecordingError("data is not a text", valid="a field of type string")
         if self._table.text == "json":
             try:
                 return json.loads(text)
@@ -70,18 +66,35 @@ class MessageRows:
         return {name: _items(value) for name, value in _PAIRS.findall(_COMMAND.sub("", text))}
 
 
+def _append_rows(rows: dict[str, list[Any]], values: dict[str, tuple[Any, int]], index: int) -> None:
+    """Append one row for each element of the innermost lists; `values`: (value, depth of its lists)."""
+    lists = [value for value, depth in values.values() if depth]
+    if not lists:
+        if len(rows[LIST_INDEX]) >= MAX_ROWS:
+            raise RecordingError(f"more than {MAX_ROWS} ranges in one message", valid=f"at most {MAX_ROWS}")
+        rows[LIST_INDEX].append(index)
+        for name, (value, _) in values.items():
+            rows[name].append(value)
+    for number in range(min(map(len, lists), default=0)):
+        element = {
+            name: (value[number], depth - 1) if depth else (value, 0)
+            for name, (value, depth) in values.items()
+        }
+        _append_rows(rows, element, number)
+
+
 def _items(text: str) -> Any:
     """Return the list in brackets, or the text itself."""
     return [item.strip() for item in text[1:-1].split(",")] if text[0] in "([" else text
 
 
 def _walk(value: Any, path: list[str], column: str) -> Any:
-    for number, part in enumerate(path):
-        if part == "[]":
+    for number, step in enumerate(path):
+        if step == "[]":
             if isinstance(value, str | dict) or not hasattr(value, "__len__"):
                 raise RecordingError(f"{column} is not a list")
             return [_walk(item, path[number + 1 :], column) for item in value]
-        value = _step(value, part, column)
+        value = _step(value, step, column)
     seconds = getattr(value, "sec", getattr(value, "secs", None))
     if seconds is not None:
         nanoseconds = getattr(value, "nanosec", getattr(value, "nsecs", 0))
@@ -93,19 +106,19 @@ def _step(value: Any, name: str, column: str) -> Any:
     if isinstance(value, dict):
         if name in value:
             return value[name]
-        known = [str(key) for key in value]
+        fields = [str(key) for key in value]
     elif isinstance(value, list | tuple) and name.isdigit() and int(name) < len(value):
         return value[int(name)]
     else:
         if not name.startswith("_") and hasattr(value, name):
             return getattr(value, name)
-        known = [
-            str(each).lstrip("_")
-            for each in getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
-            if each != "__msgtype__"
+        fields = [
+            str(field).lstrip("_")
+            for field in getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
+            if field != "__msgtype__"
         ]
     raise RecordingError(
         f"no field {name} for column {column}",
-        valid=f"the message has {', '.join(known[:30]) or 'no fields'}",
-        suggestion=did_you_mean(name, known),
+        valid=f"the message has {', '.join(fields[:30]) or 'no fields'}",
+        suggestion=did_you_mean(name, fields),
     )

@@ -1,18 +1,20 @@
-"""Rows of CSV, Parquet, NumPy, MATLAB, HDF5 and YAML files and of ROS bags, in chunks of bounded size."""
+"""Rows of CSV, MATLAB, HDF5 and YAML files and of ROS bags, in chunks of bounded size."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import gzip
+import io
 import lzma
 import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
@@ -26,7 +28,7 @@ from uwb_mitigation.errors import (
     not_installed,
 )
 from uwb_mitigation.files import read_bounded
-from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TableFormat
+from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MessageRows
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
@@ -45,12 +47,14 @@ TOPIC = "@topic"
 """Column with the topic of a message."""
 
 _SUFFIXES = {
-    ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".parquet": "parquet", ".npy": "numpy", ".npz": "numpy",
-    ".mat": "matlab", ".h5": "hdf5", ".hdf5": "hdf5", ".bag": "messages", ".db3": "messages", ".mcap": "messages",
-    ".yaml": "yaml", ".yml": "yaml",
+    ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".mat": "matlab", ".h5": "hdf5", ".hdf5": "hdf5", ".bag": "messages",
+    ".db3": "messages", ".mcap": "messages", ".yaml": "yaml", ".yml": "yaml",
 }  # fmt: skip
+_OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
 UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError)
 """Errors of values that do not have the expected form."""
+
+OnWarning = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,16 +79,16 @@ class Chunk:
         """Return the location of a row for errors."""
         return f"{self.path}: row {self.rows[row] + 1}"
 
-    def take(self, kept: NDArray[np.bool_]) -> Chunk:
+    def take(self, mask: NDArray[np.bool_]) -> Chunk:
         """Return the chosen rows."""
-        if kept.all():
+        if mask.all():
             return self
-        chosen = np.flatnonzero(kept).tolist()
+        chosen = np.flatnonzero(mask).tolist()
         columns = {
-            name: values[kept] if isinstance(values, np.ndarray) else [values[row] for row in chosen]
+            name: values[mask] if isinstance(values, np.ndarray) else [values[row] for row in chosen]
             for name, values in self.columns.items()
         }
-        return Chunk(columns, len(chosen), self.path, self.rows[kept], self.before)
+        return Chunk(columns, len(chosen), self.path, self.rows[mask], self.before)
 
 
 def _kind_of(path: Path) -> str:
@@ -110,24 +114,28 @@ def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> li
         if isinstance(pattern, dict):
             absolute = (ranges or root).resolve().as_posix()
             pattern = next((glob for rule, glob in pattern.items() if re.search(rule, absolute)), "")
-        found = sorted(path for path in root.glob(pattern) if path.is_file()) if pattern else []
+        paths = sorted(path for path in root.glob(pattern) if path.is_file()) if pattern else []
     except (ValueError, NotImplementedError, OSError, re.error) as error:
         raise RecordingError(f"files = {pattern!r}: {error}", where=str(root), valid="a glob") from error
     if pattern == "*":
-        found = [path for path in found if (_kind_of(path) or table.format or "yaml") != "yaml"]
-    if not found:
+        paths = [path for path in paths if (_kind_of(path) or table.format or "yaml") != "yaml"]
+    if not paths:
         what = "no such file or folder" if not root.exists() else f"no file {pattern!r}"
         raise RecordingError(what, where=str(root), valid="the folder that contains the files of the mapping")
-    return found
+    return paths
 
 
 _Rows = Iterator[tuple[dict[str, Any], int]]
 _Choose = Callable[[Sequence[str]], dict[str, str]]
-"""Returns {wanted column: column of the file}, from all columns of the file."""
+"""Returns {column: column of the file}, from all columns of the file."""
 
 
 def read_chunks(
-    table: TableFormat, path: Path, columns: Mapping[str, bool], before: int = 0
+    table: TableFormat,
+    path: Path,
+    columns: Mapping[str, bool],
+    before: int = 0,
+    on_warning: OnWarning | None = None,
 ) -> Iterator[Chunk]:
     """Yield the rows of a file, only the given columns and those of the rules to drop rows.
 
@@ -136,25 +144,34 @@ def read_chunks(
         path: the file.
         columns: {name: whether it is left out if it is missing}.
         before: number of rows in the files before.
+        on_warning: called if the last row of a CSV file is cut, and not yielded; None: it is yielded.
 
     Raises:
         RecordingError: the file cannot be read, or a column is missing; the message names similar columns.
         DamagedRecordingError: the file is truncated, after yielding the rows before.
     """
     kind = ("" if path.is_dir() else table.format) or _kind_of(path)
-    wanted = {**columns, **{rule.column: False for rule in table.drop}}
-    first = 0
+    needed = {**columns, **{rule.column: False for rule in table.drop}}
+    choose, first = partial(_choose, table, needed, path), 0
     try:
         if kind == "messages":
-            rows = _messages(table, path, wanted)
-        elif kind in _READERS:
-            rows = _READERS[kind](table, path, partial(_choose, wanted, path))
+            rows = _messages(table, path, needed)
+        elif kind == "csv":
+            rows = _csv(table, path, choose, on_warning)
+        elif kind:
+            rows = _arrays(table, path, choose)
         else:
-            raise RecordingError("unknown format", where=str(path), valid=", ".join([*_READERS, "messages"]))
-        for found, count in rows:
-            yield Chunk(found, count, path, np.arange(first, first + count), before)
+            raise RecordingError(
+                "unknown format", where=str(path), valid=", ".join(sorted({*_SUFFIXES.values()}))
+            )
+        for values, count in rows:
+            numbers = np.arange(first, first + count)
             first += count
-    except (EOFError, lzma.LZMAError, zlib.error) as error:
+            if table.unpivot:
+                values, repeats = _unpivot(table, values, count)
+                numbers = np.repeat(numbers, repeats)
+            yield Chunk(values, len(numbers), path, numbers, before)
+    except (EOFError, lzma.LZMAError, zlib.error, gzip.BadGzipFile) as error:
         raise DamagedRecordingError(
             f"truncated or corrupt: {error}", where=f"{path}: after row {first}"
         ) from error
@@ -165,21 +182,77 @@ def read_chunks(
         raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
 
 
-def _choose(columns: Mapping[str, bool], path: Path, known: Sequence[str]) -> dict[str, str]:
+def _choose(
+    table: TableFormat, columns: Mapping[str, bool], path: Path, names: Sequence[str]
+) -> dict[str, str]:
     """Return the columns that exist, also with other case; raise RecordingError if a required one is missing."""
-    folded = {name.strip().lower(): name for name in known}
-    chosen = {name: name if name in known else folded.get(name.lower(), "") for name in columns}
-    for name, found in chosen.items():
-        if not found and name not in known and not columns[name]:
-            valid = f"columns: {', '.join(known[:40])}"
-            if len(known) == 1 and (other := next((mark for mark in ";\t|," if mark in known[0]), "")):
-                valid = f"there is one column {known[0]!r:.60}; set separator: {other!r}"
-            suggestion = did_you_mean(name, known)
+    folded = {name.strip().lower(): name for name in names}
+    chosen = {name: name if name in names else folded.get(name.lower(), "") for name in columns}
+    for name in (*table.unpivot, *([VARIABLE] if table.unpivot else ())):
+        chosen.pop(name, None)
+    for rule in table.unpivot.values():
+        if not (matches := [name for name in names if re.fullmatch(rule, name)]):
+            raise RecordingError(
+                f"no column matches unpivot {rule!r}", where=str(path), valid=", ".join(names[:40])
+            )
+        chosen |= dict(zip(matches, matches, strict=True))
+    for name, column in chosen.items():
+        if not column and name not in names and not columns[name]:
+            valid = f"columns: {', '.join(names[:40])}"
+            if len(names) == 1 and (mark := next((mark for mark in ";\t|," if mark in names[0]), "")):
+                valid = f"there is one column {names[0]!r:.60}; set separator: {mark!r}"
+            suggestion = did_you_mean(name, names)
             raise RecordingError(f"no column {name}", where=str(path), valid=valid, suggestion=suggestion)
-    return {name: found for name, found in chosen.items() if found in known}
+    return {name: column for name, column in chosen.items() if column in names}
 
 
-def _csv(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
+def _unpivot(table: TableFormat, columns: Mapping[str, Any], count: int) -> tuple[dict[str, Any], int]:
+    """Return one row for each column that matches, as `pandas.melt`, and the number of rows for each row."""
+    melted: dict[str, dict[str, str]] = {}
+    for target, rule in table.unpivot.items():
+        for name in columns:
+            if match := re.fullmatch(rule, name):
+                melted.setdefault(match[1] if match.re.groups == 1 else name, {})[target] = name
+    sources = {name for names in melted.values() for name in names.values()}
+    rows = {
+        name: np.repeat(values, len(melted), axis=0)
+        for name, values in columns.items()
+        if name not in sources
+    }
+    unknown = np.full(count, np.nan)
+    for target in table.unpivot:
+        values = [columns[names[target]] if target in names else unknown for names in melted.values()]
+        rows[target] = np.stack(values, axis=1).reshape(-1)
+    return rows | {VARIABLE: np.tile(np.array(list(melted), object), count)}, len(melted)
+
+
+class _Tail(io.RawIOBase):
+    """A stream that keeps the last bytes that were read."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream, self.tail = stream, b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._stream.read(len(buffer))
+        self.tail = (self.tail + data)[-(1 << 16) :]
+        buffer[: len(data)] = data
+        return len(data)
+
+    def fault(self, separator: str, columns: int) -> str:
+        """Return why the last line is not complete; empty: it is."""
+        if not self.tail.endswith((b"\n", b"\r")):
+            return "the file does not end with a line break"
+        *_, start, line = [b"", *self.tail.rstrip().splitlines()]
+        text = line.decode(errors="replace")
+        fields = next(csv.reader([text], delimiter=separator), []) if len(separator) == 1 else text.split()
+        # The start of a line that is longer than the tail is unknown.
+        return "the last row is short" if start and len(fields) < columns else ""
+
+
+def _csv(table: TableFormat, path: Path, choose: _Choose, on_warning: OnWarning | None) -> _Rows:
     import pandas as pd
 
     options: dict[str, Any] = {
@@ -189,85 +262,84 @@ def _csv(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
     if table.columns:
         options |= {"names": table.columns, "header": None, "index_col": False}
     try:
-        known = table.columns or [str(name) for name in pd.read_csv(path, nrows=0, **options).columns]
-        chosen = choose(known)
+        names = table.columns or [str(name) for name in pd.read_csv(path, nrows=0, **options).columns]
+        chosen = choose(names)
         rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(len(chosen), 1)))
         # Unused columns cost most of the time of a file with CIRs.
-        with pd.read_csv(path, usecols=list(chosen.values()), chunksize=rows, **options) as frames:
-            for frame in frames:
-                yield {name: frame[column].to_numpy() for name, column in chosen.items()}, len(frame)
+        options |= {"usecols": list(chosen.values()), "chunksize": rows}
+        with _OPENERS.get(path.suffix, open)(path, "rb") as stream:
+            tail, previous = _Tail(stream), None
+            for frame in pd.read_csv(io.BufferedReader(tail), **options):
+                if previous is not None:
+                    yield previous
+                previous = {name: frame[column].to_numpy() for name, column in chosen.items()}, len(frame)
+        if previous is not None:
+            # The rows of a file without a header may have several widths.
+            fault = tail.fault(table.separator, 0 if table.columns else len(names))
+            if fault and on_warning:
+                on_warning(f"{path.name}: {fault}; the last row is not used")
+                previous = {name: values[:-1] for name, values in previous[0].items()}, previous[1] - 1
+            yield previous
     except pd.errors.EmptyDataError as error:
         raise RecordingError("the file is empty", where=str(path)) from error
 
 
-def _parquet(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
-    file = _installed("pyarrow.parquet").ParquetFile(path)
-    chosen = choose(file.schema_arrow.names)
-    for batch in file.iter_batches(batch_size=CHUNK_ROWS // 10, columns=list(chosen.values())):
-        found = {name: batch.column(column) for name, column in chosen.items()}
-        yield {name: values.to_numpy(zero_copy_only=False) for name, values in found.items()}, batch.num_rows
-
-
 def _arrays(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
-    """Read a NumPy, MATLAB, HDF5 or YAML file in slices."""
+    """Read a MATLAB, HDF5 or YAML file in slices."""
     with contextlib.ExitStack() as stack:
         arrays = _as_columns(_load(table, path, stack), table, path)
         chosen = choose([str(name) for name in arrays if not str(name).startswith("__")])
-        found = {name: arrays[column] for name, column in chosen.items()}
+        columns = {name: arrays[column] for name, column in chosen.items()}
         # Slices of large files are read later, other values are arrays of one row at least.
-        found = {
-            name: each if getattr(each, "ndim", 0) else np.atleast_1d(each) for name, each in found.items()
+        columns = {
+            name: array if getattr(array, "ndim", 0) else np.atleast_1d(array)
+            for name, array in columns.items()
         }
-        lengths = {name: len(each) for name, each in found.items()}
+        lengths = {name: len(array) for name, array in columns.items()}
         if len(set(lengths.values())) > 1:
             raise RecordingError("columns of different length", where=str(path), valid=str(lengths))
-        width = max([int(np.prod(each.shape[1:])) for each in found.values()], default=1)
+        width = max([int(np.prod(array.shape[1:])) for array in columns.values()], default=1)
         rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(width, 1)))
         count = max(lengths.values(), default=0)
         for first in range(0, count, rows):
-            part = {name: np.asarray(each[first : first + rows]) for name, each in found.items()}
-            yield part, min(rows, count - first)
+            values = {name: np.asarray(array[first : first + rows]) for name, array in columns.items()}
+            yield values, min(rows, count - first)
 
 
 def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Any:
     """Return an array, or {name: array}: the variables of a file, or of its variable `group`."""
     kind = table.format or _kind_of(path)
-    if kind != "hdf5" and path.stat().st_size > MAX_ARRAY_BYTES:
-        raise RecordingError(f"more than {MAX_ARRAY_BYTES >> 30} GiB", where=str(path), valid="Parquet, HDF5")
-    found: Any = None
+    if kind == "matlab" and path.stat().st_size > MAX_ARRAY_BYTES:
+        raise RecordingError(f"more than {MAX_ARRAY_BYTES >> 30} GiB", where=str(path), valid="CSV, HDF5")
+    content: Any = None
     if kind == "yaml":
-        found = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
-    elif kind == "numpy":
-        found = np.load(path, allow_pickle=False, mmap_mode="r" if path.suffix == ".npy" else None)
+        content = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
     elif kind == "matlab":
         from scipy.io import loadmat
 
         # Version 7.3 is HDF5.
         with contextlib.suppress(NotImplementedError):
-            found = loadmat(path, simplify_cells=True)
-    if is_hdf5 := found is None:
-        found = stack.enter_context(_installed("h5py").File(path, "r"))
-    if table.group and not isinstance(found, np.ndarray):
-        if table.group not in found:
+            content = loadmat(path, simplify_cells=True)
+    if is_hdf5 := content is None:
+        try:
+            import h5py
+        except ImportError as error:
+            raise not_installed("h5py") from error
+        content = stack.enter_context(h5py.File(path, "r"))
+    if table.group:
+        if table.group not in content:
             raise RecordingError(
-                f"no variable {table.group}", where=str(path), valid=", ".join(map(str, found))
+                f"no variable {table.group}", where=str(path), valid=", ".join(map(str, content))
             )
-        found = found[table.group]
+        content = content[table.group]
     if kind == "yaml":
-        return _yaml_rows(found)
+        return _yaml_rows(content)
     if is_hdf5 and kind == "matlab":
         # MATLAB writes the transposed array.
-        if hasattr(found, "dtype"):
-            return found[()].T
-        return {name: np.squeeze(item[()].T) for name, item in found.items() if hasattr(item, "dtype")}
-    return found
-
-
-def _installed(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise not_installed(name.partition(".")[0]) from error
+        if hasattr(content, "dtype"):
+            return content[()].T
+        return {name: np.squeeze(item[()].T) for name, item in content.items() if hasattr(item, "dtype")}
+    return content
 
 
 def _as_columns(arrays: Any, table: TableFormat, path: Path) -> Mapping[str, Any]:
@@ -278,13 +350,12 @@ def _as_columns(arrays: Any, table: TableFormat, path: Path) -> Mapping[str, Any
         return {name: np.array([row[name] for row in arrays]) for name in arrays[0]}
     if names := getattr(getattr(arrays, "dtype", None), "names", None):
         return {name: arrays[name] for name in names}
-    if table.columns and len(arrays.shape) == 2 and arrays.shape[1] == len(table.columns):
+    shape: tuple[int, ...] = getattr(arrays, "shape", ())
+    if table.columns and len(shape) == 2 and shape[1] == len(table.columns):
         return {name: arrays[:, column] for column, name in enumerate(table.columns)}
-    if not table.columns and len(arrays.shape) > 1:
+    if not table.columns and len(shape) > 1:
         return {"": arrays}
-    raise RecordingError(
-        f"an array of shape {arrays.shape}", where=str(path), valid="`columns` names its columns"
-    )
+    raise RecordingError(f"an array of shape {shape}", where=str(path), valid="`columns` names its columns")
 
 
 def _yaml_rows(document: Any) -> dict[str, NDArray[Any]]:
@@ -309,35 +380,29 @@ def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
         yield prefix.rstrip("."), value
 
 
-_READERS = {"csv": _csv, "parquet": _parquet} | dict.fromkeys(("numpy", "matlab", "hdf5", "yaml"), _arrays)
-
-
 def _messages(table: TableFormat, path: Path, columns: Mapping[str, bool]) -> _Rows:
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from uwb_mitigation.recordings.mapping.bag_messages import read_messages
 
-    reader = MessageRows(table, columns)
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in table.definitions.items():
-        store.register(get_types_from_msg(text, name))
-    with AnyReader([path], default_typestore=store) as bag:
-        topics = {connection.topic: connection.msgtype for connection in bag.connections}
-        # Without topics, the library would read all of them.
-        if missing := [topic for topic in table.topics or [""] if topic not in topics]:
-            known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())[:40])
-            what = f"no topic {missing[0]}" if missing[0] else "the mapping has no topics"
-            raise RecordingError(what, where=str(path), valid=f"the bag has: {known}")
-        messages = bag.messages([each for each in bag.connections if each.topic in table.topics])
-        while batch := list(islice(messages, 1000)):
-            rows: dict[str, list[Any]] = {}
-            for connection, stamp_ns, data in batch:
+    reader, damage = MessageRows(table, columns), None
+    messages = read_messages(path, table.topics)
+    while damage is None:
+        rows: dict[str, list[Any]] = {LIST_INDEX: []}
+        count = 0
+        try:
+            for topic, stamp_ns, message in islice(messages, 1000):
+                count += 1
                 try:
-                    found = reader.rows(bag.deserialize(data, connection.msgtype))
+                    values = reader.rows(message)
                 except RecordingError as error:
-                    where = f"{path}: {connection.topic}"
-                    raise RecordingError(error.what, where=where, valid=error.valid) from error
-                count = len(found[LIST_INDEX])
-                found |= {LOG_TIME: [stamp_ns] * count, TOPIC: [connection.topic] * count}
-                for name, values in found.items():
-                    rows.setdefault(name, []).extend(values)
-            yield rows, len(rows[LIST_INDEX])
+                    raise RecordingError(error.what, where=f"{path}: {topic}", valid=error.valid) from error
+                repeats = len(values[LIST_INDEX])
+                values |= {LOG_TIME: [stamp_ns] * repeats, TOPIC: [topic] * repeats}
+                for name, cells in values.items():
+                    rows.setdefault(name, []).extend(cells)
+        except DamagedRecordingError as error:
+            damage = error
+        if count == 0:
+            break
+        yield rows, len(rows[LIST_INDEX])
+    if damage:
+        raise damage
