@@ -13,7 +13,7 @@ from rich.markup import escape
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.support.checks import OffsetsOption
-from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption
+from uwb_mitigation.commands.support.console import JsonOption, show_table
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def process(
     seconds = outcomes[0].seconds if len(jobs) == 1 else time.perf_counter() - started
     result = _result(outcomes, seconds, bundle.model_id)
     if any(outcome.written for outcome in outcomes):
-        _show(outcomes, result)
+        _show(result)
     console.write_json(json, result)
     _raise_failures(outcomes)
 
@@ -123,43 +123,48 @@ def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str,
         "seconds": seconds,
         "model_id": model_id,
         "failed": sum(outcome.error is not None for outcome in outcomes),
-        "bags": [_bag(outcome) for outcome in outcomes],
+        "bags": [_row(outcome) for outcome in outcomes],
     }
 
 
-def _bag(outcome: Outcome) -> dict[str, Any]:
-    counts = {name: getattr(outcome, name) for name in ("messages", "ranges", "replaced", "seconds")}
-    return {
+def _row(outcome: Outcome) -> dict[str, Any]:
+    ok, error = outcome.statuses["OK"], outcome.error
+    names = ("messages", "ranges", "replaced", "seconds", "statuses", "skipped", "mismatches", "error")
+    return {name: getattr(outcome, name) for name in names} | {
+        "bag": outcome.job.source.name,
         "source": str(outcome.job.source),
         "output": str(outcome.job.output) if outcome.written else None,
-        **counts,
-        "statuses": dict(outcome.statuses),
-        "skipped": dict(outcome.skipped),
-        "mismatches": dict(outcome.mismatches),
-        "error": str(outcome.error) if outcome.error else None,
+        "ok": ok,
+        "passed_through": outcome.ranges - ok,
+        "warnings": outcome.skipped.total(),
+        "state": "corrected" if error is None else "damaged" if outcome.written else "failed",
     }
 
 
-def _show(outcomes: list[Outcome], result: dict[str, Any]) -> None:
-    table = ConsoleTable("bag", title=f"Corrected by model {result['model_id']:08x}", title_justify="left")
-    for column in ("messages", "ranges", "OK", "passed through", "replaced", "skipped"):
-        table.add_column(column, justify="right")
-    if any(outcome.error for outcome in outcomes):
-        table.add_column("")
-    for outcome in outcomes:
-        passed = outcome.ranges - outcome.statuses["OK"]
-        numbers = (outcome.messages, outcome.ranges, outcome.statuses["OK"], passed, outcome.replaced)
-        state = [] if outcome.error is None else ["damaged" if outcome.written else "failed"]
-        table.add_row(
-            escape(outcome.job.source.name), *map(str, numbers), str(outcome.skipped.total()), *state
-        )
-    console.out.print(table)
-    console.out.print(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s", highlight=False)
-    for outcome in outcomes:
-        for kind, count in outcome.skipped.items():
-            console.warn(f"{outcome.job.source}: {count} x {kind}")
-        for reason, count in outcome.mismatches.items():
-            console.warn(f"{outcome.job.source}: {count} ranges are not corrected: {reason}")
+def _show(result: dict[str, Any]) -> None:
+    columns = {
+        "bag": "bag",
+        "ranges": "ranges:d",
+        "OK": "ok:d",
+        "passed through": "passed_through:d",
+        "warnings": "warnings:d",
+        "state": "state",
+        "messages": "messages:d",
+        "replaced": "replaced:d",
+    }
+    show_table(
+        f"Corrected by model {result['model_id']:08x}",
+        columns,
+        result["bags"],
+        max_rows=len(result["bags"]),
+        optional=("warnings", "messages", "replaced") if result["failed"] else tuple(columns)[4:],
+    )
+    console.print_line(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s")
+    for row in result["bags"]:
+        for kind, count in row["skipped"].items():
+            console.warn(f"{row['source']}: {count} x {kind}")
+        for reason, count in row["mismatches"].items():
+            console.warn(f"{row['source']}: {count} ranges are not corrected: {reason}")
 
 
 def _raise_failures(outcomes: list[Outcome]) -> None:
