@@ -1,0 +1,269 @@
+"""Recordings whose stamps differ from their log times, and clients that are slow, in a real browser."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_material import START_NS, corrected, record
+from browser import Browser
+from drives import HALL, drive
+
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.palette import TrackKind
+from uwb_mitigation.types.ros import codec
+from uwb_mitigation.types.ros.poses import encode_true_position
+from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
+from uwb_mitigation.viewer import timeline as timeline_module
+from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.page import View
+from uwb_mitigation.viewer.playback import BagPlayer
+from uwb_mitigation.viewer.scene import Pose, Sample, Scene
+from uwb_mitigation.viewer.server import ViewerServer
+
+BAD = 700
+"""Row of the range whose status is not OK and whose error is the largest."""
+
+
+def write_drive(
+    path: Path, delays_s: dict[int, float], latency_s: float = 0.05, gap_s: tuple[float, float] = (0.0, 0.0)
+) -> Path:
+    """Write a drive of 40 s with corrected ranges, their truth, and true positions.
+
+    Args:
+        path: the bag.
+        delays_s: {tag: what its clock shows more than the clock of the recorder}.
+        latency_s: time from a range to its log time.
+        gap_s: interval without ranges.
+    """
+    ranges, truth = drive(seconds=40.0, rate_hz=25.0)
+    with BagWriter(path, {}) as out:
+        channel = out.corrected_channel()
+        for tag, delay_s in delays_s.items():
+            for row in range(len(ranges)):
+                time_s = ranges.stamp_ns[row] / 1e9
+                if gap_s[0] < time_s < gap_s[1]:
+                    continue
+                log_ns = START_NS + int(ranges.stamp_ns[row]) + int(latency_s * 1e9)
+                stamp_ns = START_NS + int(ranges.stamp_ns[row]) + int(delay_s * 1e9)
+                range_m = float(ranges.range_m[row]) + 3.0 * (row == BAD)
+                item = record(row)
+                anchor = HALL.anchors[ranges.anchor[row]].id
+                measurement = replace(item.measurement, stamp_ns=stamp_ns, anchor_id=anchor, tag_id=tag)
+                status = Status.BAD_CIR if row == BAD else Status.OK
+                result = replace(corrected(row), range_m=range_m, range_raw_m=range_m + 0.4, status=status)
+                out.write_serialized(
+                    channel, codec.encode_corrected(measurement, result), log_ns, log_ns, row
+                )
+                distance_m = float(np.linalg.norm(truth.position[row] - HALL.position[ranges.anchor[row]]))
+                true_range = codec.encode_truth(measurement, replace(item.truth, range_m=distance_m))
+                out.write_message(
+                    "/uwb/range_truth", "uwb_mitigation_msgs/msg/RangeTruth", true_range, log_ns
+                )
+                place = encode_true_position(tuple(truth.position[row].tolist()), tag, stamp_ns)
+                out.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, place, log_ns)
+    return path
+
+
+@contextmanager
+def serve(path: Path, origins: tuple[str, ...] = ()) -> Iterator[tuple[BagPlayer, ViewerServer]]:
+    """Serve an indexed bag, paused at its begin."""
+    lock = threading.Lock()
+    feed = SceneUpdater(Scene(), lock)
+    player = BagPlayer(path, feed, lambda: pytest.fail("the bag contains corrected ranges"))
+    feed.anchors(HALL)
+    player.index(HALL).join()
+    with ViewerServer(View(feed.scene, lock, player=player), port=0, origins=origins) as server:
+        yield player, server
+
+
+def cards(browser: Browser) -> dict[str, str]:
+    """Return the large figures of the page, {title: value}."""
+    script = "return [...document.querySelectorAll('#cards div')].map((c) => [...c.children].map((e) => e.textContent))"
+    return {title: value for title, value, _ in browser.run(script)}
+
+
+def send(browser: Browser, name: str, *arguments: object) -> None:
+    """Send a command of the page."""
+    script = "Bokeh.documents[0].get_model_by_name('controls').command = [arguments[0], arguments[1], Math.random()]"
+    browser.run(script, name, list(arguments))
+
+
+def position_s(browser: Browser) -> float:
+    return float(browser.run("return document.getElementById('position').value"))
+
+
+@pytest.mark.parametrize("delay_s", [0.0, -2.0, 3600.0])
+def test_marks_and_map_agree_with_the_log_time(browser: Browser, tmp_path: Path, delay_s: float):
+    with serve(write_drive(tmp_path / "drive.mcap", {7: delay_s})) as (player, server):
+        browser.open(server.url)
+        browser.wait("the figures", lambda: "Position RMSE, whole recording" in cards(browser))
+        assert ("Stamps differ from the log time" in browser.text()) == (delay_s != 0.0)
+        for button in ("Largest error", "Next bad range", "Previous bad range"):
+            if button != "Largest error":
+                send(browser, "seek", 0.0 if button == "Next bad range" else 40.0)
+                browser.wait("the other position", lambda: abs(position_s(browser) - BAD / 25.0) > 1.0)
+            browser.click("button", button)
+            browser.wait(button, lambda: position_s(browser) == pytest.approx(BAD / 25.0, abs=0.05))
+            browser.wait("its status", lambda: "BAD_CIR" in browser.column("pairs", "status"))
+        browser.wait(
+            "the track",
+            lambda: len(browser.column("map", "heading")) == 0 and "tag_7" in browser.column("map", "name"),
+        )
+        assert player.timeline is not None
+        assert (
+            np.abs(player.timeline.tracks["tag_7", TrackKind.TRUE][:, 0] - np.arange(1000) / 25.0).max() < 0.1
+        )
+        assert float(cards(browser)["Position RMSE, whole recording"].split()[0]) < 0.5
+        assert browser.console_messages() == []
+
+
+def test_clocks_of_two_tags_may_differ_by_an_hour(browser: Browser, tmp_path: Path):
+    with serve(write_drive(tmp_path / "two.mcap", {7: 0.0, 8: 3600.0})) as (_, server):
+        browser.open(server.url + "#t=30&anchor=1&tag=8")
+        browser.wait("pairs of both tags", lambda: len(browser.column("pairs", "tag")) == 10)
+        browser.wait("a full strip", lambda: len(browser.column("strip", "raw")) > 140)
+    scene = Scene()
+    for step in range(100):
+        for tag, clock_s in ((7, 1000.0), (8, 4600.0)):
+            scene.add_sample((1, tag), Sample(clock_s + step / 10, 5.3, 5.1, 0.1, Status.OK))
+    assert [len(scene.pairs[1, tag].samples) for tag in (7, 8)] == [100, 100]
+
+
+def test_same_url_shows_the_same_figures(browser: Browser, tmp_path: Path):
+    with serve(write_drive(tmp_path / "drive.mcap", {7: 0.0})) as (player, server):
+        browser.open(server.url + "#t=20")
+        browser.wait("the figures", lambda: cards(browser).get("Position error, now", "-") != "-")
+        whole = cards(browser)
+        send(browser, "seek", 0.0)
+        send(browser, "speed", 50.0)
+        send(browser, "play", True)
+        browser.wait("the end", lambda: player.position_s == player.seconds)
+        browser.find("combobox", "figures of").send_keys("last")
+        browser.wait("the other figures", lambda: "Position RMSE, last 60 s" in cards(browser))
+        assert "window=last" in browser.driver.current_url
+        browser.open(server.url + "#t=20.0")
+        browser.wait(
+            "the figures", lambda: cards(browser).get("Position error, now") == whole["Position error, now"]
+        )
+        assert cards(browser) == whole
+        assert browser.find("heading", "Range errors, whole recording")
+
+
+def test_gaps_are_shown_as_gaps(browser: Browser, tmp_path: Path):
+    with serve(write_drive(tmp_path / "gap.mcap", {7: -2.0}, gap_s=(10.0, 30.0))) as (player, server):
+        browser.open(server.url + "#t=25")
+        browser.wait(
+            "an old tag", lambda: any("no data for 15 s" in name for name in browser.column("map", "name"))
+        )
+        assert player.timeline is not None
+        mean = player.timeline.mean_errors(player.seconds)
+        assert np.isnan(mean["corrected"][(mean["time"] > 11.0) & (mean["time"] < 29.0)]).all()
+        assert np.isnan(mean["time"]).sum() == 1
+        send(browser, "seek", 35.0)
+        browser.wait("a gap in the strip", lambda: None in browser.column("strip", "raw"))
+
+
+def test_index_reads_all_ranges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(timeline_module, "CHUNK", 100)
+    with serve(write_drive(tmp_path / "drive.mcap", {7: 0.0})) as (player, _):
+        timeline = player.timeline
+        assert timeline is not None
+        assert (len(timeline.bad), timeline.bad.sum()) == (1000, 1)
+        assert timeline.largest_error() == BAD
+        assert np.isfinite(timeline.true_m).all()
+        assert timeline.losses[1, 7] == (0, 200)
+
+
+class SlowLink:
+    """A TCP proxy that forwards at most a number of bytes per second to the client.
+
+    Args:
+        port: port of the server.
+
+    Attributes:
+        port: port of the proxy.
+        rate: bytes per second.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._target, self.rate = port, 1e9
+        self._listener = socket.create_server(("localhost", 0))
+        self.port = self._listener.getsockname()[1]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            server = socket.socket()
+            # Small buffers: otherwise they contain data of many seconds.
+            server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+            server.connect(("localhost", self._target))
+            for source, sink, is_slow in ((client, server, False), (server, client, True)):
+                threading.Thread(target=self._forward, args=(source, sink, is_slow), daemon=True).start()
+
+    def _forward(self, source: socket.socket, sink: socket.socket, is_slow: bool) -> None:
+        try:
+            while data := source.recv(2048):
+                sink.sendall(data)
+                time.sleep(len(data) / self.rate if is_slow else 0.0)
+        except OSError:
+            pass
+        finally:
+            source.close()
+            sink.close()
+
+    def close(self) -> None:
+        self._listener.close()
+
+
+def test_slow_client_shows_current_data_or_its_age(browser: Browser):
+    lock = threading.Lock()
+    view = View(Scene(), lock)
+    stop = threading.Event()
+
+    def feed() -> None:
+        while not stop.wait(0.02):
+            now_s = time.time()
+            with lock:
+                for anchor in range(8):
+                    view.scene.add_sample((anchor, 7), Sample(now_s, 5.0, now_s % 1000.0, 0.1, Status.OK))
+                view.scene.add_pose("tag", Pose(math.sin(now_s), math.cos(now_s), 0.0, stamp_s=now_s))
+
+    with socket.create_server(("localhost", 0)) as reserved:
+        server_port = reserved.getsockname()[1]
+    link = SlowLink(server_port)
+    thread = threading.Thread(target=feed)
+    with ViewerServer(view, port=server_port, origins=(f"localhost:{link.port}",)):
+        thread.start()
+        try:
+            browser.open(f"http://localhost:{link.port}/")
+            browser.wait("pairs", lambda: len(browser.column("pairs", "corrected")) == 8)
+            link.rate = 40_000.0
+            ages = []
+            for _ in range(20):
+                time.sleep(0.5)
+                shown = max(browser.column("pairs", "corrected"))
+                ages.append((time.time() % 1000.0 - shown) % 1000.0)
+            assert max(ages) < 6.0, "nothing queues: without acknowledgements, the age grows to 10 s"
+            assert "behind" in browser.text() or "LIVE" in browser.text()
+            link.rate = 500.0
+            browser.wait("a page that admits its age", lambda: "s behind" in browser.text())
+            link.rate = 1e9
+        finally:
+            stop.set()
+            thread.join()
+            link.close()
