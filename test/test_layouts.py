@@ -81,7 +81,7 @@ def test_foxglove_layout_uses_existing_topics_and_fields():
     assert len(paths) > 8
     outputs = {
         re.search(r'output = "(.*)"', script["sourceCode"])[1]: dict(
-            re.findall(r"(\w+): ([\w\[\]]+)", re.search(r"type Output = \{(.*)\}", script["sourceCode"])[1])
+            re.findall(r"(\w+): ([\w\[\]]+)", re.search(r"type Output = (.*)", script["sourceCode"])[1])
         )
         for script in layout["userNodes"].values()
     }
@@ -110,7 +110,9 @@ def test_foxglove_scripts_filter_64_bit_ids_and_compute_magnitudes(browser: Brow
     def run(name: str, topic: str, message: str, **variables: str) -> object:
         source = layout["userNodes"][name]["sourceCode"]
         assert f'"{topic}"' in re.search(r"inputs = (.*)", source)[1]
-        source = re.sub(r"type Output.*|: any\b|: Output \| undefined|export default |export ", "", source)
+        source = re.sub(
+            r"import .*|type Output.*|: any\b|: Output \| undefined|export default |export ", "", source
+        )
         event = f"{{topic: '{topic}', message: {message}}}"
         return browser.run(f"{source}; return script({event}, arguments[0]) ?? null", variables)
 
@@ -125,6 +127,9 @@ def test_foxglove_scripts_filter_64_bit_ids_and_compute_magnitudes(browser: Brow
     shown = run("uwb-range", "/uwb/range_corrected", ranges, anchor=big, tag="7")
     assert (shown["raw"], shown["corrected"]) == (5, 4.5)
     assert run("uwb-range", "/uwb/range_truth", ranges)["truth"] == 4.5
+    odometry = "{header: {frame_id: 'map'}, pose: {pose: {position: {x: 1}}, covariance: []}}"
+    place = run("uwb-truth", "/uwb/odometry_truth", odometry)
+    assert place == {"header": {"frame_id": "map"}, "pose": {"position": {"x": 1}}}
 
 
 def test_layouts_use_the_colours_of_the_page():
@@ -147,6 +152,8 @@ def test_plotjuggler_shows_fields_of_the_topics():
     names = {curve.get("name") for curve in root.iter("curve")} - functions
     names |= {element.text for tag in ("linked_source", "v1") for element in root.iter(tag)}
     assert len(names) > 5
+    for function in root.iter("function"):
+        assert function.text.endswith("else return {} end"), "without a value PlotJuggler removes the curve"
     for name in names:
         topic = next(topic for topic in TYPES if name.startswith(f"{topic}/"))
         assert has(TYPES[topic], name.removeprefix(topic).replace("/", ".")), name
