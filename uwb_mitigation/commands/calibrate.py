@@ -118,6 +118,7 @@ def calibrate(
     """
     from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
+    from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.training.site.calibration import calibrate_site
     from uwb_mitigation.training.site.solution import LivePrior
     from uwb_mitigation.types.anchors import anchors_path, load_anchors
@@ -132,7 +133,9 @@ def calibrate(
     if not abs(stamp_offset) <= MAX_STAMP_OFFSET_S:
         raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
     prior = LivePrior(None if height is None else Height(height, height_sd), Area.parse(area), height_sd)
-    anchor_map = load_anchors(anchors or anchors_path(bags[0]))
+    anchor_map = (None if anchors else recorded_anchors(bags[0])) or load_anchors(
+        anchors or anchors_path(bags[0])
+    )
     source = bundle_for(None, bags[0])
     try:
         site = _gather(bags, anchor_map, source, stamp_offset, height_topic, height_sd)

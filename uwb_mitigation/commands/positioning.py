@@ -249,6 +249,7 @@ def _read(
     from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+    from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.recordings.bag.pose_paths import read_heights
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
     from uwb_mitigation.types.anchors import anchors_path, load_anchors
@@ -261,7 +262,7 @@ def _read(
     prior, box, model = Height(height or 0.0, height_sd), Area.parse(area), NoiseModel(acceleration)
     if not bag.exists():
         raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
-    anchor_map = load_anchors(anchors or anchors_path(bag))
+    anchor_map = (None if anchors else recorded_anchors(bag)) or load_anchors(anchors or anchors_path(bag))
     with console.progress() as bar:
         bar.add_task("reading", total=None)
         recorded = read_ranges(bag, anchor_map, stamp_offset)

@@ -79,7 +79,8 @@ def view(
     from threading import Lock
 
     from uwb_mitigation.positioning.geometry import Height
-    from uwb_mitigation.types.anchors import anchors_path, load_anchors
+    from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
+    from uwb_mitigation.types.anchors import load_anchors
     from uwb_mitigation.viewer.feed import SceneUpdater
     from uwb_mitigation.viewer.floor_plan import load_floor_plan
     from uwb_mitigation.viewer.page import View
@@ -88,8 +89,7 @@ def view(
     from uwb_mitigation.viewer.server import ViewerServer
 
     lock = Lock()
-    file = anchors or anchors_path(bag)
-    anchor_map = load_anchors(file) if anchors is not None or file.is_file() else None
+    anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
     players, scenes = [], []
     for path in (bag, second):
         if path is None:
@@ -102,7 +102,7 @@ def view(
             console.err.print(
                 f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
             )
-        player.index(anchor_map or feed.anchor_map, None if height is None else Height(height))
+        player.index(anchor_map, None if height is None else Height(height))
         players.append(player)
         scenes.append(feed.scene)
     first = players[0]

@@ -15,7 +15,8 @@ import numpy as np
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_ellipse
-from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
+from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros import topics
@@ -24,8 +25,6 @@ from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
-    MAX_ID_DIGITS,
-    MAX_TEXT,
     MAX_TRUTHS,
     MAX_WITHOUT_TRUTH,
     AnchorPosition,
@@ -154,20 +153,10 @@ class SceneUpdater:
                 self.scene.add_position(tag, kind, (stamp_s, position.x, position.y, position.z, sd_m))
 
     def markers(self, message: Any) -> None:
-        """Add the anchors of a visualization_msgs/MarkerArray.
-
-        A marker of the namespace `anchors` has the id of the anchor as its text, that of `names` with the same number its label.
-        """
-        anchors: dict[int, AnchorPosition] = {}
-        labels = {marker.id: str(marker.text) for marker in message.markers if marker.ns == "names"}
-        for marker in message.markers:
-            position, text = marker.pose.position, marker.text
-            if marker.ns != "anchors" or not math.isfinite(position.x + position.y):
-                continue
-            if text.isascii() and text.isdigit() and len(text) <= MAX_ID_DIGITS:
-                label = labels.get(marker.id, "")
-                name = label.partition(" (")[2].removesuffix(")")[:MAX_TEXT]
-                anchors[int(text)] = AnchorPosition(position.x, position.y, position.z, name)
+        """Add the anchors of a visualization_msgs/MarkerArray."""
+        anchors = {
+            anchor.id: AnchorPosition(*anchor.position, anchor.name) for anchor in parse_markers(message)
+        }
         if anchors:
             with self.lock:
                 self.scene.set_anchors(anchors)
@@ -177,16 +166,6 @@ class SceneUpdater:
         places = {anchor.id: AnchorPosition(*anchor.position, anchor.name) for anchor in anchors.anchors}
         with self.lock:
             self.scene.set_anchors(places)
-
-    @property
-    def anchor_map(self) -> AnchorMap | None:
-        """The anchors of the scene; None: it has none."""
-        anchors = [
-            Anchor(id_, (p.x, p.y, p.z), name=p.name)
-            for id_, p in self.scene.anchors.items()
-            if math.isfinite(p.z)
-        ]
-        return AnchorMap(anchors) if anchors else None
 
     def _diagnostics(self, message: Any) -> None:
         """Add a diagnostic_msgs/DiagnosticArray."""

@@ -36,7 +36,6 @@ MAX_CELLS = 4000  # of the heat map
 WATERFALL = 50  # CIRs of each pair
 MAX_VALUES = 2 * 1016  # of a CIR: the DW1000's complete accumulator, real and imaginary
 MAX_TEXT = 400  # characters of a name or a message
-MAX_ID_DIGITS = 20  # decimal digits of a 64-bit id
 MAX_RANGE_M = 10_000.0  # a longer range is shown in the table only; a larger error is not counted
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
 MAX_MESSAGES = 20_000  # read at a seek; older ones are skipped

@@ -1,6 +1,6 @@
 """Process one bag into one corrected bag.
 
-Every message is copied unchanged. Each raw range is followed by its corrected range with the same log time. The output is
+Every message is copied unchanged, and the anchors of the anchors file are added. Each raw range is followed by its corrected range with the same log time. The output is
 byte-identical to that of correcting the ranges one by one.
 """
 
@@ -23,13 +23,14 @@ from uwb_mitigation.errors import (
 )
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors, write_anchors
 from uwb_mitigation.recordings.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.recordings.bag.writer import METADATA_RECORD, BagWriter
 from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment, Status
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.ros import schemas
 from uwb_mitigation.types.ros.codec import RangeBatch, decode_range, encode_corrected
-from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
+from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_RAW
 
 BATCH = 256
 """Messages per batch: large enough for vectorisation, small enough for the network's inputs to fit into the cache."""
@@ -123,6 +124,8 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
     }
     with BagWriter(job.output, origin, force=job.force) as out:
         corrector = _Corrector(job.source, mitigation, out)
+        if ANCHORS not in bag.topics and bag.bounds_ns and (anchors := recorded_anchors(job.source)):
+            write_anchors(out, anchors, bag.bounds_ns[0])
         damage = None
         total, done = bag.message_count, 0
         messages = bag.messages()

@@ -1,0 +1,90 @@
+"""Anchors as markers in a bag, so that they stay with the recording."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap, anchors_path, load_anchors
+from uwb_mitigation.types.ros import schemas
+from uwb_mitigation.types.ros.poses import MAP
+from uwb_mitigation.types.ros.topics import ANCHORS, MARKERS_TYPE
+from uwb_mitigation.types.stamps import NS_PER_S
+
+MAX_NAME = 100
+SPHERE = 2
+"""Type of a marker."""
+
+
+def parse_markers(message: Any) -> Iterator[Anchor]:
+    """Yield the anchors of a visualization_msgs/MarkerArray; implausible markers are skipped.
+
+    A marker of the namespace `anchors` has the id of the anchor as its text, that of `names` with the same number its label.
+    """
+    labels = {marker.id: str(marker.text) for marker in message.markers if marker.ns == "names"}
+    for marker in message.markers:
+        point, text = marker.pose.position, marker.text
+        if marker.ns != "anchors" or not math.isfinite(point.x + point.y):
+            continue
+        if text.isascii() and text.isdigit() and len(text) <= 20 and int(text) < 1 << 64:
+            name = labels.get(marker.id, "").partition(" (")[2].removesuffix(")")[:MAX_NAME]
+            yield Anchor(int(text), (point.x, point.y, point.z), name=name)
+
+
+def recorded_anchors(bag: Path) -> AnchorMap | None:
+    """Return the anchors of a bag's anchors file, else of the first markers in the bag; None: there are none.
+
+    Raises:
+        ParameterError: the anchors file is invalid.
+    """
+    if (file := anchors_path(bag)).is_file():
+        return load_anchors(file)
+    with contextlib.suppress(RecordingError):
+        for message in BagReader(bag).messages([ANCHORS]):
+            with contextlib.suppress(Exception):  # rosbags raises various types.
+                parsed = parse_markers(schemas.typestore().deserialize_cdr(message.data, MARKERS_TYPE))
+                anchors = {anchor.id: anchor for anchor in parsed if math.isfinite(anchor.position[2])}
+                if anchors:
+                    return AnchorMap([*anchors.values()][:MAX_ANCHORS], str(bag))
+    return None
+
+
+def write_anchors(bag: BagWriter, anchors: AnchorMap, stamp_ns: int) -> None:
+    """Write the anchors as one MarkerArray.
+
+    Raises:
+        RecordingError: the bag cannot be written.
+    """
+    store = schemas.typestore()
+    types = store.types
+
+    def vector(kind: str, *values: float) -> Any:
+        return types[f"geometry_msgs/msg/{kind}"](*values)
+
+    def marker(row: int, namespace: str, text: str) -> Any:
+        time = types["builtin_interfaces/msg/Time"](stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
+        pose = vector(
+            "Pose", vector("Point", *anchors.anchors[row].position), vector("Quaternion", 0.0, 0.0, 0.0, 1.0)
+        )
+        header, no_bytes = types["std_msgs/msg/Header"](time, MAP), np.zeros(0, np.uint8)
+        return types["visualization_msgs/msg/Marker"](
+            header=header, ns=namespace, id=row, type=SPHERE, action=0, pose=pose, scale=vector("Vector3", 0.2, 0.2, 0.2),
+            color=types["std_msgs/msg/ColorRGBA"](0.0, 0.0, 0.0, 1.0), text=text, frame_locked=False, points=[], colors=[],
+            lifetime=types["builtin_interfaces/msg/Duration"](0, 0), texture_resource="", uv_coordinates=[],
+            texture=types["sensor_msgs/msg/CompressedImage"](header, "", no_bytes), mesh_resource="",
+            mesh_file=types["visualization_msgs/msg/MeshFile"]("", no_bytes), mesh_use_embedded_materials=False,
+        )  # fmt: skip
+
+    rows = range(len(anchors))
+    markers = [marker(row, "anchors", str(anchors.anchors[row].id)) for row in rows]
+    markers += [marker(row, "names", str(anchors.anchors[row])) for row in rows]
+    message = types[MARKERS_TYPE](markers)
+    bag.write_message(ANCHORS, MARKERS_TYPE, bytes(store.serialize_cdr(message, MARKERS_TYPE)), stamp_ns)
