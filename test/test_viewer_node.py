@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import signal
+import threading
+import time
 from pathlib import Path
 
 import psutil
@@ -137,3 +139,42 @@ def test_deactivated_viewer_unsubscribes_and_can_be_activated_again(ros: ros_har
     for _ in range(20):
         corrected.publish(RangeCorrected(anchor_id=1, tag_id=2))
     ros.diagnosis("viewer", lambda status: status.message == "serving 0 pages")
+
+
+def test_rates_and_losses_are_correct_at_1000_ranges_per_second(ros: ros_harness.Ros, browser: Browser):
+    viewer = ros.start("viewer", "port:=0")
+    publisher = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 10_000)
+    browser.open(address(viewer))
+    browser.wait("the page", browser.ready)
+    ros.spin_until(lambda: publisher.get_subscription_count() == 1)
+    stop = threading.Event()
+
+    def publish() -> None:
+        message, began_s, number = RangeCorrected(range=4.0, range_raw=4.2), time.monotonic(), 0
+        while not stop.wait(0.005):
+            while number < 1000 * (time.monotonic() - began_s):
+                message.anchor_id, message.tag_id = number % 30, number // 30 % 5
+                message.sequence = number
+                # The range of one exchange in ten was lost by the radio.
+                if number // 150 % 10 != 3:
+                    stamp = number + 1_000_000
+                    message.header.stamp.sec, message.header.stamp.nanosec = (
+                        stamp // 1000,
+                        stamp % 1000 * 1_000_000,
+                    )
+                    publisher.publish(message)
+                number += 1
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        browser.wait("all pairs", lambda: len(browser.column("pairs", "rate")) == 150)
+        ros.spin_for(10.0)
+        rates, lost = browser.column("pairs", "rate"), browser.column("pairs", "lost")
+    finally:
+        stop.set()
+        thread.join()
+    assert rates == pytest.approx([6.0] * 150, abs=0.7)
+    assert max(lost) - min(lost) <= 1
+    assert 5 < min(lost) < 30
+    assert "dropped by the viewer" not in browser.text()
