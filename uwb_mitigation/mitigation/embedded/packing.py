@@ -93,18 +93,7 @@ def pack(weights: Int8Weights) -> PackedNetwork:
 
 
 def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
-    for name, value, valid in (
-        ("filters", shape.filters, (FILTERS,)),
-        ("kernel", shape.kernel, (3,)),
-        ("first_kernel", shape.first_kernel, FIRST_KERNELS),
-        ("samples", shape.samples, SAMPLES),
-        ("modules", shape.modules, MODULES),
-    ):
-        if value not in valid:
-            raise ModelError(
-                f"the firmware has no kernels for {name} = {value}",
-                valid=" or ".join(map(str, valid)) if len(valid) < 3 else f"{valid[0]} to {valid[-1]}",
-            )
+    _check_shape(shape)
     scale = weights.activation_scale
     reads = layer_inputs(shape)
 
@@ -117,10 +106,10 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
         )
 
     def total(name: str, first: str, second: str) -> Sum:
-        found = solve_sum(np.float32(scale[first] / scale[name]), np.float32(scale[second] / scale[name]))
-        if found is None:
+        exact = solve_sum(np.float32(scale[first] / scale[name]), np.float32(scale[second] / scale[name]))
+        if exact is None:
             raise ModelError("the sum has no exact integer form", where=name, valid=_REMEDY)
-        return found
+        return exact
 
     first = np.zeros((FILTERS, shape.first_kernel + 1), np.int16)
     first[:, :-1] = weights.weight["first"][:, 0].astype(np.int16) * _UNIT
@@ -128,9 +117,9 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
     tensor = "first"
     for number in range(1, shape.modules + 1):
         name = f"module{number}"
-        wide = weights.weight[f"{name}.reduce"]
+        reduce = weights.weight[f"{name}.reduce"]
         taps = np.stack(
-            [wide[..., 0], wide[..., 2], wide[..., 1], weights.weight[f"{name}.skip"][..., 0]], -1
+            [reduce[..., 0], reduce[..., 2], reduce[..., 1], weights.weight[f"{name}.skip"][..., 0]], -1
         )
         modules.append(
             PackedModule(
@@ -155,6 +144,22 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
         first=channels("first"),
         modules=tuple(modules),
     )
+
+
+def _check_shape(shape: Remnet) -> None:
+    """Raise ModelError if the firmware has no kernels for the shape."""
+    for name, value, valid in (
+        ("filters", shape.filters, (FILTERS,)),
+        ("kernel", shape.kernel, (3,)),
+        ("first_kernel", shape.first_kernel, FIRST_KERNELS),
+        ("samples", shape.samples, SAMPLES),
+        ("modules", shape.modules, MODULES),
+    ):
+        if value not in valid:
+            raise ModelError(
+                f"the firmware has no kernels for {name} = {value}",
+                valid=" or ".join(map(str, valid)) if len(valid) < 3 else f"{valid[0]} to {valid[-1]}",
+            )
 
 
 def _pack_mlp(weights: Int8Weights, shape: Mlp) -> PackedNetwork:

@@ -63,36 +63,57 @@ def fit(
         optimizer = torch.optim.AdamW(
             network.parameters(), options.learning_rate, weight_decay=options.weight_decay, fused=True
         )
-        mean_weights = [weight.detach().clone() for weight in network.parameters()]
+        mean = RunningMean(network)
         network.train()
         steps, step = options.epochs * -(-len(source) // options.batch), 0
         for epoch in range(1, options.epochs + 1):
             for rows in torch.randperm(len(source)).split(options.batch):
                 batch = source[rows]
                 if vary is not None:
-                    factor = next(factor for until, factor in STAGES if step < until * steps)
-                    optimizer.param_groups[0]["lr"] = options.learning_rate * factor
+                    optimizer.param_groups[0]["lr"] = options.learning_rate * _rate_factor(step, steps)
                     batch = vary(batch, generator)
                 optimizer.zero_grad()
                 loss = nn.functional.l1_loss(network(batch), target_values[rows])
                 loss.backward()
                 optimizer.step()
-                if not math.isfinite(loss.item()):
-                    raise DatasetError(
-                        f"the loss is {loss.item()} in epoch {epoch}", valid="try a lower learning rate"
-                    )
+                _check_loss(loss.item(), epoch)
                 step += 1
                 if vary is not None:
-                    # The mean adapts faster during the first steps, so that the initial weights have no effect.
-                    decay = min(MEAN_DECAY, (1 + step) / (10 + step))
-                    for mean, weight in zip(mean_weights, network.parameters(), strict=True):
-                        mean.lerp_(weight.detach(), 1.0 - decay)
+                    mean.update(step)
             on_epoch()
         if vary is not None:
-            with torch.no_grad():
-                for mean, weight in zip(mean_weights, network.parameters(), strict=True):
-                    weight.copy_(mean)
+            mean.copy_to_network()
         return networks.weights_of(network)
+
+
+def _check_loss(loss: float, epoch: int) -> None:
+    if not math.isfinite(loss):
+        raise DatasetError(f"the loss is {loss} in epoch {epoch}", valid="try a lower learning rate")
+
+
+def _rate_factor(step: int, steps: int) -> float:
+    return next(factor for until, factor in STAGES if step < until * steps)
+
+
+class RunningMean:
+    """Running mean of the weights of a network."""
+
+    def __init__(self, network: networks.Network) -> None:
+        self._network = network
+        self._means = [weight.detach().clone() for weight in network.parameters()]
+
+    def update(self, step: int) -> None:
+        """Add the weights after `step`, from 1."""
+        # The mean adapts faster during the first steps, so that the initial weights have no effect.
+        decay = min(MEAN_DECAY, (1 + step) / (10 + step))
+        for mean, weight in zip(self._means, self._network.parameters(), strict=True):
+            mean.lerp_(weight.detach(), 1.0 - decay)
+
+    def copy_to_network(self) -> None:
+        """Replace the weights by their means."""
+        with torch.no_grad():
+            for mean, weight in zip(self._means, self._network.parameters(), strict=True):
+                weight.copy_(mean)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S
 
 try:
     import matplotlib
+    from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 except ModuleNotFoundError as error:
@@ -134,64 +135,67 @@ def over_k(
     with _drawing():
         figure = Figure(figsize=(7.6, 7.0), layout="constrained")
         box_axes, bar_axes = figure.subplots(2, 1, height_ratios=(3, 2))
-        shown = {position: box for position, box in enumerate(boxes.values()) if box is not None}
-        keys = ("whislo", "q1", "med", "q3", "whishi")
-        drawn = box_axes.bxp(
-            [dict(zip(keys, box, strict=True)) for box in shown.values()],
-            positions=list(shown),
-            widths=0.6,
-            showfliers=False,
-            patch_artist=True,
-            medianprops={"color": "#000000", "linewidth": 1.6},
-        )
-        for name, patch in zip((list(boxes)[position] for position in shown), drawn["boxes"], strict=True):
-            patch.set_facecolor("#bbbbbb" if name.startswith("raw") else "#56B4E9")
-        box_axes.axhline(0, color="#555555", linewidth=1)
-        box_axes.set(xlim=(-0.6, len(boxes) - 0.4), ylabel="range error, m")
-        box_axes.set_xticks(range(len(boxes)), list(boxes))
-        box_axes.set_title("Errors: median, quartiles, 5th and 95th percentile", loc="left", fontsize=10)
-        kinds = {"los": ("LOS MAE", "//"), "nlos": ("NLOS MAE", ""), "sigma": ("σ, all", "..")}
-        for number, (kind, (name, hatch)) in enumerate(kinds.items()):
-            means = {
-                index: statistics[k][kind] for index, k in enumerate(windows) if kind in statistics.get(k, {})
-            }
-            bar_axes.bar(
-                np.array(list(means)) + 0.25 * (number - 1),
-                [spread.mean for spread in means.values()],
-                0.23,
-                yerr=[spread.std or 0.0 for spread in means.values()],
-                capsize=2,
-                color=_COLOURS[number],
-                hatch=hatch,
-                edgecolor="white",
-                label=name,
-            )
-        marked = [(index, paper_mae[k]) for index, k in enumerate(windows) if k in paper_mae]
-        label = "paper: MAE of all, int8"
-        bar_axes.plot(*zip(*marked, strict=True), "_k", markersize=20, markeredgewidth=2, label=label)
-        bar_axes.legend(ncols=2, fontsize=8, loc="upper left", markerscale=0.6)
-        bar_axes.set(xlim=(-0.6, len(windows) - 0.4), ylim=(0, bar_axes.get_ylim()[1] * 1.5), ylabel="m")
-        bar_axes.set_xticks(range(len(windows)), [f"K = {k}" for k in windows])
-        bar_axes.set_title(
-            "After correction, mean and standard deviation over seeds", loc="left", fontsize=10
-        )
-        for panel, gaps in (
-            (box_axes, [index for index in range(len(boxes)) if index not in shown]),
-            (bar_axes, [index for index, k in enumerate(windows) if k not in statistics]),
-        ):
-            for index in gaps:
-                transform = panel.get_xaxis_transform()
-                panel.text(
-                    index,
-                    0.3,
-                    "not measured",
-                    transform=transform,
-                    rotation=90,
-                    ha="center",
-                    va="center",
-                    fontsize=9,
-                )
+        _draw_boxes(box_axes, boxes)
+        _draw_bars(bar_axes, statistics, paper_mae, windows)
         return _svg(figure)
+
+
+def _draw_boxes(axes: Axes, boxes: Mapping[str, Box | None]) -> None:
+    shown = {position: box for position, box in enumerate(boxes.values()) if box is not None}
+    keys = ("whislo", "q1", "med", "q3", "whishi")
+    drawn = axes.bxp(
+        [dict(zip(keys, box, strict=True)) for box in shown.values()],
+        positions=list(shown),
+        widths=0.6,
+        showfliers=False,
+        patch_artist=True,
+        medianprops={"color": "#000000", "linewidth": 1.6},
+    )
+    for name, patch in zip((list(boxes)[position] for position in shown), drawn["boxes"], strict=True):
+        patch.set_facecolor("#bbbbbb" if name.startswith("raw") else "#56B4E9")
+    axes.axhline(0, color="#555555", linewidth=1)
+    axes.set(xlim=(-0.6, len(boxes) - 0.4), ylabel="range error, m")
+    axes.set_xticks(range(len(boxes)), list(boxes))
+    axes.set_title("Errors: median, quartiles, 5th and 95th percentile", loc="left", fontsize=10)
+    _mark_gaps(axes, [index for index in range(len(boxes)) if index not in shown])
+
+
+def _draw_bars(
+    axes: Axes,
+    statistics: Mapping[int, Mapping[str, Spread]],
+    paper_mae: Mapping[int, float],
+    windows: Sequence[int],
+) -> None:
+    kinds = {"los": ("LOS MAE", "//"), "nlos": ("NLOS MAE", ""), "sigma": ("σ, all", "..")}
+    for number, (kind, (name, hatch)) in enumerate(kinds.items()):
+        means = {
+            index: statistics[k][kind] for index, k in enumerate(windows) if kind in statistics.get(k, {})
+        }
+        axes.bar(
+            np.array(list(means)) + 0.25 * (number - 1),
+            [spread.mean for spread in means.values()],
+            0.23,
+            yerr=[spread.std or 0.0 for spread in means.values()],
+            capsize=2,
+            color=_COLOURS[number],
+            hatch=hatch,
+            edgecolor="white",
+            label=name,
+        )
+    marked = [(index, paper_mae[k]) for index, k in enumerate(windows) if k in paper_mae]
+    label = "paper: MAE of all, int8"
+    axes.plot(*zip(*marked, strict=True), "_k", markersize=20, markeredgewidth=2, label=label)
+    axes.legend(ncols=2, fontsize=8, loc="upper left", markerscale=0.6)
+    axes.set(xlim=(-0.6, len(windows) - 0.4), ylim=(0, axes.get_ylim()[1] * 1.5), ylabel="m")
+    axes.set_xticks(range(len(windows)), [f"K = {k}" for k in windows])
+    axes.set_title("After correction, mean and standard deviation over seeds", loc="left", fontsize=10)
+    _mark_gaps(axes, [index for index, k in enumerate(windows) if k not in statistics])
+
+
+def _mark_gaps(axes: Axes, positions: Sequence[int]) -> None:
+    style: dict[str, Any] = {"rotation": 90, "ha": "center", "va": "center", "fontsize": 9}
+    for position in positions:
+        axes.text(position, 0.3, "not measured", transform=axes.get_xaxis_transform(), **style)
 
 
 def _svg(figure: Figure) -> str:

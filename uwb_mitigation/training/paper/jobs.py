@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import multiprocessing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -43,46 +43,56 @@ def run_jobs(
     """
     if workers < 1:
         raise ParameterError(f"{workers} workers", valid="1 or more")
-    results: dict[str, dict[str, Any]] = {}
     try:
-        lines = journal.read_text(encoding="utf-8", errors="replace").splitlines() if journal.exists() else []
+        results = _finished(journal, fingerprint, jobs)
         stream = journal.open("a", encoding="utf-8")
     except OSError as error:
         raise UwbMitigationError(f"cannot be used: {error.strerror}", where=str(journal)) from error
-    for line in lines:
+    missing = sorted((name for name in jobs if name not in results), key=lambda name: -cost(jobs[name]))
+    total = sum(map(cost, jobs.values())) or 1.0
+    with stream:
+        for name, result in _run(work, {name: jobs[name] for name in missing}, workers):
+            results[name] = result
+            # The line before may be incomplete, if its process was killed.
+            stream.write(f"\n{json.dumps({'fingerprint': fingerprint, 'name': name, 'result': result})}\n")
+            stream.flush()
+            on_progress(sum(cost(jobs[finished]) for finished in results) / total)
+    return {name: results[name] for name in jobs}
+
+
+def _finished(journal: Path, fingerprint: int, jobs: Mapping[str, Job]) -> dict[str, dict[str, Any]]:
+    """Return the results of `jobs` in a journal."""
+    results: dict[str, dict[str, Any]] = {}
+    text = journal.read_text(encoding="utf-8", errors="replace") if journal.exists() else ""
+    for line in text.splitlines():
         with contextlib.suppress(ValueError, TypeError, KeyError):  # empty or incomplete line
             entry = json.loads(line)
             if entry["fingerprint"] == fingerprint and entry["name"] in jobs:
                 results[entry["name"]] = dict(entry["result"])
-    missing = sorted((name for name in jobs if name not in results), key=lambda name: -cost(jobs[name]))
-    total = sum(map(cost, jobs.values())) or 1.0
+    return results
 
-    def finish(name: str, result: dict[str, Any]) -> None:
-        results[name] = result
-        # The line before may be incomplete, if its process was killed.
-        stream.write(f"\n{json.dumps({'fingerprint': fingerprint, 'name': name, 'result': result})}\n")
-        stream.flush()
-        on_progress(sum(cost(jobs[done]) for done in results) / total)
 
-    with stream:
-        if workers == 1 or len(missing) < 2:
-            for name in missing:
-                finish(name, work(jobs[name]))
-            return {name: results[name] for name in jobs}
-        # Not forked: a forked child would inherit torch's thread pools in an undefined state.
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(workers, len(missing)), context) as pool:
-            pending = {pool.submit(work, jobs[name]): name for name in missing}
-            try:
-                for future in as_completed(pending):
-                    finish(pending[future], future.result())
-            except BrokenProcessPool as error:
-                raise UwbMitigationError(
-                    "a training process was killed", valid="fewer workers, or more memory"
-                ) from error
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in multiprocessing.active_children():
-                    process.terminate()
-                raise
-    return {name: results[name] for name in jobs}
+def _run(
+    work: Callable[[Job], dict[str, Any]], jobs: Mapping[str, Job], workers: int
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield name and result of each job as it ends; the jobs start in their order."""
+    if workers == 1 or len(jobs) < 2:
+        for name, job in jobs.items():
+            yield name, work(job)
+        return
+    # Not forked: a forked child would inherit torch's thread pools in an undefined state.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(jobs)), context) as pool:
+        pending = {pool.submit(work, job): name for name, job in jobs.items()}
+        try:
+            for future in as_completed(pending):
+                yield pending[future], future.result()
+        except BrokenProcessPool as error:
+            raise UwbMitigationError(
+                "a training process was killed", valid="fewer workers, or more memory"
+            ) from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
