@@ -252,6 +252,8 @@ def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypat
     assert [line for line in printed.splitlines() if "<-" in line and candidates.COLD_START in line]
     mae = {row["name"]: row["mae"] for row in found["choice"]["rows"]}
     assert found["improved"] == (mae[NESTED] < mae["raw"])
+    with pytest.raises(ParameterError, match="exists"):
+        run_or_raise("train", "--data", tmp_path, "-o", output)
     assert set(found) == {"model_id", "n", "skipped", "rows", "improved", "by_configuration", "choice"}
     inputs = windows(5, 157)
     expected = network_m(float_network(start), inputs)
@@ -264,9 +266,19 @@ def test_harmful_model_is_reported(tmp_path, monkeypatch):
     loads(monkeypatch, replace(data, error_m=np.where(np.isin(data.configurations, ("c0", "c1")), 1.0, -1.0)))
     output, result = tmp_path / "x.onnx", tmp_path / "x.json"
     words = ("--recipe", "constant", "--samples", 8, "-o", output, "--json", result)
-    assert "no improvement" in run_or_raise("train", "--data", tmp_path, *words)
+    assert "not better than measured ranges" in run_or_raise("train", "--data", tmp_path, *words)
     assert json.loads(result.read_text())["improved"] is False
     assert load_bundle(output).card.training["recipe"] == {"line": False, "network": False}
+
+
+def test_network_is_compared_with_the_best_baseline(tmp_path, monkeypatch):
+    # All ranges have the same error: nothing is better than a constant.
+    data = numbered(lambda number: 0.3)
+    loads(monkeypatch, data)
+    words = ("--recipe", "network", "--samples", 8, "--epochs", 1, "-o", tmp_path / "x.onnx")
+    printed = " ".join(run_or_raise("train", "--data", tmp_path, *words).split())
+    assert "best baseline, one constant offset: 0.000 m" in printed
+    assert "Warning: the model is not better than one constant offset" in printed
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,7 @@ def train(
         int, typer.Option(help="Seed of the splits, the initial weights and the order of the data.")
     ] = 0,
     folds: Annotated[int, typer.Option(help="Number of folds of the cross-validation.")] = 6,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Train a float bundle; the amount of data determines the complexity of the model.
@@ -117,7 +118,7 @@ def train(
     given = {key: value for key, value in given.items() if value is not None}
     options = FitOptions(**given)
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
-    check_output(output)
+    check_output(output, force)
     with needs_torch():
         from uwb_mitigation.training import train as training
         from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)

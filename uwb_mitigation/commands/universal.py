@@ -36,6 +36,7 @@ def train_universal(
     workers: Annotated[
         int | None, typer.Option(help="Number of processes for the simulation; default: one per processor.")
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Train a model for unknown sites in simulated buildings.
@@ -56,15 +57,9 @@ def train_universal(
 
     preprocessing = Preprocessing(samples, Scaling(scaling))
     radios = {"dw1000": RADIO, "dw3000": DW3000_STS}
-    for name, value, low, high in (
-        ("seed", seed, 0, 2**31),
-        ("blocks", blocks, 1, MAX_BLOCKS),
-        ("workers", workers, 1, 256),
-    ):
-        if value is not None and not low <= value <= high:
-            raise ParameterError(f"{name} = {value}", valid=f"{low} to {high}")
+    _check_options(seed, blocks, workers)
     for path in (output, *([float_output] if float_output else [])):
-        check_output(path)
+        check_output(path, force)
     with needs_torch():
         from uwb_mitigation.training import universal
 
@@ -100,3 +95,13 @@ def train_universal(
             },
         },
     )
+
+
+def _check_options(seed: int, blocks: int | None, workers: int | None) -> None:
+    for name, value, low, high in (
+        ("seed", seed, 0, 2**31),
+        ("blocks", blocks, 1, MAX_BLOCKS),
+        ("workers", workers, 1, 256),
+    ):
+        if value is not None and not low <= value <= high:
+            raise ParameterError(f"{name} = {value}", valid=f"{low} to {high}")

@@ -142,7 +142,7 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
         selection = _select(job, candidates, seed)
         recipe_name = selection.chosen
         if recipe_name in (models.COLD_START, models.COLD_START_MEAN):
-            return _write_selected(job, selection, universal, recipe.fit, ("raw",))
+            return _write_selected(job, selection, universal, recipe.fit, ("raw", models.CONSTANT))
     recipe = recipe.for_candidate(recipe_name)
     total = recipe.fit.epochs * (folds + 1)
     on_epoch = selections.step_counter(total, lambda share: job.on_progress("training", share))
@@ -154,7 +154,12 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
     mae_m = mae.get("int8", mae["float"]) if selection is None else selection.mae()[NESTED]
     assert fitted.network is not None
     bundle = save_bundle(job.output, graph.float_model(fitted.network), card)
-    return TrainedBundle(bundle, selection, validation, mae_m, {"raw": mae["raw"]})
+    baselines = {"raw": mae["raw"]}
+    if recipe_name != models.CONSTANT:
+        baselines[models.CONSTANT] = (
+            mae["overall_median"] if selection is None else selection.mae()[models.CONSTANT]
+        )
+    return TrainedBundle(bundle, selection, validation, mae_m, baselines)
 
 
 def train_from_bundle(
@@ -176,7 +181,7 @@ def train_from_bundle(
         candidates = models.with_cold_start(candidates, job.dataset, universal)
     selection = _select(job, candidates, options.seed)
     start_bundle = universal if selection.chosen in (models.COLD_START, models.COLD_START_MEAN) else source
-    return _write_selected(job, selection, start_bundle, options, ("raw", models.AS_SHIPPED))
+    return _write_selected(job, selection, start_bundle, options, ("raw", models.CONSTANT, models.AS_SHIPPED))
 
 
 def _select(job: TrainingJob, candidates: Sequence[Candidate], seed: int) -> Selection:
@@ -217,7 +222,13 @@ def _write_selected(
     model = graph.float_model(zero_network if network is None else network)
     bundle = save_bundle(job.output, model, replace(card, training=training))
     mae = selection.mae()
-    return TrainedBundle(bundle, selection, validation, mae[NESTED], {row: mae[row] for row in baselines})
+    return TrainedBundle(
+        bundle,
+        selection,
+        validation,
+        mae[NESTED],
+        {row: mae[row] for row in baselines if row in mae and row != selection.chosen},
+    )
 
 
 def cross_validate(

@@ -35,8 +35,8 @@ def needs_torch() -> Iterator[None]:
         raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
 
 
-def check_output(output: Path) -> None:
-    """Check that a bundle can be written to a path.
+def check_output(output: Path, force: bool = True) -> None:
+    """Check that a bundle can be written to a path, with `force` also over an existing file.
 
     Raises:
         ParameterError: it cannot.
@@ -45,3 +45,5 @@ def check_output(output: Path) -> None:
         raise ParameterError(
             "not a path for a bundle", where=str(output), valid="a file .onnx in an existing folder"
         )
+    if output.exists() and not force:
+        raise ParameterError("the file exists", where=str(output), valid="another path, or --force")

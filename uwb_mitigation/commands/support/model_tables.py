@@ -56,12 +56,15 @@ def show_trained(trained: TrainedBundle) -> None:
             ("", "MAE", "std", "p95"),
             [(_ROWS[name], *values.values()) for name, values in rows],
         )
-    for name, before in trained.baseline_mae_m.items():
-        change = trained.mae_m / before - 1 if before else 0.0
-        verdict = "lower" if trained.mae_m < before else "higher, no improvement"
-        print_line(
-            f"MAE on held-out configurations: {trained.mae_m:.3f} m, {name} {before:.3f} m: {abs(change):.0%} {verdict}"
-        )
+    before, baseline = min((mae, name) for name, mae in trained.baseline_mae_m.items())
+    change = trained.mae_m / before - 1 if before else 0.0
+    verdict = "lower" if trained.improved else "higher, no improvement"
+    print_line(
+        f"MAE on held-out configurations: {trained.mae_m:.3f} m; best baseline, {_CANDIDATES[baseline]}: "
+        f"{before:.3f} m: {abs(change):.0%} {verdict}"
+    )
+    if not trained.improved:
+        print_line(f"Warning: the model is not better than {_CANDIDATES[baseline]}. Do not use it.")
     show_bundle(trained.bundle)
 
 
