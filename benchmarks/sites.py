@@ -17,7 +17,6 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
 from uwb_mitigation.simulation.odometry import SimulatedMotion
-from uwb_mitigation.simulation.radio import Boards
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import AnchorMap
@@ -153,7 +152,7 @@ def _away(
 def _received_share(plan: Building, anchor: Point, cells: NDArray[np.float64]) -> float:
     """Return the share of positions from which a frame is received according to its mean level."""
     n = len(cells)
-    boards = Boards(np.zeros(n), np.full(n, RADIO.noise_figure_db), np.full(n, float(RADIO.preamble_symbols)))
+    boards = RADIO.boards(n)
     here = np.tile(anchor, (n, 1))
     level = mean_level_dbm(RESIDENTIAL, here, cells, plan.direct_path(here, cells), boards)
     return float((level >= RADIO.sensitivities_dbm(boards)).mean())

@@ -36,7 +36,7 @@ def received() -> tuple[list[RangeMeasurement], np.ndarray]:
     """Ranges with the whole CIR, and their errors, in buildings that were not used for the training or its evaluation."""
     ranges, errors = [], []
     for number in range(3):
-        block, rng = block_of(UNUSED_SEED, number, wide=True, radio=DW3000_STS)
+        block, rng = block_of(UNUSED_SEED, number, radio=DW3000_STS)
         reception = DW3000_STS.receive(block.pairs.multipath(rng), rng, block.boards)
         for row in np.flatnonzero(np.isfinite(reception.first_path_index)):
             index = float(reception.first_path_index[row])

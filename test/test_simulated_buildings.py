@@ -73,7 +73,7 @@ def test_plans_match_their_kind(kind: buildings.BuildingType) -> None:
 
 
 def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
-    blocks = [block_of(7, number, wide=True)[0] for number in range(40)]
+    blocks = [block_of(7, number)[0] for number in range(40)]
     crossings = {
         kind: np.concatenate([block.pairs.path.crossings for block in blocks if block.kind == kind])
         for kind in ("open", "flat")
@@ -83,14 +83,14 @@ def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
     # In LOS only a tilted antenna attenuates the direct path.
     loss = [block.pairs.path.loss_db[block.pairs.path.crossings == 0] for block in blocks]
     tilted = [values.max() > 0.0 for values in loss if len(values)]
-    assert 0.1 < np.mean(tilted) < 0.5
+    assert 0.15 < np.mean(tilted) < 0.5
 
 
 @pytest.mark.parametrize("distance_m", [(0.0, 3.0), (3.0, 8.0), (12.0, 50.0)])
 def test_nlos_delay_grows_with_the_distance(
     distance_m: tuple[float, float],
 ) -> None:
-    blocks = [block_of(5, number)[0] for number in range(12)]
+    blocks = [block_of(5, number)[0] for number in range(24)]
     distance = np.concatenate([block.pairs.distance_m for block in blocks])
     first = np.concatenate([block.pairs.fields[1].delay_ns[:, 0] for block in blocks])
     here = (distance >= distance_m[0]) & (distance < distance_m[1])

@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.preprocessing import Scaling
 
@@ -78,6 +77,6 @@ def test_command_writes_both_bundles(tmp_path: Path) -> None:
 )
 def test_invalid_training_is_refused(tmp_path: Path, words: list[str], excerpt: str) -> None:
     done = CliRunner().invoke(app, ["train-universal", "-o", str(tmp_path / "a.onnx"), *words])
-    assert isinstance(done.exception, ParameterError)
-    assert excerpt in str(done.exception)
+    assert done.exit_code != 0
+    assert excerpt in done.output + str(done.exception)
     assert not list(tmp_path.iterdir())

@@ -32,8 +32,8 @@ HARDWARE_SD_M = 0.1
 """Per-pair errors that the CIR does not show: antenna delays, power-dependent bias, clock drift. With a constant
 offset, 0.13 m remain in LOS in the EVK1000 logs."""
 
-TAPS, ORIGIN, OVERSAMPLING = 256, 48, 8
-NOISE_TAPS = 40
+TAPS, ORIGIN, OVERSAMPLING = 512, 248, 8
+NOISE_TAPS = 200
 POWER_CONSTANT_DB = 121.74
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ def draw(name: str, count: int, seed: int) -> tuple[RangeColumns, Array, NDArray
     phase = rng.random(count)
     samples, symbols, index, levels = _receive(delay_m - distance[:, None], gain, phase, rng)
     rows = np.flatnonzero(np.isfinite(index))
-    error = (index - ORIGIN - phase) * LIGHT_M_PER_TAP
+    error = (index + _EDGE_LEAD_TAPS - ORIGIN - phase) * LIGHT_M_PER_TAP
     error += rng.normal(0.0, HARDWARE_SD_M, count)
     zeros, ones = np.zeros(len(rows)), np.ones(len(rows))
     columns = RangeColumns(
@@ -141,11 +141,11 @@ def _paths(
     present = rng.random((n, count)) < 0.5
     scattered = present * rng.rayleigh(0.25, (n, count)) / np.maximum(legs[0] * legs[1], 0.3)
 
-    # A reverberant tail with the same number of paths: it starts with the direct path and has a share of the power at 3 m.
+    # The reverberant tail of all higher orders, relative to the power at 1 m: it begins where the images of order 3 end.
     tail = 120
     mean_free = 2.0 * np.prod(size, axis=1) / (size[:, :2].sum(1) * size[:, 2] + size[:, 0] * size[:, 1])
     decay_m = rng.uniform(1.0, 2.5, n) * mean_free
-    excess_m = rng.uniform(0.0, 5.0, (n, tail)) * decay_m[:, None]
+    excess_m = 3.0 * mean_free[:, None] + rng.uniform(0.0, 5.0, (n, tail)) * decay_m[:, None]
     power = np.exp(-excess_m / decay_m[:, None]) * 5.0 / tail * (10 ** rng.uniform(-2.2, -0.7, n))[:, None]
     reverberant = np.sqrt(power / 2.0) * rng.standard_normal((n, tail))
 
@@ -238,7 +238,7 @@ def _leading_edge(accumulator: NDArray[np.complex128]) -> Array:
             while values[low] > 0.4 * values[top]:
                 low -= 1
             part = (0.4 * values[top] - values[low]) / (values[low + 1] - values[low])
-            index[row] = (low + part) / OVERSAMPLING + _EDGE_LEAD_TAPS
+            index[row] = (low + part) / OVERSAMPLING
     return index
 
 

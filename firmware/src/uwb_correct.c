@@ -136,9 +136,11 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     /* volatile: the host rounds the network's product before it adds the linear bias. */
     volatile float rounded;
     float network_m;
-    status = uwb_network(model, window, arena, arena_bytes, &network_m);
-    if (status != UWB_OK) {
-        return status;
+    if (!model->early_path || !uwb_early_path(model, cir, &network_m)) {
+        status = uwb_network(model, window, arena, arena_bytes, &network_m);
+        if (status != UWB_OK) {
+            return status;
+        }
     }
     rounded = network_m;
     *error_m = bias_m + rounded;

@@ -128,6 +128,7 @@ typedef struct {
     float variance_per_m2; /* times the square of the predicted error */
     float variance_uncorrected_m2;
     const uwb_ood_bands *ood_bands; /* NULL = unknown: no OOD score */
+    int early_path; /* 1: a missed direct path replaces the output of the network */
 } uwb_model;
 
 /* Return the bytes of arena that the other functions need for `model`; 0 if it is null or cannot be run. */
@@ -135,6 +136,10 @@ size_t uwb_arena_size(const uwb_model *model);
 
 /* Write the network's input for `cir`, model->samples values, to `window`; undefined on failure. */
 uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *window);
+
+/* Return 1 and the range error that a missed direct path before the first path causes, m; 0 if there is none. Call it
+ * after uwb_preprocess has accepted `cir`; it needs 168 samples before the first path. */
+int uwb_early_path(const uwb_model *model, const uwb_cir *cir, float *error_m);
 
 /* Compute the network's output for a window of model->samples values, m, without the linear bias. */
 uwb_status uwb_network(const uwb_model *model, const float *window, void *arena, size_t arena_bytes,

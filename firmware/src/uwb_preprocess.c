@@ -88,3 +88,68 @@ uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *win
     }
     return UWB_OK;
 }
+
+/* As in uwb_mitigation/mitigation/early_path.py, with its constants. */
+enum { SEARCH_TAPS = 40, EDGE_TAPS = 3, NOISE_TAPS = 128, MIN_NOISE_RATIO = 3, MAX_WINDOW_RATIO = 400 };
+
+static const float TAP_M = 0.300272882f; /* light in one sample period */
+
+static uint32_t tap_power(const uwb_cir *cir, size_t tap) {
+    if (cir->encoding != UWB_COMPLEX_INT16) {
+        const int32_t magnitude = cir->samples[tap];
+        return (uint32_t)(magnitude * magnitude);
+    }
+    const int32_t re = cir->samples[2 * tap];
+    const int32_t im = cir->samples[2 * tap + 1];
+    return (uint32_t)(re * re) + (uint32_t)(im * im);
+}
+
+static uint32_t strongest(const uwb_cir *cir, size_t start, size_t stop) {
+    uint32_t largest = 0;
+    for (size_t tap = start; tap < stop; tap++) {
+        const uint32_t power = tap_power(cir, tap);
+        largest = power > largest ? power : largest;
+    }
+    return largest;
+}
+
+int uwb_early_path(const uwb_model *model, const uwb_cir *cir, float *error_m) {
+    const float whole = floorf(cir->first_path_index);
+    const size_t first = (size_t)((int64_t)whole - cir->start_index);
+    if (first < SEARCH_TAPS + NOISE_TAPS) {
+        return 0;
+    }
+    const size_t window = first - UWB_WINDOW_LEAD;
+    const size_t stop = window + model->samples;
+    const size_t begin = first - SEARCH_TAPS;
+    const uint64_t noise = MIN_NOISE_RATIO * (uint64_t)strongest(cir, begin - NOISE_TAPS, begin);
+    const uint64_t least = strongest(cir, window, stop) / MAX_WINDOW_RATIO;
+    const uint64_t threshold = noise > least ? noise : least;
+    size_t top = begin;
+    while (top <= first - EDGE_TAPS && tap_power(cir, top) <= threshold) {
+        top++;
+    }
+    if (top > first - EDGE_TAPS) {
+        return 0;
+    }
+    while (top + 1 < stop && tap_power(cir, top + 1) > tap_power(cir, top)) {
+        top++;
+    }
+    const uint32_t peak = tap_power(cir, top);
+    size_t low = top;
+    while (low > begin - NOISE_TAPS && 4 * (uint64_t)tap_power(cir, low) > peak) {
+        low--;
+    }
+    if (4 * (uint64_t)tap_power(cir, low) > peak) {
+        return 0;
+    }
+    /* volatile: the host rounds every operation. */
+    const volatile float half = sqrtf((float)peak) * 0.5f;
+    const float below = sqrtf((float)tap_power(cir, low));
+    const float above = sqrtf((float)tap_power(cir, low + 1));
+    const volatile float fraction = above > below ? (half - below) / (above - below) : 0.0f;
+    const volatile float taps = (float)(first - low) + (cir->first_path_index - whole);
+    const volatile float error = (taps - fraction) * TAP_M;
+    *error_m = error;
+    return 1;
+}

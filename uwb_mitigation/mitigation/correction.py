@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.mitigation.early_path import early_path_error_m
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
 from uwb_mitigation.types.measurement import (
@@ -210,7 +211,7 @@ def pass_other_radio(
 class Mitigation(Corrector):
     """Corrects ranges with one bundle, by ONNX Runtime. Not thread-safe.
 
-    Predicted error = linear bias + network, correction = offset of the radios + predicted error, and corrected = range -
+    Predicted error = linear bias + network (or a missed direct path, see `early_path`), correction = offset of the radios + predicted error, and corrected = range -
     correction, each one float32 operation, so that a microcontroller computes the same bits. The bundle uses the range
     minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
     through with a status that gives the reason and a larger variance:
@@ -262,7 +263,7 @@ class Mitigation(Corrector):
             predicted[~is_predictable] = np.nan
         if len(windows):
             try:
-                predicted[rows] += self._session.predict_m(windows)
+                predicted[rows] += self._network_m(ranges, rows, windows)
             except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
                 predicted[rows] = np.nan
             score[rows] = self._rule.score(windows, range_m[rows], *(power[rows] for power in powers))
@@ -290,6 +291,17 @@ class Mitigation(Corrector):
             variance,
         )
         return corrected
+
+    def _network_m(
+        self, ranges: RangeColumns, rows: slice | NDArray[np.bool_], windows: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return the output of the network for `rows`, or the error of a missed direct path, m, float32 (m,)."""
+        network_m = self._session.predict_m(windows)
+        if not self.bundle.card.early_path:
+            return network_m
+        indices = np.arange(len(ranges))[rows]
+        early_m = early_path_error_m(ranges, indices, self.bundle.preprocessing.samples)
+        return np.where(np.isnan(early_m), network_m, early_m)
 
 
 def _row_index(mask: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:

@@ -29,6 +29,7 @@ from uwb_mitigation.simulation.radio import Boards, Receiver
 from uwb_mitigation.simulation.scene import (
     BRICK,
     CONCRETE,
+    FLAT,
     GLASS,
     PLASTERBOARD,
     WOOD,
@@ -76,10 +77,10 @@ KINDS = (
 )
 
 WIDE_KINDS = (
-    *(replace(kind, share=share) for kind, share in zip(KINDS, (0.5, 0.2, 0.1, 0.1), strict=True)),
+    *(replace(kind, share=0.7 * kind.share) for kind in KINDS),
     BuildingType(
         "open",
-        0.1,
+        0.3,
         (5.0, 40.0),
         (4.0, 30.0),
         (60.0, 60.0),
@@ -113,7 +114,18 @@ limited by regulations; small antennas have a gain of -2 to 3 dB."""
 WIDE_GAIN_SHARE, WIDE_GAIN_DB = 0.1, (-15.0, 15.0)
 """Share of blocks with a power amplifier, an external antenna or attenuation."""
 
-TILTED_SHARE, TILTED_LOSS_DB = 0.3, (2.0, 6.0)
+SELF_NOISE_CHANGE_DB, NOISE_MULTIPLIER = (-3.0, 9.0), (10.0, 24.0)
+"""Bounds for boards: change of the residue of the preamble's correlation, and factor from the noise to the detection
+threshold (NTM)."""
+
+DECAY_FACTOR = (0.7, 2.2)
+"""Bounds of the factor of the decay times of clusters and rays of a block. In halls and open sites the decay times are
+also proportional to the mean free path, if it is longer than in the flat of the other parameters."""
+
+WIDE_SHARE = 0.5
+"""Share of the blocks with open sites, other decay times, tilted antennas, and other boards than the EVB1000."""
+
+TILTED_SHARE, TILTED_LOSS_DB = 0.6, (2.0, 12.0)
 """Share of blocks whose antennas move or are tilted, as on drones: the direct path loses an exponentially distributed
 number of dB, with a mean between these bounds; reflections do not."""
 
@@ -129,6 +141,11 @@ PLACEMENTS, BUILDINGS = 256, 4
 
 CANDIDATES = 16
 """Candidate placements for each one that is kept."""
+
+
+def mean_free_path_m(size: tuple[float, float]) -> float:
+    """Return the mean free path of rays in a rectangle: pi area / perimeter (Kosten, 1960)."""
+    return math.pi * size[0] * size[1] / (2.0 * (size[0] + size[1]))
 
 
 def draw_plan(kind: BuildingType, rng: np.random.Generator) -> Building:
@@ -211,6 +228,8 @@ def draw_boards(n: int, rng: np.random.Generator, *, wide: bool = False, radio: 
         rng.uniform(*gain_db, n),
         rng.uniform(*(WIDE_NOISE_FIGURE_DB if wide else NOISE_FIGURE_DB), n),
         rng.choice(np.array(radio.symbol_counts, np.float64), n),
+        radio.self_noise_db + (rng.uniform(*SELF_NOISE_CHANGE_DB, n) if wide else np.zeros(n)),
+        rng.uniform(*NOISE_MULTIPLIER, n) if wide else np.full(n, radio.noise_multiplier),
     )
 
 
@@ -229,9 +248,7 @@ class Block:
         return f"simulated buildings seed {seed}/{self.kind} {building}/placement {number * PLACEMENTS + placement}"
 
 
-def block_of(
-    seed: int, number: int, *, wide: bool = False, radio: Receiver = RADIO
-) -> tuple[Block, np.random.Generator]:
+def block_of(seed: int, number: int, *, radio: Receiver = RADIO) -> tuple[Block, np.random.Generator]:
     """Draw a block of `PLACEMENTS` placements in one type of building; also return the generator for fading and noise.
 
     About a third of the placements each is in line of sight, behind obstacles, and behind obstacles with a lost direct path.
@@ -241,16 +258,22 @@ def block_of(
     Args:
         seed: seed of all blocks.
         number: number of the block, from 0.
-        wide: also open sites, tilted antennas, and wider gains and noise figures.
         radio: type of all radios.
     """
     rng = np.random.default_rng([seed, number])
+    wide = bool(rng.random() < WIDE_SHARE)
     kinds = WIDE_KINDS if wide else KINDS
     kind = kinds[int(rng.choice(len(kinds), p=[kind.share for kind in kinds]))]
     environment_pairs, shares = zip(*kind.environments, strict=True)
     environments = environment_pairs[int(rng.choice(len(environment_pairs), p=shares))]
     each = CANDIDATES * PLACEMENTS // BUILDINGS
     plans = [draw_plan(kind, rng) for _ in range(BUILDINGS)]
+    if wide:
+        factor = float(rng.uniform(*DECAY_FACTOR))
+        if kind.name in ("hall", "open"):
+            path_m = float(np.mean([mean_free_path_m(plan.size) for plan in plans]))
+            factor *= max(1.0, path_m / mean_free_path_m(FLAT.size))
+        environments = tuple(_with_decay(environment, factor) for environment in environments)
     places = [place(plan.size, each, rng) for plan in plans]
     path = DirectPath.joined(
         [plan.direct_path(anchor, tag) for plan, (anchor, tag) in zip(plans, places, strict=True)]
@@ -274,6 +297,15 @@ def block_of(
         stationary=True,
     )
     return Block(kind.name, chosen // each, pairs, boards.take(chosen)), rng
+
+
+def _with_decay(environment: Environment, factor: float) -> Environment:
+    """Return an environment with decay times of clusters and rays that are multiplied by `factor`."""
+    return replace(
+        environment,
+        cluster_decay_ns=factor * environment.cluster_decay_ns,
+        ray_decay_ns=factor * environment.ray_decay_ns,
+    )
 
 
 LOS, NLOS, NDP_NLOS, WEAK = range(4)

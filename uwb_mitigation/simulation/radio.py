@@ -8,7 +8,7 @@ were fitted to the EVK1000 logs, and the quality of the fit. `DW3000_STS` is a v
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,16 +124,18 @@ class Boards:
 
     Attributes:
         gain_db: transmit power and both antennas, relative to the `Receiver`.
-        noise_figure_db, preamble_symbols: replace those of the `Receiver`.
+        noise_figure_db, preamble_symbols, self_noise_db, noise_multiplier: replace those of the `Receiver`.
     """
 
     gain_db: NDArray[np.float64]
     noise_figure_db: NDArray[np.float64]
     preamble_symbols: NDArray[np.float64]
+    self_noise_db: NDArray[np.float64]
+    noise_multiplier: NDArray[np.float64]
 
     def take(self, index: NDArray[np.intp]) -> Boards:
         """Return the pairs at `index`, in that order."""
-        return Boards(self.gain_db[index], self.noise_figure_db[index], self.preamble_symbols[index])
+        return Boards(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +196,13 @@ class Receiver:
 
     def boards(self, n: int) -> Boards:
         """Return the properties of n pairs between identical boards."""
-        return Boards(np.zeros(n), np.full(n, self.noise_figure_db), np.full(n, float(self.preamble_symbols)))
+        values = (
+            self.noise_figure_db,
+            self.preamble_symbols,
+            self.self_noise_db,
+            self.noise_multiplier,
+        )
+        return Boards(np.zeros(n), *(np.full(n, float(value)) for value in values))
 
     @staticmethod
     def noise_level_dbm(noise_figure_db: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -238,8 +246,8 @@ class Receiver:
         peak = PULSE_PEAK * np.sqrt(strongest) * self.compression(power)
         count = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
         thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
-        noise = thermal / np.maximum(count, 1.0) + power * 10.0 ** (self.self_noise_db / 10.0)
-        threshold = self.noise_multiplier**2 * RAYLEIGH_VARIANCE * noise
+        noise = thermal / np.maximum(count, 1.0) + power * 10.0 ** (boards.self_noise_db / 10.0)
+        threshold = boards.noise_multiplier**2 * RAYLEIGH_VARIANCE * noise
         if self.pulses_per_symbol:
             side_lobes = PULSE_PEAK**2 * strongest / (self.pulses_per_symbol * np.maximum(count, 1.0))
             threshold = np.maximum(threshold, SIDE_LOBE_SIGMAS**2 * side_lobes)
@@ -276,13 +284,13 @@ class Receiver:
         if self.pulses_per_symbol:
             symbol += _side_lobes(symbol, self.pulses_per_symbol * count, rng)
         # Over the symbols, thermal noise adds up in power, the residue of the preamble in amplitude.
-        noise = thermal * count * gain * gain + power * count**2.0 * 10.0 ** (self.self_noise_db / 10.0)
+        noise = thermal * count * gain * gain + power * count**2.0 * 10.0 ** (boards.self_noise_db / 10.0)
         accumulator = rng.standard_normal(components.shape, dtype=np.float32)
         accumulator *= np.sqrt(noise / 2.0).astype(np.float32)[:, None]
         accumulator += components * count.astype(np.float32)[:, None]
         samples = np.clip(np.rint(accumulator), -32768, 32767).astype(np.int16)
         direct = np.abs(multipath.gain[:, 0]) * scale * gain * count * PULSE_PEAK
-        return self._report(samples, count, direct, place, above_sensitivity, rng)
+        return self._report(samples, count, direct, place, above_sensitivity, boards, rng)
 
     def _report(
         self,
@@ -291,12 +299,13 @@ class Receiver:
         direct: NDArray[np.float64],
         place: NDArray[np.float64],
         above_sensitivity: NDArray[np.bool_],
+        boards: Boards,
         rng: np.random.Generator,
     ) -> Reception:
         quantised = samples.astype(np.float32)
         taps = quantised.view(np.complex64)
         magnitude = np.abs(taps)
-        threshold = noise_threshold(magnitude, self.noise_multiplier)
+        threshold = noise_threshold(magnitude, boards.noise_multiplier)
         if self.pulses_per_symbol:
             side_lobe = magnitude.max(axis=1) / np.sqrt(self.pulses_per_symbol * count)
             threshold = np.maximum(threshold, np.rint(SIDE_LOBE_SIGMAS * side_lobe).astype(np.int64))
@@ -351,7 +360,7 @@ def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) ->
     return result
 
 
-def noise_threshold(magnitude: NDArray[np.float32], multiplier: float) -> NDArray[np.int64]:
+def noise_threshold(magnitude: NDArray[np.float32], multiplier: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return LDE_THRESH of (n, TAPS) magnitudes: the noise's standard deviation times NTM, at least 1."""
     deviation = magnitude[:, NOISE_TAPS].std(axis=1)
     threshold: NDArray[np.int64] = np.clip(np.rint(multiplier * deviation), 1, 65535).astype(np.int64)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.simulation.buildings import mean_free_path_m
 from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, Environment
 from uwb_mitigation.simulation.scene import (
     BRICK,
@@ -86,18 +87,13 @@ class Room:
     divided: bool = False
 
 
-def _mean_free_path_m(size: Point) -> float:
-    """Return the mean free path of rays in a rectangle: pi area / perimeter (Kosten, 1960)."""
-    return math.pi * size[0] * size[1] / (2.0 * (size[0] + size[1]))
-
-
 def _furnished(name: str, size: Point) -> Room:
     """Return a room whose decays and delays are the residential ones scaled with the mean free path.
 
     An obstacle attenuates only the direct path: the reflections keep their power, and the first of them is
     delayed.
     """
-    share = _mean_free_path_m(size) / _mean_free_path_m(FLAT.size)
+    share = mean_free_path_m(size) / mean_free_path_m(FLAT.size)
     los = replace(
         RESIDENTIAL_LOS,
         name=f"{name}, LOS",

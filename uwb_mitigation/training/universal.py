@@ -6,11 +6,14 @@ or in held-out simulated buildings (models/universal.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from uwb_mitigation.mitigation.model import floating
 from uwb_mitigation.mitigation.model.architecture import Remnet
@@ -25,6 +28,7 @@ from uwb_mitigation.training.data.augmentation import (
     normalised,
     scaled_calibration_inputs,
     vary_channel,
+    vary_noise,
     vary_receiver,
 )
 from uwb_mitigation.training.data.dataset import Dataset
@@ -96,15 +100,12 @@ def train_universal_model(
     count_block = step_counter(total_blocks, lambda share: on_share(0.2 * share, "simulating"))
     # Augmentation needs the levels, even if the scaling removes them.
     level_preprocessing = Preprocessing(plan.samples)
-    # With levels, other receivers and sites are detected as out of distribution. Without, train on them.
-    has_levels = plan.scaling is Scaling.PREAMBLE
     train_data = building_dataset(
         plan.seed,
         plan.blocks,
         level_preprocessing,
         workers,
         count_block,
-        wide=not has_levels,
         radio=plan.radio,
     )
     held_out = building_dataset(
@@ -113,25 +114,34 @@ def train_universal_model(
         preprocessing,
         workers,
         count_block,
-        wide=not has_levels,
         radio=plan.radio,
     )
     count_epoch = step_counter(plan.fit.epochs, lambda share: on_share(0.2 + 0.75 * share, "training"))
     options = replace(plan.fit, seed=plan.seed)
+    # The network does not correct missed direct paths: nothing in its window shows them.
+    early_m = train_data.early_path_m
+    network_data = train_data if early_m is None else train_data.rows(np.isnan(early_m))
     network = fit(
         Remnet(samples=plan.samples),
-        train_data.inputs,
-        train_data.error_m,
+        network_data.inputs,
+        network_data.error_m,
         options,
         count_epoch,
-        vary=vary_channel
-        if has_levels
-        else lambda inputs, generator: normalised(vary_receiver(vary_channel(inputs, generator), generator)),
+        vary=_vary_levels if plan.scaling is Scaling.PREAMBLE else _vary_amplitudes,
     )
-    subset = train_data.inputs[:: max(1, len(train_data) // CALIBRATION_INPUTS)]
+    subset = network_data.inputs[:: max(1, len(network_data) // CALIBRATION_INPUTS)]
     integers = quantize_network(network, scaled_calibration_inputs(subset, plan.scaling))
     on_share(1.0, "evaluating")
     return _evaluate(plan, name, network, integers, train_data, held_out)
+
+
+def _vary_levels(inputs: Tensor, generator: torch.Generator) -> Tensor:
+    return vary_noise(vary_channel(inputs, generator), generator)
+
+
+def _vary_amplitudes(inputs: Tensor, generator: torch.Generator) -> Tensor:
+    # Without levels, other receivers are not detected as out of distribution.
+    return normalised(vary_receiver(_vary_levels(inputs, generator), generator))
 
 
 def _evaluate(
@@ -154,9 +164,12 @@ def _evaluate(
         "raw": error,
         "constant": error - np.median(train_data.error_m),
         "line in levels": error - line.predict_m(test.rx_power_dbm, test.first_path_power_dbm),
-        "float": error - floating.predict_m(network, test.inputs).astype(float),
-        "int8": error - IntegerNetwork(integers).predict_m(test.inputs).astype(float),
     }
+    for row, predict_m in (
+        ("float", partial(floating.predict_m, network)),
+        ("int8", IntegerNetwork(integers).predict_m),
+    ):
+        errors[row] = error - test.with_early_paths(predict_m(test.inputs)).astype(float)
     conditions = {"all": np.ones(len(test), np.bool_)} | {
         str(label): test.labels == label for label in np.unique(test.labels)
     }
@@ -164,9 +177,6 @@ def _evaluate(
         row: {label: ErrorStatistics.of(values[rows]) for label, rows in conditions.items()}
         for row, values in errors.items()
     }
-    evidence = "no radio was involved"
-    if plan.radio is not RADIO:
-        evidence = "experimental, no real recording was available"
     balanced = _balanced_rows(test.labels)
     card = card_of(
         name,
@@ -175,22 +185,34 @@ def _evaluate(
         LinearBiasModel(0.0),
         test.rows(balanced),
         errors["float"][balanced],
-        {
-            "data": f"simulated buildings, seed {plan.seed}: {evidence}",
-            "boards": f"simulated {plan.radio.kind.name}s whose powers, antennas and preambles differ; no site",
-            "placements": plan.blocks * PLACEMENTS,
-            "split": f"graded in simulated buildings, seed {plan.seed + HELD_OUT_SEED}",
-            "seed": plan.seed,
-            "recipe": asdict(replace(plan.fit, seed=plan.seed)),
-            "metrics_m": {
-                row: {key: round(value, 4) for key, value in asdict(statistics[row]["all"]).items()}
-                for row in ("raw", "float", "int8")
-            },
-        },
+        _description(plan, statistics),
         # The correction shrinks to zero out of distribution, because an offset depends on the radio, not on the channel.
         ood_bands_of(test, known_offset_m=0.0),
     )
-    return UniversalModel(card, network, integers, statistics)
+    return UniversalModel(
+        replace(card, early_path=test.early_path_m is not None), network, integers, statistics
+    )
+
+
+def _description(
+    plan: TrainingPlan, statistics: Mapping[str, Mapping[str, ErrorStatistics]]
+) -> dict[str, object]:
+    """Return the origin of the model for its card."""
+    evidence = "no radio was involved"
+    if plan.radio is not RADIO:
+        evidence = "experimental, no real recording was available"
+    return {
+        "data": f"simulated buildings, seed {plan.seed}: {evidence}",
+        "boards": f"simulated {plan.radio.kind.name}s whose powers, antennas and preambles differ; no site",
+        "placements": plan.blocks * PLACEMENTS,
+        "split": f"graded in simulated buildings, seed {plan.seed + HELD_OUT_SEED}",
+        "seed": plan.seed,
+        "recipe": asdict(replace(plan.fit, seed=plan.seed)),
+        "metrics_m": {
+            row: {key: round(value, 4) for key, value in asdict(statistics[row]["all"]).items()}
+            for row in ("raw", "float", "int8")
+        },
+    }
 
 
 def _balanced_rows(labels: NDArray[np.str_]) -> NDArray[np.intp]:

@@ -1,4 +1,4 @@
-/* universal, model 427bf8f8, written by `uwb-mitigation board export-c`. */
+/* universal, model 1bd2b9b8, written by `uwb-mitigation board export-c`. */
 #ifndef UWB_MODEL_H
 #define UWB_MODEL_H
 
@@ -380,9 +380,9 @@ static const uwb_ood_bands uwb_model_ood_bands = {0.0f, {
 }};
 
 static const uwb_model uwb_model_data = {
-    0x427bf8f8u, 157u, UWB_SCALE_PREAMBLE, 0.0100363968f, 3u, 3u, uwb_first_weights, uwb_first,
+    0x1bd2b9b8u, 157u, UWB_SCALE_PREAMBLE, 0.0100363968f, 3u, 3u, uwb_first_weights, uwb_first,
     uwb_modules, 0u, NULL, uwb_head_weights, 384u, 166912, 6.12721487e-05f, 0.0f, 0.0f, 0.0f,
-    -8.72018242f, 25.2730923f, 0.0237812009f, 0.199585781f, 0.13643989f, &uwb_model_ood_bands,
+    -8.72018242f, 25.2730923f, 0.0237812009f, 0.199585781f, 0.13643989f, &uwb_model_ood_bands, 1,
 };
 
 #ifdef UWB_GOLDEN_VECTORS

@@ -179,6 +179,7 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
         format_number(card.variance_per_m2),
         format_number(card.variance_uncorrected_m2),
         "NULL" if card.ood_bands is None else "&uwb_model_ood_bands",
+        f"{int(card.early_path)}",
     ]
     return f"static const uwb_model uwb_model_data = {{\n{_wrapped(values)}}};\n"
 

@@ -58,6 +58,7 @@ class ModelCard:
         interval95_sigmas: number of standard deviations that cover 95 % of the errors on unseen configurations.
         ood_bands: bands outside of which a measurement is out of distribution; None = unknown.
         radios, segments: sources of the CIRs that the network was trained for.
+        early_path: a missed direct path (`mitigation.early_path`) replaces the prediction of the network.
         needs_cir: False = the network predicts 0, so that the linear bias model also corrects ranges without a CIR.
     """
 
@@ -74,6 +75,7 @@ class ModelCard:
     interval95_sigmas: float = 1.96
     ood_bands: OodBands | None = None
     needs_cir: bool = True
+    early_path: bool = False
     radios: tuple[RadioType, ...] = (RadioType.DW1000,)
     segments: tuple[Segment, ...] = (Segment.IPATOV,)
 
@@ -354,6 +356,7 @@ def _card(metadata: dict[str, Any]) -> ModelCard:
         interval95_sigmas=float(metadata["interval95_sigmas"]),
         ood_bands=_ood_bands(metadata["ood"]),
         needs_cir=metadata["needs_cir"] is True,
+        early_path=metadata["early_path"] is True,
         radios=tuple(RadioType[str(name)] for name in metadata["radios"]),
         segments=tuple(Segment[str(name)] for name in metadata["segments"]),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,6 +21,10 @@ FIRST_VARIED_TAP = 12
 AMPLIFIED_SHARE, MAX_GAIN_DB = 0.15, 22.0
 """Share of the inputs that are amplified, and maximum gain. No DW1000 reaches these levels, because its gain control
 compresses, but a model that was not trained with them predicts errors of metres for them."""
+
+NOISY_SHARE, NOISE_DB = 0.25, (-46.0, -32.0)
+"""Share of the inputs with additional noise, and bounds of its level relative to the strongest tap: real boards differ, and
+without it the network takes the noise for a sign of a weak direct path."""
 
 OTHER_RECEIVER_SHARE = 0.5
 """Share of the inputs that are changed to imitate another receiver."""
@@ -45,6 +51,20 @@ def vary_channel(inputs: Tensor, generator: torch.Generator) -> Tensor:
     )
     amplified: Tensor = varied * 10 ** (level_db / 40)
     return amplified
+
+
+def vary_noise(inputs: Tensor, generator: torch.Generator) -> Tensor:
+    """Add complex noise to the taps of some of the inputs (n, K), scaled by the preamble count."""
+    n = len(inputs)
+    is_noisy = torch.rand(n, 1, generator=generator) < NOISY_SHARE
+    level_db = NOISE_DB[0] + (NOISE_DB[1] - NOISE_DB[0]) * torch.rand(n, 1, generator=generator)
+    amplitude = inputs * inputs
+    component = 10 ** (level_db / 20) * amplitude.amax(1, keepdim=True) / math.sqrt(2.0)
+    # The phase of a tap does not matter, because that of the noise is uniform.
+    real = amplitude + component * torch.randn(inputs.shape, generator=generator)
+    imaginary = component * torch.randn(inputs.shape, generator=generator)
+    noisy: Tensor = torch.where(is_noisy, torch.hypot(real, imaginary).sqrt(), inputs)
+    return noisy
 
 
 def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:

@@ -7,20 +7,29 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.mitigation.early_path import early_path_error_m
 from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing
-from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Truth
+from uwb_mitigation.types.measurement import (
+    Cir,
+    RadioType,
+    RangeColumns,
+    RangeMeasurement,
+    Record,
+    Segment,
+    Truth,
+)
 
 _BATCH = 256
 
 _COLUMNS = (
     *("inputs", "rx_power_dbm", "first_path_power_dbm", "range_m", "error_m", "configurations", "labels"),
-    *("headers", "tags", "anchors"),
+    *("headers", "tags", "anchors", "early_path_m"),
 )
 
 
@@ -41,6 +50,8 @@ class Dataset:
         headers: float32 (n, 2), preamble count and noise threshold; None = not kept.
         tags, anchors: ids, int (n,), for splits by location; None = not kept.
         radios, segments: known sources of the CIRs.
+        early_path_m: float32 (n,), errors that missed direct paths cause (`mitigation.early_path`), NaN: none; None = not
+            computed.
     """
 
     preprocessing: Preprocessing
@@ -57,6 +68,7 @@ class Dataset:
     anchors: NDArray[np.uint64] | None = None
     radios: tuple[RadioType, ...] = (RadioType.DW1000,)
     segments: tuple[Segment, ...] = (Segment.IPATOV,)
+    early_path_m: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.error_m)
@@ -80,12 +92,20 @@ class Dataset:
 
     @classmethod
     def joined(cls, parts: Sequence[Dataset]) -> Dataset:
-        """Concatenate parts with the same preprocessing, without headers and ids."""
+        """Concatenate parts with the same preprocessing; columns that a part does not have are left out."""
+        values = {name: [getattr(part, name) for part in parts] for name in _COLUMNS}
         columns: dict[str, Any] = {
-            name: np.concatenate([getattr(selected_columns, name) for selected_columns in parts])
-            for name in _COLUMNS[:7]
+            name: np.concatenate(arrays)
+            for name, arrays in values.items()
+            if all(array is not None for array in arrays)
         }
         return cls(parts[0].preprocessing, **columns)
+
+    def with_early_paths(self, predicted_m: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the output of a network, (n,), m, with missed direct paths in place of it."""
+        if self.early_path_m is None:
+            return predicted_m
+        return np.where(np.isnan(self.early_path_m), predicted_m, self.early_path_m)
 
     @property
     def names(self) -> list[str]:
@@ -117,6 +137,15 @@ class CirSources:
         return tuple(sorted(self._segments)) or (Segment.IPATOV,)
 
 
+class _Row(NamedTuple):
+    """A labelled measurement with its window, and the error of a missed direct path, m (NaN: none)."""
+
+    measurement: RangeMeasurement
+    truth: Truth
+    window: NDArray[np.float32]
+    early_path_m: float
+
+
 def build_dataset(
     records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
 ) -> Dataset:
@@ -130,80 +159,73 @@ def build_dataset(
         DatasetError: no measurement is usable.
     """
     skipped: Counter[str] = Counter()
-    inputs, values, headers, ids, configurations, labels = [], [], [], [], [], []
-    without_cir: list[tuple[RangeMeasurement, Truth]] = []
-    sources = CirSources()
-
-    def add(measurement: RangeMeasurement, truth: Truth, window: NDArray[np.float32]) -> None:
-        inputs.append(window)
-        sources.add(measurement.cir)
-        values.append(
-            (
-                measurement.cir.rx_power_dbm,
-                measurement.cir.first_path_power_dbm,
-                measurement.range_m,
-                measurement.range_m - truth.range_m,
-            )
-        )
-        headers.append((measurement.cir.preamble_count, measurement.cir.noise_threshold))
-        ids.append((measurement.tag_id, measurement.anchor_id))
-        configurations.append(truth.configuration)
-        labels.append(truth.label)
-
-    for record, fault, window in _preprocessed(records, preprocessing, on_record):
+    rows: list[_Row] = []
+    without_cir: list[_Row] = []
+    no_window = np.zeros(preprocessing.samples, np.float32)
+    for record, fault, window, early_m in _preprocessed(records, preprocessing, on_record):
         measurement, truth = record.measurement, record.truth
         if truth is None or not math.isfinite(truth.range_m):
             skipped["no true range"] += 1
-            continue
-        if not (math.isfinite(measurement.range_m) and measurement.range_m >= 0):
+        elif not (math.isfinite(measurement.range_m) and measurement.range_m >= 0):
             skipped["no valid range"] += 1
-            continue
-        if fault == CirFault.EMPTY and not inputs:
-            without_cir.append((measurement, truth))
+        elif fault == CirFault.EMPTY and not rows:
+            without_cir.append(_Row(measurement, truth, no_window, math.nan))
         elif fault:
             skipped[CirFault(fault).text] += 1
         else:
-            add(measurement, truth, window)
-    if inputs or skipped[CirFault.EMPTY.text]:
+            rows.append(_Row(measurement, truth, window, early_m))
+    if rows or skipped[CirFault.EMPTY.text]:
         skipped[CirFault.EMPTY.text] += len(without_cir)
     else:
-        for measurement, truth in without_cir:
-            add(measurement, truth, np.zeros(preprocessing.samples, np.float32))
+        rows = without_cir
     skipped = +skipped
-    if not inputs:
+    if not rows:
         reasons = ", ".join(f"{count} x {reason}" for reason, count in skipped.items()) or "no measurements"
         raise DatasetError(f"no labelled measurement that can be used: {reasons}")
-    rx_power, first_path_power, range_m, error_m = np.array(values, np.float64).T
-    tags, anchors = np.array(ids, np.uint64).T
+    return _dataset_of(rows, preprocessing, skipped)
+
+
+def _dataset_of(rows: Sequence[_Row], preprocessing: Preprocessing, skipped: Mapping[str, int]) -> Dataset:
+    measurements, truths, windows, early_paths = zip(*rows, strict=True)
+    sources = CirSources()
+    for measurement in measurements:
+        sources.add(measurement.cir)
+    range_m = np.array([measurement.range_m for measurement in measurements], np.float64)
+    cirs = [measurement.cir for measurement in measurements]
     return Dataset(
         preprocessing,
-        np.stack(inputs),
-        _power(rx_power),
-        _power(first_path_power),
+        np.stack(windows),
+        _power(np.array([cir.rx_power_dbm for cir in cirs], np.float64)),
+        _power(np.array([cir.first_path_power_dbm for cir in cirs], np.float64)),
         range_m,
-        error_m,
-        np.array(configurations),
-        np.array(labels),
+        range_m - np.array([truth.range_m for truth in truths], np.float64),
+        np.array([truth.configuration for truth in truths]),
+        np.array([truth.label for truth in truths]),
         dict(skipped),
-        np.array(headers, np.float32),
-        tags=tags,
-        anchors=anchors,
+        np.array([(cir.preamble_count, cir.noise_threshold) for cir in cirs], np.float32),
+        tags=np.array([measurement.tag_id for measurement in measurements], np.uint64),
+        anchors=np.array([measurement.anchor_id for measurement in measurements], np.uint64),
         radios=sources.radios,
         segments=sources.segments,
+        early_path_m=np.array(early_paths, np.float32),
     )
 
 
 def _preprocessed(
     records: Iterable[Record], preprocessing: Preprocessing, on_record: Callable[[], None]
-) -> Iterator[tuple[Record, int, NDArray[np.float32]]]:
-    """Yield each record with the `CirFault` of its CIR, 0 if there is none, and its window."""
+) -> Iterator[tuple[Record, int, NDArray[np.float32], float]]:
+    """Yield each record with the `CirFault` of its CIR (0: none), its window, and the error of a missed direct path."""
     stream = iter(records)
     while batch := list(islice(stream, _BATCH)):
-        for record, fault, window in zip(
-            batch, *preprocessing.windows_of([record.measurement for record in batch]), strict=True
-        ):
+        measurements = [record.measurement for record in batch]
+        faults, windows = preprocessing.windows_of(measurements)
+        early_m = np.full(len(batch), np.nan, np.float32)
+        for indices, ranges in RangeColumns.grouped(measurements):
+            rows = np.flatnonzero(np.array(faults)[indices] == 0)
+            early_m[np.array(indices)[rows]] = early_path_error_m(ranges, rows, preprocessing.samples)
+        for row in zip(batch, faults, windows, early_m.tolist(), strict=True):
             on_record()
-            yield record, fault, window
+            yield row
 
 
 def _power(levels: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.mitigation.early_path import early_path_error_m
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.simulation.antenna_pairs import label
 from uwb_mitigation.simulation.buildings import RADIO, block_of
@@ -25,15 +26,14 @@ def building_dataset(
     workers: int,
     on_block: Callable[[], None] = lambda: None,
     *,
-    wide: bool = False,
     radio: Receiver = RADIO,
 ) -> Dataset:
     """Return one range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
 
     Ranges that are not received, or whose window is not usable, are omitted. The result does not depend on the number
-    of `workers` (processes); `on_block` is called after each block. `wide`, `radio`: see `block_of`.
+    of `workers` (processes); `on_block` is called after each block. `radio`: see `block_of`.
     """
-    simulate = partial(_block, seed, preprocessing, wide, radio)
+    simulate = partial(_block, seed, preprocessing, radio)
     parts = []
     # Do not fork: the caller may run threads (torch, a progress bar).
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
@@ -43,12 +43,16 @@ def building_dataset(
     return replace(Dataset.joined(parts), radios=(radio.kind,), segments=(radio.segment,))
 
 
-def _block(seed: int, preprocessing: Preprocessing, wide: bool, radio: Receiver, number: int) -> Dataset:
-    block, rng = block_of(seed, number, wide=wide, radio=radio)
+def _block(seed: int, preprocessing: Preprocessing, radio: Receiver, number: int) -> Dataset:
+    block, rng = block_of(seed, number, radio=radio)
     reception = radio.receive(block.pairs.multipath(rng), rng, block.boards)
     distance = block.pairs.distance_m
     received = np.flatnonzero(np.isfinite(reception.first_path_index))
-    faults, inputs = preprocessing.apply(_columns(reception, distance, received))
+    columns = _columns(reception, distance, received)
+    faults, inputs = preprocessing.apply(columns)
+    early_m = None
+    if radio is RADIO:  # Other radios deliver too few taps before the first path.
+        early_m = early_path_error_m(columns, np.flatnonzero(faults == 0), preprocessing.samples)
     rows = received[faults == 0]
     is_blocked, is_direct = block.pairs.path.crossings > 0, reception.direct_above_threshold
     return Dataset(
@@ -60,6 +64,7 @@ def _block(seed: int, preprocessing: Preprocessing, wide: bool, radio: Receiver,
         reception.error_m[rows],
         np.array([block.configuration(seed, number, int(row)) for row in rows]),
         np.array([label(bool(is_blocked[row]), bool(is_direct[row])) for row in rows]),
+        early_path_m=early_m,
     )
 
 

@@ -73,7 +73,10 @@ def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> ZeroShot:
         ModelError: ONNX Runtime rejects the bundle's network.
     """
     linear_bias = bundle.card.linear_bias.predict_m(dataset.rx_power_dbm, dataset.first_path_power_dbm)
-    predicted = (linear_bias + Session(bundle).predict_m(dataset.inputs)).astype(np.float32)
+    network_m = Session(bundle).predict_m(dataset.inputs)
+    if bundle.card.early_path:
+        network_m = dataset.with_early_paths(network_m).astype(np.float32)
+    predicted = (linear_bias + network_m).astype(np.float32)
     corrections = correct_with_card(dataset, bundle.card, predicted)
     residual = dataset.error_m - corrections.correction_m
 
