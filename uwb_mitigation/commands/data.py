@@ -92,7 +92,7 @@ def import_recordings(
 ) -> None:
     """Write recordings into one MCAP bag, with truth where known."""
     from uwb_mitigation.commands.support import mapped_report
-    from uwb_mitigation.recordings.bag.writer import check_output
+    from uwb_mitigation.recordings.bag.writer import check_bag_output
     from uwb_mitigation.recordings.formats import open_mapped
 
     if dry_run and not mapping:
@@ -101,7 +101,7 @@ def import_recordings(
         raise ParameterError("no output", valid="-o OUT, or --dry-run with --map")
     if output is not None and not dry_run:
         # Before a long recording is read.
-        check_output(output, force=force)
+        check_bag_output(output, force=force)
     opened: Sequence[Source]
     extra: dict[str, Any] = {}
     if mapping:

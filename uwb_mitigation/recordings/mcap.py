@@ -65,11 +65,11 @@ class McapRecording(Source):
         finally:
             self.skipped.update(bag.warnings)
         if not self._closed and self._topic not in bag.topics:
-            known = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.topics.items()))
+            listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.topics.items()))
             raise RecordingError(
                 f"no topic {self._topic}",
                 where=str(self._path),
-                valid=f"the bag contains: {known or 'no topic'}",
+                valid=f"the bag contains: {listed or 'no topic'}",
                 suggestion=did_you_mean(self._topic, bag.topics),
             )
 

@@ -39,17 +39,17 @@ def load_truth(path: Path) -> list[TruthSegment]:
     """
     numbers = {"range_m": (0.0, MAX_RANGE_M), "start_s": (0.0, MAX_RANGE_M), "stop_s": (0.0, math.inf)}
     optional = ("start_s", "stop_s", "label", "configuration")
-    found = read_csv(path, ("tag_id", "anchor_id"), numbers, optional)
-    starts = np.nan_to_num(found["start_s"])
-    stops = np.where(np.isnan(found["stop_s"]), math.inf, found["stop_s"])
+    columns = read_csv(path, ("tag_id", "anchor_id"), numbers, optional)
+    starts = np.nan_to_num(columns["start_s"])
+    stops = np.where(np.isnan(columns["stop_s"]), math.inf, columns["stop_s"])
     if bad := np.flatnonzero(starts >= stops).tolist():
         what = f"start_s = {starts[bad[0]]} is not before stop_s = {stops[bad[0]]}"
         raise RecordingError(what, where=f"{path}: row {bad[0] + 1}")
     segments = []
-    for row, range_m in enumerate(found["range_m"].tolist()):
-        name = found["configuration"][row] or f"{path.name} row {row + 1}"
-        truth = Truth(range_m, found["label"][row], name)
-        ids = int(found["tag_id"][row]), int(found["anchor_id"][row])
+    for row, range_m in enumerate(columns["range_m"].tolist()):
+        name = columns["configuration"][row] or f"{path.name} row {row + 1}"
+        truth = Truth(range_m, columns["label"][row], name)
+        ids = int(columns["tag_id"][row]), int(columns["anchor_id"][row])
         segments.append(TruthSegment(*ids, float(starts[row]), float(stops[row]), truth))
     return segments
 

@@ -47,14 +47,14 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
     planned: dict[Path, PlannedBag] = {}
     for source in sources:
         if _is_one_bag(source):
-            found = [(source, Path(source.resolve().name))]
+            bags = [(source, Path(source.resolve().name))]
         else:
             # Mirror the contents of a single folder; with several folders, also keep their names.
             root = Path() if len(sources) == 1 else Path(source.resolve().name)
-            found = [(bag, root / bag.relative_to(source)) for bag in _bags(source, output.resolve())]
-            if not found:
+            bags = [(bag, root / bag.relative_to(source)) for bag in _bags(source, output.resolve())]
+            if not bags:
                 raise RecordingError("the folder contains no MCAP bag", where=str(source))
-        for bag, name in found:
+        for bag, name in bags:
             place = output / name
             if place in planned:
                 raise ParameterError(
@@ -79,10 +79,10 @@ def _is_one_bag(path: Path) -> bool:
 def _bags(folder: Path, without: Path) -> Iterator[Path]:
     """Return the bags below a folder that is not a bag itself."""
     for place, folders, files in os.walk(folder):
-        here = Path(place)
+        root = Path(place)
         below = []
         for name in sorted(folders):
-            path = here / name
+            path = root / name
             if path.resolve() == without:
                 continue
             if _may_be_one_bag(path):
@@ -90,7 +90,7 @@ def _bags(folder: Path, without: Path) -> Iterator[Path]:
             else:
                 below.append(name)
         folders[:] = below
-        yield from (here / name for name in sorted(files) if name.endswith(".mcap"))
+        yield from (root / name for name in sorted(files) if name.endswith(".mcap"))
 
 
 def _may_be_one_bag(path: Path) -> bool:

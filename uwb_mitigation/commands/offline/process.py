@@ -127,7 +127,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         if ANCHORS not in bag.topics and bag.bounds_ns and (anchors := recorded_anchors(job.source)):
             write_anchors(out, anchors, bag.bounds_ns[0])
         damage = None
-        total, done = bag.message_count, 0
+        total, num_read = bag.message_count, 0
         messages = bag.messages()
         while True:
             batch: list[RawMessage] = []
@@ -140,12 +140,12 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
             if not batch:
                 break
             corrector.write(batch)
-            done += len(batch)
+            num_read += len(batch)
             if report is not None:
-                report(done, total)
+                report(num_read, total)
             if damage is not None:
                 break
-        if damage is not None and done == 0:
+        if damage is not None and num_read == 0:
             raise damage
         if RANGE_RAW not in bag.topics:
             topics = ", ".join(sorted(bag.topics)) or "no topic"
@@ -155,7 +155,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
     seconds = time.perf_counter() - started
     return Outcome(
         job,
-        messages=done,
+        messages=num_read,
         ranges=corrector.statuses.total(),
         statuses=corrector.statuses,
         replaced=corrector.replaced,

@@ -45,7 +45,7 @@ class McapFile:
     def __init__(self, stream: BinaryIO, library: str) -> None:
         self._stream = stream
         self._size = 0
-        self._parts: list[bytes] = []
+        self._pieces: list[bytes] = []
         self._chunk_size = 0
         self._entries: dict[int, list[tuple[int, int]]] = {}
         self._schemas: list[records.McapRecord] = []
@@ -89,7 +89,7 @@ class McapFile:
         if channel not in self._entries:
             self._entries[channel] = []
         self._entries[channel].append((log_time_ns, self._chunk_size))
-        self._parts += (head, data)
+        self._pieces += (head, data)
         self._chunk_size += length + _RECORD_HEADER
         if self._chunk_size > CHUNK_SIZE:
             self._finish_chunk()
@@ -157,13 +157,13 @@ class McapFile:
 
     def _define(self, record: records.McapRecord, group: list[records.McapRecord]) -> None:
         group.append(record)
-        self._parts.append(_packed(record))
-        self._chunk_size += len(self._parts[-1])
+        self._pieces.append(_packed(record))
+        self._chunk_size += len(self._pieces[-1])
 
     def _finish_chunk(self) -> None:
         if not self._entries:
             return
-        content = b"".join(self._parts)
+        content = b"".join(self._pieces)
         compressed = zstandard.compress(content)
         bounds, checksum, offset = self._chunk_bounds(), zlib.crc32(content), self._size
         length = _CHUNK.size - _RECORD_HEADER + len(compressed)
@@ -189,7 +189,7 @@ class McapFile:
                 uncompressed_size=len(content),
             )
         )
-        self._parts, self._chunk_size, self._entries = [], 0, {}
+        self._pieces, self._chunk_size, self._entries = [], 0, {}
 
 
 def _packed(record: records.McapRecord) -> bytes:

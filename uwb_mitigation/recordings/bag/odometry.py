@@ -14,7 +14,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import check_topic, decode_messages
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.ros.poses import header, quaternion, vector, yaw_of
+from uwb_mitigation.types.ros.poses import header_fields, quaternion, vector, yaw_of
 from uwb_mitigation.types.ros.schemas import serialize
 from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, ROBOT_IMU, ROBOT_ODOMETRY, TF, TF_TYPE
 from uwb_mitigation.types.stamps import to_ns
@@ -38,7 +38,7 @@ def encode_odometry_row(odometry: Odometry, row: int, frame_id: str = ODOM, chil
     twist = Fields(linear=vector(vx, vy), angular=vector(z=yaw_rate))
     return serialize(
         ODOMETRY_TYPE,
-        header=header(int(odometry.stamp_ns[row]), frame_id),
+        header=header_fields(int(odometry.stamp_ns[row]), frame_id),
         child_frame_id=child,
         pose=Fields(pose=pose, covariance=_six(odometry.pose_covariance[row])),
         twist=Fields(twist=twist, covariance=_six(odometry.twist_covariance[row])),
@@ -55,7 +55,7 @@ def encode_imu_row(imu: Imu, row: int, frame_id: str = BASE_LINK) -> bytes:
     turning[[0, 4, 8]] = _UNMEASURED, _UNMEASURED, imu.yaw_rate_variance[row]
     return serialize(
         IMU_TYPE,
-        header=header(int(imu.stamp_ns[row]), frame_id),
+        header=header_fields(int(imu.stamp_ns[row]), frame_id),
         orientation=quaternion(yaw if math.isfinite(yaw) else 0.0),
         orientation_covariance=orientation,
         angular_velocity=vector(z=float(imu.yaw_rate[row])),
@@ -69,7 +69,7 @@ def encode_transform_row(odometry: Odometry, row: int, frame_id: str = ODOM, chi
     """Return the pose of one row as `tf2_msgs/TFMessage` in CDR."""
     x, y, yaw = odometry.pose[row].tolist()
     transform = Fields(
-        header=header(int(odometry.stamp_ns[row]), frame_id),
+        header=header_fields(int(odometry.stamp_ns[row]), frame_id),
         child_frame_id=child,
         transform=Fields(translation=vector(x, y), rotation=quaternion(yaw)),
     )
@@ -105,7 +105,7 @@ def read_odometry(path: Path, topic: str) -> Odometry:
         pose, twist = decoded.pose.pose, decoded.twist.twist
         values = [pose.position.x, pose.position.y, yaw_of(pose.orientation)]
         values += [twist.linear.x, twist.linear.y, twist.angular.z]
-        covariances = [_three(one.covariance).ravel() for one in (decoded.pose, decoded.twist)]
+        covariances = [_three(item.covariance).ravel() for item in (decoded.pose, decoded.twist)]
         rows[to_ns(decoded.header.stamp)] = np.concatenate([values, *covariances])
     # Some robots publish twists only: their orientation is zero, and the yaw NaN.
     stamp_ns, columns = _columns(rows, path, topic, slice(3, None))
@@ -126,8 +126,8 @@ def read_imu(path: Path, topic: str) -> Imu:
         if turning[0] == -1.0:
             continue
         yaw = math.nan if orientation[0] == -1.0 else yaw_of(decoded.orientation)
-        known = math.isfinite(yaw)
-        row = (decoded.angular_velocity.z, turning[8], yaw if known else 0.0, orientation[8], known)
+        has_yaw = math.isfinite(yaw)
+        row = (decoded.angular_velocity.z, turning[8], yaw if has_yaw else 0.0, orientation[8], has_yaw)
         rows[to_ns(decoded.header.stamp)] = np.array(row, np.float64)
     stamp_ns, values = _columns(rows, path, topic)
     yaw_rate, yaw_rate_variance, yaw, yaw_variance, known_yaw = values.T

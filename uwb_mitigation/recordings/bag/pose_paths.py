@@ -65,12 +65,16 @@ def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, True
             q = decoded.pose.pose.orientation
             child = _frame(getattr(decoded, "child_frame_id", ""))
             yaws.setdefault(child, {})[to_ns(decoded.header.stamp)] = 2.0 * math.atan2(q.z, q.w)
-    found = {}
-    for child, one in bodies.items():
-        own = yaws.get(child, {})
-        yaw = np.array([own.get(stamp, math.nan) for stamp in one.stamp_ns.tolist()]) if own else None
-        found[tag_of_frame(child)] = TruePath(one.stamp_ns, one.position, yaw)
-    return found
+    paths = {}
+    for child, poses in bodies.items():
+        yaw_by_stamp = yaws.get(child, {})
+        yaw = (
+            np.array([yaw_by_stamp.get(stamp, math.nan) for stamp in poses.stamp_ns.tolist()])
+            if yaw_by_stamp
+            else None
+        )
+        paths[tag_of_frame(child)] = TruePath(poses.stamp_ns, poses.position, yaw)
+    return paths
 
 
 def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
@@ -100,14 +104,14 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
     bodies = _bodies(bag, topic, where)
     if frames is None or not set(bodies) - {""}:
         return bodies
-    if (wanted := _frame(frames[1])) not in bodies:
+    if (frame := _frame(frames[1])) not in bodies:
         raise RecordingError(
-            f"no poses of {wanted}",
+            f"no poses of {frame}",
             where=where,
             valid=f"--frames of: {', '.join(sorted(bodies))}",
-            suggestion=did_you_mean(wanted, bodies),
+            suggestion=did_you_mean(frame, bodies),
         )
-    return {wanted: bodies[wanted]}
+    return {frame: bodies[frame]}
 
 
 def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) -> dict[str, PosePath]:
@@ -121,7 +125,7 @@ def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) ->
             rows.setdefault(child, []).append(row)
     if oriented and not rows:
         rows[""] = []
-    return {child: _path(own, where, 2 if oriented else 1) for child, own in rows.items()}
+    return {child: _path(poses, where, 2 if oriented else 1) for child, poses in rows.items()}
 
 
 def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, float] | None:
@@ -160,11 +164,11 @@ def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str,
     """Return {child frame: {parent frame: transforms}}."""
     edges: dict[str, dict[str, list[_Row]]] = {}
     for decoded in decode_messages(bag, topics, where):
-        for one in decoded.transforms:
-            row = _row(one.header.stamp, one.transform.translation, one.transform.rotation)
-            child = _frame(one.child_frame_id)
+        for transform in decoded.transforms:
+            row = _row(transform.header.stamp, transform.transform.translation, transform.transform.rotation)
+            child = _frame(transform.child_frame_id)
             if row is not None and (child in edges or len(edges) < _MAX_FRAMES):
-                edges.setdefault(child, {}).setdefault(_frame(one.header.frame_id), []).append(row)
+                edges.setdefault(child, {}).setdefault(_frame(transform.header.frame_id), []).append(row)
     return edges
 
 
@@ -193,8 +197,8 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
             height, variance = float(decoded.pose.pose.position.z), float(decoded.pose.covariance[14])
             valid = True
         if valid and math.isfinite(height):
-            known = math.isfinite(variance) and variance > 0.0
-            rows[to_ns(decoded.header.stamp)] = height, variance if known else sd_m**2
+            has_variance = math.isfinite(variance) and variance > 0.0
+            rows[to_ns(decoded.header.stamp)] = height, variance if has_variance else sd_m**2
     if not rows:
         raise RecordingError("no valid height", where=where, valid="finite heights within the sensor's range")
     stamps = sorted(rows)
@@ -280,11 +284,11 @@ def _composed(edges: dict[str, dict[str, list[_Row]]], root: str, leaf: str, whe
     frame = leaf
     while frame != root:
         if frame not in edges or len(chain) > len(edges):
-            known = ", ".join(sorted({*edges, *(parent for own in edges.values() for parent in own)}))
+            names = ", ".join(sorted({*edges, *(parent for parents in edges.values() for parent in parents)}))
             raise RecordingError(
                 f"no transforms from {root} to {leaf}",
                 where=where,
-                valid=f"--frames of: {known or 'no frames found'}",
+                valid=f"--frames of: {names or 'no frames found'}",
             )
         frame, rows = max(edges[frame].items(), key=lambda edge: len(edge[1]))
         chain.append(_path(rows, where, 1))

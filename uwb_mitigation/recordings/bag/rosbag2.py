@@ -137,8 +137,8 @@ def bag_files(path: Path) -> list[Path]:
         return [path]
     names = listed_files(path)
     if names is None:
-        found = (entry.name for entry in path.glob("*.mcap") if entry.is_file())
-        names = sorted(found, key=_natural_sort_key)
+        paths = (entry.name for entry in path.glob("*.mcap") if entry.is_file())
+        names = sorted(paths, key=_natural_sort_key)
         if not names and any(path.glob("*.db3")):
             raise _unsupported_storage(path, "sqlite3")
     # Ignore the directory part of a listed name: the file must be in this folder.
@@ -153,7 +153,7 @@ def bag_files(path: Path) -> list[Path]:
 
 def _natural_sort_key(name: str) -> list[tuple[int, str]]:
     """Return a natural sort key: bag_10 follows bag_9."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
+    return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"([0-9]+)", name)]
 
 
 def _unsupported_storage(path: Path, storage: str) -> RecordingError:

@@ -63,7 +63,7 @@ def _bag_file(path: Path) -> Path:
     return path if path.suffix == ".mcap" else path / f"{path.name}_0.mcap"
 
 
-def check_output(path: Path, *, force: bool = False) -> None:
+def check_bag_output(path: Path, *, force: bool = False) -> None:
     """Check that a bag can be created at `path`.
 
     Raises:
@@ -108,7 +108,7 @@ class BagWriter:
         self._schemas: dict[Schema, int] = {}
         self._stream: BinaryIO | None = None
 
-        check_output(path, force=force)
+        check_bag_output(path, force=force)
         with self._translate_os_errors():
             self._created_folder = self._folder is not None and not self._folder.exists()
             if self._folder is not None:

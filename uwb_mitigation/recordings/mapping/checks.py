@@ -72,11 +72,11 @@ def _scale(ranges_m: NDArray[np.float64], true_m: NDArray[np.float64]) -> float:
     x, y = true_m[finite], ranges_m[finite]
     if len(x) < 10 or np.median(x) <= 0:
         return np.nan
-    far = x > np.median(x)
+    upper = x > np.median(x)
     ratio = float(np.median(y) / np.median(x))
-    if not far.any() or (spread := float(np.median(x[far]) - np.median(x[~far]))) < 0.2 * np.median(x):
+    if not upper.any() or (spread := float(np.median(x[upper]) - np.median(x[~upper]))) < 0.2 * np.median(x):
         return ratio
-    slope = float(np.median(y[far]) - np.median(y[~far])) / spread
+    slope = float(np.median(y[upper]) - np.median(y[~upper])) / spread
     # A constant offset changes only the ratio.
     return slope if abs(slope / ratio - 1) < 0.15 else np.nan
 

@@ -86,19 +86,21 @@ def join_by_time(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, join:
     import pandas as pd
 
     keys = ("stamp", "tag", "anchor")
-    left = pd.DataFrame({name: ranges[name][rows] for name in keys} | {"target": rows})
-    right = pd.DataFrame({name: cirs[name] for name in (*keys, "cir", "first_path_index")})
-    right = right[right["cir"] >= 0].assign(cir_stamp=right["stamp"])
-    left, right = (frame.sort_values("stamp", kind="stable") for frame in (left, right))
+    targets = pd.DataFrame({name: ranges[name][rows] for name in keys} | {"target": rows})
+    sources = pd.DataFrame({name: cirs[name] for name in (*keys, "cir", "first_path_index")})
+    sources = sources[sources["cir"] >= 0].assign(cir_stamp=sources["stamp"])
+    targets, sources = (frame.sort_values("stamp", kind="stable") for frame in (targets, sources))
     tolerance = {"direction": "nearest", "tolerance": round(join.tolerance_s * 1e9)}
-    pairs = pd.merge_asof(left, right, on="stamp", by=["tag", "anchor"], **tolerance).dropna(subset="cir")
+    pairs = pd.merge_asof(targets, sources, on="stamp", by=["tag", "anchor"], **tolerance).dropna(
+        subset="cir"
+    )
     # A CIR belongs to one range only.
     distance = (pairs["cir_stamp"] - pairs["stamp"]).abs()
     pairs = pairs.loc[distance.sort_values(kind="stable").index].drop_duplicates("cir")
     ranges["cir"][pairs["target"]] = pairs["cir"]
     index = pairs["first_path_index"]
     ranges["first_path_index"][pairs["target"][index.notna()]] = index.dropna()
-    return _summary(left, right, len(pairs), join)
+    return _summary(targets, sources, len(pairs), join)
 
 
 def _summary(ranges: Any, cirs: Any, attached: int, join: Join) -> tuple[str, bool]:

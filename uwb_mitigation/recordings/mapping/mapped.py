@@ -185,9 +185,11 @@ class MappedRecording(Source):
                     if before > MAX_RANGES:
                         raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
                     chunk = chunk.take(filter_rows(table.drop, chunk, self.dropped, what))
-                    part = converter.convert(chunk, name)
-                    part["cir"] = self._cirs.add(cir, chunk) if cir else np.full(chunk.count, -1)
-                    tables.append(part | {"row": chunk.rows, "file": np.full(chunk.count, number, np.int32)})
+                    table_rows = converter.convert(chunk, name)
+                    table_rows["cir"] = self._cirs.add(cir, chunk) if cir else np.full(chunk.count, -1)
+                    tables.append(
+                        table_rows | {"row": chunk.rows, "file": np.full(chunk.count, number, np.int32)}
+                    )
             except DamagedRecordingError as error:
                 self._damage = error
                 self.warnings.append(f"{error}: only the rows before are used")

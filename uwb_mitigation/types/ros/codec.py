@@ -163,21 +163,21 @@ def decode_range(data: bytes) -> RangeMeasurement:
         RecordingError: the bytes are not a `RangeCir`; `what` is one of a few texts without values,
             so that callers can count errors by it.
     """
-    stamp_ns, frame_id, at = _decode_header(data)
-    _require(data, at + _RANGE_CIR.size)
+    stamp_ns, frame_id, offset = _decode_header(data)
+    _require(data, offset + _RANGE_CIR.size)
     (tag_id, anchor_id, sequence, ticks, range_m, period, start, first_path, encoding, scale, count) = (
-        _RANGE_CIR.unpack_from(data, at)
+        _RANGE_CIR.unpack_from(data, offset)
     )
     if encoding not in _ENCODINGS:
         raise RecordingError("message with an unknown CIR encoding", where=f"encoding {encoding}")
-    at += _RANGE_CIR.size
-    powers_at = at + 2 * count + _CIR_COUNTS.size + 2 * (count % 2)
+    offset += _RANGE_CIR.size
+    powers_at = offset + 2 * count + _CIR_COUNTS.size + 2 * (count % 2)
     missing = powers_at + _CIR_POWERS.size - len(data)
     if 0 < missing <= _CIR_SOURCE_BYTES:
         # Padding of an earlier version is zero, too: UNKNOWN.
         data += bytes(missing)
     _require_end(data, powers_at + _CIR_POWERS.size)
-    preamble_count, noise_threshold = _CIR_COUNTS.unpack_from(data, at + 2 * count)
+    preamble_count, noise_threshold = _CIR_COUNTS.unpack_from(data, offset + 2 * count)
     rx_power, first_path_power, channel, prf, radio, segment = _CIR_POWERS.unpack_from(data, powers_at)
     if radio not in _RADIOS or segment not in _SEGMENTS:
         raise RecordingError(
@@ -191,7 +191,7 @@ def decode_range(data: bytes) -> RangeMeasurement:
         ticks,
         range_m,
         Cir(
-            np.frombuffer(data, "<i2", count, at),
+            np.frombuffer(data, "<i2", count, offset),
             _ENCODINGS[encoding],
             start,
             first_path,
@@ -216,12 +216,12 @@ def decode_truth(data: bytes) -> tuple[MeasurementKey, Truth]:
     Raises:
         RecordingError: the bytes are not a `RangeTruth`; `what` as for `decode_range`.
     """
-    stamp_ns, _, at = _decode_header(data)
-    _require(data, at + _TRUTH.size)
-    tag_id, anchor_id, sequence, range_m = _TRUTH.unpack_from(data, at)
-    label, at = _decode_string(data, at + _TRUTH.size)
-    configuration, at = _decode_string(data, at + -at % 4)
-    _require_end(data, at)
+    stamp_ns, _, offset = _decode_header(data)
+    _require(data, offset + _TRUTH.size)
+    tag_id, anchor_id, sequence, range_m = _TRUTH.unpack_from(data, offset)
+    label, offset = _decode_string(data, offset + _TRUTH.size)
+    configuration, offset = _decode_string(data, offset + -offset % 4)
+    _require_end(data, offset)
     return MeasurementKey(stamp_ns, tag_id, anchor_id, sequence), Truth(range_m, label, configuration)
 
 
@@ -231,10 +231,10 @@ def decode_corrected(data: bytes) -> tuple[MeasurementKey, CorrectedRange]:
     Raises:
         RecordingError: the bytes are not a `RangeCorrected`; `what` as for `decode_range`.
     """
-    stamp_ns, _, at = _decode_header(data)
-    _require_end(data, at + _CORRECTED.size)
+    stamp_ns, _, offset = _decode_header(data)
+    _require_end(data, offset + _CORRECTED.size)
     (tag_id, anchor_id, sequence, range_m, raw_m, correction_m, variance_m2, status, origin, model_id) = (
-        _CORRECTED.unpack_from(data, at)
+        _CORRECTED.unpack_from(data, offset)
     )
     if status not in _STATUSES:
         raise RecordingError("message with an unknown status", where=f"status {status}")
@@ -364,8 +364,8 @@ def _decode_header(data: bytes) -> tuple[int, str, int]:
         raise RecordingError(f"message in {kind}", where=encapsulation.hex(" "), valid="little-endian CDR")
     if nanoseconds >= NS_PER_S:
         raise RecordingError("message with an invalid time stamp", where=f"nanosec {nanoseconds}")
-    frame_id, at = _decode_string(data, _PREFIX.size - _LENGTH.size)
-    return seconds * NS_PER_S + nanoseconds, frame_id, first_field_offset(at)
+    frame_id, offset = _decode_string(data, _PREFIX.size - _LENGTH.size)
+    return seconds * NS_PER_S + nanoseconds, frame_id, first_field_offset(offset)
 
 
 def _append_string(data: bytes, text: str) -> bytes:
@@ -373,21 +373,21 @@ def _append_string(data: bytes, text: str) -> bytes:
     return data + bytes(-len(data) % 4) + _LENGTH.pack(len(encoded)) + encoded
 
 
-def _decode_string(data: bytes, at: int) -> tuple[str, int]:
+def _decode_string(data: bytes, offset: int) -> tuple[str, int]:
     """Return the string at `at`, and its end."""
-    _require(data, at + _LENGTH.size)
-    (length,) = _LENGTH.unpack_from(data, at)
-    at += _LENGTH.size
-    end = at + length
+    _require(data, offset + _LENGTH.size)
+    (length,) = _LENGTH.unpack_from(data, offset)
+    offset += _LENGTH.size
+    end = offset + length
     _require(data, end)
     # Some middleware sends empty strings without the terminator.
-    text = data[at:end]
+    text = data[offset:end]
     if text and text[-1] != 0:
-        raise RecordingError("message with an unterminated string", where=f"byte {at}")
+        raise RecordingError("message with an unterminated string", where=f"byte {offset}")
     try:
         return text[:-1].decode(), end
     except UnicodeDecodeError:
-        raise RecordingError("message with a string that is not UTF-8", where=f"byte {at}") from None
+        raise RecordingError("message with a string that is not UTF-8", where=f"byte {offset}") from None
 
 
 def _require(data: bytes, size: int) -> None:

@@ -61,7 +61,7 @@ def tag_topic(topic: str, tag_id: int | None) -> str:
 
 def encode_pose(estimate: Estimate, frame_id: str = MAP) -> bytes:
     """Return `geometry_msgs/PoseWithCovarianceStamped` in CDR."""
-    return serialize(POSE_TYPE, header=header(estimate.stamp_ns, frame_id), pose=_pose(estimate))
+    return serialize(POSE_TYPE, header=header_fields(estimate.stamp_ns, frame_id), pose=_pose(estimate))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def encode_odometry(
         np.fill_diagonal(covariance, variances)
     return serialize(
         ODOMETRY_TYPE,
-        header=header(estimate.stamp_ns, frame_id),
+        header=header_fields(estimate.stamp_ns, frame_id),
         child_frame_id=child_frame_id,
         pose=_pose(estimate),
         twist=Fields(twist=velocity, covariance=covariance.ravel()),
@@ -153,7 +153,7 @@ def decode_true_position(data: bytes) -> tuple[int, int, tuple[float, float, flo
     return to_ns(odometry.header.stamp), tag_id, xyz, 2.0 * math.atan2(turn.z, turn.w) if has_yaw else None
 
 
-def header(stamp_ns: int, frame_id: str) -> Fields:
+def header_fields(stamp_ns: int, frame_id: str) -> Fields:
     """Return the fields of `std_msgs/Header`."""
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     return Fields(stamp=Fields(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)

@@ -89,20 +89,20 @@ def difference(schema: str, type_name: str) -> str | None:
     Comments and constants are ignored, because they do not change the layout. None: messages of that
     schema can be decoded.
     """
-    found = _layout(schema)
+    sections = _layout(schema)
     for section, fields in _layout(definition(type_name)).items():
         place = section or type_name
-        if section not in found:
+        if section not in sections:
             return f"{place} is not defined"
-        for number, wanted in enumerate(fields):
-            have = found[section][number] if number < len(found[section]) else None
-            if have is None and (section, wanted[1]) in _OPTIONAL:
+        for number, field in enumerate(fields):
+            have = sections[section][number] if number < len(sections[section]) else None
+            if have is None and (section, field[1]) in _OPTIONAL:
                 continue
-            if have != wanted:
+            if have != field:
                 shown = " ".join(have) if have else "nothing"
-                return f"field {number + 1} of {place} is {shown!r}, expected {' '.join(wanted)!r}"
-        if len(found[section]) > len(fields):
-            extra = " ".join(found[section][len(fields)])
+                return f"field {number + 1} of {place} is {shown!r}, expected {' '.join(field)!r}"
+        if len(sections[section]) > len(fields):
+            extra = " ".join(sections[section][len(fields)])
             return f"{place} has an additional field {extra!r}"
     return None
 
@@ -130,7 +130,7 @@ def _layout(schema: str) -> Layout:
 
 def _full_name(type_name: str) -> str:
     """Return `pkg/Name` for `pkg/msg/Name`, and for `Name` inside the same package."""
-    parts = [part for part in type_name.split("/") if part != "msg"]
-    if len(parts) == 1 and parts[0][:1].isupper():
-        return "std_msgs/Header" if parts[0] == "Header" else f"{PACKAGE}/{parts[0]}"
-    return "/".join(parts)
+    names = [name for name in type_name.split("/") if name != "msg"]
+    if len(names) == 1 and names[0][:1].isupper():
+        return "std_msgs/Header" if names[0] == "Header" else f"{PACKAGE}/{names[0]}"
+    return "/".join(names)
