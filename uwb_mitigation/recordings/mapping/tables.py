@@ -245,11 +245,14 @@ class _Tail(io.RawIOBase):
         """Return why the last line is not complete; empty: it is."""
         if not self.tail.endswith((b"\n", b"\r")):
             return "the file does not end with a line break"
-        *_, start, line = [b"", *self.tail.rstrip().splitlines()]
-        text = line.decode(errors="replace")
-        fields = next(csv.reader([text], delimiter=separator), []) if len(separator) == 1 else text.split()
-        # The start of a line that is longer than the tail is unknown.
-        return "the last row is short" if start and len(fields) < columns else ""
+        widths = []
+        for line in self.tail.rstrip().splitlines()[-2:]:
+            text = line.decode(errors="replace")
+            fields = (
+                next(csv.reader([text], delimiter=separator), []) if len(separator) == 1 else text.split()
+            )
+            widths.append(len(fields))
+        return "the last row is short" if widths[-1:] < [columns] and widths[-1:] < widths[:1] else ""
 
 
 def _csv(table: TableFormat, path: Path, choose: _Choose, on_warning: OnWarning | None) -> _Rows:
