@@ -284,6 +284,17 @@ def test_dry_run_shows_extent_outliers_names_and_missing_levels(tmp_path: Path):
     assert "no receive level" not in done.stdout
 
 
+def test_chunks_without_rows_do_not_change_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("uwb_mitigation.recordings.mapping.tables.CHUNK_ROWS", 2)
+    write(
+        tmp_path / "x.csv",
+        "t,a,r\n" + "".join(f"{n / 10},1,{-1 if n in (0, 1, 5) else n}\n" for n in range(8)),
+    )
+    source = read(PLAIN | {"drop": [{"column": "r", "below": 0}]}, tmp_path / "x.csv")
+    assert [record.measurement.range_m for record in source] == [2.0, 3.0, 4.0, 6.0, 7.0]
+    assert (source.values["cir"] == -1).all()
+
+
 def test_missing_output_folder_is_an_error_before_reading(tmp_path: Path):
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(PLAIN))
     done = run("data", "import", "absent.csv", "--map", "map.yaml", "-o", "no/x.mcap", folder=tmp_path)

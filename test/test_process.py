@@ -286,7 +286,7 @@ def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) ->
         (["in.mcap", "-o", "out.mcap", "--jobs", "0"], "jobs = 0"),
         (["in.mcap", "-o", "out.mcap", "--model", "absent.onnx"], "absent.onnx"),
         (["in.mcap", "-o", "out.mcap", "--offsets", "absent.yaml"], "absent.yaml"),
-        (["in.mcap", "-o", "no/such/folder.mcap"], "cannot be written"),
+        (["in.mcap", "-o", "no/such/folder.mcap"], "the folder of the output does not exist"),
     ],
 )
 def test_invalid_arguments_are_reported_in_one_line(tmp_path: Path, given: list[str], excerpt: str) -> None:

@@ -74,7 +74,12 @@ def open_mapped(path: Path, mapping: str) -> MappedRecording:
     from uwb_mitigation.recordings.mapping.mapped import MappedRecording
     from uwb_mitigation.recordings.mapping.mapping import load_mapping
 
-    return MappedRecording(load_mapping(mapping), path)
+    table = load_mapping(mapping)
+    try:
+        return MappedRecording(table, path)
+    except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
+        what = f"the values cannot be converted: {type(error).__name__}: {error!s:.200}"
+        raise RecordingError(what, where=str(path), valid=f"values as mapping {mapping} describes") from error
 
 
 def _is_bag(path: Path) -> bool:

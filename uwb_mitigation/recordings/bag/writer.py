@@ -109,13 +109,18 @@ class BagWriter:
         self._stream: BinaryIO | None = None
 
         check_bag_output(path, force=force)
-        with self._translate_os_errors():
-            self._created_folder = self._folder is not None and not self._folder.exists()
-            if self._folder is not None:
-                self._folder.mkdir(parents=True, exist_ok=True)
-            self._stream = self._partial.open("wb")
-            self._mcap = McapFile(self._stream, f"uwb_mitigation {uwb_mitigation.__version__}")
-            self._mcap.add_metadata(METADATA_RECORD, self._metadata)
+        self._created_folder = self._folder is not None and not self._folder.exists()
+        try:
+            with self._translate_os_errors():
+                if self._folder is not None:
+                    self._folder.mkdir(parents=True, exist_ok=True)
+                self._stream = self._partial.open("wb")
+                self._mcap = McapFile(self._stream, f"uwb_mitigation {uwb_mitigation.__version__}")
+                self._mcap.add_metadata(METADATA_RECORD, self._metadata)
+        except BaseException:
+            # Ctrl-C before the `with` block of the caller.
+            self._discard()
+            raise
 
     @property
     def counts(self) -> Counter[str]:

@@ -47,14 +47,14 @@ as `range`, `true range` and `tag x`: float64, NaN: unknown."""
 
 def concat(tables: list[ColumnDict]) -> ColumnDict:
     """Concatenate tables with the same columns, and empty them to save memory."""
-    count = sum(len(table["stamp"]) if "stamp" in table else len(table["row"]) for table in tables)
     columns = {}
     for name in list(tables[0]):
         arrays = [table.pop(name) for table in tables]
-        is_constant = all(array.strides == (0,) for array in arrays)
-        columns[name] = (
-            np.broadcast_to(arrays[0][:1], count) if is_constant and count else np.concatenate(arrays)
-        )
+        arrays = [array for array in arrays if len(array)] or arrays
+        if all(array.strides == (0,) for array in arrays):
+            columns[name] = np.broadcast_to(arrays[0][:1], sum(map(len, arrays)))
+        else:
+            columns[name] = np.concatenate(arrays)
     return columns
 
 

@@ -115,6 +115,7 @@ class MappedRecording(Source):
         del values
         if mapping.cir and mapping.cir.files:
             self._add_other_cirs(mapping.cir)
+        del self.values["row"]
         if is_numbered := bool(mapping.fields.stamp and mapping.fields.stamp.rate_hz):
             self._separate_placements(mapping.fields.stamp.rate_hz if mapping.fields.stamp else 1.0)
         late = int(np.count_nonzero(np.diff(self.values["stamp"]) < 0))
@@ -186,7 +187,9 @@ class MappedRecording(Source):
                         raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
                     chunk = chunk.take(filter_rows(table.drop, chunk, self.dropped, what))
                     table_rows = converter.convert(chunk, name)
-                    table_rows["cir"] = self._cirs.add(cir, chunk) if cir else np.full(chunk.count, -1)
+                    table_rows["cir"] = (
+                        self._cirs.add(cir, chunk) if cir else np.broadcast_to(-1, chunk.count)
+                    )
                     tables.append(
                         table_rows | {"row": chunk.rows, "file": np.full(chunk.count, number, np.int32)}
                     )
@@ -226,7 +229,7 @@ class MappedRecording(Source):
         keys: dict[str, FieldRule | None] = {"first_path_index": source.first_path_index}
         if join:
             keys |= {"stamp": join.stamp, "tag": join.tag, "anchor": join.anchor}
-        self.values["first_path_index"] = self.values["first_path_index"].copy()
+        self.values |= {name: self.values[name].copy() for name in ("cir", "first_path_index")}
         for number, file in enumerate(self._files):
             if paths := self._files_of(source, file, optional=source.optional):
                 rows = np.flatnonzero(self.values["file"] == number)
