@@ -144,8 +144,8 @@ def test_displays_start_if_they_are_installed(generate, tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("one_process", ["false", "true"])
-def test_finished_recording_is_not_replayed(generate, one_process: str):
-    given = {"source": "mcap", "path": "a.mcap", "one_process": one_process}
+def test_finished_recording_is_not_replayed(generate, one_process: str, tmp_path: Path):
+    given = {"source": "mcap", "path": str(tmp_path), "one_process": one_process}
     respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **given)}
     assert respawning == (
         {"pipeline": False} if one_process == "true" else {"driver": False, "mitigator": True}
@@ -205,6 +205,8 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         ({"source": "serial"}, "serial without a port"),
         ({"source": "uci"}, "uci without a port"),
         ({"source": "decaranging"}, "decaranging without a path"),
+        ({"source": "mcap", "path": "absent.mcap"}, "path = absent.mcap: no such file"),
+        ({"source": "uci", "path": "absent.uci"}, "path = absent.uci: no such file"),
     ],
 )
 def test_invalid_argument_stops_the_launch(generate, given: dict[str, str], excerpt: str):
@@ -274,7 +276,7 @@ def test_simulation_starts_only_on_request(generate, tmp_path: Path):
     with pytest.raises(RuntimeError, match=r"source:=serial.*source:=simulated"):
         launch(generate, "uwb.launch.py")
     mine = tmp_path / "mine.yaml"
-    mine.write_text("driver:\n  ros__parameters:\n    source: mcap\n    path: a.mcap\n")
+    mine.write_text(f"driver:\n  ros__parameters:\n    source: mcap\n    path: {tmp_path}\n")
     driver, _ = launch(generate, "uwb.launch.py", driver_params=str(mine))
     assert settings(driver) == {"use_sim_time": False}
     assert not driver.respawn

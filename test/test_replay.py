@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,9 +17,16 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
-from ros_harness import Ros
+from rclpy.serialization import serialize_message
+from rclpy.time import Time
+from ros_harness import PAUSED, Ros
 from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import Imu
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
@@ -27,6 +35,8 @@ from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
+from uwb_mitigation.types.stamps import to_ns
 
 MS = 1_000_000
 COUNT = 400
@@ -340,3 +350,49 @@ def test_time_to_open_a_source_does_not_make_its_first_records_late():
     player = Player(SlowSource([0, 10 * MS, 20 * MS])).play()
     assert player.stamps[0] >= opened_ns[0]
     assert np.diff(player.stamps).tolist() == [10 * MS] * 2
+
+
+@pytest.mark.ros
+def test_odometry_imu_and_transforms_of_a_recording_are_replayed_with_the_same_shift(
+    ros: Ros, tmp_path: Path
+):
+    bag, records = tmp_path / "robot.mcap", list(SimulatedSource(seed=1, count=60, rate_hz=40.0))
+    stamps = [10**18 + record.measurement.stamp_ns for record in records]
+
+    def header(stamp_ns: int, frame: str) -> Header:
+        return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=frame)
+
+    with BagWriter(bag, {"source": "a test", "simulated": "true"}) as writer:
+        for record, stamp_ns in zip(records, stamps, strict=True):
+            writer.write(replace(record, measurement=replace(record.measurement, stamp_ns=stamp_ns)))
+            odometry = Odometry(header=header(stamp_ns + MS, "odom"), child_frame_id="base_link")
+            transforms = [
+                TransformStamped(header=header(stamp_ns + MS, parent), child_frame_id=child)
+                for parent, child in (("map", "odom"), ("odom", "base_link"))
+            ]
+            for topic, kind, message in (
+                ("/odom", ODOMETRY_TYPE, odometry),
+                ("/imu", IMU_TYPE, Imu(header=odometry.header)),
+                ("/tf", TF_TYPE, TFMessage(transforms=transforms)),
+            ):
+                writer.write_message(topic, kind, serialize_message(message), stamp_ns + 3 * MS)
+        mast = TransformStamped(header=header(stamps[0], "base_link"), child_frame_id="uwb_antenna")
+        writer.write_message(
+            "/tf_static", TF_TYPE, serialize_message(TFMessage(transforms=[mast])), stamps[9]
+        )
+        writer.write_message("/odom2", ODOMETRY_TYPE, serialize_message(Odometry()), stamps[9])
+    ranges, odometry = ros.collect(RangeCir, "/uwb/range_raw"), ros.collect(Odometry, "/odom")
+    imu, transforms = ros.collect(Imu, "/imu"), ros.collect(TFMessage, "/tf")
+    static = ros.collect(TFMessage, "/tf_static")
+    ros.start("driver", "source:=mcap", f"path:={bag}", *PAUSED)
+    ros.play()
+    ros.spin_until(lambda: all(len(messages) == 60 for messages in (ranges, odometry, imu, transforms)))
+    shift_ns = to_ns(ranges[0].header.stamp) - stamps[0]
+    expected = [stamp_ns + MS + shift_ns for stamp_ns in stamps]
+    assert [to_ns(message.header.stamp) for message in odometry] == expected
+    assert [to_ns(message.header.stamp) for message in imu] == expected
+    (links,) = {tuple((t.header.frame_id, t.child_frame_id) for t in m.transforms) for m in transforms}
+    assert links == (("odom", "base_link"),), "the locator of the replay publishes map to odom"
+    assert [to_ns(message.transforms[0].header.stamp) for message in transforms] == expected
+    assert [t.child_frame_id for message in static for t in message.transforms] == ["uwb_antenna"]
+    assert "/odom2" not in dict(ros.node.get_topic_names_and_types())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
@@ -15,6 +16,7 @@ from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.nodes.feeds.publishing import RangePublisher
 from uwb_mitigation.nodes.feeds.radios import RADIO_SOURCES, RadioFeed, SourceHandle, radio_source
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed, open_source
+from uwb_mitigation.nodes.feeds.robot_messages import RobotMessages
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
@@ -119,6 +121,10 @@ class Driver(ManagedNode):
     def _prepare_replay(self) -> Callable[[], SourceHandle]:
         source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
         self._output = output = RangePublisher(self, self._consumer, corrections=False, recording=True)
+        robot = None
+        if self.value("source") == "mcap":
+            names = [name.strip() for name in self.value("robot_topics").split(",")]
+            robot = RobotMessages(self, Path(self.value("path")).expanduser(), names)
         # A node that publishes /clock must not wait for /clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         clock = steady if self.value("publish_clock") else self.get_clock()
@@ -131,6 +137,7 @@ class Driver(ManagedNode):
             publish=output.publish_records,
             on_time=output.publish_clock,
             on_end=self._finish,
+            robot=robot,
         )
 
     def _check(self, values: Mapping[str, Any]) -> None:

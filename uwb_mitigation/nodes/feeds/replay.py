@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import heapq
 import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.nodes.feeds.robot_messages import RobotMessage, RobotMessages
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import clock_reader
@@ -119,6 +121,7 @@ class ReplayFeed:
         subscribers: returns the number of subscribers.
         publish: publishes [(record, stamp_ns), ...].
         on_time: with `publish_clock`, called with the recorded time (ns) at every tick, to drive `/clock`.
+        robot: messages of a recorded robot; None: none.
         on_end: called once from the playing thread with the error or None, unless `stop` came first.
 
     Attributes:
@@ -137,10 +140,12 @@ class ReplayFeed:
         publish: Callable[[Sequence[tuple[Record, int]]], None],
         on_time: Callable[[int], None],
         on_end: Callable[[UwbMitigationError | None], None],
+        robot: RobotMessages | None = None,
     ) -> None:
         self.played = 0
         self.late_ns = 0
         self._source = source
+        self._robot = robot
         self._clock = ReplayClock(clock)
         self._value = value
         self._logger = logger
@@ -163,6 +168,12 @@ class ReplayFeed:
             self._logger.warning(f"replaying simulated ranges: {self._source.name}")
         else:
             self._logger.info(f"replaying {self._source.name}")
+        if self._robot is not None and self._robot.topics:
+            self._logger.info(f"replaying {', '.join(self._robot.topics)} of the robot")
+            if self._rate != 1.0 and not self._uses_recorded_stamps:
+                self._logger.warning(
+                    "velocities and yaw rates of the robot do not fit the stamps of another rate: set publish_clock"
+                )
         self._thread.start()
 
     def stop(self) -> None:
@@ -248,8 +259,8 @@ class ReplayFeed:
         last_ns: int | None = None
         pause_ns, longest_ns = 1, int(self._value("longest_pause") * NS_PER_S)
         try:
-            for record in self._source:
-                recorded_ns = record.measurement.stamp_ns
+            for record in self._recorded():
+                recorded_ns = _recorded_ns(record)
                 if first_ns is None:
                     first_ns = recorded_ns
                 if recorded_ns - first_ns < from_ns:
@@ -269,6 +280,11 @@ class ReplayFeed:
                 stamp_ns = recorded_ns
                 if not self._uses_recorded_stamps:
                     stamp_ns = self._clock.stamp_ns(self._clock_ns(due_ns))
+                if isinstance(record, RobotMessage):
+                    self._flush()
+                    assert self._robot is not None
+                    self._robot.publish(record, stamp_ns - recorded_ns)
+                    continue
                 self._late.append((record, stamp_ns))
                 if late_ns < LATE_NS or len(self._late) == BATCH:
                     self._flush()
@@ -277,6 +293,12 @@ class ReplayFeed:
             self._flush()
         # The next round begins when the next record would be due.
         return first_ns is not None, due_ns + max(pause_ns, 1)
+
+    def _recorded(self) -> Iterator[Record | RobotMessage]:
+        if self._robot is None:
+            return iter(self._source)
+        self._robot.publish_static()
+        return heapq.merge(self._source, self._robot, key=_recorded_ns)
 
     def _start_clock(self, due_ns: int) -> None:
         """Let a record be due not before now: opening a source and skipping records takes time."""
@@ -318,3 +340,7 @@ class ReplayFeed:
         if self._paused:
             return self._reference_ns
         return self._reference_ns + int((now_ns - self._reference_clock_ns) * self._rate)
+
+
+def _recorded_ns(item: Record | RobotMessage) -> int:
+    return item.recorded_ns if isinstance(item, RobotMessage) else item.measurement.stamp_ns

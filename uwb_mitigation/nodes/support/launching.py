@@ -177,7 +177,7 @@ def check_package(argument: str, package: str) -> None:
 
 
 def check_driver(values: Mapping[str, Any]) -> None:
-    """Raise ParameterError if the source needs a port or a recording, and none is given."""
+    """Raise ParameterError if the source needs a port or a recording, and none is given, or the recording is missing."""
     serial = ("port", "/dev/ttyACM0")
     needed = {
         "serial": serial,
@@ -192,6 +192,8 @@ def check_driver(values: Mapping[str, Any]) -> None:
     name, example = needed.get(str(source), ("", ""))
     if name and not values.get(name):
         raise ParameterError(f"source {source} without a {name}", valid=f"{name}:={example}")
+    if name == "path" and not Path(str(values["path"])).expanduser().exists():
+        raise ParameterError(f"parameter path = {values['path']}: no such file or folder")
 
 
 def from_files(node: str, node_file: str, shared: str = "") -> dict[str, Any]:

@@ -136,6 +136,9 @@ DRIVER = (
     Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging), or a capture (uci)."),
     Parameter("topic", "", "Topic of the ranges inside the bag, empty: /uwb/range_raw (mcap); or topics instead of those "
               "of the mapping, separated by commas (topic)."),
+    Parameter("robot_topics", "/odom,/imu,/tf,/tf_static", "Topics of a robot that are replayed with the ranges of a bag, if "
+              "it contains them, separated by commas: Odometry, Imu and TFMessage. Transforms from map are left out, because "
+              "a locator publishes them. Empty: none (mcap)."),
     Parameter("map", "", "Mapping file for messages of other software, or name of a shipped mapping (topic)."),
     Parameter("cir", "final", "Frame whose CIR belongs to a range (decaranging).",
               choices=("final", "poll")),
