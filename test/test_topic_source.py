@@ -26,7 +26,8 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError
-from uwb_mitigation.nodes.feeds.topic import TopicFeed, message_type
+from uwb_mitigation.nodes.feeds.topic import TopicFeed
+from uwb_mitigation.nodes.support.endpoints import message_type
 from uwb_mitigation.recordings.mapping.mapping import FieldRule, Mapping, RowFilter, load_mapping
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.types.measurement import RangeMeasurement

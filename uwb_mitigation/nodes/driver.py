@@ -16,7 +16,6 @@ from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.nodes.feeds.publishing import RangePublisher
 from uwb_mitigation.nodes.feeds.radios import RADIO_SOURCES, RadioFeed, SourceHandle, radio_source
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed, open_source
-from uwb_mitigation.nodes.feeds.robot_messages import RobotMessages
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
@@ -123,6 +122,9 @@ class Driver(ManagedNode):
         self._output = output = RangePublisher(self, self._consumer, corrections=False, recording=True)
         robot = None
         if self.value("source") == "mcap":
+            # Other sources do not need the readers of bags.
+            from uwb_mitigation.nodes.feeds.robot_messages import RobotMessages
+
             names = [name.strip() for name in self.value("robot_topics").split(",")]
             robot = RobotMessages(self, Path(self.value("path")).expanduser(), names)
         # A node that publishes /clock must not wait for /clock.

@@ -9,12 +9,11 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 from rclpy.clock import Clock, ClockType
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
-from uwb_mitigation.nodes.feeds.robot_messages import RobotMessage, RobotMessages
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import clock_reader
@@ -107,6 +106,27 @@ class ReplayClock:
         return self._clock.clock_type == ClockType.ROS_TIME and bool(self._clock.ros_time_is_active)
 
 
+class RobotMessage(NamedTuple):
+    """A recorded message, and the time in the recording at which it is due."""
+
+    recorded_ns: int
+    topic: str
+    message: Any
+
+
+class RobotSource(Protocol):
+    """Recorded messages of a robot in the order of time; see `robot_messages.RobotMessages`."""
+
+    @property
+    def topics(self) -> list[str]: ...
+
+    def publish_static(self) -> None: ...
+
+    def __iter__(self) -> Iterator[RobotMessage]: ...
+
+    def publish(self, item: RobotMessage, shift_ns: int) -> None: ...
+
+
 class ReplayFeed:
     """Publishes the records of a source when they are due, from its own thread; implements `Feed`.
 
@@ -140,7 +160,7 @@ class ReplayFeed:
         publish: Callable[[Sequence[tuple[Record, int]]], None],
         on_time: Callable[[int], None],
         on_end: Callable[[UwbMitigationError | None], None],
-        robot: RobotMessages | None = None,
+        robot: RobotSource | None = None,
     ) -> None:
         self.played = 0
         self.late_ns = 0

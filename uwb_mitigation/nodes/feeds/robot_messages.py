@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.time import Time
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.nodes.feeds.topic import message_type
+from uwb_mitigation.nodes.feeds.replay import RobotMessage
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.recordings.bag.reader import BagReader
@@ -24,14 +24,6 @@ _TYPES = (ODOMETRY_TYPE, IMU_TYPE, TF_TYPE)
 _QOS = QoSProfile(depth=100)
 _MAX_DELAY_NS = NS_PER_S
 """A message that was received later than this after its stamp is due when it was received."""
-
-
-class RobotMessage(NamedTuple):
-    """A recorded message, and the time in the recording at which it is due."""
-
-    recorded_ns: int
-    topic: str
-    message: Any
 
 
 class RobotMessages:
@@ -53,7 +45,9 @@ class RobotMessages:
     def __init__(self, node: ManagedNode, path: Path, topics: Iterable[str]) -> None:
         self._path, self._node = path, node
         recorded = BagReader(path).topics
-        self._types = {name: message_type(recorded[name]) for name in topics if recorded.get(name) in _TYPES}
+        self._types = {
+            name: endpoints.message_type(recorded[name]) for name in topics if recorded.get(name) in _TYPES
+        }
         self._publishers = {name: self._create_publisher(name) for name in self._types}
 
     @property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.recordings.mapping.conversion import (
@@ -28,25 +27,6 @@ from uwb_mitigation.recordings.mapping.tables import LOG_TIME, TOPIC, UNREADABLE
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement
 
 _WARNING_PERIOD_S = 10.0
-
-
-def message_type(name: str) -> type:
-    """Return the class of a message type such as `sensor_msgs/msg/Range`.
-
-    Raises:
-        ParameterError: The name has another form.
-        MissingDependencyError: The package is not installed, or has no such message.
-    """
-    package, _, kind = name.replace("/msg/", "/").partition("/")
-    if not (package.isidentifier() and kind.isidentifier()):
-        raise ParameterError(f"type = {name!r:.60}", valid="PACKAGE/msg/NAME, such as sensor_msgs/msg/Range")
-    try:
-        message_class: type = getattr(import_module(f"{package}.msg"), kind)
-    except (ImportError, AttributeError) as error:
-        raise MissingDependencyError(
-            f"the message type {name} is not installed", valid=f"install {package}, and source its workspace"
-        ) from error
-    return message_class
 
 
 class TopicFeed:
@@ -89,7 +69,7 @@ class TopicFeed:
         self._problem = ""
         self._node, self._mapping, self._on_range, self._now_ns = node, mapping, on_range, now_ns
         self._meter = diagnostics.RateMonitor(now_ns)
-        self._type = message_type(mapping.type)
+        self._type = endpoints.message_type(mapping.type)
         self._converter = Converter(mapping.values)
         extra_columns = [*mapping.cir_columns, *(rule.column for rule in mapping.drop)]
         self._rows = MessageRows(mapping, self._converter.columns | dict.fromkeys(extra_columns, False))

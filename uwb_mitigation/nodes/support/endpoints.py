@@ -10,6 +10,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -22,7 +23,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
 
-from uwb_mitigation.errors import ParameterError, format_id
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, format_id
 from uwb_mitigation.types.measurement import CorrectedRange
 from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, relative
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -55,6 +56,25 @@ LATCHED = QoSProfile(
     depth=1,
 )
 """QoS of messages that late-joining subscribers need too."""
+
+
+def message_type(name: str) -> type:
+    """Return the class of a message type such as `sensor_msgs/msg/Range`.
+
+    Raises:
+        ParameterError: The name has another form.
+        MissingDependencyError: The package is not installed, or has no such message.
+    """
+    package, _, kind = name.replace("/msg/", "/").partition("/")
+    if not (package.isidentifier() and kind.isidentifier()):
+        raise ParameterError(f"type = {name!r:.60}", valid="PACKAGE/msg/NAME, such as sensor_msgs/msg/Range")
+    try:
+        message_class: type = getattr(import_module(f"{package}.msg"), kind)
+    except (ImportError, AttributeError) as error:
+        raise MissingDependencyError(
+            f"the message type {name} is not installed", valid=f"install {package}, and source its workspace"
+        ) from error
+    return message_class
 
 
 def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
