@@ -23,9 +23,11 @@ from PIL import Image
 
 from benchmarks.equipment.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.types.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
+from uwb_mitigation.viewer.health import predicted_accuracy
 from uwb_mitigation.viewer.page import Page, View
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
@@ -673,3 +675,112 @@ def test_invalid_floor_plan_is_refused(tmp_path: Path, text: str, cause: str) ->
     path.write_text(text)
     with pytest.raises(ParameterError, match=cause):
         load_floor_plan(path)
+
+
+def test_empty_page_has_axes_and_no_dark_blocks(browser: Browser, view: View, server: ViewerServer) -> None:
+    open_page(browser, server)
+    assert len(browser.column("waterfall", "image")) == 0
+    ends = browser.run(
+        "return ['cir', 'strip', 'errors'].flatMap((name) => ['x_range', 'y_range'].flatMap((range) => {"
+        "  const {start, end} = Bokeh.documents[0].get_model_by_name(name)[range]; return [start, end]}))"
+    )
+    assert all(end is not None and math.isfinite(end) for end in ends)
+    assert cards(browser) == {}
+    browser.screenshot("viewer_empty")
+
+
+def test_anchors_have_a_traffic_light_and_advice(
+    browser: Browser, view: View, server: ViewerServer, clock: Clock
+) -> None:
+    with view.lock:
+        view.scene.set_anchors({1: AnchorPosition(0, 0, 2), 2: AnchorPosition(8, 0, 2)})
+        view.scene.add_pose("tag", Pose(4, 3, 2, stamp_s=1005.0))
+        for step in range(20):
+            for anchor, range_m in ((1, 5.0), (2, 5.42)):
+                view.scene.add_sample(
+                    (anchor, 7), Sample(1005.0 + step / 10, range_m, range_m, 0.1, Status.OK)
+                )
+    open_page(browser, server)
+    browser.wait(
+        "advice", lambda: "Anchor 2 reads 0.42 m long: calibrate, or check its position." in browser.text()
+    )
+    states = browser.run(
+        "return [...document.querySelectorAll('#health tr')].map((row) => row.cells[0].textContent)"
+    )
+    assert states[1].endswith("bad")
+    browser.click("checkbox", "predicted accuracy")
+    browser.wait("the map", lambda: len(browser.column("map", "dw")) == 1)
+    clock.now_s = 20.0
+    browser.wait("a stopped anchor", lambda: "Anchor 1 has not answered for 20 s" in browser.text())
+
+
+def test_predicted_accuracy_is_hdop_times_standard_deviation() -> None:
+    anchors = np.array([[0.0, 0.0, 1.0], [8.0, 0.0, 1.0], [8.0, 8.0, 1.0], [0.0, 8.0, 1.0]])
+    image, low, size = predicted_accuracy(anchors, 1.0, 0.1)
+    centre = np.array([*(low + size * (20 + 0.5) / 40), 1.0])
+    assert image[20, 20] == pytest.approx(0.1 * dop(anchors, centre, level=True).hdop, rel=1e-5)
+    assert np.isnan(predicted_accuracy(anchors[:1], 1.0, 0.1)[0]).all()
+
+
+def test_many_diagnostics_scroll_and_a_printed_page_is_complete(
+    browser: Browser, view: View, server: ViewerServer
+) -> None:
+    fill_scene(view)
+    with view.lock:
+        for number in range(64):
+            view.scene.set_node_status(f"node_{number}", NodeStatus(0, "text " * 60))
+    open_page(browser, server)
+    assert browser.run("return document.documentElement.scrollHeight") < 3500
+    browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    try:
+        clipped = "return [...document.querySelectorAll('.scroll')].filter((e) => e.scrollHeight > e.clientHeight + 1).length"
+        browser.wait("complete tables", lambda: browser.run(clipped) == 0)
+        overlaps = (
+            "const boxes = ['map', 'strip', 'cir', 'waterfall', 'errors'].map((id) => document.getElementById(id).getBoundingClientRect());"
+            "return boxes.some((a, i) => boxes.some((b, j) => i < j && a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1))"
+        )
+        assert not browser.run(overlaps)
+    finally:
+        browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+
+
+def test_selected_pair_survives_a_restart(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    browser.open(server.url + "#anchor=3&tag=7")
+    browser.wait("the requested pair", lambda: browser.find("heading", "Range: anchor 3, tag 7"))
+    with view.lock:
+        view.scene.add_sample((3, 7), Sample(1005.0, 5.3, 5.2, 0.1, Status.OK))
+    browser.wait("its range", lambda: len(browser.column("strip", "raw")) == 1)
+    assert "anchor=3" in browser.driver.current_url
+
+
+def test_space_pauses(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    open_page(browser, server)
+    browser.driver.find_element("css selector", "body").send_keys(" ")
+    browser.wait("a pause", lambda: browser.find("button", "Resume"))
+    browser.wait("the state", lambda: "PAUSED" in browser.text())
+
+
+def test_token_protects_page_script_and_websocket(browser: Browser, view: View) -> None:
+    with ViewerServer(view, "0.0.0.0", 0, token="s3cret/+") as server:
+        assert server.warning == ""
+        for path in ("", "ws", "static/js/bokeh.min.js", "?token=wrong", "?token="):
+            assert fetch(server, path, Host=f"localhost:{server.port}").status == 403
+        fill_scene(view)
+        browser.open(server.url)
+        browser.wait("the page", browser.ready)
+        browser.wait("the pairs", lambda: len(browser.column("pairs", "anchor")) == 2)
+        with view.lock:
+            view.scene.add_sample((3, 7), Sample(1005.0, 5.3, 5.2, 0.1, Status.OK))
+        browser.wait("updates", lambda: len(browser.column("pairs", "anchor")) == 3)
+    with ViewerServer(view, "0.0.0.0", 0) as server:
+        assert "everyone in the network" in server.warning
+
+
+def test_ipv6_address_is_served(browser: Browser, view: View) -> None:
+    with ViewerServer(view, "::1", 0) as server:
+        assert server.url == f"http://[::1]:{server.port}/"
+        fill_scene(view)
+        open_page(browser, server)
+        assert browser.column("pairs", "anchor") == ["1", "2"]

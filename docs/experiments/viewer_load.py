@@ -49,7 +49,14 @@ def feed_ranges(feed: SceneUpdater, stop: threading.Event) -> None:
             with feed.lock:
                 feed.scene.add_pose(
                     f"tag_{tag}",
-                    Pose(12 + 8 * np.cos(angle), 9 + 6 * np.sin(angle), 1.0, (0.5, 0.3, 0.2), 1.0),
+                    Pose(
+                        12 + 8 * np.cos(angle),
+                        9 + 6 * np.sin(angle),
+                        1.0,
+                        (0.5, 0.3, 0.2),
+                        1.0,
+                        stamp_s=time.time(),
+                    ),
                 )
         for _ in range(int(RATE_HZ * PERIOD_S)):
             anchor, tag = 1 + sequence % ANCHORS, 1 + sequence // ANCHORS % TAGS

@@ -118,10 +118,12 @@ def _track(tracks: _Tracks, name: str, kind: TrackKind) -> NDArray[np.float64] |
 
 
 def _range_cards(means_m: dict[str, float], not_ok: int, count: int, window: str) -> list[Card]:
+    if not count:
+        return []
     cards = [
         [
             f"Ranges not OK, {window}",
-            f"{100.0 * not_ok / count:.1f} %" if count else "-",
+            f"{100.0 * not_ok / count:.1f} %",
             f"{not_ok} of {count}",
         ]
     ]
