@@ -4,22 +4,27 @@
         source:=evb1000 port:=/dev/ttyACM0 anchors:=anchors.yaml
 
 The coordinates of the anchors are those of the map. The robot's driver or a local EKF publishes odom -> base_link. Every
-argument of `uwb.launch.py` is accepted.
+argument of `uwb.launch.py` is accepted. With `namespace:=robot1` all nodes and relative topics are in /robot1, also /tf and
+/tf_static, as in Nav2's own launch files.
 """
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
+from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
 
 MAP_SERVER = "map_server"
 
 
-def included(package, file, **arguments):
+TF = [("/tf", "tf"), ("/tf_static", "tf_static")]
+NAMESPACE = LaunchConfiguration("namespace")
+
+
+def included(package, file, *actions, **arguments):
     path = PathJoinSubstitution([FindPackageShare(package), "launch", file])
     # A group of its own: defaults of one launch file must not reach the other, which has arguments of the same names.
-    return GroupAction([IncludeLaunchDescription(path, launch_arguments=arguments.items())])
+    return GroupAction([*actions, IncludeLaunchDescription(path, launch_arguments=arguments.items())])
 
 
 def generate_launch_description():
@@ -28,7 +33,8 @@ def generate_launch_description():
         [
             DeclareLaunchArgument("map", description="Map of Nav2, a YAML file."),
             DeclareLaunchArgument("params_file", description="Parameters of Nav2, a YAML file."),
-            DeclareLaunchArgument("odometry", default_value="/odom", description="Topic of the odometry."),
+            DeclareLaunchArgument("odometry", default_value="odom", description="Topic of the odometry."),
+            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the robot."),
             DeclareLaunchArgument(
                 "use_sim_time", default_value="false", description="Take the time from /clock."
             ),
@@ -38,12 +44,15 @@ def generate_launch_description():
                 locate="true",
                 publish_tf="true",
                 odometry=LaunchConfiguration("odometry"),
+                namespace=NAMESPACE,
             ),
             # Nav2's localization_launch.py would start AMCL too.
             Node(
                 package="nav2_map_server",
                 executable="map_server",
                 name=MAP_SERVER,
+                namespace=NAMESPACE,
+                remappings=TF,
                 parameters=[use_sim_time, {"yaml_filename": LaunchConfiguration("map")}],
                 output="screen",
             ),
@@ -51,12 +60,16 @@ def generate_launch_description():
                 package="nav2_lifecycle_manager",
                 executable="lifecycle_manager",
                 name="lifecycle_manager_map",
+                namespace=NAMESPACE,
                 parameters=[use_sim_time, {"autostart": True, "node_names": [MAP_SERVER]}],
                 output="screen",
             ),
             included(
                 "nav2_bringup",
                 "navigation_launch.py",
+                # It puts its parameters into the namespace, but not its nodes.
+                PushRosNamespace(NAMESPACE),
+                namespace=NAMESPACE,
                 params_file=LaunchConfiguration("params_file"),
             ),
         ]

@@ -46,7 +46,7 @@ def generate(monkeypatch: pytest.MonkeyPatch):
             "PathJoinSubstitution": lambda parts: parts,
         },
         "launch_ros": {},
-        "launch_ros.actions": {"Node": record("node")},
+        "launch_ros.actions": {"Node": record("node"), "PushRosNamespace": record("push")},
         "launch_ros.substitutions": {"FindPackageShare": lambda package: f"share/{package}"},
     }
     for name, contents in modules.items():
@@ -315,25 +315,35 @@ def test_malformed_board_is_refused(generate, text: str):
         launch(generate, "boards.launch.py", boards=text)
 
 
-def test_nav2_gets_the_transform_of_the_locator_and_no_amcl(generate):
+def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(generate):
     entities = generate("nav2.launch.py")
     groups = [entity.values[0] for entity in entities if entity.kind == "group"]
-    assert all(len(group) == 1 for group in groups), "each file in a scope of its own"
-    included = {group[0].values[0][0]: group[0] for group in groups}
-    assert {share: one.values[0][1:] for share, one in included.items()} == {
+    context = {"odometry": "odom", "namespace": "robot1", "params_file": "nav2.yaml"}
+    included = {group[-1].values[0][0]: group for group in groups}
+    assert {share: group[-1].values[0][1:] for share, group in included.items()} == {
         "share/uwb_mitigation": ["launch", "uwb.launch.py"],
         "share/nav2_bringup": ["launch", "navigation_launch.py"],
     }
+    pushed, navigation = included["share/nav2_bringup"]
+    assert (pushed.kind, pushed.values[0].perform(context)) == ("push", "robot1")
+    given = {name: value.perform(context) for name, value in navigation.launch_arguments}
+    assert given == {"namespace": "robot1", "params_file": "nav2.yaml"}
     nodes = [entity for entity in entities if entity.kind == "node"]
     assert [node.executable for node in nodes] == ["map_server", "lifecycle_manager"]
+    assert {node.namespace.perform(context) for node in nodes} == {"robot1"}
+    assert nodes[0].remappings == [("/tf", "tf"), ("/tf_static", "tf_static")]
     assert nodes[1].parameters[1]["node_names"] == [nodes[0].name]
     # The arguments for the locator, as uwb.launch.py understands them.
-    given = dict(included["share/uwb_mitigation"].launch_arguments)
-    given["odometry"] = given["odometry"].perform({"odometry": "/odom"})
+    (group,) = included["share/uwb_mitigation"]
+    given = {
+        name: value if isinstance(value, str) else value.perform(context)
+        for name, value in group.launch_arguments
+    }
     (locator,) = launch(generate, "uwb.launch.py", **given, anchors="a.yaml")
+    assert locator.namespace == "robot1"
     assert settings(locator) == {
         "publish_tf": True,
-        "odometry": "/odom",
+        "odometry": "odom",
         "anchors": "a.yaml",
         "use_sim_time": False,
     }

@@ -54,24 +54,27 @@ def stamp_ns(header: Header) -> int:
 class LiveRobot:
     """Publishes ranges and odometry of a robot in chunks, and waits until the locator has processed each."""
 
-    def __init__(self, ros: Ros, *, seconds: float = 40.0, imu: bool = False, slip=(0.0, 0.0)) -> None:
+    def __init__(
+        self, ros: Ros, *, seconds: float = 40.0, imu: bool = False, slip=(0.0, 0.0), namespace: str = ""
+    ) -> None:
         self.robot = Robot(lever=LEVER, facing=0.7, seconds=seconds, slip=slip)
         self.ranges = self.robot.ranges(seconds=seconds)
         # Old enough that the locator does not predict poses at the current time.
         self.start_ns = ros.node.get_clock().now().nanoseconds - round((seconds + 40.0) * NANOSECONDS)
         self._ros, self._at_s, self._uses_imu = ros, 0.0, imu
         qos = QoSProfile(depth=1000)
-        self._ranges_out = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", qos)
-        self._odometry_out = ros.node.create_publisher(Odometry, "/odom", qos)
-        self._imu_out = ros.node.create_publisher(Imu, "/imu", qos)
-        self.poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
-        self.odometry = ros.collect(Odometry, "/uwb/odometry")
-        self.transforms = ros.collect(TFMessage, "/tf")
+        self._ranges_out = ros.node.create_publisher(RangeCorrected, f"{namespace}/uwb/range_corrected", qos)
+        self._odometry_out = ros.node.create_publisher(Odometry, f"{namespace}/odom", qos)
+        self._imu_out = ros.node.create_publisher(Imu, f"{namespace}/imu", qos)
+        self.poses = ros.collect(PoseWithCovarianceStamped, f"{namespace}/uwb/pose")
+        self.odometry = ros.collect(Odometry, f"{namespace}/uwb/odometry")
+        self.transforms = ros.collect(TFMessage, f"{namespace}/tf")
+        self._namespace = namespace
         self.diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
 
     def wait(self) -> None:
-        self._ros.wait_for_subscribers("/uwb/range_corrected", 1)
-        self._ros.wait_for_subscribers("/odom", 1)
+        self._ros.wait_for_subscribers(f"{self._namespace}/uwb/range_corrected", 1)
+        self._ros.wait_for_subscribers(f"{self._namespace}/odom", 1)
 
     def header(self, stamp: int, frame: str = "") -> Header:
         stamp += self.start_ns
@@ -286,6 +289,34 @@ def test_lever_arm_of_the_parameters_and_yaw_rates_of_an_imu(ros: Ros, anchors: 
     ros.spin_until(lambda: bool(others))
     assert others[-1].pose.pose.position.z == pytest.approx(1.2, abs=0.09)
     assert live.poses[-1].pose.pose.position.z == pytest.approx(1.0, abs=0.09)
+
+
+def test_namespace_contains_the_topics_and_transforms_of_a_robot(ros: Ros, anchors: Path):
+    qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    static = ros.node.create_publisher(TFMessage, "/robot1/tf_static", qos)
+    antenna = TransformStamped(child_frame_id="uwb_antenna", header=Header(frame_id="base_link"))
+    antenna.transform = Transform(
+        translation=Vector3(x=LEVER[0], y=LEVER[1], z=LEVER[2]), rotation=Quaternion(w=1.0)
+    )
+    static.publish(TFMessage(transforms=[antenna]))
+    parameters = (f"anchors:={anchors}", "level:=true", f"height:={1.0 + LEVER[2]}", "odometry:=odom")
+    locator = ros.start(
+        "locator", *parameters, "rate:=0.0", "publish_tf:=true", arguments=("-r", "__ns:=/robot1")
+    )
+    locator.wait_for_output("locating")
+    elsewhere = ros.collect(TFMessage, "/tf")
+    live = LiveRobot(ros, seconds=16.0, namespace="/robot1")
+    live.wait()
+    live.play(16.0)
+    assert "lever arm of the antenna: 0.300, 0.100, 0.200" in locator.output
+    (links,) = {
+        (transform.header.frame_id, transform.child_frame_id)
+        for message in live.transforms
+        for transform in message.transforms
+    }
+    assert links == ("map", "odom")
+    assert np.abs(live.errors(live.poses[-20:])[1]).max() < math.radians(8.0)
+    assert not elsewhere
 
 
 def test_transform_is_repeated_while_there_is_no_position(ros: Ros, anchors: Path):
