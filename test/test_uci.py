@@ -313,6 +313,17 @@ def test_a_session_that_ends_by_itself_is_started_again_with_growing_pauses_and_
     assert not any("no answer to the reset" in text for text in texts)
 
 
+def test_a_session_that_ends_without_having_been_active_shows_its_reason():
+    class Silent(Ending):
+        def _state(self, handle, state):
+            return b"" if state == 2 else super()._state(handle, state)
+
+    run = Bench(Silent()).start()
+    for _ in range(100):
+        run.step()
+    assert "maximum number of measurements" in run.session.state
+
+
 def test_a_refused_start_is_repeated_with_growing_pauses():
     class Refusing(UciBoardModel):
         starts = 0

@@ -136,7 +136,7 @@ def test_the_first_board_is_the_tag_of_the_others():
     assert tag.session_id(3) == other.session_id(1)
 
 
-@pytest.mark.parametrize("anchors", [[3, 4], ["3", "0x4"], "3,4", array("q", [3, 4])])
+@pytest.mark.parametrize("anchors", [[3, 4], ["3", "0x4"], "3,4", "[3, 4]", array("q", [3, 4])])
 def test_anchors_are_a_list_or_a_text(anchors: object):
     row = next(row for row in DRIVER if row.name == "radio.anchors")
     row.check(anchors)

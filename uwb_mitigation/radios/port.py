@@ -185,6 +185,10 @@ class RadioPort(ABC):
         """True once `close` was called."""
         return self._stop.is_set()
 
+    def request_close(self) -> None:
+        """Let the thread close the hardware; `close` waits for it."""
+        self._stop.set()
+
     def close(self) -> None:
         """Stop the thread and close the hardware; may be called twice."""
         self._stop.set()

@@ -204,7 +204,7 @@ def read_addresses(value: ValueReader, name: str, highest: int = 2**64 - 2) -> t
         ParameterError: one of them is not an address.
     """
     content = value(PREFIX + name)
-    texts = content.split(",") if isinstance(content, str) else content
+    texts = content.strip(" []").split(",") if isinstance(content, str) else content
     texts = texts if isinstance(texts, Iterable) else [texts]
     addresses = []
     for text in filter(None, (str(item).strip() for item in texts)):

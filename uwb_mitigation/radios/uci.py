@@ -158,10 +158,10 @@ class UciPort(StreamPort):
 
     def close(self) -> None:
         """End the sessions, restore the calibration, and close the port."""
-        already_closed = self.closed
         super().close()
-        if self._capture is not None and not already_closed:
-            self._capture.close()
+        capture, self._capture = self._capture, None
+        if capture is not None:
+            capture.close()
 
     @property
     def problem(self) -> str:

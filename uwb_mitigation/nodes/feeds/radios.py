@@ -89,7 +89,9 @@ class RadioFeed:
         self._ports = self._source.open(self._settings, self._on_event, self._now_ns)
 
     def stop(self) -> None:
-        """Close the radios."""
+        """Close the radios, all at the same time."""
+        for port in self._ports:
+            port.request_close()
         for port in self._ports:
             port.close()
 

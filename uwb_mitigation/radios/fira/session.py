@@ -358,8 +358,13 @@ class UciSession:
         self._handles |= {self.settings.session_id(peer): handle, handle: handle}
         answer = yield _Command(codes.RANGE_START, struct.pack("<I", handle))
         # The answer may be lost, and a repeated start is refused.
-        started = handle in self._active or (answer is not None and answer.status == STATUS_OK)
-        return "" if started else _refused("RANGE_START", answer)
+        if handle in self._ended or handle in self._active:
+            return ""
+        if answer is None or answer.status != STATUS_OK:
+            return _refused("RANGE_START", answer)
+        # The notification of the active state may be lost.
+        self._active.add(handle)
+        return ""
 
     def _configure(self, handle: int, entries: list[tuple[int, bytes]]) -> _Steps:
         """Set the parameters of a session without those that the board rejects: firmware versions differ."""
