@@ -18,7 +18,7 @@ from functools import partial
 import serial
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.dw1000.port import ChipPort, read_chips
+from uwb_mitigation.radios.dw1000.port import ChipPort, open_chips, read_chips
 from uwb_mitigation.radios.port import OnEvent, PortAddress
 from uwb_mitigation.radios.settings import DEFAULT_RADIO, RadioSettings, ValueReader
 
@@ -49,30 +49,16 @@ class Evb1000Settings:
 
 
 def read_settings(value: ValueReader) -> list[Evb1000Settings]:
-    """Return the settings of each board from the parameters of the driver.
-
-    Raises:
-        ParameterError: a parameter is invalid.
-    """
+    """Return the settings of each radio from the parameters; raise ParameterError if one is invalid."""
     return [Evb1000Settings(PortAddress.parse(port), radio) for port, radio in read_chips(value)]
 
 
 def open(
     settings: Sequence[Evb1000Settings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
 ) -> list[ChipPort]:
-    """Open boards; `RadioPort.close` ends them. See `ChipPort` for the events.
-
-    Raises:
-        ParameterError: the settings are invalid.
-        MissingDependencyError: there is no C compiler.
-    """
-    ports = [
-        ChipPort(str(board.address), partial(Evb1000Bus, board.address), board.radio, on_event, stamp_clock)
-        for board in settings
-    ]
-    for port in ports:
-        port.start()
-    return ports
+    """Open radios; see `ChipPort` for the events and errors."""
+    chips = [(str(board.address), partial(Evb1000Bus, board.address), board.radio) for board in settings]
+    return open_chips(chips, on_event, stamp_clock)
 
 
 class Evb1000Bus:

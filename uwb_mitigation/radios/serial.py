@@ -35,17 +35,8 @@ from uwb_mitigation.radios.settings import (
     settings_text,
     status_warning,
 )
-from uwb_mitigation.radios.wire.events import (
-    Connected,
-    Disconnected,
-    Event,
-    LinkState,
-    ModeChanged,
-    ModeRefused,
-    OffsetsRefused,
-    RadioRefused,
-    VersionMismatch,
-)
+from uwb_mitigation.radios.wire import events
+from uwb_mitigation.radios.wire.events import Event, LinkState
 from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, LogLevel, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Log, RadioConfigured
 from uwb_mitigation.radios.wire.session import BoardSession
@@ -83,11 +74,7 @@ class SerialSettings:
 
 
 def read_settings(value: ValueReader) -> list[SerialSettings]:
-    """Return the settings of the board from the parameters of the driver.
-
-    Raises:
-        ParameterError: a parameter is invalid.
-    """
+    """Return the settings of the board from the parameters; raise ParameterError if one is invalid."""
     digits = value("board_model")
     if digits and not re.fullmatch("[0-9a-fA-F]{8}", digits):
         raise ParameterError(
@@ -116,7 +103,7 @@ def open(
         on_event: called with measurements, corrections, events of the session and `PortMessage`.
         stamp_clock: the clock of the stamps, ns.
     """
-    ports = [BoardPort(each_settings, on_event, stamp_clock) for each_settings in settings]
+    ports = [BoardPort(board, on_event, stamp_clock) for board in settings]
     for port in ports:
         port.start()
     return ports
@@ -235,10 +222,10 @@ class BoardPort(StreamPort):
         return self._observed(self.session.opened(now_ns))
 
     def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
-        events = self._observed(self.session.receive(data, now_ns, stamp_ns))
+        observed = self._observed(self.session.receive(data, now_ns, stamp_ns))
         if self.session.idle_ns(now_ns) > REOPEN_TIMEOUT_NS:
             raise LinkError("sends no data", where=str(self._address))
-        return events
+        return observed
 
     def _outgoing(self) -> bytes:
         return self.session.outgoing()
@@ -247,10 +234,10 @@ class BoardPort(StreamPort):
         self._was_connected = self.session.counts.connections > self._connections
         return self._observed(self.session.closed(now_ns))
 
-    def _observed(self, events: list[Event]) -> list[Any]:
+    def _observed(self, received: list[Event]) -> list[Any]:
         """Update the state for the diagnostics; return the events and the messages for the log."""
         observed: list[Any] = []
-        for event in events:
+        for event in received:
             observed.append(event)
             if (message := self._message(event)) is not None:
                 observed.append(message)
@@ -271,35 +258,35 @@ class BoardPort(StreamPort):
                 if settings != self._radio:
                     text = f"the board's radio {format_id(settings.address)}: {settings_text(settings)}"
                 self._radio = settings
-            case RadioRefused(text=reason):
+            case events.RadioRefused(text=reason):
                 self._refused[_RADIO_PROBLEM] = reason
                 level, text = logging.ERROR, f"{_RADIO_PROBLEM}: {reason}"
-            case Connected(hello=hello):
+            case events.Connected(hello=hello):
                 self._refused.clear()
                 self._radio = self._radio_status = None
                 board, model = format_id(hello.board_id), f"{hello.model_id:08x} ({hello.model_id})"
                 text = f"connected to board {board}, model {model}, mode {hello.mode.name}"
-            case Disconnected(loss=loss):
+            case events.Disconnected(loss=loss):
                 self.monitor.reset()
                 if not self.closed:
                     level, text = (
                         logging.WARNING,
                         f"disconnected from the board: {loss.value}; waiting for it",
                     )
-            case VersionMismatch(version=version):
+            case events.VersionMismatch(version=version):
                 level = logging.ERROR
                 text = (
                     f"the board uses version {version} of the protocol, this driver version {PROTOCOL_VERSION}: "
                     "update the older one"
                 )
-            case ModeChanged(mode=mode):
+            case events.ModeChanged(mode=mode):
                 text = f"the board is in mode {mode.name}"
-            case ModeRefused(mode=mode, requested=requested):
+            case events.ModeRefused(mode=mode, requested=requested):
                 level = logging.WARNING
                 text = (
                     f"the board stays in mode {mode.name} instead of {requested.name}: does it have a model?"
                 )
-            case OffsetsRefused(text=reason):
+            case events.OffsetsRefused(text=reason):
                 self._refused[_OFFSETS_PROBLEM] = reason
                 level = logging.ERROR
                 text = f"the board's corrections are not published: {_OFFSETS_PROBLEM}: {reason}"

@@ -62,30 +62,10 @@ AGE_UNKNOWN_MS = 0xFFFFFFFF
 class RadioSettings:
     """Settings of a radio. Both ends of a link must use the same channel, PRF, code, rate, delimiter and PAN.
 
-    Attributes:
-        role: tag or anchor.
-        address: 64 bits; 0 = the chip's own.
-        pan: PAN id; frames of other networks are ignored.
-        channel: 1 to 5, 7.
-        prf_mhz: 16, 64.
-        preamble: symbols; may differ between the ends.
-        preamble_code: 0 = the first code of the standard for channel and PRF.
-        rate_kbps: 110, 850, 6800.
-        decawave_sfd: Decawave's start-of-frame delimiter instead of the standard's.
-        tx_power: register TX_POWER in smart-power format, as in the OTP memory: octets, from the lowest, for frames of
-            any length, up to 500, 250 and 125 us. Below 6.8 Mbit/s the lowest octet is used for all frames. 0: the
-            calibrated value of the OTP memory, or the manual's if it is not programmed.
-        antenna_delay: total TX + RX antenna delay in ticks; 0: the value of the OTP memory (of a TREK1000 board the one
-            for this role, channel and rate), or 2 x 16436 if it is not programmed.
-        window: number of complex accumulator samples per range, from 5 before the first path; 0 = none,
-            1016 or more = all.
-        anchors: addresses that a tag polls in turn; empty = anchors found by broadcast.
-        reply_us: time from the reception of ANSWER to FINAL; 0 = default for the tag's bus and processor, plus the
-            duration of long frames.
-        timeout_us: timeout of a tag for an anchor's frames; 0 = default, also plus the duration of long frames.
-        interval_us: minimum time between the starts of two exchanges.
-        report: an anchor also sends its ranges to its host.
-        bias_correction: correct ranges for the received power (APS011); the models were trained without it.
+    `wire.layout` describes the fields and their units. 0 in `tx_power` and `antenna_delay` means the value of the OTP
+    memory (of a TREK1000 board the delay for this role, channel and rate), and otherwise the manual's, or 2 x 16436 ticks;
+    0 in `reply_us` and `timeout_us` means the default for the tag's bus and processor, plus the duration of long frames.
+    `window` counts complex samples from 5 before the first path. The models were trained without `bias_correction`.
     """
 
     role: Role = Role.TAG

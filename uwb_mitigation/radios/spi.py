@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, not_installed
-from uwb_mitigation.radios.dw1000.port import ChipPort, read_chips
+from uwb_mitigation.radios.dw1000.port import ChipPort, open_chips, read_chips
 from uwb_mitigation.radios.port import OnEvent
 from uwb_mitigation.radios.settings import DEFAULT_RADIO, PREFIX, RadioSettings, ValueReader
 
@@ -39,30 +39,16 @@ class SpiSettings:
 
 
 def read_settings(value: ValueReader) -> list[SpiSettings]:
-    """Return the settings of each chip from the parameters of the driver.
-
-    Raises:
-        ParameterError: a parameter is invalid.
-    """
+    """Return the settings of each radio from the parameters; raise ParameterError if one is invalid."""
     return [SpiSettings(port, value(PREFIX + "reset"), radio) for port, radio in read_chips(value)]
 
 
 def open(
     settings: Sequence[SpiSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
 ) -> list[ChipPort]:
-    """Open chips; `RadioPort.close` ends them. See `ChipPort` for the events.
-
-    Raises:
-        ParameterError: the settings are invalid.
-        MissingDependencyError: there is no C compiler.
-    """
-    ports = [
-        ChipPort(chip.device, partial(SpidevBus, chip.device, chip.reset), chip.radio, on_event, stamp_clock)
-        for chip in settings
-    ]
-    for port in ports:
-        port.start()
-    return ports
+    """Open radios; see `ChipPort` for the events and errors."""
+    chips = [(chip.device, partial(SpidevBus, chip.device, chip.reset), chip.radio) for chip in settings]
+    return open_chips(chips, on_event, stamp_clock)
 
 
 class SpidevBus:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -49,6 +49,18 @@ def read_chips(value: ValueReader) -> list[tuple[str, RadioSettings]]:
         )
     anchor = replace(radio, role=Role.ANCHOR, anchors=())
     return [(port, anchor if number else radio) for number, port in enumerate(ports)]
+
+
+def open_chips(
+    chips: Iterable[tuple[str, Callable[[], Bus], RadioSettings]],
+    on_event: OnEvent,
+    stamp_clock: Callable[[], int],
+) -> list[ChipPort]:
+    """Open radios, each with its name, the function that opens its bus, and its settings; see `ChipPort`."""
+    ports = [ChipPort(*chip, on_event, stamp_clock) for chip in chips]
+    for port in ports:
+        port.start()
+    return ports
 
 
 class ChipPort(RadioPort):

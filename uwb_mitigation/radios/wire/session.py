@@ -12,35 +12,13 @@ from typing import TypeVar
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.settings import RadioSettings, RadioStatus
+from uwb_mitigation.radios.wire import events as link_events
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.clock import DeviceClock
-from uwb_mitigation.radios.wire.events import (
-    Connected,
-    Disconnected,
-    Event,
-    LinkState,
-    Loss,
-    ModeChanged,
-    ModeRefused,
-    OffsetsRefused,
-    RadioRefused,
-    SessionCounts,
-    VersionMismatch,
-)
+from uwb_mitigation.radios.wire.events import Event, LinkState, Loss, SessionCounts
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import Flag, MessageType, Mode
-from uwb_mitigation.radios.wire.messages import (
-    BoardStatus,
-    Correction,
-    GetRadio,
-    Hello,
-    Log,
-    OffsetsAnswer,
-    RadioConfigured,
-    SetOffsets,
-    SetRadio,
-    TimeSyncReply,
-)
+from uwb_mitigation.radios.wire.messages import Correction, Hello, RadioConfigured, SetOffsets, SetRadio
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 
@@ -245,11 +223,11 @@ class BoardSession:
                 self._send(*messages.encode(messages.GetInfo()))
                 return events
             if self._send_request(self._offsets_request) and self._offsets:
-                events.append(OffsetsRefused(self._offsets_request.unanswered))
+                events.append(link_events.OffsetsRefused(self._offsets_request.unanswered))
             if self._mode_request.pending:
                 self._send_request(self._mode_request)
             elif self._send_request(self._radio_request):
-                events.append(RadioRefused(self._radio_request.unanswered))
+                events.append(link_events.RadioRefused(self._radio_request.unanswered))
         if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
             self._send_sync(now_ns, stamp_ns)
         return events
@@ -279,16 +257,16 @@ class BoardSession:
         message = messages.decode(frame.type, frame.payload, stamp_ns=at_ns)
         if isinstance(message, Correction):
             return self._handle_correction(message, bool(frame.flags & Flag.ANSWER))
-        if isinstance(message, TimeSyncReply):
+        if isinstance(message, messages.TimeSyncReply):
             self._handle_sync(message, frame.time_us, stamp_ns)
             return []
         if isinstance(message, RadioConfigured):
             return self._handle_radio(message, bool(frame.flags & Flag.ANSWER))
-        if isinstance(message, OffsetsAnswer):
+        if isinstance(message, messages.OffsetsAnswer):
             return self._handle_offsets(message)
         if isinstance(message, RadioStatus) and self.radio is None:
-            self._send(*messages.encode(GetRadio()))
-        if isinstance(message, RangeMeasurement | Log | BoardStatus | RadioStatus):
+            self._send(*messages.encode(messages.GetRadio()))
+        if isinstance(message, RangeMeasurement | messages.Log | messages.BoardStatus | RadioStatus):
             return [message]
         # A board never sends the types of the host: count them as unknown.
         self.counts.unknown_type[frame.type] += 1
@@ -324,11 +302,15 @@ class BoardSession:
             self._offsets_request.repeat(self._offsets_request.message)
             self._offsets_confirmed = False
             self._next_request_ns = now_ns
-            events.append(Connected(hello))
+            events.append(link_events.Connected(hello))
         elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
             requested = hello.mode if self._mode is None else self._mode
             is_set = hello.mode == requested
-            events.append(ModeChanged(requested) if is_set else ModeRefused(requested, hello.mode))
+            events.append(
+                link_events.ModeChanged(requested)
+                if is_set
+                else link_events.ModeRefused(requested, hello.mode)
+            )
         return events
 
     @property
@@ -349,17 +331,17 @@ class BoardSession:
             _add_bounded(request.sent, sequence, None)
         return False
 
-    def _handle_offsets(self, answer: OffsetsAnswer) -> list[Event]:
+    def _handle_offsets(self, answer: messages.OffsetsAnswer) -> list[Event]:
         if not self._offsets_request.is_answered_by(answer.request_sequence):
             self.counts.unsolicited += 1
             return []
         self._offsets_confirmed = answer.accepted
         text = f"it can store {answer.slots} offsets, but {len(self._offsets)} were requested"
-        return [] if answer.accepted else [OffsetsRefused(text)]
+        return [] if answer.accepted else [link_events.OffsetsRefused(text)]
 
     def _handle_radio(self, radio: RadioConfigured, answer: bool) -> list[Event]:
         if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
-            return [RadioRefused(radio.text)]
+            return [link_events.RadioRefused(radio.text)]
         self.radio = radio
         return [radio]
 
@@ -376,7 +358,7 @@ class BoardSession:
             return []
         return [correction]
 
-    def _handle_sync(self, reply: TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
+    def _handle_sync(self, reply: messages.TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
         sent_ns = self._sync_send_times_ns.pop(reply.request_sequence, None)
         if sent_ns is None:
             self.counts.unsolicited += 1
@@ -409,7 +391,7 @@ class BoardSession:
             return []
         self.state = LinkState.WRONG_VERSION
         self.foreign_version = version
-        return [VersionMismatch(version)]
+        return [link_events.VersionMismatch(version)]
 
     def _disconnect(self, loss: Loss, now_ns: int) -> list[Event]:
         was_ready = self.state is LinkState.READY
@@ -421,7 +403,7 @@ class BoardSession:
             request.sent.clear()
         self._sync_send_times_ns.clear()
         self._next_request_ns = now_ns
-        return [Disconnected(loss)] if was_ready else []
+        return [link_events.Disconnected(loss)] if was_ready else []
 
     def _send_sync(self, now_ns: int, stamp_ns: int) -> None:
         request = self._send(*messages.encode(messages.TimeSync()))
