@@ -264,6 +264,16 @@ def test_wide_tables_have_one_row_for_each_pair(tmp_path: Path):
         for m in (r.measurement for r in source)
     ] == [(0, 1, 2.5, -80.0), (0, 12, 3.5, -81.0), (1, 1, 2.6, -82.0)]
     assert source.dropped == {"range is not a number": 1}
+    from scipy.io import savemat
+
+    savemat(tmp_path / "x.mat", {"t": np.array([0.0, 0.1]), "dist": np.array([[2.5, 3.5], [2.6, np.nan]])})
+    fields = {"stamp": "t", "anchor": "variable", "range": "value"}
+    matrix = read({"name": "m", "unpivot": {"value": "dist"}, "fields": fields}, tmp_path / "x.mat")
+    assert [(r.measurement.anchor_id, r.measurement.range_m) for r in matrix] == [
+        (1, 2.5),
+        (2, 3.5),
+        (1, 2.6),
+    ]
     with pytest.raises(RecordingError, match=r"no column matches unpivot 'x\(.*t, r1, s1"):
         read(document | {"unpivot": {"range": r"x(\d)"}}, tmp_path / "x.csv")
 

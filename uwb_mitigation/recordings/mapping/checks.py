@@ -101,7 +101,7 @@ def check_rate(values: ColumnDict, name: str, *, moving: bool) -> None:
 def anchor_warnings(
     values: ColumnDict, positions: Mapping[int, NDArray[np.float64]], differences_m: NDArray[np.float64]
 ) -> Iterator[str]:
-    """Yield what is wrong with the positions of anchors.
+    """Yield warnings about the positions of anchors.
 
     Args:
         values: the ranges.

@@ -183,7 +183,7 @@ class TableFormat(_Strict):
         text: the field `data` of the message contains JSON, or `key:value` pairs.
         unpivot: {new column: regular expression}: one row for each column that matches, such as {value: 'r(\\d+)'} for
             r1 to r24. The column `variable` contains the first group, or without one the name of the column; columns of
-            several expressions with the same `variable` are in the same row.
+            several expressions with the same `variable` are in the same row. A matrix has the columns 1, 2, and so on.
         drop: rules for rows that are not used.
     """
 

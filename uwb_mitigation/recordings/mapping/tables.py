@@ -207,13 +207,21 @@ def _choose(
 
 
 def _unpivot(table: TableFormat, columns: Mapping[str, Any], count: int) -> tuple[dict[str, Any], int]:
-    """Return one row for each column that matches, as `pandas.melt`, and the number of rows for each row."""
-    melted: dict[str, dict[str, str]] = {}
+    """Return one row for each column that matches, as `pandas.melt`, and the number of rows for each row.
+
+    The columns of a matrix are numbered from 1.
+    """
+    melted: dict[str, dict[str, Any]] = {}
+    sources = set()
     for target, rule in table.unpivot.items():
-        for name in columns:
+        for name, values in columns.items():
             if match := re.fullmatch(rule, name):
-                melted.setdefault(match[1] if match.re.groups == 1 else name, {})[target] = name
-    sources = {name for names in melted.values() for name in names.values()}
+                sources.add(name)
+                keys = [match[1] if match.re.groups == 1 else name]
+                if is_matrix := np.ndim(values) == 2:
+                    keys = [str(number + 1) for number in range(values.shape[1])]
+                for key, column in zip(keys, values.T if is_matrix else [values], strict=True):
+                    melted.setdefault(key, {})[target] = column
     rows = {
         name: np.repeat(values, len(melted), axis=0)
         for name, values in columns.items()
@@ -221,8 +229,7 @@ def _unpivot(table: TableFormat, columns: Mapping[str, Any], count: int) -> tupl
     }
     unknown = np.full(count, np.nan)
     for target in table.unpivot:
-        values = [columns[names[target]] if target in names else unknown for names in melted.values()]
-        rows[target] = np.stack(values, axis=1).reshape(-1)
+        rows[target] = np.stack([cells.get(target, unknown) for cells in melted.values()], axis=1).reshape(-1)
     return rows | {VARIABLE: np.tile(np.array(list(melted), object), count)}, len(melted)
 
 

@@ -3,7 +3,7 @@
 The layouts are fixed except for strings and one array, so each consists of a few packed blocks. Every length
 is checked before use. CDR aligns each value to its size, counted from the end of the four-byte
 encapsulation header (OMG DDSI-RTPS 2.5, section 10.2; OMG CDR, section 15.3). Only little-endian plain CDR is
-supported, the format of ROS 2. A library is not used, because `RangeBatch` decodes many messages at once by these offsets,
+supported, the format of ROS 2. A library is not used, because `RangeBatch` decodes many messages together by these offsets,
 and a live range is decoded twice as fast.
 """
 
@@ -256,7 +256,7 @@ class RangeBatch:
 
     Raises:
         RecordingError: the first message cannot be decoded, or another one has another form: length of the message or
-            frame_id, encoding, number of samples, radio, segment; or it must be decoded on its own to know what is wrong.
+            frame_id, encoding, number of samples, radio, segment; or its fields are not valid.
     """
 
     def __init__(self, messages: Sequence[bytes]) -> None:
