@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption, print_line
-from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError, format_id
+from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table
+from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 from uwb_mitigation.types.stamps import NS_PER_S
 
 if TYPE_CHECKING:
@@ -342,25 +342,21 @@ def _show_summary(result: dict[str, Any]) -> None:
     console.out.print(
         f"{result['ranges']} ranges, {result['with_truth']} with truth, {_pairs(result)}, {result['duration_s']:.1f} s"
     )
-    pairs = ConsoleTable("anchor", "tag", "label", title="Pairs", title_justify="left")
-    for column in ("ranges", "rate (Hz)", "mean range (m)", "mean true (m)"):
-        pairs.add_column(column, justify="right")
-    for pair in result["by_pair"]:
-        means = (_number(pair[name], 3) for name in ("mean_range_m", "mean_true_range_m"))
-        ids = (format_id(pair[name]) for name in ("anchor_id", "tag_id"))
-        pairs.add_row(*ids, pair["label"], str(pair["ranges"]), _number(pair["rate_hz"], 1), *means)
-    console.out.print(pairs)
+    columns = {
+        "anchor": "anchor_id:id",
+        "tag": "tag_id:id",
+        "label": "label",
+        "ranges": "ranges:d",
+        "rate, Hz": "rate_hz:.1f",
+        "range, m": "mean_range_m:.3f",
+        "true, m": "mean_true_range_m:.3f",
+    }
+    rows = sorted(result["by_pair"], key=lambda pair: (pair["anchor_id"], pair["tag_id"], pair["label"]))
+    show_table("Pairs, mean ranges", columns, rows, max_rows=len(rows), optional=("true, m", "rate, Hz"))
     if result["skipped"]:
-        oddities = ConsoleTable("warning", title="Warnings", title_justify="left")
-        oddities.add_column("count", justify="right")
-        for kind, count in sorted(result["skipped"].items(), key=lambda item: -item[1]):
-            oddities.add_row(kind, str(count))
-        console.out.print(oddities)
+        counts = sorted(result["skipped"].items(), key=lambda item: -item[1])
+        show_table("Warnings", ("warning", "count"), counts, max_rows=len(counts))
 
 
 def _pairs(result: dict[str, Any]) -> str:
     return f"{result['pairs']} pair{'' if result['pairs'] == 1 else 's'}"
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
