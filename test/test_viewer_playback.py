@@ -170,10 +170,7 @@ def test_output_of_track_is_shown(tmp_path: Path):
                 out.write(Record(RangeMeasurement(stamp_ns, tag, anchor, i, 0, range_m, cir)))
     anchors_path(bag).write_text(dump_anchors(HALL))
     processed = tmp_path / "processed.mcap"
-    for command in (
-        ("process", bag, "-o", processed),
-        ("track", processed, "-o", track, "--height", "1.0"),
-    ):
+    for command in (("process", bag, "-o", processed), ("track", processed, "-o", track, "--height", "1.0")):
         done = run(*command, folder=tmp_path)
         assert done.returncode == 0, done.stderr
     assert not anchors_path(processed).exists(), "the anchors are in the bag"

@@ -35,8 +35,7 @@ def view(
     anchors: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
-            help="Anchors file. Default: X.anchors.yaml next to BAG, else the markers in BAG.",
+            metavar="FILE", help="Anchors file. Default: X.anchors.yaml next to BAG, else the markers in BAG."
         ),
     ] = None,
     height: Annotated[

@@ -40,7 +40,7 @@ class PositionErrors:
 def position_errors(
     track: NDArray[np.float64], truth: NDArray[np.float64], begin_s: float, end_s: float
 ) -> PositionErrors | None:
-    """Return the errors of a track in an interval; None: no true position is known there.
+    """Return the errors of a track in an interval; None if no true position is known there.
 
     Args:
         track: time (s), x, y, ..., float64 (n, 3 or more).
@@ -120,13 +120,7 @@ def _track(tracks: _Tracks, name: str, kind: TrackKind) -> NDArray[np.float64] |
 def _range_cards(means_m: dict[str, float], not_ok: int, count: int, window: str) -> list[Card]:
     if not count:
         return []
-    cards = [
-        [
-            f"Ranges not OK, {window}",
-            f"{100.0 * not_ok / count:.1f} %",
-            f"{not_ok} of {count}",
-        ]
-    ]
+    cards = [[f"Ranges not OK, {window}", f"{100.0 * not_ok / count:.1f} %", f"{not_ok} of {count}"]]
     if "" in means_m:
         references = [f"{label}: {_metres(mean_m)}" for label, mean_m in means_m.items() if label]
         cards.append([f"Mean absolute range error, {window}", _metres(means_m[""]), "; ".join(references)])
@@ -156,8 +150,8 @@ def _position_cards(
     now = None if truth is None else position_errors(track, truth, position_s - NOW_S, position_s)
     if truth is None or errors is None:
         rows = track[(track[:, 0] >= interval[0]) & (track[:, 0] <= interval[1])]
-        past = track[(track[:, 0] <= position_s) & (track[:, 0] >= position_s - NOW_S)]
-        now_sd = past[-1, 4] if len(past) else np.nan
+        latest = track[(track[:, 0] <= position_s) & (track[:, 0] >= position_s - NOW_S)]
+        now_sd = latest[-1, 4] if len(latest) else np.nan
         median_sd = np.nanmedian(rows[:, 4]) if np.isfinite(rows[:, 4]).any() else np.nan
         return [
             ["Reported standard deviation, now", _metres(now_sd), "horizontal; the true position is unknown"],

@@ -157,7 +157,7 @@ class Page:
     @property
     def _is_waiting(self) -> bool:
         """Whether the page has not drawn the last update: another one would queue behind it and show old data."""
-        return bool(self._sent > self._models.controls.acknowledged)
+        return bool(self._sent != self._models.controls.acknowledged)
 
     def tick(self) -> None:
         """Draw if it is time, the page is not paused, and it has drawn the last update."""
@@ -174,15 +174,11 @@ class Page:
     def draw(self) -> None:
         """Update every model from the scene, and number the update if anything has changed."""
         self._draw_player()
+        player, scene = self._player, self._view.scene
+        position = None if player is None else (player.position_s, player.is_behind, player.timeline is None)
         with self._view.lock:
-            scene = self._view.scene
             # Ages change without data; drawing them once a second is enough.
-            state = (
-                scene.revision,
-                self._selected,
-                math.floor(scene.clock()),
-                self._player and self._player.timeline,
-            )
+            state = scene.revision, self._selected, math.floor(scene.clock()), position
             is_changed = self._changed("scene", state)
             if is_changed:
                 self._draw_scene(scene)
@@ -294,14 +290,14 @@ class Page:
     def _draw_summary(self, scene: Scene) -> None:
         """Show counts, the reason for an empty page, and the pairs and tags that have stopped."""
         histories = [history for _, history, _ in scene.latest()]
-        parts = [f"{len(histories)} pair{'' if len(histories) == 1 else 's'}"]
+        texts = [f"{len(histories)} pair{'' if len(histories) == 1 else 's'}"]
         timeline = None if self._player is None else self._player.timeline
-        parts.append(f"{scene.ranges if timeline is None else len(timeline.bad)} ranges")
+        texts.append(f"{scene.ranges if timeline is None else len(timeline.bad)} ranges")
         missing, ranges = self._view.missing, ""
         if scene.dropped:
-            parts.append(f"{scene.dropped} dropped by the viewer")
+            texts.append(f"{scene.dropped} dropped by the viewer")
         if math.isfinite(now_s := scene.now_s(None if self._selected is None else self._selected[1])):
-            parts.insert(0, _utc(now_s))
+            texts.insert(0, _utc(now_s))
         if not histories:
             ranges = missing.ranges
         elif all(_no_data(scene, history) for history in histories):
@@ -312,7 +308,7 @@ class Page:
             "" if scene.tags or scene.tracks else missing.positions,
             *(() if self._player is None or self._player.timeline is None else self._player.timeline.notices),
         )
-        self._set(summary=" \u00b7 ".join(parts), notice=[line for line in lines if line])
+        self._set(summary=" \u00b7 ".join(texts), notice=[line for line in lines if line])
 
     def _draw_map(self, scene: Scene) -> None:
         models = self._models
@@ -518,24 +514,20 @@ class Page:
         _set_rows(models.marks, [marks])
 
     def _draw_errors(self, scene: Scene) -> None:
-        player, second = self._player, None
-        if player is None:
-            counts = scene.error_counts
-        elif player.timeline is None:
+        player = self._player
+        timeline = None if player is None else player.timeline
+        second = None if player is None or player.companion is None else player.companion.timeline
+        end_s = math.inf if player is None or self._window == WHOLE else player.position_s
+        if not self._changed("errors", (scene.errors, end_s, timeline is None, second is None)):
             return
-        else:
-            end_s = math.inf if self._window == WHOLE else player.position_s
-            second = None if player.companion is None else player.companion.timeline
-            counts = count_errors(
-                player.timeline.range_errors(end_s - HISTORY_S if end_s < math.inf else -math.inf, end_s)
-            )
-        compared = counts[1] if second is None else count_errors(second.range_errors(-math.inf, math.inf))[1]
-        if self._changed("errors", counts.tobytes() + compared.tobytes()):
-            columns = dict(
-                zip(("raw", "corrected", "second"), [*counts.astype(float), compared], strict=True)
-            )
-            self._models.show_empty("errors", not counts.any())
-            self._models.errors.data = columns | {"left": ERROR_EDGES_M[:-1], "right": ERROR_EDGES_M[1:]}
+        begin_s = end_s - HISTORY_S if end_s < math.inf else -math.inf
+        counts = (
+            scene.error_counts if timeline is None else count_errors(timeline.range_errors(begin_s, end_s))
+        )
+        compared = counts if second is None else count_errors(second.range_errors(begin_s, end_s))
+        columns = zip(("raw", "corrected", "second"), (*counts.astype(float), compared[1]), strict=True)
+        self._models.show_empty("errors", not counts.any())
+        self._models.errors.data = dict(columns) | {"left": ERROR_EDGES_M[:-1], "right": ERROR_EDGES_M[1:]}
 
     def _changed(self, name: str, value: object) -> bool:
         if name in self._drawn and self._drawn[name] == value:

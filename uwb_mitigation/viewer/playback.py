@@ -27,14 +27,7 @@ from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording
-from uwb_mitigation.viewer.scene import (
-    HISTORY_S,
-    MAX_MESSAGES,
-    SPEEDS,
-    MissingData,
-    NodeStatus,
-    Pair,
-)
+from uwb_mitigation.viewer.scene import HISTORY_S, MAX_MESSAGES, SPEEDS, MissingData, NodeStatus, Pair
 from uwb_mitigation.viewer.timeline import BATCH, Timeline, index_recording
 
 READ_S = 0.15
@@ -188,9 +181,11 @@ class BagPlayer:
     def _move(self, position_s: float, seek: bool = False) -> None:
         self.position_s = min(max(position_s, 0.0), self.seconds)
         self._read()
-        if (other := self.companion) is not None:
-            position_s = self.position_s + (self._recording.start_ns - other._recording.start_ns) / NS_PER_S
-            (other.seek if seek else other._move)(position_s)
+        if (companion := self.companion) is not None:
+            position_s = (
+                self.position_s + (self._recording.start_ns - companion._recording.start_ns) / NS_PER_S
+            )
+            (companion.seek if seek else companion._move)(position_s)
 
     def _read(self) -> None:
         """Read up to the current position for at most `READ_S`; the next call continues."""

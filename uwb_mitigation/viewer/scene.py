@@ -267,7 +267,7 @@ class TrackView:
 
     def columns(self) -> NDArray[np.float64]:
         """Return the points as float64 (k, 5)."""
-        return np.array(self.points, np.float64).reshape(-1, 5)
+        return np.asarray(self.points, np.float64).reshape(-1, 5)
 
 
 @dataclass(frozen=True, slots=True)
