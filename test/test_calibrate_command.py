@@ -18,7 +18,7 @@ from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.training.site.live_position import LiveError
 from uwb_mitigation.training.site.selection import SiteErrors
-from uwb_mitigation.types.anchors import save_anchors
+from uwb_mitigation.types.anchors import load_anchors, save_anchors
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.types.offsets import read_offsets
 from uwb_mitigation.types.ros.poses import encode_odometry
@@ -241,10 +241,22 @@ def test_heights_come_from_a_topic_and_stamps_are_shifted(site):
     assert (both.returncode, "either of them" in both.stderr) == (2, True)
 
 
-def test_without_a_transform_the_lever_arm_is_zero(site):
-    result, done = figures(site, "drive.mcap", "--height", 1.0, "--truth-topic", "/odom")
-    assert result["localisation"]["lever_arm_m"] == [0.0, 0.0, 0.0]
+def test_lever_arm_that_contradicts_the_ranges_is_refused(site):
+    """Without a transform it is 0."""
+    done = run(
+        "calibrate", "drive.mcap", *LEVEL, "--truth-topic", "/odom", "-o", "f.onnx", "--force", folder=site
+    )
+    assert done.returncode == 1
     assert "no transform from base_link" in done.stderr
+    assert "the lever arm (0.00, 0.00) m contradicts the ranges: they fit (0.4" in done.stderr
+
+
+def test_recording_of_unknown_anchors_is_refused(site):
+    from uwb_mitigation.types.anchors import AnchorMap
+
+    save_anchors(site / "few.yaml", AnchorMap(load_anchors(site / "anchors.yaml").anchors[:2]), force=True)
+    done = run("calibrate", "drive.mcap", "--anchors", "few.yaml", "-o", "f.onnx", folder=site)
+    assert (done.returncode, "not in the anchors file: 3, 4, 5" in done.stderr) == (1, True)
 
 
 def test_pair_with_few_ranges_gets_the_common_offset(site):

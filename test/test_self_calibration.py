@@ -27,13 +27,13 @@ def with_own(ranges: Ranges, own=OWN) -> Ranges:
 
 
 @pytest.fixture(scope="module")
-def minute():
-    return drive(seconds=60, rate_hz=25.0, offset_m=0.25)
+def recorded():
+    return drive(seconds=150, rate_hz=10.0, offset_m=0.25)
 
 
 @pytest.fixture(scope="module")
-def solved(minute):
-    return self_calibrate(HALL, [with_own(minute[0])], height=LEVEL)
+def solved(recorded):
+    return self_calibrate(HALL, [with_own(recorded[0])], height=LEVEL)
 
 
 def places_at_rest(count=12, seed=3, slope=-0.02):
@@ -62,8 +62,8 @@ def test_pair_offsets_of_a_drive_match_their_standard_deviations(solved):
     assert np.abs(error / found[:, 1]).max() < 3.0
 
 
-def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved, minute):
-    ranges, path = minute
+def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved, recorded):
+    ranges, path = recorded
     truth = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
     error = solved.pseudo_m - truth
     assert np.isfinite(error).all()
@@ -76,8 +76,8 @@ def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved
     assert np.abs(again.pseudo_m - truth)[own].mean() < 0.15
 
 
-def test_held_out_ranges_do_not_affect_the_offsets(solved, minute):
-    ranges = with_own(minute[0])
+def test_held_out_ranges_do_not_affect_the_offsets(solved, recorded):
+    ranges = with_own(recorded[0])
     late = ranges.stamp_ns > 30 * 10**9
     changed = replace(ranges, range_m=ranges.range_m + np.where(late & (ranges.anchor == 2), 0.5, 0.0))
     found = self_calibrate(HALL, [changed], height=LEVEL)
@@ -91,15 +91,15 @@ def test_held_out_ranges_do_not_affect_the_offsets(solved, minute):
     assert np.abs(same.fit.parameters - solved.fit.parameters).max() < 2e-3
 
 
-def test_common_offset_is_selected_if_pairs_do_not_differ(minute):
-    found = self_calibrate(HALL, [minute[0]], height=LEVEL)
+def test_common_offset_is_selected_if_pairs_do_not_differ(recorded):
+    found = self_calibrate(HALL, [recorded[0]], height=LEVEL)
     assert found.level == "one"
     assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.05)
     assert any("share one" in note for note in found.notes)
 
 
-def test_ranges_with_larger_errors_have_lower_weights(minute):
-    ranges, _ = minute
+def test_ranges_with_larger_errors_have_lower_weights(recorded):
+    ranges, _ = recorded
     # Behind walls, half of the predicted error remains; anchors at one side are affected more often.
     rng = np.random.default_rng(8)
     blocked = rng.random(len(ranges)) < np.array([0.8, 0.1, 0.1, 0.8, 0.4])[ranges.anchor]
@@ -170,8 +170,8 @@ def refused(match, anchors, tags, **options):
         self_calibrate(anchors, tags, **options)
 
 
-def test_unobservable_calibration_is_refused(minute):
-    ranges = minute[0]
+def test_unobservable_calibration_is_refused(recorded):
+    ranges = recorded[0]
     refused("3 anchors were received", HALL, [ranges.take(ranges.anchor < 3)], height=LEVEL)
     refused("4 anchors were received", HALL, [ranges.take(ranges.anchor < 4)])
     refused("on a line", HALL.moved(HALL.position * (1, 0, 0), HALL.sd), [ranges], height=LEVEL)
@@ -190,21 +190,30 @@ def test_track_with_two_mirror_images_is_refused():
 
 
 @pytest.mark.parametrize(("row", "by"), [(3, (3.0, -2.5, 0.0)), (4, (1.5, 0.0, 0.0))])
-def test_moved_anchor_is_named_by_its_id(minute, row, by):
+def test_moved_anchor_is_named_by_its_id(recorded, row, by):
     wrong = HALL.position.copy()
     wrong[row] += by
-    refused(f"anchor {row + 1} contradicts", HALL.moved(wrong, HALL.sd), [minute[0]], height=LEVEL)
+    refused(f"anchor {row + 1} contradicts", HALL.moved(wrong, HALL.sd), [recorded[0]], height=LEVEL)
 
 
-def test_two_swapped_opposite_anchors_are_named(minute):
+def test_wrong_height_is_refused(recorded):
+    refused("they fit a height of about 1", HALL, [recorded[0]], height=Height(2.5))
+
+
+def test_ranges_in_feet_are_refused(recorded):
+    feet = replace(recorded[0], range_m=recorded[0].range_m / 0.3048)
+    refused("if the ranges were in feet", HALL, [feet], height=LEVEL)
+
+
+def test_two_swapped_opposite_anchors_are_named(recorded):
     swapped = HALL.moved(HALL.position[[2, 1, 0, 3, 4]], HALL.sd)
-    some = minute[0].take(np.arange(0, len(minute[0]), 4))
+    some = recorded[0].take(np.arange(0, len(recorded[0]), 4))
     refused("anchors 1 and 3 contradict", swapped, [some], height=LEVEL)
 
 
-def test_heavy_tail_accuses_no_anchor(minute):
+def test_heavy_tail_accuses_no_anchor(recorded):
     """A person between the tag and one anchor lengthens 80 % of its ranges."""
-    ranges, _ = minute
+    ranges, _ = recorded
     rng = np.random.default_rng(4)
     blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
     tail = np.where(blocked, rng.exponential(1.5, len(ranges)), 0.0)
@@ -229,8 +238,8 @@ def test_offset_that_slow_errors_can_explain_is_not_subtracted():
     assert any("not significant" in note for note in found.notes)
 
 
-def test_anchor_with_few_ranges_gets_the_common_offset(minute):
-    ranges = with_own(minute[0])
+def test_anchor_with_few_ranges_gets_the_common_offset(recorded):
+    ranges = with_own(recorded[0])
     few = np.isin(np.arange(len(ranges)), np.flatnonzero(ranges.anchor == 4)[:1])
     found = self_calibrate(HALL, [ranges.take(few | (ranges.anchor != 4))], height=LEVEL)
     assert found.level == "pair"
@@ -243,7 +252,7 @@ def test_anchor_with_few_ranges_gets_the_common_offset(minute):
 
 def test_area_excludes_the_mirror_image_in_a_plane():
     flat = HALL.moved(HALL.position * (1, 1, 0) + (0, 0, 2.5), HALL.sd)
-    ranges, _ = drive(flat, seconds=60, rate_hz=25.0, offset_m=0.25)
+    ranges, _ = drive(flat, seconds=150, rate_hz=10.0, offset_m=0.25)
     found = self_calibrate(flat, [ranges], area=Area((-1.0, -1.0, 0.0), (13.0, 10.0, 2.0)))
     assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.06)
     assert found.fit.position[:, 2].max() < 2.5
@@ -258,8 +267,8 @@ def turning(path, lever, late_ns=0):
     return PosePath(path.stamp_ns + late_ns, path.position - off, quaternion)
 
 
-def test_time_offset_and_lever_arm_are_estimated_with_a_localisation(minute):
-    ranges, path = minute
+def test_time_offset_and_lever_arm_are_estimated_with_a_localisation(recorded):
+    ranges, path = recorded
     lever = np.array([0.3, -0.25, 0.0])
     late = turning(path, lever, 300_000_000)
     nothing = Regressors.none(len(ranges))
@@ -277,8 +286,8 @@ def test_time_offset_and_lever_arm_are_estimated_with_a_localisation(minute):
         align_poses(HALL, [short], [still], nothing, time_offset_s=0.0, estimate_lever_arm=True)
 
 
-def test_each_tag_has_its_own_lever_arm_and_its_own_body(minute):
-    ranges, path = minute
+def test_each_tag_has_its_own_lever_arm_and_its_own_body(recorded):
+    ranges, path = recorded
     arms = np.array([[0.4, 0.0, 0.0], [-0.3, 0.2, 0.0]])
     other, _ = drive(seconds=60, rate_hz=25.0, offset_m=0.25, seed=5)
     bodies = [turning(path, arms[0]), turning(path, arms[1])]

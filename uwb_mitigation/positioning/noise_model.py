@@ -132,7 +132,7 @@ NETWORK_SD = 0.03
 """Prior standard deviation of the factor of the universal network's predictions. It is small because errors of the
 predictor reduce a free factor, and the remaining errors would appear in the offsets."""
 
-SLOW_SD_M, CORRECTED_SLOW_SD_M = 0.12, 0.05
+SLOW_SD_M, CORRECTED_SLOW_SD_M = 0.10, 0.05
 """Standard deviation of the errors of a pair that stay the same for many seconds: reflections and obstacles at one position,
 and the range bias of a DW1000, which changes by 0.1 m with the received power (Decawave APS011). The second value is for
 ranges that the network corrects. Averaging does not reduce these errors, and residuals hardly show them, because the track
@@ -177,16 +177,22 @@ class Regressors:
         inverse: NDArray[np.float64] = 1.0 / np.maximum(self.sd, 1e-6) ** 2
         return inverse
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Regressors:
+    def select_rows(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Regressors:
         """Return the parameters for the ranges at `index`."""
         return replace(self, rows=self.rows[index], noise_group=self.noise_group[index])
 
-    def only(self, kept: NDArray[np.bool_]) -> Regressors:
-        """Return only the parameters `kept`, bool (q,)."""
-        names = tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept)
-        return replace(self, names=names, rows=self.rows[:, kept], mean=self.mean[kept], sd=self.sd[kept])
+    def select_columns(self, is_selected: NDArray[np.bool_]) -> Regressors:
+        """Return only these parameters, bool (q,)."""
+        names = tuple(name for name, selected in zip(self.names, is_selected, strict=True) if selected)
+        return replace(
+            self,
+            names=names,
+            rows=self.rows[:, is_selected],
+            mean=self.mean[is_selected],
+            sd=self.sd[is_selected],
+        )
 
-    def joined(self, other: Regressors) -> Regressors:
+    def concat(self, other: Regressors) -> Regressors:
         """Return these parameters followed by the others; `noise_group` is unchanged."""
         return Regressors(
             self.names + other.names,

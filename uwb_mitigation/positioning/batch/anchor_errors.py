@@ -40,9 +40,11 @@ MIN_LOSS_GAIN = 12.0
 LARGER = 0.35
 """The share of the misfit that two swapped anchors must also explain."""
 
-SUSPECT_OFFSET_M, SUSPECT_MISFIT = 0.3, 2.5
-"""An anchor is examined if its offset is that far from the median offset (radios of one kind differ by 0.3 m at three
-sigma, Decawave APS014), or if its median residual is that many times the median of all."""
+STANDS_OUT = 1.3
+"""The gain of a displaced anchor relative to the next one: obstacles make several anchors look displaced."""
+
+HEIGHTS_M = np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
+"""Changes of the height that are tried."""
 
 MISFIT_M, MISFIT_SHARE = 0.5, 0.08
 """Swaps are examined if this share of the ranges has larger residuals."""
@@ -66,6 +68,11 @@ MIN_GROUPS = 8
 MIN_SD_M = 0.1
 MAX_ANCHOR_RANGES = 2000
 
+MIN_MEAN_GAIN = 0.1
+"""Reduction of the mean loss of a range by two swapped anchors, in addition to `LARGER`."""
+
+_FIX = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
+_NO_POSITION_LOSS = 6.0
 _DISPLACEMENT_SD_M = 2.0
 _STEPS = 6
 _MAX_RANGES = 1000
@@ -141,127 +148,182 @@ def mirrored(fit: JointFit) -> NDArray[np.bool_]:
     corrected = observations.range_m - observations.rows @ fit.parameters
     fixed = replace(observations, range_m=corrected, rows=np.zeros((len(observations), 0)))
     try:
-        other = fit_joint(config, fixed, Regressors.none(len(observations)), image, scale_m=fit.scale_m)
+        refit = fit_joint(config, fixed, Regressors.none(len(observations)), image, scale_m=fit.scale_m)
     except DatasetError:
         return np.zeros(len(fit.segment_loss), np.bool_)
-    apart = np.linalg.norm(other.position - fit.position, axis=1) > MOVES_M
+    is_distinct = np.linalg.norm(refit.position - fit.position, axis=1) > MOVES_M
     if config.area is not None:
-        apart &= config.area.holds(other.position)
-    share = np.bincount(observations.knot_segment, apart) / np.bincount(observations.knot_segment)
-    return (other.segment_loss - fit.segment_loss < MIRRORED) & (share > 0.5)
+        is_distinct &= config.area.holds(refit.position)
+    distinct_share = np.bincount(observations.knot_segment, is_distinct) / np.bincount(
+        observations.knot_segment
+    )
+    return (refit.segment_loss - fit.segment_loss < MIRRORED) & (distinct_share > 0.5)
 
 
-def check_anchor_positions(found: Segments, fit: JointFit, first_positions: FirstPositions) -> None:
+def check_height(fit: JointFit) -> None:
+    """Refuse a height with which the ranges fit much worse than with another one.
+
+    Raises:
+        DatasetError: gives the better height.
+    """
+    config, height = fit.config, fit.config.height
+    if height is None:
+        return
+    best_gain, best_m = MIN_LOSS_GAIN, height.value
+    for change_m in HEIGHTS_M[np.abs(HEIGHTS_M) > 3.0 * height.sd].tolist():
+        other = replace(config, height=replace(height, value=height.value + change_m))
+        try:
+            refit = fit_joint(
+                other,
+                fit.observations,
+                fit.prior,
+                fit.position,
+                fit.parameters,
+                scale_m=fit.scale_m,
+                around=fit.position,
+                near=True,
+            )
+        except DatasetError:
+            continue
+        if fit.loss - refit.loss > best_gain:
+            best_gain, best_m = fit.loss - refit.loss, height.value + change_m
+    if best_m != height.value:
+        raise DatasetError(
+            f"the height of {height.value:g} m contradicts the ranges: they fit a height of about {best_m:g} m much better",
+            valid="the height of the tag's antenna in the coordinates of the anchors",
+        )
+
+
+def check_anchor_positions(segments: Segments, fit: JointFit, first_positions: FirstPositions) -> None:
     """Refuse ranges that other anchor positions explain much better.
 
     Args:
-        found: ranges of the solution.
+        segments: ranges of the solution.
         fit: solution with the positions of the file.
         first_positions: as in `self_calibration`.
 
     Raises:
         DatasetError: names the anchors.
     """
-    anchors, observations = fit.config.anchors.anchors, fit.observations
-    fix = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
-    best: tuple[float, int, float] | None = None
-    for row in _suspects(fit):
-        moved_m, gain = _displaced(row, found, fit)
-        if moved_m > MISPLACED_M and gain > MIN_LOSS_GAIN and (best is None or gain > best[0]):
-            best = gain, row, moved_m
+    observations = fit.observations
     misfit = float(
         (observations.share * (np.abs(fit.residual_m) > MISFIT_M)).sum() / observations.share.sum()
     )
-    if misfit > MISFIT_SHARE and (pair := _swapped(found, fit, first_positions)) is not None:
-        a, b = (anchors[row] for row in pair)
-        raise DatasetError(
-            f"anchors {a} and {b} contradict the others: swapped, they explain the ranges", valid=fix
-        )
-    if best is not None:
-        _, row, moved_m = best
-        raise DatasetError(
-            f"anchor {anchors[row]} contradicts the others: {moved_m:.1f} m from its position in the anchors "
-            "file, it explains the ranges",
-            valid=fix,
-        )
-
-
-def _suspects(fit: JointFit) -> list[int]:
-    observations = fit.observations
-    used = np.unique(observations.anchor)
-    own = dict(zip(fit.prior.names, fit.parameters.tolist(), strict=True))
-    offset = np.array([own.get(f"anchor {row}", 0.0) for row in used])
-    size = np.abs(fit.residual_m)
-    misfit = np.array([np.median(size[observations.anchor == row]) for row in used])
-    suspect = (np.abs(offset - np.median(offset)) > SUSPECT_OFFSET_M) | (
-        misfit > SUSPECT_MISFIT * np.median(size)
+    if misfit > MISFIT_SHARE:
+        check_swapped(segments, fit.config, fit.prior, first_positions, fit.scale_m)
+    displaced = {
+        row: (gain, moved_m)
+        for row in np.unique(observations.anchor).tolist()
+        for moved_m, gain in [_displaced(row, segments, fit)]
+        if moved_m > MISPLACED_M and gain > MIN_LOSS_GAIN
+    }
+    gains = sorted(gain for gain, _ in displaced.values())
+    if not gains or (len(gains) > 1 and gains[-1] < STANDS_OUT * gains[-2]):
+        return
+    row = max(displaced, key=displaced.__getitem__)
+    raise DatasetError(
+        f"anchor {fit.config.anchors.anchors[row]} contradicts the others: {displaced[row][1]:.1f} m from its position in the "
+        "anchors file, it explains the ranges",
+        valid=_FIX,
     )
-    return [int(row) for row in used[suspect]]
 
 
-def _displaced(row: int, found: Segments, fit: JointFit) -> tuple[float, float]:
+def check_swapped(
+    segments: Segments,
+    config: EstimatorConfig,
+    prior: Regressors,
+    first_positions: FirstPositions,
+    scale_m: NDArray[np.float64],
+) -> None:
+    """Refuse two anchors whose exchange explains the ranges much better.
+
+    Raises:
+        DatasetError: names them.
+    """
+    if (pair := _swapped(segments, config, prior, first_positions, scale_m)) is not None:
+        a, b = (config.anchors.anchors[row] for row in pair)
+        raise DatasetError(
+            f"anchors {a} and {b} contradict the others: swapped, they explain the ranges", valid=_FIX
+        )
+
+
+def _displaced(row: int, segments: Segments, fit: JointFit) -> tuple[float, float]:
     """Return the displacement of the anchor that explains the ranges best, m, and the gain in log likelihood."""
-    config, keep = fit.config, np.array([name != f"anchor {row}" for name in fit.prior.names])
-    base, anchors = fit.prior.only(keep), config.anchors
-    observations = observations_of(found, base, config.model)
-    own = (observations.anchor == row)[:, None]
-    position, shared, moved = fit.position, fit.parameters[keep], anchors
+    config, has_column = fit.config, np.array([name != f"anchor {row}" for name in fit.prior.names])
+    base, anchors = fit.prior.select_columns(has_column), fit.config.anchors
+    observations = observations_of(segments, base, config.model)
+    is_of_anchor = (observations.anchor == row)[:, None]
+    position, parameters, displaced = fit.position, fit.parameters[has_column], anchors
     gain, axes = 0.0, slice(0, 2)
     try:
-        for _ in range(_STEPS):
+        for iteration in range(_STEPS):
             tag = position[observations.knot] + observations.relative_height[:, None] * (0.0, 0.0, 1.0)
-            unit, _ = unit_vectors(tag, moved.position[observations.anchor])
-            rows = np.concatenate([observations.rows, -unit[:, axes] * own], axis=1)
-            shift = moved.position[row, axes] - anchors.position[row, axes]
+            unit, _ = unit_vectors(tag, displaced.position[observations.anchor])
+            rows = np.concatenate([observations.rows, -unit[:, axes] * is_of_anchor], axis=1)
+            shift = displaced.position[row, axes] - anchors.position[row, axes]
             prior = replace(
                 base,
                 mean=np.concatenate([base.mean, -shift]),
                 sd=np.concatenate([base.sd, np.full(2, _DISPLACEMENT_SD_M)]),
             )
-            other = fit_joint(
-                replace(config, anchors=moved),
+            refit = fit_joint(
+                replace(config, anchors=displaced),
                 replace(observations, rows=rows),
                 prior,
                 position,
-                np.concatenate([shared, np.zeros(2)]),
+                np.concatenate([parameters, np.zeros(2)]),
                 scale_m=fit.scale_m,
                 around=position,
                 near=True,
             )
-            position, shared, step = other.position, other.parameters[:-2], other.parameters[-2:]
-            where = moved.position.copy()
-            where[row, axes] += step
-            moved = moved.moved(where, moved.sd)
-            gain = fit.loss - other.loss
-            if float(np.abs(step).max()) < 0.02:
+            position, parameters, step = refit.position, refit.parameters[:-2], refit.parameters[-2:]
+            anchor_position = displaced.position.copy()
+            anchor_position[row, axes] += step
+            displaced = displaced.moved(anchor_position, displaced.sd)
+            gain = fit.loss - refit.loss
+            if float(np.abs(step).max()) < 0.02 or (iteration == 0 and gain < 0.5 * MIN_LOSS_GAIN):
                 break
     except DatasetError:
         return 0.0, 0.0
-    return float(np.linalg.norm(moved.position[row] - anchors.position[row])), gain
+    return float(np.linalg.norm(displaced.position[row] - anchors.position[row])), gain
 
 
-def _swapped(found: Segments, fit: JointFit, first_positions: FirstPositions) -> tuple[int, int] | None:
+def _swapped(
+    segments: Segments,
+    config: EstimatorConfig,
+    prior: Regressors,
+    first_positions: FirstPositions,
+    scale_m: NDArray[np.float64],
+) -> tuple[int, int] | None:
     """Return the pair of anchors that explains the ranges best if swapped; None: no pair is much better."""
-    config, part = fit.config, np.arange(len(found.ranges)) < _MAX_RANGES
-    few, columns = found.only(part), fit.prior.take(part)
-    observations = observations_of(few, columns, config.model)
-    scale = np.maximum(fit.scale_m, 0.1)
+    is_trial = np.arange(len(segments.ranges)) < _MAX_RANGES
+    trial, columns = segments.select_ranges(is_trial), prior.select_rows(is_trial)
+    scale = np.maximum(scale_m, 0.1)
 
     def loss(order: NDArray[np.intp]) -> float:
+        """Return the mean loss of a range; a range without a position counts as an outlier."""
         anchors = config.anchors
-        tried = replace(config, anchors=anchors.moved(anchors.position[order], anchors.sd))
-        position, placed = first_positions(tried, few, columns.rows @ columns.mean)
-        if not placed.all():
-            return np.inf
+        swapped = replace(config, anchors=anchors.moved(anchors.position[order], anchors.sd))
+        position, has_position = first_positions(swapped, trial, columns.rows @ columns.mean)
+        if not has_position.any():
+            return _NO_POSITION_LOSS
+        ranges_with_position = has_position[trial.of]
+        observations = observations_of(
+            trial.select(has_position), columns.select_rows(ranges_with_position), config.model
+        )
         try:
-            return fit_joint(tried, observations, columns, position, scale_m=scale).loss
+            refit = fit_joint(
+                swapped, observations, columns.select_rows(ranges_with_position), position, scale_m=scale
+            )
         except DatasetError:
-            return np.inf
+            return _NO_POSITION_LOSS
+        used = float(ranges_with_position.mean())
+        return used * refit.loss / float(observations.share.sum()) + (1.0 - used) * _NO_POSITION_LOSS
 
     order = np.arange(len(config.anchors))
-    limit = (1.0 - LARGER) * loss(order) - MIN_LOSS_GAIN
+    limit = (1.0 - LARGER) * loss(order) - MIN_MEAN_GAIN
     best: tuple[int, int] | None = None
-    for a, b in itertools.combinations(np.unique(found.ranges.anchor).tolist(), 2):
+    for a, b in itertools.combinations(np.unique(trial.ranges.anchor).tolist(), 2):
         swapped = order.copy()
         swapped[[a, b]] = b, a
         if (value := loss(swapped)) < limit:
@@ -284,10 +346,10 @@ def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:
     """
     used = np.unique(fit.observations.anchor)
     groups = min(MAX_GROUPS, len(used))
-    parts = [used[k::groups] for k in range(groups)]
-    if len(used) - max(map(len, parts)) < fit.config.dims + 1:
+    anchor_groups = [used[k::groups] for k in range(groups)]
+    if len(used) - max(map(len, anchor_groups)) < fit.config.dims + 1:
         return float("nan")
-    tracks = np.array([fit.without_anchors(part, correction_m).position[:, :2] for part in parts])
+    tracks = np.array([fit.without_anchors(rows, correction_m).position[:, :2] for rows in anchor_groups])
     squared = np.sum((tracks - tracks.mean(axis=0)) ** 2, axis=(0, 2))
     return float(np.sqrt(squared.mean() * (groups - 1) / groups))
 
@@ -296,23 +358,23 @@ def leave_one_out_residual(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[
     """Return for each range the distance of its anchor from the other anchors' track, and its standard deviation."""
     observations, used = fit.observations, np.unique(fit.observations.anchor)
     distance, sd = np.full(len(observations), np.nan), np.full(len(observations), np.nan)
-    # With many anchors, leave out several together: enough others remain.
-    for part in (used[k::MAX_REFITS] for k in range(min(MAX_REFITS, len(used)))):
+    # With many anchors, leave out several together: enough remain.
+    for anchor_group in (used[k::MAX_REFITS] for k in range(min(MAX_REFITS, len(used)))):
         try:
-            seen = fit.without_anchors(part, observations.rows @ fit.parameters)
-            covariance = seen.covariances()
+            refit = fit.without_anchors(anchor_group, observations.rows @ fit.parameters)
+            covariance = refit.covariances()
         except (DatasetError, np.linalg.LinAlgError):
             continue
-        own = np.isin(observations.anchor, part)
+        mask = np.isin(observations.anchor, anchor_group)
         received = np.zeros(len(observations.time_s), np.bool_)
-        received[observations.knot[~own]] = True
-        knot = observations.knot[own]
-        tag = seen.position[knot] + observations.ahead_s[own][:, None] * seen.velocity[knot]
-        tag[:, 2] += observations.relative_height[own]
-        unit, distance[own] = unit_vectors(tag, fit.config.anchors.position[observations.anchor[own]])
-        known = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
-        known[~(_gap_s(observations, received)[knot] <= FAR_S)] = np.nan
-        sd[own] = known
+        received[observations.knot[~mask]] = True
+        knot = observations.knot[mask]
+        tag = refit.position[knot] + observations.ahead_s[mask][:, None] * refit.velocity[knot]
+        tag[:, 2] += observations.relative_height[mask]
+        unit, distance[mask] = unit_vectors(tag, fit.config.anchors.position[observations.anchor[mask]])
+        sd_of_group = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
+        sd_of_group[~(_gap_s(observations, received)[knot] <= FAR_S)] = np.nan
+        sd[mask] = sd_of_group
     return distance[observations.of], sd[observations.of]
 
 
@@ -322,12 +384,13 @@ def _gap_s(observations: Observations, received: NDArray[np.bool_]) -> NDArray[n
     time = observations.time_s + observations.knot_segment * (
         float(observations.time_s.max(initial=0.0)) + 1e6
     )
-    there = time[received]
-    if not len(there):
+    received_time = time[received]
+    if not len(received_time):
         return np.full(len(time), np.inf)
-    after = np.searchsorted(there, time).clip(min(1, len(there) - 1), len(there) - 1)
+    last = len(received_time) - 1
+    after = np.searchsorted(received_time, time).clip(min(1, last), last)
     nearest: NDArray[np.float64] = np.minimum(
-        np.abs(time - there[after]), np.abs(time - there[np.maximum(after - 1, 0)])
+        np.abs(time - received_time[after]), np.abs(time - received_time[np.maximum(after - 1, 0)])
     )
     return nearest
 

@@ -17,7 +17,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution
 from uwb_mitigation.positioning.batch.motion_segments import Segments
 from uwb_mitigation.positioning.geometry import unit_vectors
-from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
+from uwb_mitigation.positioning.noise_model import CORRECTED_SLOW_SD_M, NoiseModel, Regressors, scatter_of
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -331,16 +331,17 @@ class _JointProblem:
         observations = self._links
         problem = LeastSquares(len(observations.time_s), 2 * self._config.dims, observations.rows.shape[1])
         rows = solution.reduced(problem.add(*self._rows(problem, unit), 0.0, 1.0))
-        gain = weight[:, None] * rows @ solution.shared_covariance
+        # The errors of stationary positions are independent, so that the residuals show most of them.
+        is_stationary = observations.is_stationary[observations.segment]
+        slow_sd_m = np.where(is_stationary, CORRECTED_SLOW_SD_M, self._prior.slow_sd_m)
+        gain = (weight * slow_sd_m)[:, None] * rows @ solution.shared_covariance
         chunk = (observations.time_s[observations.knot] // SLOW_S).astype(np.intp)
         _, of = np.unique(
             np.stack([observations.segment, chunk, observations.anchor]), axis=1, return_inverse=True
         )
         summed = np.zeros((int(of.max(initial=0)) + 1, observations.rows.shape[1]))
         np.add.at(summed, of.reshape(-1), gain)
-        found: NDArray[np.float64] = (
-            SD_INFLATION**2 * solution.shared_covariance + self._prior.slow_sd_m**2 * summed.T @ summed
-        )
+        found: NDArray[np.float64] = SD_INFLATION**2 * solution.shared_covariance + summed.T @ summed
         return found
 
     def residuals(

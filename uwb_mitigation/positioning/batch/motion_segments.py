@@ -51,21 +51,21 @@ class Segments:
         """The number of segments."""
         return len(self.is_stationary)
 
-    def keep(self, wanted: NDArray[np.bool_]) -> Segments:
+    def select(self, is_selected: NDArray[np.bool_]) -> Segments:
         """Return only these segments, bool (s,)."""
-        return self.only(wanted[self.of])
+        return self.select_ranges(is_selected[self.of])
 
-    def only(self, kept: NDArray[np.bool_]) -> Segments:
+    def select_ranges(self, is_selected: NDArray[np.bool_]) -> Segments:
         """Return only these ranges, bool (n,), and the segments that contain them."""
-        numbers, of = np.unique(self.of[kept], return_inverse=True)
+        numbers, of = np.unique(self.of[is_selected], return_inverse=True)
         columns = (
-            self.tag[kept],
-            self.row[kept],
+            self.tag[is_selected],
+            self.row[is_selected],
             of,
             self.is_stationary[numbers],
-            self.relative_height[kept],
+            self.relative_height[is_selected],
         )
-        return Segments(self.ranges.take(kept), *columns)
+        return Segments(self.ranges.take(is_selected), *columns)
 
 
 def find_segments(tags: Sequence[Ranges]) -> Segments:

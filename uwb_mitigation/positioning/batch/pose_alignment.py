@@ -199,7 +199,7 @@ class _AlignmentProblem:
 
     def take(self, index: NDArray[np.intp]) -> _AlignmentProblem:
         columns = {name: getattr(self, name)[index] for name in ("tag", "pair", "anchor")}
-        return replace(self, ranges=self.ranges.take(index), known=self.known.take(index), **columns)
+        return replace(self, ranges=self.ranges.take(index), known=self.known.select_rows(index), **columns)
 
     def likely(self, lever: NDArray[np.float64], free_lever: bool) -> tuple[float, NDArray[np.float64]]:
         """Return the time offset with which the ranges agree best, and its lever arms.

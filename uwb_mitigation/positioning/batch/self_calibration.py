@@ -6,6 +6,7 @@ significant; otherwise all share one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +17,9 @@ from scipy.stats import chi2
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.anchor_errors import (
     check_anchor_positions,
+    check_height,
     check_motion,
+    check_swapped,
     detect_anchor_errors,
     leave_one_out_residual,
     mirrored,
@@ -27,7 +30,8 @@ from uwb_mitigation.positioning.batch.motion_segments import Segments, find_segm
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
 from uwb_mitigation.positioning.online.initialization import CandidatePosition, candidate_positions
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.robot_estimator import live_track
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
@@ -65,6 +69,13 @@ OFFSETS_M = np.arange(-1.0, 2.01, 0.5)
 START_SD_M = 0.2
 WINDOW_S = 0.5
 MAX_WINDOWS = 12
+
+MIN_POSITION_SHARE = 0.5
+"""If fewer ranges have a position, swapped anchors are examined."""
+
+NO_POSITION_LOSS = 50.0
+MIN_UNIT_LOSS = 5.0
+"""Loss of a moment from which other units are examined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -109,17 +120,19 @@ class SelfCalibration:
         """Return a parameter and its standard deviation; (0, 0): it was not estimated."""
         if name not in self.fit.prior.names:
             return 0.0, 0.0
-        at = self.fit.prior.names.index(name)
-        return float(self.fit.parameters[at]), float(np.sqrt(self.fit.covariance[at, at]))
+        column = self.fit.prior.names.index(name)
+        return float(self.fit.parameters[column]), float(np.sqrt(self.fit.covariance[column, column]))
 
     def pair(self, tag: int, row: int) -> tuple[float, float]:
         """Return the offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
-        at, sd = self._columns(tag, row), self.fit.config.anchors.sd
+        columns, sd = self._columns(tag, row), self.fit.config.anchors.sd
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
-        placed = sd[row] ** 2 / 2.0 if len(at) > 1 else np.mean(sd**2) / len(sd) + self.individual_sd_m**2
-        variance = self.fit.covariance[np.ix_(at, at)].sum() + placed + self.common_offset_m**2
-        return float(self.fit.parameters[at].sum()), float(np.sqrt(variance))
+        placed = (
+            sd[row] ** 2 / 2.0 if len(columns) > 1 else np.mean(sd**2) / len(sd) + self.individual_sd_m**2
+        )
+        variance = self.fit.covariance[np.ix_(columns, columns)].sum() + placed + self.common_offset_m**2
+        return float(self.fit.parameters[columns].sum()), float(np.sqrt(variance))
 
     def applied(self, tag: int, row: int) -> tuple[float, float]:
         """Return the offset to subtract from the ranges of a tag and an anchor, m, and its standard deviation.
@@ -144,20 +157,20 @@ class SelfCalibration:
         rows = np.zeros((len(pairs), len(self.fit.parameters)))
         for number, (tag, row) in enumerate(pairs):
             rows[number, self._columns(tag, row)] = 1.0
-        of_mean = rows.mean(axis=0)
+        weight = rows.mean(axis=0)
         placed = float(np.mean(sd**2)) / 2.0 / len(sd)
-        variance = of_mean @ self.fit.covariance @ of_mean + placed + self.common_offset_m**2
-        return float(of_mean @ self.fit.parameters), float(np.sqrt(variance))
+        variance = weight @ self.fit.covariance @ weight + placed + self.common_offset_m**2
+        return float(weight @ self.fit.parameters), float(np.sqrt(variance))
 
     def _columns(self, tag: int, row: int) -> list[int]:
         """The parameters that are added to the ranges of a tag and an anchor."""
-        wanted = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
-        return [i for i, name in enumerate(self.fit.prior.names) if name in wanted]
+        names = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
+        return [i for i, name in enumerate(self.fit.prior.names) if name in names]
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return (tag number, anchor row) of all pairs with ranges."""
-        found = np.unique(np.stack([self.segments.tag, self.segments.ranges.anchor]), axis=1).T
-        return [(int(tag), int(row)) for tag, row in found]
+        pairs = np.unique(np.stack([self.segments.tag, self.segments.ranges.anchor]), axis=1).T
+        return [(int(tag), int(row)) for tag, row in pairs]
 
 
 def self_calibrate(
@@ -189,94 +202,172 @@ def self_calibrate(
         # Initial positions are found with the median height.
         height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), height_sd_m))
     config = EstimatorConfig(anchors, MODEL, height, area)
-    known = regressors or Regressors.none(sum(map(len, tags)))
-    detect_anchor_errors(anchors, np.unique(np.concatenate([one.anchor for one in tags])), height, area)
-    notes: list[str] = []
-    found = find_segments(tags)
-    of_range = np.cumsum([0, *map(len, tags)])[found.tag] + found.row
-    known = known.take(of_range)
-    if heights_m is not None and height is not None:
-        found = replace(found, relative_height=heights_m[of_range] - height.value)
-    expected = known.rows @ known.mean
-    offset = likely_offset(config, found, expected)
-    position, placed = first_positions(config, found, expected + offset)
+    extra = regressors or Regressors.none(sum(map(len, tags)))
+    detect_anchor_errors(anchors, np.unique(np.concatenate([tag.anchor for tag in tags])), height, area)
+    solver = _Solver(config, tags, extra, heights_m)
     if heights_m is not None and height is not None:
         # The spread of the heights was for the initial positions: each height has the accuracy of its measurement.
-        config = replace(config, height=Height(height.value, height_sd_m))
-    if not placed.all():
-        notes.append(
-            f"{int((~placed).sum())} of {len(placed)} segments left out: no position of the tag can be determined"
-        )
-    if not placed.any():
-        raise DatasetError(
-            "no position of a tag can be determined",
-            valid="four anchors or more that receive a tag at once, --height or --area",
-        )
-    kept = placed[found.of]
-    common = Regressors.one("offset", np.ones(len(kept)), offset, COMMON_SD_M)
-    shared = replace(common.joined(known), noise_group=known.noise_group).take(kept)
-    found = found.keep(placed)
-    # The positions contain no knots of segments that were left out.
-    fit = fit_segments(config, found, shared, position)
-    ambiguous = mirrored(fit)
-    if ambiguous.all():
-        raise DatasetError(
-            "the track has two mirror images, and either explains the ranges equally well",
-            valid="--height or --area to choose one, or an anchor that is not on the others' line (above or below their plane)",
-        )
-    if ambiguous.any():
-        notes.append(
-            f"{int(ambiguous.sum())} of {len(ambiguous)} segments left out: their mirror images fit equally well"
-        )
-        position = fit.position[~ambiguous[fit.observations.knot_segment]]
-        shared, found = shared.take(~ambiguous[found.of]), found.keep(~ambiguous)
-        fit = fit_segments(config, found, shared, position)
-    check_motion(fit)
-    common_sd = float(np.sqrt(fit.covariance[0, 0]))
-    level, own_sd = "one", 0.0
-    # Without the common offset the true ranges are unknown: own offsets would contain its error.
-    for group, members in candidates(found) if common_sd <= MAX_COMMON_SD_M else []:
-        better, unobservable, sd_of_group = with_own_offsets(found, fit, members)
-        if group == "anchor":
-            own_sd = sd_of_group
-        if better is None:
-            notes.append(f"own offsets of {group}s are not significant, so that all share one")
-            break
-        before, after = _held_out_scatter(fit), _held_out_scatter(better)
-        if after > before:
-            notes.append(
-                f"own offsets of {group}s: positions without one anchor scatter by {after:.3f} m with them, by "
-                f"{before:.3f} m without them, so that all share one"
+        solver.config = replace(config, height=Height(height.value, height_sd_m))
+    fit = solver.fit_common_offset()
+    level, fit, individual_sd = solver.with_own_offsets(fit)
+    fit = fit_segments(solver.config, solver.segments, fit.prior, fit.position, fit.parameters)
+    # The hypotheses of another height and of another anchor position compete with that of own offsets.
+    alternative = solver.with_free_offsets(fit)
+    check_anchor_positions(solver.segments, alternative, first_positions)
+    if heights_m is None:
+        check_height(alternative)
+    result = SelfCalibration(
+        segments=solver.segments,
+        fit=fit,
+        level=level,
+        tag_ids=tuple(tag.tag_id for tag in tags),
+        individual_sd_m=individual_sd,
+    )
+    if not any(result.applied(*pair)[0] for pair in result.pairs()) or solver.common_sd > MAX_COMMON_SD_M:
+        result = solver.without_offset(result)
+    pseudo, pseudo_sd = leave_one_out_residual(result.fit)
+    scatter = (
+        position_scatter(result.fit, np.zeros(len(result.fit.observations))),
+        _held_out_scatter(result.fit),
+    )
+    return replace(
+        result,
+        notes=tuple(solver.notes),
+        pseudo_m=pseudo,
+        pseudo_sd_m=pseudo_sd,
+        position_scatter_m=scatter,
+    )
+
+
+class _Solver:
+    """The steps of `self_calibrate`.
+
+    Attributes:
+        config: anchors, noise model, height and area. segments: ranges whose positions can be determined.
+        common: regressors of `segments`: the common offset, and the given ones.
+        common_sd: standard deviation of the common offset, m.
+        notes: messages about parameters that are not observable, and about ranges that were left out.
+    """
+
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        tags: Sequence[Ranges],
+        extra: Regressors,
+        heights_m: NDArray[np.float64] | None,
+    ) -> None:
+        self.config, self.notes, self.common_sd = config, list[str](), math.inf
+        self._tags = tags
+        self.segments = find_segments(tags)
+        site_rows = np.cumsum([0, *map(len, tags)])[self.segments.tag] + self.segments.row
+        extra = extra.select_rows(site_rows)
+        if heights_m is not None and config.height is not None:
+            relative_height = heights_m[site_rows] - config.height.value
+            self.segments = replace(self.segments, relative_height=relative_height)
+        expected = extra.rows @ extra.mean
+        check_units(config, self.segments, expected)
+        offset = likely_offset(config, self.segments, expected)
+        self._position, has_position = first_positions(config, self.segments, expected + offset)
+        common = Regressors.one("offset", np.ones(len(expected)), offset, COMMON_SD_M)
+        self.common = replace(common.concat(extra), noise_group=extra.noise_group)
+        used = float(has_position[self.segments.of].mean())
+        if used < MIN_POSITION_SHARE:
+            scale_m = np.full(int(extra.noise_group.max(initial=0)) + 1, START_SD_M)
+            check_swapped(self.segments, config, self.common, first_positions, scale_m)
+        if not has_position.any():
+            raise DatasetError(
+                "no position of a tag can be determined",
+                valid="four anchors or more that receive a tag at once, --height or --area",
             )
-            break
-        fit, level = better, "pair" if group != "anchor" else "anchor"
-        if unobservable:
-            names = ", ".join(_with_ids(name, anchors, tags) for name in unobservable)
-            notes.append(
-                f"{names}: their own offsets are not significant, so that they get the common offset"
+        if not has_position.all():
+            self.notes.append(
+                f"{int((~has_position).sum())} of {len(has_position)} segments left out: no position of the tag can be "
+                "determined"
             )
-    if level == "anchor" and len(np.unique(found.tag)) == 1:
-        # With one tag, the offset of an anchor is that of the pair.
-        level = "pair"
-    fit = fit_segments(config, found, fit.prior, fit.position, fit.parameters)
-    check_anchor_positions(found, fit, first_positions)
-    ids = tuple(one.tag_id for one in tags)
-    result = SelfCalibration(segments=found, fit=fit, level=level, tag_ids=ids, individual_sd_m=own_sd)
-    if common_sd > MAX_COMMON_SD_M or not any(result.applied(*pair)[0] for pair in result.pairs()):
+        self._select(has_position)
+
+    def _select(self, is_selected: NDArray[np.bool_]) -> None:
+        self.common = self.common.select_rows(is_selected[self.segments.of])
+        self.segments = self.segments.select(is_selected)
+
+    def fit_common_offset(self) -> JointFit:
+        """Fit tracks and common parameters.
+
+        Raises:
+            DatasetError: the track is ambiguous, or position and offset cannot be separated.
+        """
+        # The positions contain no knots of segments that were left out.
+        fit = fit_segments(self.config, self.segments, self.common, self._position)
+        ambiguous = mirrored(fit)
+        if ambiguous.all():
+            raise DatasetError(
+                "the track has two mirror images, and either explains the ranges equally well",
+                valid="--height or --area to choose one, or an anchor that is not on the others' line (above or below their "
+                "plane)",
+            )
+        if ambiguous.any():
+            self.notes.append(
+                f"{int(ambiguous.sum())} of {len(ambiguous)} segments left out: their mirror images fit equally well"
+            )
+            position = fit.position[~ambiguous[fit.observations.knot_segment]]
+            self._select(~ambiguous)
+            fit = fit_segments(self.config, self.segments, self.common, position)
+        check_motion(fit)
+        self.common_sd = float(np.sqrt(fit.covariance[0, 0]))
+        return fit
+
+    def with_own_offsets(self, fit: JointFit) -> tuple[str, JointFit, float]:
+        """Add own offsets that are significant; return their level, the fit, and the scatter of those of the anchors, m."""
+        level, individual_sd = "one", 0.0
+        # Without the common offset the true ranges are unknown: own offsets would contain its error.
+        groups = candidates(self.segments) if self.common_sd <= MAX_COMMON_SD_M else []
+        for group, members in groups:
+            extended, unobservable, sd = with_own_offsets(self.segments, fit, members)
+            if group == "anchor":
+                individual_sd = sd
+            if extended is None:
+                self.notes.append(f"own offsets of {group}s are not significant, so that all share one")
+                break
+            before, after = _held_out_scatter(fit), _held_out_scatter(extended)
+            if after > before:
+                self.notes.append(
+                    f"own offsets of {group}s: positions without one anchor scatter by {after:.3f} m with them, by "
+                    f"{before:.3f} m without them, so that all share one"
+                )
+                break
+            fit, level = extended, "pair" if group != "anchor" else "anchor"
+            if unobservable:
+                names = ", ".join(_with_ids(name, self.config.anchors, self._tags) for name in unobservable)
+                self.notes.append(
+                    f"{names}: their own offsets are not significant, so that they get the common offset"
+                )
+        if level == "anchor" and len(np.unique(self.segments.tag)) == 1:
+            # With one tag, the offset of an anchor is that of the pair.
+            level = "pair"
+        return level, fit, individual_sd
+
+    def with_free_offsets(self, fit: JointFit) -> JointFit:
+        """Return a fit with an own offset for each anchor, whether significant or not."""
+        _, members = candidates(self.segments)[0]
+        missing = {name: rows for name, rows in members.items() if name not in fit.prior.names}
+        if not missing:
+            return fit
+        own = own_offset_columns(missing, OWN_SD_M, fit.prior.noise_group)
+        start = np.append(fit.parameters, np.zeros(len(missing)))
+        return fit_segments(self.config, self.segments, fit.prior.concat(own), fit.position, start, near=True)
+
+    def without_offset(self, result: SelfCalibration) -> SelfCalibration:
+        """Return the solution with an offset of zero, because the estimate is not significant."""
         value, sd = result.mean()
-        notes.append(
+        self.notes.append(
             f"the offset is not significant, so that no offset is subtracted: {value:.2f} m with a standard deviation of "
             f"{sd:.2f} m. Drive between the anchors, not only past them"
         )
-        zero = replace(shared, mean=np.append(0.0, shared.mean[1:]), sd=np.append(1e-4, shared.sd[1:]))
+        common, fit = self.common, result.fit
+        zero = replace(common, mean=np.append(0.0, common.mean[1:]), sd=np.append(1e-4, common.sd[1:]))
         start = np.append(0.0, fit.parameters[1 : len(zero.names)])
-        fit = fit_segments(config, found, zero, fit.position, start)
-        result = replace(result, fit=fit, level="one", common_offset_m=float(np.hypot(value, sd)))
-    pseudo, pseudo_sd = leave_one_out_residual(fit)
-    scatter = position_scatter(fit, np.zeros(len(fit.observations))), _held_out_scatter(fit)
-    return replace(
-        result, notes=tuple(notes), pseudo_m=pseudo, pseudo_sd_m=pseudo_sd, position_scatter_m=scatter
-    )
+        fit = fit_segments(self.config, self.segments, zero, fit.position, start)
+        return replace(result, fit=fit, level="one", common_offset_m=float(np.hypot(value, sd)))
 
 
 def _held_out_scatter(fit: JointFit) -> float:
@@ -292,30 +383,38 @@ def _held_out_scatter(fit: JointFit) -> float:
     return position_scatter(fit, correction)
 
 
-def candidates(found: Segments) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
+def candidates(segments: Segments) -> list[tuple[str, dict[str, NDArray[np.bool_]]]]:
     """Return candidates for separate offsets in the order of their tests: {name: which ranges}."""
-    row, tag = found.ranges.anchor, found.tag
-    tried = [("anchor", {f"anchor {one}": row == one for one in np.unique(row).tolist()})]
+    row, tag = segments.ranges.anchor, segments.tag
+    tried = [("anchor", {f"anchor {anchor}": row == anchor for anchor in np.unique(row).tolist()})]
     # The offset of a tag that stays at one position can hardly be separated from this position.
-    num_segments = {one: len(np.unique(found.of[tag == one])) for one in np.unique(tag).tolist()}
+    num_segments = {number: len(np.unique(segments.of[tag == number])) for number in np.unique(tag).tolist()}
     several = [
-        one
-        for one, count in num_segments.items()
-        if count > 1 or not found.is_stationary[found.of[tag == one][0]]
+        number
+        for number, count in num_segments.items()
+        if count > 1 or not segments.is_stationary[segments.of[tag == number][0]]
     ]
     if len(several) > 1:
-        tried.append(("tag", {f"tag {one}": tag == one for one in several}))
+        tried.append(("tag", {f"tag {number}": tag == number for number in several}))
         pairs = {
-            f"pair {one} {anchor}": (tag == one) & (row == anchor)
-            for one in several
-            for anchor in np.unique(row[tag == one]).tolist()
+            f"pair {number} {anchor}": (tag == number) & (row == anchor)
+            for number in several
+            for anchor in np.unique(row[tag == number]).tolist()
         }
         tried.append(("pair", pairs))
     return tried
 
 
+def own_offset_columns(
+    members: dict[str, NDArray[np.bool_]], sd: float, noise_group: NDArray[np.intp]
+) -> Regressors:
+    """Return an offset with prior standard deviation `sd`, m, for each group of ranges, {name: bool (n,)}."""
+    rows = np.column_stack([mask.astype(float) for mask in members.values()])
+    return Regressors(tuple(members), rows, np.zeros(len(members)), np.full(len(members), sd), noise_group)
+
+
 def with_own_offsets(
-    found: Segments, fit: JointFit, members: dict[str, NDArray[np.bool_]]
+    segments: Segments, fit: JointFit, members: dict[str, NDArray[np.bool_]]
 ) -> tuple[JointFit | None, list[str], float]:
     """Add offsets of these groups of ranges to a fit, if they are significant.
 
@@ -328,20 +427,19 @@ def with_own_offsets(
     count = len(members)
 
     def with_groups(names: list[str], sd: float) -> JointFit:
-        rows, zero = np.column_stack([members[name].astype(float) for name in names]), np.zeros(len(names))
-        own = Regressors(tuple(names), rows, zero, np.full(len(names), sd), fit.prior.noise_group)
-        start = np.append(fit.parameters, zero)
-        return fit_segments(fit.config, found, fit.prior.joined(own), fit.position, start, near=True)
+        own = own_offset_columns({name: members[name] for name in names}, sd, fit.prior.noise_group)
+        start = np.append(fit.parameters, np.zeros(len(names)))
+        return fit_segments(fit.config, segments, fit.prior.concat(own), fit.position, start, near=True)
 
     trial = with_groups(list(members), OWN_SD_M)
     # Deviations from their mean: the mean is the common offset.
     centred = np.eye(count) - 1.0 / count
-    own = centred @ trial.parameters[-count:]
+    deviation = centred @ trial.parameters[-count:]
     variance = np.diag(centred @ trial.covariance[-count:, -count:] @ centred)
     # The estimate without the prior.
     prior = OWN_SD_M**2 * (1.0 - 1.0 / count)
     alone = 1.0 / np.maximum(1.0 / variance - 1.0 / prior, 1e-9)
-    free = own * alone / variance
+    free = deviation * alone / variance
     excess = float(np.sum(free**2 / alone))
     scatter = float(np.sum((free**2 - alone) / alone**2) / np.sum(1.0 / alone**2))
     sd = float(np.sqrt(max(scatter, 0.0)))
@@ -356,57 +454,100 @@ def with_own_offsets(
     return with_groups(names, sd), [name for name in members if name not in names], sd
 
 
-def likely_offset(config: EstimatorConfig, found: Segments, expected_m: NDArray[np.float64]) -> float:
+def likely_offset(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> float:
     """Return the one of `OFFSETS_M` with which the ranges of a few moments agree best; 0 if no moment has enough ranges.
 
     Args:
         config: anchors, noise model, height and area.
-        found: ranges, r in total.
+        segments: ranges, r in total.
         expected_m: float64 (r,), also subtracted from the ranges.
     """
+    moments = _moments(config, segments, expected_m)
+    if not moments:
+        return 0.0
+    loss = _moment_losses(config, moments)
+    return float(OFFSETS_M[int(np.argmin(loss))])
+
+
+UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2}
+
+
+def check_units(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> None:
+    """Refuse ranges or anchor positions that fit each other only in another unit.
+
+    Raises:
+        DatasetError: names the unit.
+    """
+    moments = _moments(config, segments, expected_m)
+    if not moments:
+        return
+    per_moment = float(_moment_losses(config, moments).min()) / len(moments)
+    if per_moment < MIN_UNIT_LOSS:
+        return
+    for unit, metres in UNITS.items():
+        for factor, name in ((metres, "ranges"), (1.0 / metres, "anchor positions")):
+            scaled = [(row, value * factor) for row, value in moments]
+            if float(_moment_losses(config, scaled).min()) / len(moments) < 0.3 * per_moment:
+                raise DatasetError(
+                    f"the ranges do not fit the anchor positions, but would if the {name} were in {unit}",
+                    valid="metres",
+                )
+
+
+_Moments = list[tuple[NDArray[np.intp], NDArray[np.float64]]]
+
+
+def _moments(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> _Moments:
+    """Return anchors and median ranges of at most `MAX_WINDOWS` moments with redundant ranges."""
     rng = np.random.default_rng(1)
     moments = []
-    window = (found.ranges.stamp_ns - found.ranges.stamp_ns[0]) // round(WINDOW_S * NS_PER_S)
-    key = np.where(found.is_stationary[found.of], -1 - found.of, window * len(found) + found.of)
-    for one in rng.permutation(np.unique(key)).tolist():
-        row, value = _medians(found.ranges, np.flatnonzero(key == one), expected_m)
+    ranges = segments.ranges
+    window = (ranges.stamp_ns - ranges.stamp_ns[0]) // round(WINDOW_S * NS_PER_S)
+    key = np.where(
+        segments.is_stationary[segments.of], -1 - segments.of, window * len(segments) + segments.of
+    )
+    for group in rng.permutation(np.unique(key)).tolist():
+        row, value = _medians(ranges, np.flatnonzero(key == group), expected_m)
         if len(row) > config.dims + 1:
             moments.append((row, value))
         if len(moments) == MAX_WINDOWS:
             break
-    if not moments:
-        return 0.0
+    return moments
+
+
+def _moment_losses(config: EstimatorConfig, moments: _Moments) -> NDArray[np.float64]:
+    """Return the loss of all moments with each of `OFFSETS_M`."""
     loss = np.zeros(len(OFFSETS_M))
     for row, value in moments:
         for k, offset in enumerate(OFFSETS_M.tolist()):
             possible = _candidate_positions(config, row, value - offset)
-            loss[k] += possible[0].loss if possible else 50.0
-    return float(OFFSETS_M[int(np.argmin(loss))])
+            loss[k] += possible[0].loss if possible else NO_POSITION_LOSS
+    return loss
 
 
 def first_positions(
-    config: EstimatorConfig, found: Segments, expected_m: NDArray[np.float64]
+    config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return initial positions float64 (K, 3) at the knots of the segments that have any; which these are, bool (s,)."""
     position: list[NDArray[np.float64]] = []
-    placed = np.zeros(len(found), np.bool_)
-    edges = np.searchsorted(found.of, np.arange(len(found) + 1))
-    for number in range(len(found)):
-        own = np.arange(edges[number], edges[number + 1])
-        if found.is_stationary[number]:
-            row, value = _medians(found.ranges, own, expected_m)
+    has_position = np.zeros(len(segments), np.bool_)
+    edges = np.searchsorted(segments.of, np.arange(len(segments) + 1))
+    for number in range(len(segments)):
+        rows = np.arange(edges[number], edges[number + 1])
+        if segments.is_stationary[number]:
+            row, value = _medians(segments.ranges, rows, expected_m)
             possible = _candidate_positions(config, row, value) if len(row) > config.dims else []
             if possible:
                 position.append(possible[0].position[None])
-                placed[number] = True
+                has_position[number] = True
             continue
-        ranges = found.ranges.take(own)
-        better = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[own], 0.0))
-        track = TagEstimator(config).run(better)
+        ranges = segments.ranges.take(rows)
+        corrected = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[rows], 0.0))
+        track = live_track(config, corrected)
         if len(track) >= 2:
             position.append(_at_knots(track, ranges))
-            placed[number] = True
-    return np.concatenate(position) if position else np.zeros((0, 3)), placed
+            has_position[number] = True
+    return np.concatenate(position) if position else np.zeros((0, 3)), has_position
 
 
 def _candidate_positions(
@@ -419,8 +560,8 @@ def _candidate_positions(
 def _at_knots(track: Track, ranges: Ranges) -> NDArray[np.float64]:
     since = (ranges.stamp_ns - ranges.stamp_ns[0]) / NS_PER_S
     knots = np.unique(np.rint(since / KNOT_S).astype(np.int64)) * KNOT_S
-    own = (track.stamp_ns - ranges.stamp_ns[0]) / NS_PER_S
-    return np.stack([np.interp(knots, own, axis) for axis in track.position.T], axis=1)
+    track_s = (track.stamp_ns - ranges.stamp_ns[0]) / NS_PER_S
+    return np.stack([np.interp(knots, track_s, axis) for axis in track.position.T], axis=1)
 
 
 def _medians(
@@ -429,7 +570,7 @@ def _medians(
     """Return the anchors received in `rows`, and the median corrected range of each."""
     value = ranges.range_m[rows] - expected_m[rows]
     received = np.unique(ranges.anchor[rows])
-    return received, np.array([np.median(value[ranges.anchor[rows] == one]) for one in received])
+    return received, np.array([np.median(value[ranges.anchor[rows] == row]) for row in received])
 
 
 def _with_ids(name: str, anchors: AnchorMap, tags: Sequence[Ranges]) -> str:

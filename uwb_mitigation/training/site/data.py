@@ -221,6 +221,13 @@ class _RangeTable:
                 f"no ranges of the anchors {', '.join(map(format_id, sorted(self._anchors.index)))}",
                 valid=f"anchors of the recording: {received_ids}",
             )
+        if (num_unknown := self._unknown_anchors.total()) > len(self._rows):
+            unknown_ids = ", ".join(map(format_id, sorted(self._unknown_anchors)))
+            raise DatasetError(
+                f"{num_unknown} of {num_unknown + len(self._rows)} ranges are from anchors that are not in the anchors file: "
+                f"{unknown_ids}",
+                valid=f"anchors of the file: {', '.join(map(format_id, sorted(self._anchors.index)))}",
+            )
         types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
         columns: list[NDArray[Any]] = [
             np.array(column, kind) for column, kind in zip(zip(*self._rows, strict=True), types, strict=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.floating import float_network
 from uwb_mitigation.positioning.batch.anchor_errors import validate_anchor_map
@@ -36,6 +37,9 @@ OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
 
 NETWORK_GROUPS = 8
 """Number of equal groups by size of the correction; the ranges of a group have a common standard deviation."""
+
+MAX_LEVER_ARM_ERROR_M = 0.2
+"""A given lever arm is refused if the ranges determine one that differs more, and by four standard deviations."""
 
 NETWORK, LEVEL = "network", "level"
 
@@ -327,6 +331,7 @@ class _WithLocalisation:
             DatasetError: another lever arm, or other anchor positions, explain the ranges much better.
         """
         site, alignment, rows = self._site, self._alignment, self._rows
+        self._check_lever_arm()
         validate_anchor_map(site.anchors, site.ranges, site.tag, alignment.position, self._is_used)
         common, pairs = self._pairs()
         segment = site.tag[rows]
@@ -349,6 +354,37 @@ class _WithLocalisation:
             track_of=segment,
             stationary_positions={},
         )
+
+    def _check_lever_arm(self) -> None:
+        """Refuse a given lever arm if the ranges determine another one."""
+        alignment, localisation = self._alignment, self._localisation
+        if localisation.estimate_lever_arm:
+            return
+        try:
+            estimated = align_poses(
+                self._site.anchors,
+                self._site.tags,
+                self._paths,
+                self._extra,
+                time_offset_s=alignment.time_offset_s,
+                lever_arms_m=alignment.lever_arm_m,
+                estimate_lever_arm=True,
+            )
+        except DatasetError:
+            # The drive does not determine it.
+            return
+        change_m = np.abs(estimated.lever_arm_m - alignment.lever_arm_m)[:, :2]
+        limit_m = np.maximum(MAX_LEVER_ARM_ERROR_M, 4.0 * estimated.lever_arm_sd_m[:, :2])
+        for tag in np.flatnonzero((change_m > limit_m).any(axis=1)).tolist():
+            given, better = (
+                ", ".join(f"{value:.2f}" for value in arms[tag, :2].tolist())
+                for arms in (alignment.lever_arm_m, estimated.lever_arm_m)
+            )
+            raise DatasetError(
+                f"tag {format_id(self._site.tags[tag].tag_id)}: the lever arm ({given}) m contradicts the ranges: they fit "
+                f"({better}) m",
+                valid="--lever-arm X,Y,Z, a transform in the bag, or --estimate-lever-arm",
+            )
 
     def _ids(self, tag: int, row: int) -> tuple[int, int]:
         return self._site.tags[tag].tag_id, self._site.anchors.anchors[row].id
@@ -380,7 +416,7 @@ class _WithLocalisation:
                 for number, (ranges, first_row) in enumerate(zip(site.tags, site.first_rows, strict=True))
             ],
             self._paths,
-            self._extra.take(remaining),
+            self._extra.select_rows(remaining),
             time_offset_s=alignment.time_offset_s,
             lever_arms_m=alignment.lever_arm_m,
         )
