@@ -124,7 +124,7 @@ def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
     assert "without truth" in bundle.card.origin
     # Without CIRs, only the line and the offset are used.
     cir = Cir(np.zeros(0, np.int16), rx_power_dbm=-85.0)
-    corrected = Mitigation(bundle, offsets).correct([RangeMeasurement(0, 7, 1, 0, 0, 5.4, cir)])[0]
+    corrected = Mitigation(bundle, offsets).correct([RangeMeasurement(0, 7, 5, 0, 0, 5.3, cir)])[0]
     assert corrected.status == 0
     assert corrected.range_m == pytest.approx(5.0, abs=0.12)
     none = run("quantise", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=site)

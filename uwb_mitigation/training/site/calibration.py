@@ -210,8 +210,7 @@ def calibrate_site(
 ) -> SiteCalibration:
     """Select a model for the ranges and offsets of a solution.
 
-    The simplest model is selected that no more complex one improves significantly: by the held-out range errors, among the
-    models that do not increase the error of the live position. If offsets of pairs increase it, all pairs share one offset.
+    See `SiteErrors.select`. If offsets of pairs increase the error of the live position, all pairs share one offset.
 
     Args:
         site: recorded ranges.

@@ -13,7 +13,7 @@ from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.splits import Split
 from uwb_mitigation.training.fit.candidates import Candidate
-from uwb_mitigation.training.fit.selection import held_out_errors, select_simplest, step_counter
+from uwb_mitigation.training.fit.selection import MIN_GAIN, held_out_errors, step_counter
 from uwb_mitigation.training.site.live_position import LiveError
 
 SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
@@ -43,14 +43,21 @@ class SiteErrors:
         return {name: float(np.abs(error).mean()) for name, error in self.all_errors().items()}
 
     def select(self, live: Mapping[str, LiveError]) -> str:
-        """Return the simplest candidate that no allowed one improves; the first candidate is always allowed.
+        """Return the simplest candidate that no more complex one improves by `MIN_GAIN`, in order of complexity.
 
-        A more complex candidate is allowed if it does not increase the error of the live position.
+        A more complex candidate must reduce the live position error, or the range error without increasing the former.
         """
-        errors = self.all_errors()
-        first = next(iter(errors))
-        allowed = {name: error for name, error in errors.items() if not live[name].is_worse_than(live[first])}
-        return select_simplest(allowed)
+        mae = self.mae()
+        best = first = next(iter(mae))
+        for name in mae:
+            is_allowed = not live[name].is_worse_than(live[first])
+            improves_live = live[name].change_from(live[best]) < -MIN_GAIN
+            improves_ranges = mae[name] < (1.0 - MIN_GAIN) * mae[best]
+            if is_allowed and (
+                improves_live or (improves_ranges and not live[name].is_worse_than(live[best]))
+            ):
+                best = name
+        return best
 
 
 def held_out_site_errors(
