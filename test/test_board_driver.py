@@ -88,16 +88,6 @@ def test_replugged_board_is_found_under_another_port_name(board, events, tmp_pat
         holder.close()
 
 
-def test_board_that_resets_is_connected_again(board, events):
-    events.wait_for(RangeMeasurement)
-    board.reset()
-
-    (loss,) = events.wait_for(Disconnected)
-
-    assert loss.loss in (Loss.RESET, Loss.OUT_OF_SEQUENCE)
-    events.wait_for(RangeMeasurement)
-
-
 def test_faulty_channel_delivers_only_sent_messages(link):
     faults = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05)
     # Long enough that the numbers do not start again while the port is opened.
@@ -115,14 +105,6 @@ def test_faulty_channel_delivers_only_sent_messages(link):
     assert counts["lost"] > 0
     assert counts["corrupt"] > 0
     assert counts["stale"] > 0
-
-
-def test_missing_port_is_reported_and_awaited(tmp_path):
-    path = tmp_path / "later"
-    with PortEvents(serial, SerialSettings(PortAddress(str(path)))) as events:
-        assert "is not there" in events.port.report().problem
-        with EmulatedBoard(link=path):
-            events.wait_for(Connected)
 
 
 @pytest.mark.parametrize("exclusive", [True, False])

@@ -159,6 +159,8 @@ def test_boards_at_two_computers_have_matching_settings():
         {"radio__address": "0x12345"},
         {"radio__anchors": "x"},
         {"radio__window": 1016},
+        {"radio__address": 2, "radio__anchors": "2"},
+        {"radio__preamble_code": 3},
         {"radio__rate": 200.0},
         {"radio__role": "anchor", "port": "/dev/a,/dev/b"},
     ],
