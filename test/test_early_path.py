@@ -23,11 +23,11 @@ REPORTED = 300.0
 
 
 def received(early: float, before: float = 20.0, seed: int = 0, **changes: object) -> RangeMeasurement:
-    """Return a range with noise of 5 counts, a path of 2,000 counts, and one of `early` counts `before` taps earlier."""
+    """Return a range with noise of 5 counts, a path of 1,200 counts, and one of `early` counts `before` taps earlier."""
     random = np.random.default_rng(seed)
     taps = np.arange(400.0)
     samples = random.normal(0.0, 5.0, (400, 2))
-    for position, amplitude in ((REPORTED, 2000.0), (REPORTED - before, early)):
+    for position, amplitude in ((REPORTED, 1200.0), (REPORTED - before, early)):
         phase = random.uniform(0.0, 2 * np.pi)
         shape = amplitude * pulse(taps - position - EDGE_LEAD_TAPS) / pulse(np.zeros(1))[0]
         samples += shape[:, None] * (np.cos(phase), np.sin(phase))
@@ -48,11 +48,11 @@ def error_m(measurement: RangeMeasurement) -> float:
 
 @pytest.mark.parametrize("before", [4.3, 12.0, 20.25, 38.9])
 def test_missed_path_gives_its_distance_from_the_reported_one(before: float) -> None:
-    assert error_m(received(200.0, before)) == pytest.approx(before * TAP_M, abs=0.06)
+    assert error_m(received(110.0, before)) == pytest.approx(before * TAP_M, abs=0.06)
 
 
 def test_amplitudes_give_the_same_path() -> None:
-    found = received(200.0)
+    found = received(110.0)
     magnitude = np.rint(np.hypot(*found.cir.samples.reshape(-1, 2).T)).astype(np.int16)
     amplitudes = replace(found, cir=replace(found.cir, samples=magnitude, encoding=Encoding.MAGNITUDE))
     assert error_m(amplitudes) == pytest.approx(error_m(found), abs=0.01)
@@ -60,10 +60,11 @@ def test_amplitudes_give_the_same_path() -> None:
 
 def test_noise_weak_paths_and_short_cirs_have_no_early_path() -> None:
     assert all(np.isnan(error_m(received(0.0, seed=seed))) for seed in range(300))
-    assert np.isnan(error_m(received(90.0))), "weaker than 1/400 of the strongest tap"
-    assert np.isnan(error_m(received(200.0, 45.0))), "before the search"
+    assert np.isnan(error_m(received(50.0))), "weaker than 1/400 of the strongest tap"
+    assert np.isnan(error_m(received(110.0, 45.0))), "before the search"
+    assert np.isnan(error_m(received(400.0))), "too strong to be missed"
     start = 2 * (int(REPORTED) - 160)
-    found = received(200.0)
+    found = received(110.0)
     assert np.isnan(
         error_m(replace(found, cir=replace(found.cir, samples=found.cir.samples[start:], start_index=140)))
     )
@@ -74,7 +75,7 @@ def with_early_path(folder: Path) -> Bundle:
 
 
 def test_early_path_replaces_the_network(tmp_path: Path) -> None:
-    (corrected,) = Mitigation(with_early_path(tmp_path)).correct([received(200.0)])
+    (corrected,) = Mitigation(with_early_path(tmp_path)).correct([received(110.0)])
     assert corrected.status is Status.OK
     assert corrected.correction_m == pytest.approx(20 * TAP_M, abs=0.06)
 
@@ -85,7 +86,7 @@ def test_firmware_computes_the_same_bits(tmp_path: Path) -> None:
     model = with_early_path(tmp_path)
     ranges = [
         received(
-            float(random.uniform(0.0, 400.0)),
+            float(random.uniform(0.0, 250.0)),
             float(random.uniform(3.0, 45.0)),
             seed,
             first_path_index=float(np.float32(REPORTED + random.uniform(-2.0, 2.0))),

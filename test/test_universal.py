@@ -35,6 +35,7 @@ def test_result_does_not_depend_on_the_number_of_workers(small: UniversalModel) 
 
 def test_evaluation_by_condition_uses_other_buildings(small: UniversalModel) -> None:
     assert small.card.source == "DW1000 IPATOV"
+    assert small.card.early_path
     for row in ("raw", "float", "int8"):
         assert set(small.held_out[row]) == {"all", "LOS", "NLOS", "NDP NLOS"}
     assert small.held_out["raw"]["LOS"].mae < small.held_out["raw"]["NDP NLOS"].mae

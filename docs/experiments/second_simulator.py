@@ -1,14 +1,15 @@
 """Compare the shipped universal models with a constant offset on a simulator that no model was trained or tuned on.
 
 The figures are the MAE relative to that of a constant offset, for first-path indices that are 0, 5 and 10 taps late; the
-LOS median is subtracted from the errors. The target of at most 1.02 is missed in open rooms.
+LOS median is subtracted from the errors. The target of at most 1.02 is missed in open halls.
 
 The training simulator draws the diffuse field from the statistics of IEEE 802.15.4a and detects the half-amplitude
 point of a Gaussian pulse above a noise threshold. Here the paths are reflections of order 0 to 3 in a
 three-dimensional room (Allen and Berkley, "Image method", JASA 1979) with carrier phases and Fresnel-like losses,
 point scatterers, and a reverberant tail (Andersen et al., "Room electromagnetics", 2007). The antennas are dipoles with
 random attitude. The receiver has a raised-cosine pulse, another gain compression and another leading-edge detector,
-which also rejects paths 24 dB below the peak. No value was fitted to a recording or to a model.
+which also rejects paths 24 dB below the peak. The reported index is that of the edge, as of a DW1000. In LOS the median power
+gap is 3.4 dB in the hall and 3.3 dB in the small room. No value was fitted to a recording or to a model.
 """
 
 from __future__ import annotations

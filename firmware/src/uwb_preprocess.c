@@ -90,7 +90,14 @@ uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *win
 }
 
 /* As in uwb_mitigation/mitigation/early_path.py, with its constants. */
-enum { SEARCH_TAPS = 40, EDGE_TAPS = 3, NOISE_TAPS = 128, MIN_NOISE_RATIO = 3, MAX_WINDOW_RATIO = 400 };
+enum {
+    SEARCH_TAPS = 40,
+    EDGE_TAPS = 3,
+    NOISE_TAPS = 128,
+    MIN_NOISE_RATIO = 3,
+    MAX_NOISE_RATIO = 64,
+    MAX_WINDOW_RATIO = 400
+};
 
 static const float TAP_M = 0.300272882f; /* light in one sample period */
 
@@ -122,9 +129,9 @@ int uwb_early_path(const uwb_model *model, const uwb_cir *cir, float *error_m) {
     const size_t window = first - UWB_WINDOW_LEAD;
     const size_t stop = window + model->samples;
     const size_t begin = first - SEARCH_TAPS;
-    const uint64_t noise = MIN_NOISE_RATIO * (uint64_t)strongest(cir, begin - NOISE_TAPS, begin);
+    const uint64_t noise = strongest(cir, begin - NOISE_TAPS, begin);
     const uint64_t least = strongest(cir, window, stop) / MAX_WINDOW_RATIO;
-    const uint64_t threshold = noise > least ? noise : least;
+    const uint64_t threshold = MIN_NOISE_RATIO * noise > least ? MIN_NOISE_RATIO * noise : least;
     size_t top = begin;
     while (top <= first - EDGE_TAPS && tap_power(cir, top) <= threshold) {
         top++;
@@ -136,6 +143,9 @@ int uwb_early_path(const uwb_model *model, const uwb_cir *cir, float *error_m) {
         top++;
     }
     const uint32_t peak = tap_power(cir, top);
+    if (peak > MAX_NOISE_RATIO * noise) {
+        return 0;
+    }
     size_t low = top;
     while (low > begin - NOISE_TAPS && 4 * (uint64_t)tap_power(cir, low) > peak) {
         low--;

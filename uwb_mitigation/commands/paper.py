@@ -122,16 +122,16 @@ def protocol(
     with needs_torch():
         from uwb_mitigation.training.paper import experiment
 
-    wanted = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)
+    tasks = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)
     options = replace(experiment.PAPER, epochs=epochs, learning_rate=learning_rate)
     if output.exists() and not output.is_dir():
         raise ParameterError(
             "not a folder", where=str(output), valid="a folder; it is created if it does not exist"
         )
     parts = _parts(data, max(lengths), scaling, split)
-    with console.share_bar(f"{len(wanted)} networks") as update:
+    with console.share_bar(f"{len(tasks)} networks") as update:
         result = experiment.run_experiment(
-            parts, output, wanted, options, _workers(workers), update, _command()
+            parts, output, tasks, options, _workers(workers), update, _command()
         )
     _show_experiment(result)
     console.write_json(json, result.model_dump(mode="json"))

@@ -19,9 +19,10 @@ SEARCH_TAPS, EDGE_TAPS, NOISE_TAPS = 40, 3, 128
 """The search begins `SEARCH_TAPS` before the reported first path and ends `EDGE_TAPS` before it, where its edge begins. The
 taps before the search contain noise."""
 
-MIN_NOISE_RATIO, MAX_WINDOW_RATIO = 3, 400
+MIN_NOISE_RATIO, MAX_NOISE_RATIO, MAX_WINDOW_RATIO = 3, 64, 400
 """The power of an early path is more than 3 times that of the strongest noise tap (4.8 dB), and more than 1/400 of that of
-the strongest tap in the window (-26 dB)."""
+the strongest tap in the window (-26 dB). No detector misses a path of more than 64 times the noise: its threshold is at most
+31 standard deviations (NTM of LDE_CFG1, DW1000 user manual). The reported index is then wrong, and the range may be right."""
 
 TAP_M = np.float32(299_792_458.0 * SAMPLE_PERIOD_S)
 
@@ -54,7 +55,9 @@ def early_path_error_m(ranges: RangeColumns, rows: NDArray[np.intp], samples: in
         threshold = max(MIN_NOISE_RATIO * int(noise.max()), int(window.max()) // MAX_WINDOW_RATIO)
         above = search > threshold
         if above.any():
-            edge = _half_amplitude(power, NOISE_TAPS + int(above.argmax()))
+            edge = _half_amplitude(
+                power, NOISE_TAPS + int(above.argmax()), MAX_NOISE_RATIO * int(noise.max())
+            )
             if edge is not None:
                 low, fraction = edge
                 taps = np.float32(NOISE_TAPS + SEARCH_TAPS - low)
@@ -63,11 +66,16 @@ def early_path_error_m(ranges: RangeColumns, rows: NDArray[np.intp], samples: in
     return errors
 
 
-def _half_amplitude(power: NDArray[np.int64], tap: int) -> tuple[int, np.float32] | None:
-    """Return where a rising edge reaches half the amplitude of its first maximum: the tap before, and the fraction."""
+def _half_amplitude(power: NDArray[np.int64], tap: int, limit: int) -> tuple[int, np.float32] | None:
+    """Return where a rising edge reaches half the amplitude of its first maximum: the tap before, and the fraction.
+
+    None if there is no such tap, or if the power of the maximum exceeds `limit`.
+    """
     top = tap
     while top + 1 < len(power) and power[top + 1] > power[top]:
         top += 1
+    if power[top] > limit:
+        return None
     low = top
     while low > 0 and 4 * power[low] > power[top]:
         low -= 1

@@ -160,9 +160,9 @@ class Preprocessing:
         faults = np.zeros(len(measurements), np.uint8)
         inputs = np.zeros((len(measurements), self.samples), np.float32)
         for indices, ranges in RangeColumns.grouped(measurements):
-            found, windows = self.apply(ranges)
-            faults[indices] = found
-            inputs[np.array(indices)[found == 0]] = windows
+            group_faults, windows = self.apply(ranges)
+            faults[indices] = group_faults
+            inputs[np.array(indices)[group_faults == 0]] = windows
         return faults.tolist(), inputs
 
 

@@ -182,12 +182,12 @@ def _divide(
     axis = 0 if sides[0] >= sides[1] else 1
     if sides[axis] < 1.6 * room_m:
         return
-    at = low[axis] + float(rng.uniform(0.35, 0.65)) * sides[axis]
-    start, end = ((at, low[1]), (at, high[1])) if axis == 0 else ((low[0], at), (high[0], at))
+    split = low[axis] + float(rng.uniform(0.35, 0.65)) * sides[axis]
+    start, end = ((split, low[1]), (split, high[1])) if axis == 0 else ((low[0], split), (high[0], split))
     door = [float(rng.uniform(0.1, 0.9)) * sides[1 - axis]] if rng.random() < DOORWAY_SHARE else []
     walls += _wall(start, end, rng, np.array(door))
-    _divide(low, (at, high[1]) if axis == 0 else (high[0], at), room_m, rng, walls)
-    _divide((at, low[1]) if axis == 0 else (low[0], at), high, room_m, rng, walls)
+    _divide(low, (split, high[1]) if axis == 0 else (high[0], split), room_m, rng, walls)
+    _divide((split, low[1]) if axis == 0 else (low[0], split), high, room_m, rng, walls)
 
 
 def _wall(
@@ -248,7 +248,9 @@ class Block:
         return f"simulated buildings seed {seed}/{self.kind} {building}/placement {number * PLACEMENTS + placement}"
 
 
-def block_of(seed: int, number: int, *, radio: Receiver = RADIO) -> tuple[Block, np.random.Generator]:
+def block_of(
+    seed: int, number: int, *, radio: Receiver = RADIO, wide_share: float = WIDE_SHARE
+) -> tuple[Block, np.random.Generator]:
     """Draw a block of `PLACEMENTS` placements in one type of building; also return the generator for fading and noise.
 
     About a third of the placements each is in line of sight, behind obstacles, and behind obstacles with a lost direct path.
@@ -259,14 +261,15 @@ def block_of(seed: int, number: int, *, radio: Receiver = RADIO) -> tuple[Block,
         seed: seed of all blocks.
         number: number of the block, from 0.
         radio: type of all radios.
+        wide_share: probability of a block with open sites and other boards.
     """
     rng = np.random.default_rng([seed, number])
-    wide = bool(rng.random() < WIDE_SHARE)
+    wide = bool(rng.random() < wide_share)
     kinds = WIDE_KINDS if wide else KINDS
     kind = kinds[int(rng.choice(len(kinds), p=[kind.share for kind in kinds]))]
     environment_pairs, shares = zip(*kind.environments, strict=True)
     environments = environment_pairs[int(rng.choice(len(environment_pairs), p=shares))]
-    each = CANDIDATES * PLACEMENTS // BUILDINGS
+    per_building = CANDIDATES * PLACEMENTS // BUILDINGS
     plans = [draw_plan(kind, rng) for _ in range(BUILDINGS)]
     if wide:
         factor = float(rng.uniform(*DECAY_FACTOR))
@@ -274,7 +277,7 @@ def block_of(seed: int, number: int, *, radio: Receiver = RADIO) -> tuple[Block,
             path_m = float(np.mean([mean_free_path_m(plan.size) for plan in plans]))
             factor *= max(1.0, path_m / mean_free_path_m(FLAT.size))
         environments = tuple(_with_decay(environment, factor) for environment in environments)
-    places = [place(plan.size, each, rng) for plan in plans]
+    places = [place(plan.size, per_building, rng) for plan in plans]
     path = DirectPath.joined(
         [plan.direct_path(anchor, tag) for plan, (anchor, tag) in zip(plans, places, strict=True)]
     )
@@ -296,7 +299,7 @@ def block_of(seed: int, number: int, *, radio: Receiver = RADIO) -> tuple[Block,
         np.arange(PLACEMENTS),
         stationary=True,
     )
-    return Block(kind.name, chosen // each, pairs, boards.take(chosen)), rng
+    return Block(kind.name, chosen // per_building, pairs, boards.take(chosen)), rng
 
 
 def _with_decay(environment: Environment, factor: float) -> Environment:

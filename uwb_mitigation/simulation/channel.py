@@ -40,8 +40,8 @@ def check_range(where: str, name: str, value: float, low: float, high: float, *,
 
     NaN is rejected; with `whole`, also a number that is not an integer.
     """
-    given: object = value
-    if not isinstance(given, Integral if whole else Real) or not low <= value <= high:
+    checked: object = value
+    if not isinstance(checked, Integral if whole else Real) or not low <= value <= high:
         kind = "a whole number from " if whole else ""
         raise ParameterError(f"{name} = {value!r}", where=where, valid=f"{kind}{low:g} to {high:g}")
 

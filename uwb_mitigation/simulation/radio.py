@@ -376,7 +376,7 @@ def detect_first_path(
     edge's first maximum, so that it hardly depends on the strength of the path and on later paths.
     """
     above = magnitude[:, FIRST_SEARCHED_TAP:] > threshold[:, None]
-    found = above.any(axis=1)
+    is_found = above.any(axis=1)
     crossing = above.argmax(axis=1) + FIRST_SEARCHED_TAP
     crossing = np.minimum(crossing, TAPS - 1 - int(_EDGE_WINDOW[-1]))
     rows = np.arange(len(taps))
@@ -397,7 +397,7 @@ def detect_first_path(
     fraction = np.clip((half - low) / rise, 0.0, 1.0)
     index = crossing + _FINE_TAPS[last] + fraction / _EDGE_STEPS
     index = np.rint(index * INDEX_STEPS) / INDEX_STEPS
-    located: NDArray[np.float64] = np.where(found, index, np.nan)
+    located: NDArray[np.float64] = np.where(is_found, index, np.nan)
     return located
 
 
@@ -414,11 +414,11 @@ def power_levels(
     noise_taps = magnitude[:, NOISE_TAPS].astype(np.float64)
     noise = np.einsum("ij,ij->i", noise_taps, noise_taps) / noise_taps.shape[1] * magnitude.shape[1]
     cir_power = np.maximum(np.rint((energy - noise) / 2.0**17), 1.0)
-    found = np.isfinite(index)
-    first = np.floor(np.where(found, index, 0.0)).astype(np.int64)
+    is_found = np.isfinite(index)
+    first = np.floor(np.where(is_found, index, 0.0)).astype(np.int64)
     window = np.rint(magnitude[np.arange(len(index))[:, None], first[:, None] + np.arange(1, 4)])
     first_power = np.maximum((window.astype(np.float64) ** 2).sum(axis=1), 1.0)
     squared = count.astype(np.float64) ** 2
     receive = 10.0 * np.log10(cir_power * 2.0**17 / squared) - POWER_CONSTANT_DB
     first_path = 10.0 * np.log10(first_power / squared) - POWER_CONSTANT_DB
-    return np.where(found, receive, np.nan), np.where(found, first_path, np.nan)
+    return np.where(is_found, receive, np.nan), np.where(is_found, first_path, np.nan)

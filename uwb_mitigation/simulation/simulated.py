@@ -264,20 +264,29 @@ class SimulatedSurvey(Simulated):
             rng = np.random.default_rng([self._seed, batch])
             fields = draw_fields(RESIDENTIAL, placements, rng)
             anchor, tag = place(self._plan.size, placements, rng)
-            of = np.repeat(np.arange(placements), self._exchanges)
+            pair_index = np.repeat(np.arange(placements), self._exchanges)
             names = [
-                f"simulated survey seed {self._seed}/placement {batch * placements + k}" for k in of.tolist()
+                f"simulated survey seed {self._seed}/placement {batch * placements + k}"
+                for k in pair_index.tolist()
             ]
             sequence = batch * size + np.arange(size)
             ids = np.ones(size, np.int64)
-            path = self._plan.direct_path(anchor, tag).take(of)
+            path = self._plan.direct_path(anchor, tag).take(pair_index)
             yield (
                 TwrBatch(
                     sequence,
                     ids,
                     FIRST_TAG_ID * ids,
                     names,
-                    AntennaPairs(anchor[of], tag[of], path, RESIDENTIAL, fields, of, stationary=True),
+                    AntennaPairs(
+                        anchor[pair_index],
+                        tag[pair_index],
+                        path,
+                        RESIDENTIAL,
+                        fields,
+                        pair_index,
+                        stationary=True,
+                    ),
                 ),
                 rng,
             )
@@ -308,24 +317,26 @@ class SimulatedBuildings(Simulated):
         self._exchanges = exchanges
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
-        each = self._exchanges
-        together = max(1, BATCH // each)
-        for number in range(-(-self._count // (PLACEMENTS * each))):
+        exchanges_per_placement = self._exchanges
+        together = max(1, BATCH // exchanges_per_placement)
+        for number in range(-(-self._count // (PLACEMENTS * exchanges_per_placement))):
             block, rng = block_of(self._seed, number)
             for first in range(0, PLACEMENTS, together):
                 rows = np.arange(first, min(first + together, PLACEMENTS))
-                of = np.repeat(np.arange(len(rows)), each)
-                pairs = block.pairs.take(rows, of)
+                pair_index = np.repeat(np.arange(len(rows)), exchanges_per_placement)
+                pairs = block.pairs.take(rows, pair_index)
                 names = [block.configuration(self._seed, number, k) for k in rows.tolist()]
-                ids = np.ones(len(of), np.int64)
-                sequence = (number * PLACEMENTS + first) * each + np.arange(len(of))
+                ids = np.ones(len(pair_index), np.int64)
+                sequence = (number * PLACEMENTS + first) * exchanges_per_placement + np.arange(
+                    len(pair_index)
+                )
                 exchanges = TwrBatch(
                     sequence,
                     ids,
                     FIRST_TAG_ID * ids,
-                    [names[k] for k in of.tolist()],
+                    [names[k] for k in pair_index.tolist()],
                     pairs,
-                    block.boards.take(rows[of]),
+                    block.boards.take(rows[pair_index]),
                 )
                 yield exchanges, rng
 

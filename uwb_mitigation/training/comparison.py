@@ -129,9 +129,9 @@ def compare_models(
     Raises:
         DatasetError, ParameterError: see `splits.by_group` and `fit`. MissingDependencyError: no scikit-learn.
     """
-    known = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
-    without_levels = int((~known).sum()) if known.any() else 0
-    dataset = dataset.rows(known) if known.any() else dataset
+    has_levels = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
+    without_levels = int((~has_levels).sum()) if has_levels.any() else 0
+    dataset = dataset.rows(has_levels) if has_levels.any() else dataset
     held_out_by_seed = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
     names = NAMES if dataset.has_cirs else NAMES_WITHOUT_CIRS
     errors_by_row = {

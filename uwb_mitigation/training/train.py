@@ -253,15 +253,15 @@ def cross_validate(
         assert fitted.network is not None
         linear_m = linear_bias_m(fitted.linear_bias, test)
         # If the linear bias model needs a power that is unknown, the range is passed through.
-        known = np.isfinite(linear_m)
-        residual = test.error_m - np.where(known, linear_m, 0.0)
+        is_finite = np.isfinite(linear_m)
+        residual = test.error_m - np.where(is_finite, linear_m, 0.0)
         errors["overall_median"][fold.test] -= np.median(train.error_m)
         if recipe.line:
             errors["l1_line"][fold.test] = residual
-        errors["float"][fold.test] = residual - known * floating.predict_m(fitted.network, test.inputs)
+        errors["float"][fold.test] = residual - is_finite * floating.predict_m(fitted.network, test.inputs)
         if quantised:
             integers = quantize_network(fitted.network, calibration_inputs(train, seed), exact=False)
-            errors["int8"][fold.test] = residual - known * IntegerNetwork(integers).predict_m(test.inputs)
+            errors["int8"][fold.test] = residual - is_finite * IntegerNetwork(integers).predict_m(test.inputs)
     return CrossValidation(dataset, errors, folds, seed)
 
 

@@ -172,13 +172,13 @@ class FirmwareMitigation(Corrector):
             ),
             strict=True,
         )
-        found = pass_through(self.bundle, ranges, offset, np.array(status, np.uint8))
-        is_corrected = found.status == Status.OK
+        corrected = pass_through(self.bundle, ranges, offset, np.array(status, np.uint8))
+        is_corrected = corrected.status == Status.OK
         for column, computed in zip(
-            (found.range_m, found.correction_m, found.variance_m2), values, strict=True
+            (corrected.range_m, corrected.correction_m, corrected.variance_m2), values, strict=True
         ):
             column[is_corrected] = np.array(computed, np.float32)[is_corrected]
-        return found
+        return corrected
 
 
 def _cir(ranges: RangeColumns, row: int) -> Cir:

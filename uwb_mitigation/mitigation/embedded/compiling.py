@@ -96,7 +96,7 @@ def run_tool(command: Sequence[str], timeout_s: float = 300, folder: Path | None
         UwbMitigationError: it fails or times out; the message contains its first error line.
     """
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command,
             capture_output=True,
             text=True,
@@ -109,9 +109,9 @@ def run_tool(command: Sequence[str], timeout_s: float = 300, folder: Path | None
         raise UwbMitigationError(f"timed out after {timeout_s} s", where=command[0]) from error
     except OSError as error:
         raise MissingDependencyError(f"cannot be run: {error.strerror}", where=command[0]) from error
-    if done.returncode:
-        lines = done.stderr.splitlines()
+    if process.returncode:
+        lines = process.stderr.splitlines()
         error_lines = (line for line in lines if re.search("error:|undefined reference", line))
         reason = next(error_lines, lines[-1] if lines else "no message")
-        raise UwbMitigationError(f"exit {done.returncode}: {reason}", where=Path(command[0]).name)
-    return done.stdout
+        raise UwbMitigationError(f"exit {process.returncode}: {reason}", where=Path(command[0]).name)
+    return process.stdout

@@ -44,10 +44,10 @@ class LinearBiasModel:
         """
         if not self.needs_power:
             return np.full(len(rx_power_dbm), self.offset_m, np.float32)
-        known = np.abs(rx_power_dbm) <= MAX_POWER_DBM
-        known &= np.abs(first_path_power_dbm) <= MAX_POWER_DBM
+        is_valid = np.abs(rx_power_dbm) <= MAX_POWER_DBM
+        is_valid &= np.abs(first_path_power_dbm) <= MAX_POWER_DBM
         rx, first_path = (
-            np.where(known, power, np.nan).astype(np.float32)
+            np.where(is_valid, power, np.nan).astype(np.float32)
             for power in (rx_power_dbm, first_path_power_dbm)
         )
         gap = rx - first_path

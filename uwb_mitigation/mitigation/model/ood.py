@@ -141,15 +141,17 @@ class OodBands:
             ModelError: no row is complete.
         """
         finite: NDArray[np.bool_] = np.isfinite(values)
-        known: NDArray[np.bool_] = np.any(finite, axis=0)
-        rows: NDArray[np.bool_] = np.all(finite[:, known], axis=1)
-        if not known.any() or not rows.any():
+        has_values: NDArray[np.bool_] = np.any(finite, axis=0)
+        rows: NDArray[np.bool_] = np.all(finite[:, has_values], axis=1)
+        if not has_values.any() or not rows.any():
             raise ModelError("no measurement has all features of the OOD score")
         bands = (
             Band.of(column, widening) if is_known else None
-            for column, is_known, widening in zip(values[rows].T[:-1], known[:-1], _WIDENINGS, strict=True)
+            for column, is_known, widening in zip(
+                values[rows].T[:-1], has_values[:-1], _WIDENINGS, strict=True
+            )
         )
-        lead = LEAD if known[1:-1].any() else LEAD_WITHOUT_LEVELS
+        lead = LEAD if has_values[1:-1].any() else LEAD_WITHOUT_LEVELS
         # The training data is in distribution, regardless of the meaning of its first-path index.
         highest = max(lead.high, float(np.float32(np.percentile(values[rows, -1], 99))))
         lead = replace(lead, high=highest)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.mitigation.early_path import early_path_error_m
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.simulation.antenna_pairs import label
-from uwb_mitigation.simulation.buildings import RADIO, block_of
+from uwb_mitigation.simulation.buildings import RADIO, WIDE_SHARE, block_of
 from uwb_mitigation.simulation.radio import Receiver, Reception
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.types.measurement import Encoding, RangeColumns
@@ -27,13 +27,14 @@ def building_dataset(
     on_block: Callable[[], None] = lambda: None,
     *,
     radio: Receiver = RADIO,
+    wide_share: float = WIDE_SHARE,
 ) -> Dataset:
     """Return one range of each of the first `blocks` x 256 placements of `sources.simulated`, in its order.
 
     Ranges that are not received, or whose window is not usable, are omitted. The result does not depend on the number
-    of `workers` (processes); `on_block` is called after each block. `radio`: see `block_of`.
+    of `workers` (processes); `on_block` is called after each block. `radio`, `wide_share`: see `block_of`.
     """
-    simulate = partial(_block, seed, preprocessing, radio)
+    simulate = partial(_block, seed, preprocessing, radio, wide_share)
     parts = []
     # Do not fork: the caller may run threads (torch, a progress bar).
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
@@ -43,15 +44,17 @@ def building_dataset(
     return replace(Dataset.joined(parts), radios=(radio.kind,), segments=(radio.segment,))
 
 
-def _block(seed: int, preprocessing: Preprocessing, radio: Receiver, number: int) -> Dataset:
-    block, rng = block_of(seed, number, radio=radio)
+def _block(
+    seed: int, preprocessing: Preprocessing, radio: Receiver, wide_share: float, number: int
+) -> Dataset:
+    block, rng = block_of(seed, number, radio=radio, wide_share=wide_share)
     reception = radio.receive(block.pairs.multipath(rng), rng, block.boards)
     distance = block.pairs.distance_m
     received = np.flatnonzero(np.isfinite(reception.first_path_index))
     columns = _columns(reception, distance, received)
     faults, inputs = preprocessing.apply(columns)
     early_m = None
-    if radio is RADIO:  # Other radios deliver too few taps before the first path.
+    if radio == RADIO:  # Other radios deliver too few taps before the first path.
         early_m = early_path_error_m(columns, np.flatnonzero(faults == 0), preprocessing.samples)
     rows = received[faults == 0]
     is_blocked, is_direct = block.pairs.path.crossings > 0, reception.direct_above_threshold

@@ -70,15 +70,15 @@ def by_group(dataset: Dataset, group: GroupKey, folds: int, seed: int) -> list[S
     if group is GroupKey.CONFIGURATION:
         return by_configuration(dataset.configurations, folds, seed)
     ids = dataset.tags if group is GroupKey.TAG else dataset.anchors
-    found = np.unique(ids) if ids is not None else np.zeros(0, np.uint64)
-    if ids is None or len(found) < 2:
+    unique_ids = np.unique(ids) if ids is not None else np.zeros(0, np.uint64)
+    if ids is None or len(unique_ids) < 2:
         raise DatasetError(
-            f"{len(found)} {'tags' if group is GroupKey.TAG else 'anchors'} do not make a split",
+            f"{len(unique_ids)} {'tags' if group is GroupKey.TAG else 'anchors'} do not make a split",
             valid="2 or more",
         )
-    parts = found[:, None] if group is GroupKey.TAG else np.array_split(found, 2)
+    held_out_groups = unique_ids[:, None] if group is GroupKey.TAG else np.array_split(unique_ids, 2)
     splits = []
-    for held_out_ids in parts:
+    for held_out_ids in held_out_groups:
         held_out = np.isin(ids, held_out_ids)
         # Measurements without a configuration name count as one configuration and must not be in both parts.
         is_train = ~np.isin(dataset.configurations, np.unique(dataset.configurations[held_out]))

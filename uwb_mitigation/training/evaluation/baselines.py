@@ -101,8 +101,8 @@ def _constant(value: float) -> Predict:
 
 def _weights(train: Dataset) -> NDArray[np.float64]:
     """Return weights of the rows that give every configuration the same total weight."""
-    _, of, count = np.unique(train.configurations, return_inverse=True, return_counts=True)
-    return np.asarray(len(train) / (len(count) * count[of]), np.float64)
+    _, group_index, count = np.unique(train.configurations, return_inverse=True, return_counts=True)
+    return np.asarray(len(train) / (len(count) * count[group_index]), np.float64)
 
 
 def scikit_learn(module: str):  # type: ignore[no-untyped-def]

@@ -88,5 +88,5 @@ def mae_after_rejection(
     error_m: NDArray[np.floating], variance_m2: NDArray[np.floating], rejected: float
 ) -> float:
     """Return the MAE of errors (n,) after rejecting the share `rejected` with the largest variances."""
-    kept = np.argsort(variance_m2, kind="stable")[: max(1, round((1 - rejected) * len(error_m)))]
-    return float(np.abs(error_m[kept]).mean())
+    accepted = np.argsort(variance_m2, kind="stable")[: max(1, round((1 - rejected) * len(error_m)))]
+    return float(np.abs(error_m[accepted]).mean())

@@ -86,9 +86,15 @@ def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> ZeroShot:
         [(dataset.labels[configuration_index == k] == LOS).mean() > 0.5 for k in range(len(names))]
     )
     los_offset = float(np.median(means[is_los])) if is_los.any() else 0.0
-    others = np.array([np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))])
+    offset_of_others = np.array(
+        [np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))]
+    )
     errors = dict(
-        zip(NAMES, (residual, residual - los_offset, residual - others[configuration_index]), strict=True)
+        zip(
+            NAMES,
+            (residual, residual - los_offset, residual - offset_of_others[configuration_index]),
+            strict=True,
+        )
     )
     sigmas95 = bundle.card.interval95_sigmas
     return ZeroShot(errors, los_offset, corrections.variance_m2, sigmas95, corrections.passed_through)

@@ -131,11 +131,11 @@ def network_m(network: FloatWeights, inputs: NDArray[np.float32]) -> NDArray[np.
         graph.float_model(network), session_options(), providers=["CPUExecutionProvider"]
     )
     (source,), (result,) = session.get_inputs(), session.get_outputs()
-    parts = [
+    outputs = [
         session.run([result.name], {source.name: inputs[start : start + _BATCH, None, :]})[0][:, 0]
         for start in range(0, len(inputs), _BATCH)
     ]
-    return np.concatenate(parts).astype(np.float64)
+    return np.concatenate(outputs).astype(np.float64)
 
 
 def fit_new_model(

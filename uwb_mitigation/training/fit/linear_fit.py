@@ -94,9 +94,9 @@ def fit_linear_bias_to_rows(
     gap = columns[0] - first_path_power_dbm
     if np.isfinite(gap).any():
         columns.append(gap)
-    known = np.isfinite(np.sum(columns, axis=0))
-    design = np.column_stack([np.ones(len(error_m)), *columns])[known]
-    target, los = error_m[known], is_los[known]
+    has_levels = np.isfinite(np.sum(columns, axis=0))
+    design = np.column_stack([np.ones(len(error_m)), *columns])[has_levels]
+    target, los = error_m[has_levels], is_los[has_levels]
     has_line = len(design) and float(np.ptp(design[:, 1])) >= MIN_POWER_RANGE_DB
     if not has_line or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         return constant

@@ -183,7 +183,7 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
         form: ErrorsByCondition.of(test.error_m, test.error_m - outputs, test.labels)
         for form, outputs in predicted.items()
     }
-    fields |= {f"mae_{form}": one.all.mae for form, one in errors.items()}
+    fields |= {f"mae_{form}": condition_errors.all.mae for form, condition_errors in errors.items()}
     return TrainedModel(
         network=task.network,
         samples=task.samples,
