@@ -15,10 +15,12 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.robot_estimator import live_track
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData, TagEstimator
 from uwb_mitigation.simulation.odometry import SimulatedMotion
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.offsets import Offsets
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 
 SEEDS = (11, 12, 13)
@@ -32,10 +34,14 @@ CONFIG = yaml.safe_load((REPOSITORY / "config" / "ekf.yaml").read_text())
 
 @dataclass
 class Drive:
-    """What the filter receives, the live track of the locator, and the truth at the stamps of the odometry."""
+    """What the filter receives, the live track of the locator, and the truth at the stamps of the odometry.
+
+    `with_odometry` is the track of the locator with odometry and IMU.
+    """
 
     track: Track
     motion: SimulatedMotion
+    with_odometry: Track
 
     def turned(self, angle: float) -> Drive:
         """Return the same drive in a site that is rotated by an angle."""
@@ -46,7 +52,14 @@ class Drive:
         track = replace(self.track, position=position, covariance=covariance)
         motion = self.motion
         rotated = SimulatedMotion(motion.position @ turn.T, motion.yaw + angle, motion.odometry, motion.imu)
-        return Drive(track, rotated)
+        return replace(self, track=track, motion=rotated)
+
+    def with_lever_arm(self, x_m: float) -> Drive:
+        """Return the same drive with the antenna in front of the base."""
+        stamps, position = self.motion.odometry.stamp_ns, self.track.position.copy()
+        yaw = np.interp(self.track.stamp_ns, stamps, np.unwrap(self.motion.yaw))
+        position[:, :2] += x_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
+        return replace(self, track=replace(self.track, position=position))
 
     def fuse(self, rate_hz: float, noise_factor: float = 1.0) -> NDArray[np.float64]:
         """Run the global filter with poses at a rate; return NEES/dof of x and y, squared error and yaw error, ten a second."""
@@ -95,8 +108,9 @@ def _drive(seed: int) -> Drive:
         np.array([one.variance_m2 for one in corrected]),
         np.full(len(measured), np.nan),
     )
-    track = TagEstimator(EstimatorConfig(source.anchors, height=Height(0.0, 0.05))).run(ranges)
-    return Drive(track, source.motion())
+    config, motion = EstimatorConfig(source.anchors, height=Height(0.0, 0.05)), source.motion()
+    robot = RobotData(motion.odometry, motion.imu)
+    return Drive(TagEstimator(config).run(ranges), motion, live_track(replace(config, robot=robot), ranges))
 
 
 @pytest.fixture(scope="module")
@@ -121,12 +135,23 @@ def test_the_documented_setup_is_consistent_and_20_positions_per_second_are_not(
     assert errors(drives, 20.0)[0] > 3.0, "correlated errors"
     # Autopilots need a higher rate: a larger variance has the same effect.
     assert 0.5 < errors(drives, 20.0, noise_factor=20.0)[0] < 2.0
+    assert rmse < 0.8 * locator_rmse(drives, "track"), "better than the ranges-only locator"
+    assert rmse > 0.9 * locator_rmse(drives, "with_odometry"), "the locator with odometry is as good"
+    print("antenna 0.3 m in front of base_link", end=": ")
+    assert errors([drive.with_lever_arm(0.3) for drive in drives], 1.0)[1] > 2.0 * rmse
+
+
+def locator_rmse(drives: list[Drive], name: str) -> float:
+    """Return the horizontal RMSE of a track of the locator after the first 10 s."""
     squares = []
     for drive in drives:
+        track = getattr(drive, name)
+        track = track.take(track.stamp_ns >= track.stamp_ns[0] + 10 * NS_PER_S)
         stamps, position = drive.motion.odometry.stamp_ns, drive.motion.position
-        true = np.column_stack([np.interp(drive.track.stamp_ns, stamps, axis) for axis in position.T])
-        squares.append(np.sum((drive.track.position[:, :2] - true) ** 2, axis=1).mean())
-    assert rmse < 0.8 * np.sqrt(np.mean(squares)), "better than the locator alone"
+        true = np.column_stack([np.interp(track.stamp_ns, stamps, axis) for axis in position.T])
+        squares.append(np.sum((track.position[:, :2] - true) ** 2, axis=1).mean())
+    print(f"{name} of the locator: position RMSE {np.sqrt(np.mean(squares)):.3f} m")
+    return float(np.sqrt(np.mean(squares)))
 
 
 @pytest.mark.slow
