@@ -32,7 +32,6 @@ from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, TagState
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
-from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
@@ -84,7 +83,7 @@ class _Outputs:
         self.odometry = publisher(Odometry, topics.ODOMETRY)
         self.smoothed = publisher(PoseWithCovarianceStamped, topics.POSE_SMOOTHED)
         self.frame = frame
-        self.robot = tag.estimator if isinstance(tag.estimator, RobotEstimator) else None
+        self.robot = tag.robot
         self.picture = markers.TagPicture(frame)
         self.published_ns = self.smoothed_ns = self.transform_ns = -(1 << 62)
 
@@ -392,7 +391,7 @@ class Locator(ManagedNode):
             outputs = self._outputs_of(tag)
             age_s = (stamp_ns - tag.latest_ns) / NS_PER_S
             if PREDICT_AFTER_S < age_s < PREDICT_UNTIL_S:
-                predicted = tag.estimator.at(stamp_ns)
+                predicted = tag.best.predict_at(stamp_ns)
                 if predicted is not None:
                     self._publish_estimate(outputs, predicted)
             elif outputs.smoothed_ns != tag.latest_ns and outputs.smoothed.get_subscription_count():

@@ -12,14 +12,9 @@ from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, protection_levels
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.online.filter import RangeFilter
+from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
-from uwb_mitigation.positioning.online.tag_estimator import (
-    MAX_VALUE,
-    RANGE_TIMEOUT_S,
-    EstimatorConfig,
-    TagEstimator,
-    is_valid,
-)
+from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track
 
@@ -129,24 +124,29 @@ class TagState:
 
     Attributes:
         tag_id: its number.
-        estimator, smoother: of this tag.
+        estimator: position from ranges only. robot: with odometry, if a robot carries this tag; it contains `estimator`.
+        smoother: of this tag.
         latest_ns: stamp of its latest range.
     """
 
     tag_id: int
     estimator: TagEstimator
     smoother: FixedLagSmoother
+    robot: RobotEstimator | None = None
     latest_ns: int = 0
+
+    @property
+    def best(self) -> TagEstimator | RobotEstimator:
+        """The estimator with odometry, if there is one."""
+        return self.robot or self.estimator
 
     def add_height(self, height_m: float, variance_m2: float) -> None:
         """Update with the tag's height at the time of its latest range; an implausible height is skipped."""
-        # Also false for NaN.
-        if not (abs(height_m) <= MAX_VALUE and abs(variance_m2) <= MAX_VALUE):
-            return
         # A variance of 0 means unknown in ROS.
-        variance_m2 = variance_m2 if variance_m2 > 0.0 else UNKNOWN_HEIGHT_SD_M**2
-        self.estimator.add_height(height_m, variance_m2)
-        self.smoother.add_height(height_m, variance_m2)
+        height = TagHeight(height_m, UNKNOWN_HEIGHT_SD_M**2 if variance_m2 <= 0.0 else variance_m2)
+        if height.is_valid:
+            self.best.add(height)
+            self.smoother.add_height(height_m, height.variance_m2)
 
 
 class MultiTagEstimator:
@@ -192,14 +192,13 @@ class MultiTagEstimator:
                 self.unknown_anchors[anchor_id] += 1
             return None
         tag = self.tags.get(tag_id)
-        if not is_valid(range_m, variance_m2) or (tag is None and len(self.tags) >= MAX_TAGS):
+        measurement = TagRange(stamp_ns, row, range_m, variance_m2)
+        if not measurement.is_valid or (tag is None and len(self.tags) >= MAX_TAGS):
             self.invalid += 1
             return None
         if tag is None:
-            tag = self.tags[tag_id] = TagState(
-                tag_id, self._make_estimator(tag_id), FixedLagSmoother(self._config)
-            )
-        estimate = tag.estimator.add(stamp_ns, row, range_m, variance_m2)
+            tag = self.tags[tag_id] = self._new_tag(tag_id)
+        estimate = tag.best.add(measurement)
         tag.latest_ns = stamp_ns
         known = tag.estimator.filter
         if known is None:
@@ -208,11 +207,12 @@ class MultiTagEstimator:
             tag.smoother.add(known, stamp_ns, row, range_m, variance_m2, estimate)
         return tag, estimate
 
-    def _make_estimator(self, tag_id: int) -> TagEstimator:
+    def _new_tag(self, tag_id: int) -> TagState:
+        smoother = FixedLagSmoother(self._config)
         if self._config.robot is None or self.robot is not None or self._robot_tag not in (0, tag_id):
-            return TagEstimator(self._config)
+            return TagState(tag_id, TagEstimator(self._config), smoother)
         self.robot = RobotEstimator(self._config, self.odometry)
-        return self.robot
+        return TagState(tag_id, self.robot.tag, smoother, self.robot)
 
     def warnings(self) -> list[str]:
         """Return warnings for the diagnostics; empty: none."""
@@ -222,14 +222,14 @@ class MultiTagEstimator:
             found.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
-            if not estimator.is_known:
+            if not estimator.is_initialized:
                 found.append(f"{name}: {self._unknown_reason(estimator)}")
-            if isinstance(estimator, RobotEstimator):
-                if estimator.odometry.at(tag.latest_ns) is None:
+            if tag.robot is not None:
+                if tag.robot.odometry.at(tag.latest_ns) is None:
                     found.append(
                         f"{name}: no odometry at the times of the ranges: estimated from ranges only"
                     )
-                elif estimator.rejects_odometry:
+                elif tag.robot.rejects_odometry:
                     found.append(
                         f"{name}: odometry contradicts the ranges (slip, or moved by hand): not used"
                     )
@@ -268,22 +268,22 @@ class MultiTagEstimator:
             found |= {
                 f"{name} candidates": estimator.candidates,
                 f"{name} anchors used": len(estimator.received_anchors()),
-                f"{name} found, lost, silent": f"{counts['found']}, {counts['lost']}, {counts['silent']}",
+                f"{name} found, silent": f"{counts['found']}, {counts['silent']}",
                 f"{name} out of order": counts["backwards"],
                 f"{name} innovation mean": f"{estimator.innovation_mean:.2f}",
                 f"{name} innovation square": f"{estimator.innovation_square:.2f}",
             }
-            if isinstance(estimator, RobotEstimator):
+            if tag.robot is not None:
                 found |= {
-                    f"{name} heading": estimator.heading,
+                    f"{name} heading": tag.robot.heading,
                     f"{name} heading found, odometry missing, wrong": ", ".join(
                         str(counts[key]) for key in ("heading found", "odometry missing", "odometry wrong")
                     ),
-                    "odometry rejected": estimator.odometry.rejected,
+                    "odometry rejected": tag.robot.odometry.rejected,
                 }
             dop = estimator.dop()
             if dop is not None and known is not None:
-                levels = protection_levels(known.P)
+                levels = protection_levels(known.estimate(0).covariance)
                 found |= {
                     f"{name} HDOP": f"{dop.hdop:.2f}",
                     f"{name} VDOP": f"{dop.vdop:.2f}",

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
 
+STUDENT_DOF = 4.0
+"""Degrees of freedom of the likelihood that compares hypotheses: heavy tails."""
+
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
@@ -34,14 +37,14 @@ class NoiseModel:
             decreases. Obstacles lengthen ranges only, so `long` is the smaller one.
     """
 
-    acceleration: float = 1.0
+    acceleration: float = 0.8
     speed: float = 1.0
     range_sd: float = 0.10
-    white: float = 0.1
+    white: float = 0.4
     persistence_s: float = 1.0
     offset_sd: float = 0.15
     pair_sd: float = 0.10
-    long: float = 1.0
+    long: float = 0.8
     short: float = 1.5
 
     def __post_init__(self) -> None:
@@ -87,11 +90,12 @@ class NoiseModel:
         )
         return loss
 
-    def loss_of(self, z: float, sd: float) -> float:
-        """Return minus the log likelihood of an innovation of `z` standard deviations `sd`, without its constant."""
-        limit = self.long if z > 0.0 else self.short
-        ratio = abs(z) / limit
-        return math.log(sd) + (0.5 * z * z if ratio <= 1.0 else limit**2 * (0.5 + math.log(ratio)))
+    def student_loss(self, z: float) -> float:
+        """Return minus the log likelihood of a normalised innovation for Student's t-distribution, without its constant.
+
+        It compares hypotheses: unlike `loss`, it is normalised, so that a filter does not win by a larger variance.
+        """
+        return 0.5 * (STUDENT_DOF + 1.0) * math.log1p(z * z / STUDENT_DOF)
 
     def variance(self, published_m2: float) -> float:
         """Return the variance of a range: the published one, or the default if that is unknown."""

@@ -87,8 +87,9 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
         DatasetError: no position of the tag can be determined; the message contains the reason, if the anchors show it.
     """
     ranges, anchors = recording.ranges, config.anchors
-    locator = make_estimator(config)
-    live = locator.run(ranges)
+    robot = None if config.robot is None else RobotEstimator(config)
+    locator = TagEstimator(config) if robot is None else robot.tag
+    live = (robot or locator).run(ranges)
     if len(live) < 2:
         raise _no_position(recording, config, locator)
     tracks = {

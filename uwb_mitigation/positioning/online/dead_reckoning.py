@@ -24,6 +24,10 @@ MOTION_SHARE, CORRELATION_S = 0.05, 1.0
 WHEEL_DRIFT, GYRO_DRIFT = 0.02, 0.01
 """Standard deviation of the constant yaw drift of wheels (rad/m) and of an IMU (rad/s, 0.6 degrees per second)."""
 
+WHEEL_TURN, GYRO_TURN = 0.05, 0.01
+"""Standard deviation of the constant relative error of rotations."""
+
+TURN_SHARE = 0.02
 MAX_SPEED, MAX_YAW_RATE = 50.0, 50.0
 """m/s, rad/s: faster odometry is invalid."""
 
@@ -42,6 +46,7 @@ class PathPoint(NamedTuple):
         x, y, yaw: pose in the frame of the path, m and rad.
         distance_m: distance driven.
         drift: standard deviation of the yaw error by a constant drift, rad.
+        turn: standard deviation of the yaw error by a constant relative error of rotations, rad, with the sign of the rotation.
         position_variance, yaw_variance: variances of the random errors, m^2 and rad^2.
         source: number of changes of the source of the yaw: wheels if even, IMU if odd.
     """
@@ -52,6 +57,7 @@ class PathPoint(NamedTuple):
     yaw: float = 0.0
     distance_m: float = 0.0
     drift: float = 0.0
+    turn: float = 0.0
     position_variance: float = 0.0
     yaw_variance: float = 0.0
     source: int = 0
@@ -120,7 +126,7 @@ class DeadReckoning:
         if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * NS_PER_S:
             self._part += 1
             self._samples.clear()
-            self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 7, pose))
+            self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 8, pose))
             self._imu_yaw, self.twist = imu_yaw, None
             return
         dt = gap_ns / NS_PER_S
@@ -135,13 +141,13 @@ class DeadReckoning:
                 speed = math.hypot(vx, vy)
         of_speed = _known_variance(max(twist_variance[:2]), SPEED_SD)
         of_yaw_rate = _known_variance(twist_variance[2], YAW_RATE_SD)
-        drift = WHEEL_DRIFT * speed
+        drift, turn_sd = WHEEL_DRIFT * speed, WHEEL_TURN
         share = 2.0 * CORRELATION_S * MOTION_SHARE**2
-        yaw_density = of_yaw_rate * dt + share * yaw_rate**2
+        yaw_density = of_yaw_rate * dt + 2.0 * CORRELATION_S * TURN_SHARE**2 * yaw_rate**2
         source = last.point.source + last.point.source % 2
         if imu_yaw is not None and self._imu_yaw is not None and self._imu is not None:
             yaw_rate, of_yaw_rate = (imu_yaw - self._imu_yaw) / dt, self._imu[2]
-            drift, yaw_density = GYRO_DRIFT, of_yaw_rate * dt
+            drift, turn_sd, yaw_density = GYRO_DRIFT, GYRO_TURN, of_yaw_rate * dt
             source = last.point.source | 1
         self._imu_yaw = imu_yaw
         self.twist, self.twist_variance = (vx, vy, yaw_rate), (of_speed, of_yaw_rate)
@@ -153,6 +159,7 @@ class DeadReckoning:
             yaw_rate,
             speed,
             drift,
+            turn_sd * yaw_rate,
             of_speed * dt + share * speed**2,
             yaw_density,
         )

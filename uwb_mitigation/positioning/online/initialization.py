@@ -36,13 +36,11 @@ class CandidatePosition:
     Attributes:
         position: float64 (3,), m.
         covariance: float64 (3, 3), m^2, of a tag whose ranges err independently.
-        gain: float64 (3, k), derivative of the position with respect to each range.
         loss: minus the log likelihood, up to a constant.
     """
 
     position: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    gain: NDArray[np.float64]
     loss: float
 
 
@@ -93,18 +91,15 @@ def candidate_positions(
             # Optima just outside, because of range errors: find the best positions on the boundary.
             wall = area.clip(x[outside])
             walls = problem.with_walls(outside, wall, excess[outside] != 0.0)
-            x[outside], cost[outside], *_ = walls.descend(wall)
+            x[outside], cost[outside], _, hessian[outside] = walls.descend(wall)
             x = area.clip(x)
         keep &= cost <= cost[keep].min() + IMPLAUSIBLE
     result: list[CandidatePosition] = []
     for i in np.flatnonzero(keep)[np.argsort(cost[keep])]:
         if any(_same(x[i], candidate) for candidate in result):
             continue
-        _, _, h, rows = problem.at(np.array([i])).linearised(x[i : i + 1])
-        covariance = np.linalg.inv(h[0] + 1e-6 * np.eye(3))
-        # Of the damped normal equations, ranges only: their errors move the position by this much.
-        gain = covariance @ (rows[0] / sd_m[:, None]).T
-        result.append(CandidatePosition(x[i].copy(), covariance, gain, float(cost[i])))
+        covariance = np.linalg.inv(hessian[i] + 1e-6 * np.eye(3))
+        result.append(CandidatePosition(x[i].copy(), covariance, float(cost[i])))
     return result
 
 

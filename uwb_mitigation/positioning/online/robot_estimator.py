@@ -1,9 +1,9 @@
 """Position and heading of a robot with odometry, from its first range.
 
 The estimator of the tag's position, which uses ranges only, always runs. From its position, filters with odometry start with
-several yaws, and run until one of them explains the ranges. If the odometry is missing, or explains the ranges worse than the
-ranges-only filter (wheels that slip, a robot that was moved), the estimates are those of ranges only until a heading is found
-again.
+several yaws, and run until one of them explains the ranges. Its position and that of the ranges-only filter are then mixed by
+solution separation (Brown, "A baseline GPS RAIM scheme", 1992): the larger their difference, relative to the covariance of
+the ranges-only filter, the smaller the weight of the odometry (wheels that slip, wrong axes, a robot that was moved).
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import numpy as np
 
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
+from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.online.tag_estimator import (
-    OUTLIER,
     EstimatorConfig,
     RobotData,
     TagEstimator,
-    is_valid,
+    run_estimator,
 )
-from uwb_mitigation.types.tracks import Estimate, Ranges, Track, rows_of
+from uwb_mitigation.types.tracks import Estimate, Heading, Ranges, Track, rows_of
 
 NUM_YAWS = 8
 """Number of initial yaws."""
 
 KNOWN_YAW_SD = math.radians(15.0)
-"""The heading is known if one hypothesis is left and its standard deviation is smaller."""
+"""The heading is known if one hypothesis remains and its standard deviation is smaller."""
 
 START_M = 0.1
 """The yaw is unobservable for a stationary robot: hypotheses start after it has driven this distance."""
@@ -40,11 +40,15 @@ START_M = 0.1
 SAME_YAW = math.radians(20.0)
 """Hypotheses with a smaller difference are equal."""
 
-YAW_CONCENTRATION = 2.0
-"""Concentration of the von Mises prior of the yaw after the odometry was missing or wrong."""
+SEPARATION_S = 2.0
+"""Averaging time of the separation of the two solutions."""
+
+EQUAL_SEPARATION, REJECTED_SEPARATION = 1.5, 3.0
+"""Mean squared separation, relative to the covariance, at which both solutions have equal weights, and from which the odometry is
+rejected. Two would be the mean for independent solutions; these two have their ranges in common."""
 
 
-def make_estimator(config: EstimatorConfig) -> TagEstimator:
+def make_estimator(config: EstimatorConfig) -> TagEstimator | RobotEstimator:
     """Return the estimator for a configuration: with odometry if it contains the motion of a robot."""
     return TagEstimator(config) if config.robot is None else RobotEstimator(config)
 
@@ -60,37 +64,29 @@ class _HeadingHypothesis:
     loss: float
 
 
-class RobotEstimator(TagEstimator):
-    """Locates one tag on a robot. `counts` also has `heading found`, `odometry missing` and `odometry wrong`.
+class RobotEstimator:
+    """Locates one tag on a robot.
 
     Args:
         config: with the recorded motion of the robot, if any.
-        odometry: shared with the caller; None: of its own.
+        odometry: shared with the caller; None: a separate one.
 
     Attributes:
+        tag: estimator of the position from ranges only. Its `counts` also have `heading found`, `odometry missing` and
+            `odometry wrong`.
         odometry: add live messages to it in the order of time.
         rejects_odometry: the odometry contradicted the ranges, and no heading was found since.
     """
 
     def __init__(self, config: EstimatorConfig, odometry: DeadReckoning | None = None) -> None:
-        self.odometry = odometry or DeadReckoning()
-        self._robot = config.robot or RobotData()
+        self.tag, self.odometry = TagEstimator(config), odometry or DeadReckoning()
+        self._config, self._area, self._robot = config, config.area, config.robot or RobotData()
         self._known: OdometryFilter | None = None
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
-        self._last_yaw: float | None = None
         self.rejects_odometry = False
-        self._evidence = self._outlier_share = 0.0
-        recorded: list[tuple[int, Callable[..., None], Any]] = []
-        if (imu := self._robot.imu) is not None:
-            rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
-            recorded += [(stamp_ns, self.odometry.add_imu, values) for stamp_ns, *values in rows]
-        if (motion := self._robot.odometry) is not None:
-            variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
-            rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
-            recorded += [(stamp_ns, self.odometry.add, values) for stamp_ns, *values in rows]
-        self._recorded = deque(sorted(recorded, key=lambda one: one[0]))
-        super().__init__(config)
+        self._rejections, self._separation = 0, 0.0
+        self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
 
     @property
     def lever_arm(self) -> tuple[float, float, float]:
@@ -101,12 +97,7 @@ class RobotEstimator(TagEstimator):
     def lever_arm(self, lever_arm: tuple[float, float, float]) -> None:
         if lever_arm != self._robot.lever_arm:
             self._robot = replace(self._robot, lever_arm=lever_arm)
-            self._forget(None)
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the position is known, with or without a heading."""
-        return self._known is not None or super().is_known
+            self._reset_heading(None)
 
     @property
     def heading(self) -> str:
@@ -115,111 +106,148 @@ class RobotEstimator(TagEstimator):
             return "known"
         return f"{len(self._yaws)} hypotheses" if self._yaws else "unknown"
 
-    def add(
-        self, stamp_ns: int, anchor: int, range_m: float, variance_m2: float = math.nan
-    ) -> Estimate | None:
-        """Update with a range; see `TagEstimator.add`. The estimate has a heading if it is known."""
-        if not is_valid(range_m, variance_m2):
+    def add(self, measurement: TagRange | TagHeight) -> Estimate | None:
+        """Update with a measurement; see `TagEstimator.add`. The estimate has a heading if it is known."""
+        if not measurement.is_valid:
             return None
-        while self._recorded and self._recorded[0][0] <= stamp_ns:
+        if isinstance(measurement, TagHeight):
+            for hypothesis in self._yaws:
+                hypothesis.filter.update_height(*measurement)
+            return self.tag.add(measurement)
+        while self._recorded and self._recorded[0][0] <= measurement.stamp_ns:
             recorded_ns, add, values = self._recorded.popleft()
             add(recorded_ns, *values)
-        estimate = super().add(stamp_ns, anchor, range_m, variance_m2)
-        self._update_robot(anchor, range_m, variance_m2)
-        return estimate if self._known is None else self._estimate(self._known, stamp_ns)
+        estimate = self.tag.add(measurement)
+        self._update_headings(measurement)
+        if estimate is None or self._known is None:
+            return estimate
+        return self._mixture(estimate, self._known)
 
-    def add_height(self, height_m: float, variance_m2: float) -> None:
-        """Update with the antenna's height; see `TagEstimator.add_height`."""
-        super().add_height(height_m, variance_m2)
-        for one in self._yaws:
-            one.filter.update_height(height_m, variance_m2)
+    def run(self, ranges: Ranges) -> Track:
+        """Process recorded ranges, and heights and motion of the config; return an estimate for each range with one."""
+        return run_estimator(self.add, self._config.heights, ranges)
 
-    def at(self, stamp_ns: int) -> Estimate | None:
+    def predict_at(self, stamp_ns: int) -> Estimate | None:
         """Predict position and heading at a time after the latest range; None: not known."""
-        point = self.odometry.at(stamp_ns)
-        if self._known is None or point is None or point.part != self._known.point.part:
-            return super().at(stamp_ns)
-        ahead = self._known.copy()
-        ahead.advance(self._seconds(stamp_ns), point)
-        self._confine(ahead)
-        return self._estimate(ahead, stamp_ns)
+        estimate, point = self.tag.predict_at(stamp_ns), self.odometry.at(stamp_ns)
+        if estimate is None or self._known is None or point is None or point.part != self._known.point.part:
+            return estimate
+        predicted = self._known.copy()
+        predicted.advance(self.tag.seconds(stamp_ns), point)
+        if self._area is not None:
+            predicted.confine(self._area)
+        return self._mixture(estimate, predicted)
 
     def restart(self, stamp_ns: int | None = None) -> None:
         """Reset position and heading, but not the statistics."""
-        super().restart(stamp_ns)
-        self._forget(None)
+        self.tag.restart(stamp_ns)
+        self._reset_heading(None)
 
-    def _estimate(self, known: OdometryFilter, stamp_ns: int) -> Estimate:
-        estimate = known.estimate_robot(stamp_ns, self.odometry)
-        if self._area is None:
-            return estimate
-        return replace(estimate, position=self._area.clip(estimate.position))
+    def _recorded_motion(self) -> list[tuple[int, Callable[..., None], Any]]:
+        recorded: list[tuple[int, Callable[..., None], Any]] = []
+        if (imu := self._robot.imu) is not None:
+            rows = rows_of(imu.stamp_ns, imu.yaw_rate, imu.yaw_rate_variance)
+            recorded += [(stamp_ns, self.odometry.add_imu, values) for stamp_ns, *values in rows]
+        if (motion := self._robot.odometry) is not None:
+            variance = np.diagonal(motion.twist_covariance, axis1=1, axis2=2)
+            rows = rows_of(motion.stamp_ns, motion.pose, motion.twist, variance)
+            recorded += [(stamp_ns, self.odometry.add, values) for stamp_ns, *values in rows]
+        return recorded
 
-    def _update_robot(self, anchor: int, range_m: float, variance_m2: float) -> None:
-        time_s = self._time_s
-        point = self.odometry.at((self._origin_ns or 0) + round(time_s * 1e9))
+    def _mixture(self, ranges_only: Estimate, known: OdometryFilter) -> Estimate:
+        """Return the mean of both solutions; its covariance includes their difference."""
+        estimate = known.estimate(ranges_only.stamp_ns, self.odometry)
+        excess = 2.0 * (self._separation - EQUAL_SEPARATION)
+        weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
+        delta = ranges_only.position - estimate.position
+        covariance = estimate.covariance.copy()
+        covariance[:3, :3] *= weight
+        covariance[:3, :3] += (1.0 - weight) * ranges_only.covariance[:3, :3]
+        covariance[:3, :3] += weight * (1.0 - weight) * np.multiply.outer(delta, delta)
+        position = estimate.position + (1.0 - weight) * delta
+        if self._area is not None:
+            position = self._area.clip(position)
+        assert estimate.heading is not None
+        heading = Heading(estimate.heading.yaw, estimate.heading.covariance * (weight, weight, weight, 1.0))
+        return replace(estimate, position=position, covariance=covariance, heading=heading)
+
+    def _update_headings(self, measurement: TagRange) -> None:
+        tag = self.tag
+        time_s, point = tag.seconds(measurement.stamp_ns), self.odometry.at(measurement.stamp_ns)
         if point is None or (self._yaws and point.part != self._yaws[0].filter.point.part):
             if self._yaws:
-                self._forget("odometry missing")
+                self._reset_heading("odometry missing")
             return
         if not self._yaws:
             self._start_yaws(point)
             return
-        model, best = self._model, self._yaws[0]
-        for one in self._yaws:
-            one.filter.advance(time_s, point)
-            z, sd = one.filter.update(anchor, range_m, variance_m2)
-            self._confine(one.filter)
-            loss = model.loss_of(z, sd)
-            one.loss += loss
-            if one is best:
-                best_z, best_loss = z, loss
+        dt = time_s - self._yaws[0].filter.time_s
+        for hypothesis in self._yaws:
+            hypothesis.filter.advance(time_s, point)
+            z, sd = hypothesis.filter.update(*measurement[1:])
+            if self._area is not None:
+                hypothesis.filter.confine(self._area)
+            hypothesis.loss += self._config.model.student_loss(z) + math.log(sd)
         self._prune()
-        self._outlier_share += 0.1 * ((abs(best_z) > OUTLIER) - self._outlier_share)
-        # Page's cumulative sum of the log likelihood ratio of the two models.
-        if math.isfinite(self._latest_loss):
-            self._evidence = max(0.0, self._evidence + best_loss - self._latest_loss)
-        if self._evidence > IMPLAUSIBLE or self._outlier_share > 0.5:
-            self._forget("odometry wrong")
+        if self._known is not None and tag.filter is not None:
+            self._update_separation(self._known, dt)
+
+    def _update_separation(self, known: OdometryFilter, dt: float) -> None:
+        filter_ = self.tag.filter
+        assert filter_ is not None
+        x, y = known.antenna_xy
+        dx, dy = x - float(filter_.x[0]), y - float(filter_.x[1])
+        (a, b), (_, c) = filter_.P[:2, :2].tolist()
+        separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
+        separation /= filter_.state.covariance_scale()
+        self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
+        if self._separation > REJECTED_SEPARATION:
+            self._reset_heading("odometry wrong")
+            self._rejections += 1
             self.rejects_odometry = True
 
     def _start_yaws(self, point: PathPoint) -> None:
         """Start filters at the position of the ranges-only filter when the robot drives."""
-        if self.filter is None:
+        if self.tag.filter is None:
             return
         if self._begin is None or self._begin.part != point.part:
             self._begin = point
         if point.distance_m - self._begin.distance_m < START_M:
             return
-        step = math.tau / NUM_YAWS
-        center = self._last_yaw or 0.0
-        concentration = 0.0 if self._last_yaw is None else YAW_CONCENTRATION
+        config, step = self._config, math.tau / NUM_YAWS
         for number in range(NUM_YAWS):
-            yaw = number * step
-            one = OdometryFilter(self.filter, point, self._robot.lever_arm, center + yaw, step / 2.0)
-            self._yaws.append(_HeadingHypothesis(one, concentration * (1.0 - math.cos(yaw))))
+            started = OdometryFilter(
+                config.anchors,
+                config.model,
+                self.tag.filter,
+                point,
+                self._robot.lever_arm,
+                (number * step, step / 2.0),
+            )
+            self._yaws.append(_HeadingHypothesis(started, 0.0))
 
     def _prune(self) -> None:
         """Remove implausible and equal hypotheses; the best one is the first."""
         if len(self._yaws) > 1:
-            self._yaws.sort(key=lambda one: one.loss)
-            least, kept = self._yaws[0].loss, list[_HeadingHypothesis]()
-            for one in self._yaws:
-                one.loss -= least
-                apart = [abs(math.remainder(one.filter.yaw - other.filter.yaw, math.tau)) for other in kept]
-                if one.loss <= IMPLAUSIBLE and all(angle > SAME_YAW for angle in apart):
-                    kept.append(one)
-            self._yaws = kept
+            self._yaws.sort(key=lambda hypothesis: hypothesis.loss)
+            least, plausible = self._yaws[0].loss, list[_HeadingHypothesis]()
+            for hypothesis in self._yaws:
+                hypothesis.loss -= least
+                yaw = hypothesis.filter.yaw
+                if hypothesis.loss <= IMPLAUSIBLE and all(
+                    abs(math.remainder(yaw - better.filter.yaw, math.tau)) > SAME_YAW for better in plausible
+                ):
+                    plausible.append(hypothesis)
+            self._yaws = plausible
         best = self._yaws[0].filter
         if self._known is None and len(self._yaws) == 1 and best.yaw_variance < KNOWN_YAW_SD**2:
             self._known, self.rejects_odometry = best, False
-            self._outlier_share = 0.0
-            self.counts["heading found"] += 1
+            # Not verified yet.
+            self._separation = EQUAL_SEPARATION
+            self.tag.counts["heading found"] += 1
 
-    def _forget(self, reason: str | None) -> None:
+    def _reset_heading(self, reason: str | None) -> None:
         """Continue with ranges only, for a reason to count."""
-        self._last_yaw = None if self._known is None or reason is None else self._known.yaw
-        self._known, self._begin, self._evidence, self._outlier_share = None, None, 0.0, 0.0
-        self._yaws = []
+        self._known, self._begin, self._separation, self._yaws = None, None, 0.0, []
         if reason is not None:
-            self.counts[reason] += 1
+            self.tag.counts[reason] += 1

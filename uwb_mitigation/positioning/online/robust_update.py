@@ -1,0 +1,151 @@
+"""State of a tag or robot with the errors of its ranges, and the robust Kalman update that all filters share.
+
+State: motion (0 to k - 1), the offset that the tag's ranges have in common (k), and the persisting error of each anchor's ranges
+(k + 1, ...). While the position is searched, offset and errors are only considered (S. F. Schmidt, 1966): they keep their
+uncertainty and their correlations, so that no candidate position explains its ranges by wrong offsets. Afterwards they are
+estimated. Covariances in Joseph's form, which is valid for any gain.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.types.anchors import AnchorMap
+
+MIN_VARIANCE_M2 = 1e-6
+"""Of white noise: measurements with less would make the covariance singular."""
+
+CONSISTENCY_RATE = 0.01
+"""Share of a new range in the running mean `consistency`: it includes about a hundred ranges."""
+
+MAX_RATIO = 9.0
+"""Limit of the contribution of a range to `consistency`: a single anchor with a large error must not dominate it."""
+
+SCALE, POWER, MIN_SCALE, MAX_SCALE = 2.2, 4.0, 0.2, 12.0
+"""See `RobustUpdate.covariance_scale`."""
+
+
+class RobustUpdate:
+    """Mean, covariance and measurement updates.
+
+    Args:
+        anchors: rows of the persisting errors.
+        model: range errors.
+        motion: initial values of the k motion states; their covariance is zero.
+
+    Attributes:
+        x, P: state float64 (n,) and its covariance (n, n).
+        H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
+        estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
+        consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
+    """
+
+    __slots__ = ("H", "P", "_error_variance", "_model", "_offset", "consistency", "estimates_errors", "x")
+
+    def __init__(self, anchors: AnchorMap, model: NoiseModel, motion: NDArray[np.float64]) -> None:
+        self._model, self._offset = model, len(motion)
+        n = len(motion) + 1 + len(anchors)
+        # The unconditional variance of each anchor's persisting error: what its last ranges' variances claim.
+        self._error_variance = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
+        self.estimates_errors, self.consistency = False, 1.0
+        self.H, self.x, self.P = np.zeros(n), np.zeros(n), np.zeros((n, n))
+        self.x[: len(motion)] = motion
+        self.P[self._offset, self._offset] = model.offset_sd**2
+        errors = np.arange(self._offset + 1, n)
+        self.P[errors, errors] = self._error_variance
+
+    def copy(self) -> RobustUpdate:
+        """Return an independent copy."""
+        twin = copy.copy(self)
+        for name in ("H", "P", "_error_variance", "x"):
+            setattr(twin, name, getattr(self, name).copy())
+        return twin
+
+    def replace_motion(self, motion: NDArray[np.float64]) -> RobustUpdate:
+        """Return a state with other motion states (k,), the same errors, and the covariance of position and errors."""
+        twin, k, old = copy.copy(self), len(motion), self._offset
+        twin._offset, twin._error_variance = k, self._error_variance.copy()
+        twin.x = np.concatenate([motion, self.x[old:]])
+        n = len(twin.x)
+        twin.H, twin.P = np.zeros(n), np.zeros((n, n))
+        retained = np.r_[0:3, k:n]
+        before = np.r_[0:3, old : len(self.x)]
+        twin.P[np.ix_(retained, retained)] = self.P[np.ix_(before, before)]
+        return twin
+
+    def predict_errors(self, elapsed: float) -> None:
+        """Predict the persisting errors after `elapsed` time constants."""
+        decay, first, P = math.exp(-elapsed), self._offset + 1, self.P
+        self.x[first:] *= decay
+        P[first:] *= decay
+        P[:, first:] *= decay
+        diagonal = P.reshape(-1)[:: len(P) + 1]
+        diagonal[first:] += (1.0 - decay * decay) * self._error_variance
+
+    def update_range(self, anchor: int, residual_m: float, variance_m2: float) -> tuple[float, float]:
+        """Update with a range; `H` is set.
+
+        Args:
+            anchor: a row of the anchors.
+            residual_m: measured range minus distance, m.
+            variance_m2: of its error, including the persisting part; NaN: unknown.
+
+        Returns:
+            The innovation divided by its standard deviation, and this standard deviation in m.
+        """
+        model, x, H, k = self._model, self.x, self.H, self._offset
+        row = k + 1 + anchor
+        variance, error_variance = model.variance(variance_m2), self._error_variance[anchor]
+        # The part of the variance that the persisting error does not explain is white noise.
+        white = max(model.white * variance, variance - error_variance)
+        self._error_variance[anchor] += 0.1 * ((1.0 - model.white) * variance - error_variance)
+        H[k:] = 0.0
+        H[k] = H[row] = 1.0
+        z, sd = self.update(H, float(residual_m - x[k] - x[row]), white)
+        ratio = (self.x[row] ** 2 + self.P[row, row]) / error_variance
+        self.consistency += CONSISTENCY_RATE * (min(float(ratio), MAX_RATIO) - self.consistency)
+        return z, sd
+
+    def update(self, H: NDArray[np.float64], innovation: float, R: float) -> tuple[float, float]:
+        """Update with a measurement with Jacobian H (n,) and noise variance R; return as `update_range`."""
+        R = max(R, MIN_VARIANCE_M2)
+        PH = self.P @ H
+        HPH = float(H @ PH)
+        sd = math.sqrt(HPH + R)
+        z = innovation / sd
+        S = (HPH + R) * self._model.inflation(z)
+        K = PH / S
+        if not self.estimates_errors:
+            K[self._offset :] = 0.0
+        self.x += K * innovation
+        # Joseph's form (I - K H) P (I - K H)' + K R K', as updates of rank one.
+        P = self.P - np.multiply.outer(K, PH)
+        P -= np.multiply.outer(P @ H - (S - HPH) * K, K)
+        self.P = P
+        return z, sd
+
+    def project(self, axis: int, value: float) -> None:
+        """Move a coordinate to a value, and the other states by their correlation with it.
+
+        This is estimate projection (Simon, "Kalman filtering with state constraints", 2010): the covariance stays, so
+        that repeated projections do not count as new information.
+        """
+        K = self.P[:, axis] / max(self.P[axis, axis], 1e-12)
+        # If the correlation with another coordinate is steep, the linear model is not valid.
+        K[:3] = np.clip(K[:3], -1.0, 1.0)
+        if not self.estimates_errors:
+            K[self._offset :] = 0.0
+        self.x -= K * (self.x[axis] - value)
+
+    def covariance_scale(self) -> float:
+        """Return the factor of published covariances.
+
+        The filter sees only a part of the persisting errors, so that their true variance differs from the model by more than
+        `consistency`. The power and the limits were chosen on simulated drives, the Hanyang runs and the labyrinth.
+        """
+        return min(max(SCALE * math.pow(self.consistency, POWER), MIN_SCALE), MAX_SCALE)
