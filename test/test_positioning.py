@@ -10,6 +10,8 @@ from drives import HALL, NANOSECONDS, WALL, block, circuit, drive, flight
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.position_data import simulated_runs
+from benchmarks.positions import ambiguous_drives, evaluate
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank, dop, horizontal_ellipse
@@ -17,6 +19,7 @@ from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import candidate_positions
+from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
@@ -41,7 +44,7 @@ SLOPE = AnchorMap(
 def test_filter_agrees_with_filterpy():
     kalman = pytest.importorskip("filterpy.kalman")
     own_filter = RangeFilter(HALL, PLAIN, 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
-    own_filter.updates_consider_states = True
+    own_filter.state.estimates_errors = True
     n = len(own_filter.x)
     filterpy_filter = kalman.ExtendedKalmanFilter(dim_x=n, dim_z=1)
     filterpy_filter.x, filterpy_filter.P = own_filter.x.copy()[:, None], own_filter.P.copy()
@@ -87,11 +90,11 @@ def test_filter_agrees_with_filterpy():
         min_size=1,
         max_size=60,
     ),
-    updates_consider_states=st.booleans(),
+    estimates_errors=st.booleans(),
 )
-def test_covariance_stays_valid_and_the_state_finite(steps, updates_consider_states: bool):
+def test_covariance_stays_valid_and_the_state_finite(steps, estimates_errors: bool):
     one = RangeFilter(HALL, NoiseModel(), 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
-    one.updates_consider_states = updates_consider_states
+    one.state.estimates_errors = estimates_errors
     now = 0.0
     for dt, row, range_m, variance in steps:
         now += dt
@@ -133,7 +136,7 @@ def test_every_position_is_inside_the_area(seed: int):
     track = locator.run(block(ranges, seed))
     assert len(track) > 0.9 * len(ranges)
     assert area.holds(track.position).all()
-    assert area.holds(locator.at(int(ranges.stamp_ns[-1]) + 5 * NANOSECONDS).position).all()
+    assert area.holds(locator.predict_at(int(ranges.stamp_ns[-1]) + 5 * NANOSECONDS).position).all()
     errors = track_errors(track, truth)
     assert errors.rmse < 0.6
     assert errors.height_rmse < 0.6
@@ -240,7 +243,7 @@ def test_covariance_grows_in_a_gap_and_the_tag_is_found_within_two_seconds_after
     before = ranges.take(ranges.stamp_ns < 15 * NANOSECONDS)
     locator = TagEstimator(EstimatorConfig(HALL))
     locator.run(before)
-    spread = [locator.at((15 + s) * NANOSECONDS).covariance[0, 0] for s in range(10)]
+    spread = [locator.predict_at((15 + s) * NANOSECONDS).covariance[0, 0] for s in range(10)]
     assert (np.diff(spread) > 0).all()
     assert spread[-1] > 10
     assert RANGE_TIMEOUT_S < 10
@@ -271,11 +274,11 @@ def test_invalid_input_is_skipped_and_a_restarted_replay_resets_the_tag():
     ranges, truth = drive(seconds=10)
     locator = TagEstimator(EstimatorConfig(HALL))
     for value in (math.nan, math.inf, -1.0):
-        assert locator.add(0, 0, value) is None
-    assert locator.add(0, 0, 5.0, math.inf) is None
+        assert locator.add(TagRange(0, 0, value)) is None
+    assert locator.add(TagRange(0, 0, 5.0, math.inf)) is None
     locator.run(ranges)
     stamp = int(ranges.stamp_ns[-1])
-    assert locator.add(stamp - 1000, 0, float(ranges.range_m[-1])) is not None
+    assert locator.add(TagRange(stamp - 1000, 0, float(ranges.range_m[-1]))) is not None
     assert locator.counts["backwards"] == 1
     again = locator.run(ranges)
     assert track_errors(again, truth).rmse < 0.3
@@ -340,3 +343,18 @@ def test_ellipse_contains_95_percent_of_the_errors():
     along, across = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
     assert np.mean((along / major) ** 2 + (across / minor) ** 2 < 1.0) == pytest.approx(0.95, abs=0.003)
     assert np.isnan(horizontal_ellipse(-covariance)).all()
+
+
+def test_position_is_withheld_after_the_line_of_two_anchors_was_touched():
+    entries = [entry for entry in ambiguous_drives() if entry["name"] == "two anchors, crossing the line"]
+    assert max(entry["protection_exceeded"] for entry in entries) <= 0.01
+    assert min(entry["availability"] for entry in entries) > 0.2
+
+
+@pytest.mark.parametrize("kind", ["clean", "nlos", "outliers"])
+def test_errors_are_near_those_of_simple_filters(kind: str):
+    run = next(run for run in simulated_runs() if (run.set_name, run.name) == ("hall", kind))
+    entry = evaluate(run, calibrate=False, smoothed=False)
+    assert entry["ratio_to_best_baseline"] < 1.1
+    assert entry["rows"]["raw_locator"]["coverage95"] > 0.89
+    assert entry["rows"]["raw_locator"]["rmse_m"] < 0.12

@@ -20,6 +20,7 @@ from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, RangeFilter
+from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import RobotData, TagEstimator
@@ -41,7 +42,7 @@ def test_heading_is_found_from_any_start(facing: float):
     assert len(of_yaw) == len(distance), "the heading is not lost again"
     assert rms(of_yaw) < math.radians(3.0)
     assert np.mean(np.abs(of_yaw) < 1.96 * sd) > 0.9
-    assert estimator.counts["odometry wrong"] == 0
+    assert estimator.tag.counts["odometry wrong"] == 0
 
 
 def test_odometry_reduces_the_position_error():
@@ -81,7 +82,7 @@ def test_slipping_wheels_are_detected():
     robot = Robot(slip=(20.0, 26.0))
     estimator = RobotEstimator(robot.config)
     track = estimator.run(robot.ranges())
-    assert estimator.counts["odometry wrong"] >= 1
+    assert estimator.tag.counts["odometry wrong"] >= 1
     distance, of_yaw, _ = robot.errors(track, 40.0)
     assert len(of_yaw) == len(distance)
     assert rms(of_yaw) < math.radians(4.0)
@@ -109,7 +110,7 @@ def test_missing_odometry_leaves_ranges_only():
     assert not known[missing].any()
     assert known[(track.stamp_ns > 15 * NANOSECONDS) & (track.stamp_ns < 20 * NANOSECONDS)].all()
     assert known[track.stamp_ns > 42 * NANOSECONDS].all()
-    assert estimator.counts["odometry missing"] == 1
+    assert estimator.tag.counts["odometry missing"] == 1
     alone = TagEstimator(replace(robot.config, robot=None)).run(ranges)
     np.testing.assert_allclose(
         track.position[missing], alone.position[np.isin(alone.stamp_ns, track.stamp_ns[missing])]
@@ -146,7 +147,7 @@ def test_kidnapped_robot_is_found_again():
     late = track.take(track.stamp_ns > 45 * NANOSECONDS)
     time_s = late.stamp_ns / NANOSECONDS
     true = (12.0, 9.0, 2.0) + robot.antenna(time_s) * (-1, -1, 1)
-    assert estimator.counts["odometry wrong"] >= 1
+    assert estimator.tag.counts["odometry wrong"] >= 1
     assert rms(np.linalg.norm((late.position - true)[:, :2], axis=1)) < 0.3
     assert rms(wrapped(late.yaw[:, 0] - robot.yaw(time_s) - math.pi)) < math.radians(5.0)
 
@@ -203,7 +204,7 @@ def test_hostile_input_leaves_finite_estimates(seed: int):
         # The second one is predicted over a time that no program should ask for.
         for one in (
             estimate,
-            tag.estimator.at(stamp + 10**18),
+            tag.best.predict_at(stamp + 10**18),
             tag.smoother.estimate() if i % 20 == 0 else None,
         ):
             if one is not None:
@@ -229,13 +230,13 @@ def test_prediction_after_the_last_range_uses_the_motion():
             )
             if robot.odometry.stamp_ns[one] >= stamp:
                 break
-        estimate = estimator.add(stamp, row, range_m)
-    ahead = estimator.at(int(ranges.stamp_ns[-1]) + 300_000_000)
+        estimate = estimator.add(TagRange(stamp, row, range_m))
+    ahead = estimator.predict_at(int(ranges.stamp_ns[-1]) + 300_000_000)
     assert ahead.heading is not None
     true = robot.antenna(np.array([ahead.stamp_ns / NANOSECONDS]))[0]
     assert np.linalg.norm((ahead.position - true)[:2]) < np.linalg.norm((estimate.position - true)[:2])
     # Without odometry for longer, only the ranges-only estimate is left.
-    late = estimator.at(int(ranges.stamp_ns[-1]) + 2 * NANOSECONDS)
+    late = estimator.predict_at(int(ranges.stamp_ns[-1]) + 2 * NANOSECONDS)
     assert late is not None
     assert late.heading is None
 
@@ -244,47 +245,49 @@ def _filter(lever=(0.4, -0.3, 0.2), yaw=0.7) -> OdometryFilter:
     rng = np.random.default_rng(3)
     start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.04, 0.09, 0.01]))
     start.P[FIRST_ERROR:, FIRST_ERROR:] += 0.001
-    one = OdometryFilter(start, PathPoint(1, 0.3, 0.2, 0.5), lever, yaw, 0.2)
-    one.x[:] += 0.01 * rng.normal(size=len(one.x))
+    one = OdometryFilter(HALL, NoiseModel(), start, PathPoint(1, 0.3, 0.2, 0.5), lever, (yaw, 0.2))
+    one.state.x[:] += 0.01 * rng.normal(size=len(one.state.x))
     return one
 
 
 def test_derivatives_of_the_filter_are_those_of_its_equations():
-    point = PathPoint(1, 0.8, 0.1, 0.9, 0.6, 0.012)
+    point = PathPoint(1, 0.8, 0.1, 0.9, 0.6, 0.012, 0.03)
 
     def after(x):
         one = _filter()
-        one.x[:] = x
+        one.state.x[:] = x
         one.advance(1e-9, point)
-        return one.x.copy()
+        return one.state.x.copy()
 
     one = _filter()
-    x = one.x.copy()
+    x = one.state.x.copy()
     n, step = len(x), 1e-6
     F = np.column_stack([(after(x + step * e) - after(x - step * e)) / (2 * step) for e in np.eye(n)])
-    before = one.P.copy()
+    before = one.state.P.copy()
     one.advance(1e-9, point)
-    noise = one.P - F @ before @ F.T
+    noise = one.state.P - F @ before @ F.T
     # Only the height is uncertain: the floor may be a slope.
-    np.testing.assert_allclose(noise[[0, 1, 3, 4, 5, 6], :FIRST_ERROR], 0.0, atol=1e-8)
+    np.testing.assert_allclose(noise[[0, 1, 3, 4, 5, 6, 7], :8], 0.0, atol=1e-8)
 
-    def distance(x):
+    def residual(x):
         other = _filter()
-        other.x[:] = x
-        return other._linearize(HALL.position[1])
+        other.state.x[:] = x
+        z, sd = other.update(1, 5.0, 0.01)
+        return -z * sd
 
-    x = one.x.copy()
-    one._linearize(HALL.position[1])
-    H = np.array([(distance(x + step * e) - distance(x - step * e)) / (2 * step) for e in np.eye(n)])
-    np.testing.assert_allclose(one._H[:4], H[:4], atol=1e-6)
+    x = one.state.x.copy()
+    one.update(1, 5.0, 0.01)
+    H = np.array([(residual(x + step * e) - residual(x - step * e)) / (2 * step) for e in np.eye(n)])
+    np.testing.assert_allclose(one.state.H, H, atol=1e-5)
 
 
 def test_filter_starts_with_the_antenna_of_the_range_filter():
     start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.04, 0.09, 0.01]))
-    one = OdometryFilter(start, PathPoint(1), (0.4, -0.3, 0.2), 0.7, 0.2)
-    estimate = one.estimate_robot(0, DeadReckoning())
+    one = OdometryFilter(HALL, NoiseModel(), start, PathPoint(1), (0.4, -0.3, 0.2), (0.7, 0.2))
+    estimate = one.estimate(0, DeadReckoning())
     np.testing.assert_allclose(estimate.position, start.position)
-    np.testing.assert_allclose(estimate.covariance[:3, :3], start.P[:3, :3], atol=1e-12)
+    expected = start.estimate(0).covariance[:3, :3]
+    np.testing.assert_allclose(estimate.covariance[:3, :3], expected, atol=1e-12)
 
 
 def _add_all(path: DeadReckoning, odometry: Odometry, *, poses: bool) -> None:
@@ -407,3 +410,43 @@ def test_twist_is_unknown_after_a_gap_of_the_odometry():
     latest_ns = int(Robot().odometry.stamp_ns[-1])
     path.add(latest_ns + NANOSECONDS, (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
     assert path.twist is None
+
+
+def _twisted(robot: Robot, change) -> RobotData:
+    odometry = robot.odometry
+    return RobotData(
+        replace(odometry, pose=np.full_like(odometry.pose, np.nan), twist=change(odometry.twist))
+    )
+
+
+@pytest.mark.parametrize("change", [(1.0, 1.0, -1.0), (0.5, 0.5, 1.0), (-1.0, 1.0, 1.0)])
+def test_wrong_odometry_is_not_worse_than_ranges_only(change):
+    robot = Robot(seconds=90.0)
+    ranges = robot.ranges(seconds=90.0)
+    alone = robot.errors(TagEstimator(replace(robot.config, robot=None)).run(ranges), 5.0)[0]
+    wrong = replace(robot.config, robot=_twisted(robot, lambda twist: twist * change))
+    mixed = robot.errors(RobotEstimator(wrong).run(ranges), 5.0)[0]
+    assert rms(mixed) <= 1.05 * rms(alone)
+
+
+def test_heading_survives_two_minutes_at_rest():
+    robot = Robot(stand=(20.0, 140.0), seconds=160.0)
+    estimator = RobotEstimator(robot.config)
+    track = estimator.run(robot.ranges(seconds=160.0))
+    assert estimator.tag.counts["odometry wrong"] == 0
+    _, of_yaw, sd = robot.errors(track, 15.0)
+    assert len(of_yaw) == (track.stamp_ns >= 15 * NANOSECONDS).sum()
+    assert rms(of_yaw) < math.radians(5.0)
+    assert np.mean(np.abs(of_yaw) < 1.96 * sd) > 0.9
+
+
+def test_scale_error_of_rotations_is_a_part_of_the_uncertainty_of_the_yaw():
+    start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.01, 0.01, 0.01]))
+    path = DeadReckoning()
+    path.add(0, None, (0.0, 0.0, 1.0))
+    one = OdometryFilter(HALL, NoiseModel(), start, path.at(0), (0.0, 0.0, 0.0), (0.0, 0.05))
+    for stamp in range(20_000_000, 60 * NANOSECONDS, 20_000_000):
+        path.add(stamp, None, (0.0, 0.0, 1.05))
+        one.advance(stamp / NANOSECONDS, path.at(stamp))
+    error = one.yaw - 60.0
+    assert abs(error) < 2.0 * math.sqrt(one.yaw_variance)

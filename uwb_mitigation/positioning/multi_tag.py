@@ -268,7 +268,7 @@ class MultiTagEstimator:
             found |= {
                 f"{name} candidates": estimator.candidates,
                 f"{name} anchors used": len(estimator.received_anchors()),
-                f"{name} found, silent": f"{counts['found']}, {counts['silent']}",
+                f"{name} found, lost, silent": f"{counts['found']}, {counts['lost']}, {counts['silent']}",
                 f"{name} out of order": counts["backwards"],
                 f"{name} innovation mean": f"{estimator.innovation_mean:.2f}",
                 f"{name} innovation square": f"{estimator.innovation_square:.2f}",

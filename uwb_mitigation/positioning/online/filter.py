@@ -109,7 +109,7 @@ class RangeFilter:
         """Update with the height of the tag; return the normalised innovation."""
         H = np.zeros(len(self.x))
         H[2] = 1.0
-        return self.state.update(H, height_m - float(self.x[2]), variance_m2)[0]
+        return self.state.update(H, height_m - float(self.x[2]), variance_m2, robust=False)[0]
 
     def confine(self, low: Sequence[float], high: Sequence[float]) -> None:
         """Project the position onto a box."""

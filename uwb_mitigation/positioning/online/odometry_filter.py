@@ -134,7 +134,9 @@ class OdometryFilter:
         """Update with the height of the antenna."""
         H = np.zeros(len(self.state.x))
         H[2] = 1.0
-        self.state.update(H, height_m - self._lever_arm[2] - float(self.state.x[2]), variance_m2)
+        self.state.update(
+            H, height_m - self._lever_arm[2] - float(self.state.x[2]), variance_m2, robust=False
+        )
 
     def confine(self, area: Area) -> None:
         """Project the antenna onto a box."""

@@ -48,6 +48,13 @@ EQUAL_SEPARATION, REJECTED_SEPARATION = 1.5, 3.0
 rejected. Two would be the mean for independent solutions; these two have their ranges in common."""
 
 
+VERIFIED_SEPARATION = 1.0
+"""After a rejection the odometry is reported as wrong until the separation is smaller."""
+
+FORGIVEN_S = 60.0
+"""Time constant of the number of rejections, which reduces the weight of the odometry."""
+
+
 def make_estimator(config: EstimatorConfig) -> TagEstimator | RobotEstimator:
     """Return the estimator for a configuration: with odometry if it contains the motion of a robot."""
     return TagEstimator(config) if config.robot is None else RobotEstimator(config)
@@ -75,7 +82,7 @@ class RobotEstimator:
         tag: estimator of the position from ranges only. Its `counts` also have `heading found`, `odometry missing` and
             `odometry wrong`.
         odometry: add live messages to it in the order of time.
-        rejects_odometry: the odometry contradicted the ranges, and no heading was found since.
+        rejects_odometry: the odometry contradicted the ranges, and was not verified since.
     """
 
     def __init__(self, config: EstimatorConfig, odometry: DeadReckoning | None = None) -> None:
@@ -85,7 +92,7 @@ class RobotEstimator:
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
         self.rejects_odometry = False
-        self._rejections, self._separation = 0, 0.0
+        self._rejections, self._separation = 0.0, 0.0
         self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
 
     @property
@@ -201,9 +208,12 @@ class RobotEstimator:
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
         separation /= filter_.state.covariance_scale()
         self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
+        self._rejections *= math.exp(-max(dt, 0.0) / FORGIVEN_S)
+        if self._separation < VERIFIED_SEPARATION:
+            self.rejects_odometry = False
         if self._separation > REJECTED_SEPARATION:
             self._reset_heading("odometry wrong")
-            self._rejections += 1
+            self._rejections += 1.0
             self.rejects_odometry = True
 
     def _start_yaws(self, point: PathPoint) -> None:
@@ -241,7 +251,7 @@ class RobotEstimator:
             self._yaws = plausible
         best = self._yaws[0].filter
         if self._known is None and len(self._yaws) == 1 and best.yaw_variance < KNOWN_YAW_SD**2:
-            self._known, self.rejects_odometry = best, False
+            self._known = best
             # Not verified yet.
             self._separation = EQUAL_SEPARATION
             self.tag.counts["heading found"] += 1

@@ -111,14 +111,16 @@ class RobustUpdate:
         self.consistency += CONSISTENCY_RATE * (min(float(ratio), MAX_RATIO) - self.consistency)
         return z, sd
 
-    def update(self, H: NDArray[np.float64], innovation: float, R: float) -> tuple[float, float]:
+    def update(
+        self, H: NDArray[np.float64], innovation: float, R: float, *, robust: bool = True
+    ) -> tuple[float, float]:
         """Update with a measurement with Jacobian H (n,) and noise variance R; return as `update_range`."""
         R = max(R, MIN_VARIANCE_M2)
         PH = self.P @ H
         HPH = float(H @ PH)
         sd = math.sqrt(HPH + R)
         z = innovation / sd
-        S = (HPH + R) * self._model.inflation(z)
+        S = (HPH + R) * (self._model.inflation(z) if robust else 1.0)
         K = PH / S
         if not self.estimates_errors:
             K[self._offset :] = 0.0

@@ -34,14 +34,23 @@ WINDOW_S = 1.0
 RANGE_TIMEOUT_S = 3.0
 """After a longer time without ranges the position is searched again: the predicted one may mislead."""
 
+OUTLIER, LOST_SHARE = 3.0, 0.7
+"""The tag was lost if this share of the latest ranges of at least half of the anchors had a larger normalised innovation."""
+
 DISAGREES = 1.5
 """An anchor contradicts the others if the mean of its normalised innovations is larger: persisting errors average out."""
+
+SURPRISE = 1.0
+"""Normalised innovation of the first height from which the position is searched again."""
 
 HEIGHT_AGE_NS = 200_000_000
 
 MIRROR_SD, EXCLUDED_SD = 2.0, 3.0
 """Within `MIRROR_SD` standard deviations of the mirror a position is withheld; an image that is outside the area by more than
 `EXCLUDED_SD` is excluded."""
+
+MAX_AMBIGUOUS_S = 2.0
+"""For this time the velocity determines on which side of a mirror a tag continues; after it, the position is searched again."""
 
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
@@ -93,10 +102,12 @@ class _AnchorState:
 
     Attributes:
         received_s: time of the latest; -inf: none.
+        outliers: share of the latest ranges (about twenty) that contradicted the filter.
         mean_z: running mean of the normalised innovation over about fifty ranges, each limited to 5.
     """
 
     received_s: float = -math.inf
+    outliers: float = 0.0
     mean_z: float = 0.0
 
 
@@ -111,7 +122,8 @@ class TagEstimator:
 
     Attributes:
         anchors: those of the config.
-        counts: numbers of ranges out of order (`backwards`), and of times the tag was `found` and without ranges (`silent`).
+        counts: numbers of ranges out of order (`backwards`), and of times the tag was `found`, `lost`, and without ranges
+            (`silent`).
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
             its square (1 is ideal).
         filter: the filter that follows the tag; None: its position is searched.
@@ -127,6 +139,9 @@ class TagEstimator:
     _search_began_s: float
     _next_check_s: float
     _found_s: float
+    _ambiguous_s: float
+    is_ambiguous: bool
+    undetermined: bool
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.anchors = config.anchors
@@ -204,6 +219,7 @@ class TagEstimator:
         self._origin_ns = stamp_ns
         self._time_s = -math.inf
         self._heights.clear()
+        self._recent.clear()
         for state in self._states:
             state.received_s = -math.inf
         self._restart_search(-math.inf)
@@ -232,14 +248,18 @@ class TagEstimator:
         return (stamp_ns - self._origin_ns) / NS_PER_S
 
     def _add_height(self, measurement: TagHeight) -> None:
+        is_first = self._recent_height() is None
         self._heights.append((self._time_s, *measurement))
         for hypothesis in self._hypotheses:
             z = hypothesis.filter.update_height(*measurement)
             hypothesis.loss += self._model.student_loss(z)
             self._confine(hypothesis.filter)
         if self.filter is not None:
-            self.filter.update_height(*measurement)
+            z = self.filter.update_height(*measurement)
             self._confine(self.filter)
+            if is_first and abs(z) > SURPRISE:
+                # The linear update moves the position too far: search again with the known height.
+                self._restart_search(self._time_s - WINDOW_S)
 
     def _follow(self, known: RangeFilter, measurement: TagRange) -> None:
         known.predict(self._time_s)
@@ -251,18 +271,32 @@ class TagEstimator:
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
         state = self._states[measurement.anchor]
+        state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
         if self._time_s >= self._next_check_s:
             self._next_check_s = self._time_s + _RETRY_S
-            self._mirror = self._mirror_of(self.received_anchors())
-        self.is_ambiguous = False
-        if self._mirror is not None:
-            center, normal = self._mirror
-            distance = abs(float((known.position - center) @ normal))
-            sd = math.sqrt(
-                max(float(normal @ known.P[:3, :3] @ normal), 0.0) * known.state.covariance_scale()
-            )
-            self.is_ambiguous = distance < MIRROR_SD * sd
+            received = self.received_anchors()
+            self._mirror = self._mirror_of(received)
+            num_contradicting = sum(self._states[row].outliers > LOST_SHARE for row in received)
+            if 2 * num_contradicting >= len(received):
+                self.counts["lost"] += 1
+                self._restart_search(self._time_s - WINDOW_S)
+        self._check_mirror(known)
+
+    def _check_mirror(self, known: RangeFilter) -> None:
+        """Withhold positions from the mirror on, until the image is excluded again: the tag may have crossed it, or not."""
+        if self._mirror is None:
+            if self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
+                self._restart_search(self._time_s - WINDOW_S)
+            self.is_ambiguous = False
+            return
+        center, normal = self._mirror
+        variance = float(normal @ known.P[:3, :3] @ normal) * known.state.covariance_scale()
+        distance = abs(float((known.position - center) @ normal))
+        is_near = distance < MIRROR_SD * math.sqrt(max(variance, 0.0))
+        if is_near and not self.is_ambiguous:
+            self._ambiguous_s = self._time_s
+        self.is_ambiguous = is_near or (self.is_ambiguous and not self._excludes_mirror(known))
 
     def _mirror_of(self, rows: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return a point and the normal of the line or plane in which anchors mirror positions; None: they exclude the image."""
@@ -278,6 +312,11 @@ class TagEstimator:
             return None
         normal = np.zeros(3)
         normal[:dims] = axes[dims - 1]
+        if self._area is not None:
+            corners = np.stack(np.meshgrid(*zip(self._area.low, self._area.high, strict=True)), axis=-1)
+            sides = (corners - center) @ normal
+            if sides.min() >= 0.0 or sides.max() <= 0.0:
+                return None
         return center, normal
 
     def _excludes_mirror(self, known: RangeFilter) -> bool:
@@ -311,8 +350,9 @@ class TagEstimator:
 
     def _restart_search(self, time_s: float) -> None:
         self.filter, self._hypotheses, self._mirror = None, [], None
+        for state in self._states:
+            state.outliers = 0.0
         self.is_ambiguous = self.undetermined = False
-        self._recent.clear()
         self._search_began_s, self._next_check_s, self._found_s = time_s, -math.inf, math.inf
 
     def _search(self, measurement: TagRange) -> None:
