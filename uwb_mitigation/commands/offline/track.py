@@ -14,7 +14,7 @@ from uwb_mitigation.positioning.batch.anchor_errors import is_displaced
 from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, dop
 from uwb_mitigation.positioning.online.initialization import snapshot
-from uwb_mitigation.positioning.online.robot_estimator import live_track, make_estimator
+from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator, live_track
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.recordings.bag.writer import BagWriter
