@@ -87,6 +87,9 @@ def _sqlite_messages(path: Path, topics: Collection[str]) -> Iterator[_Message]:
             texts = dict(database.execute(query)) if "message_definitions" in tables else {}
             query = "SELECT topic_id, timestamp, data FROM messages NOT INDEXED"
             for topic_id, stamp_ns, data in database.execute(query):
+                # SQLite returns NULL for a row that is cut.
+                if topic_id not in names or data is None:
+                    raise sqlite3.DatabaseError("a row is incomplete")
                 topic, kind = names[topic_id]
                 if topic in topics:
                     yield topic, stamp_ns, types.decode(kind, texts.get(kind, ""), data)
