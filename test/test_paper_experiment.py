@@ -207,7 +207,7 @@ def test_command_writes_its_results(folder):
 )
 def test_invalid_options_are_rejected_with_one_line(folder, words):
     done = run("paper", "protocol", "--data", "rooms.mcap", "-o", "x", *words, folder=folder)
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
 
 
