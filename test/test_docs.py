@@ -183,6 +183,7 @@ def test_launch_commands_start_nodes(
     monkeypatch.chdir(tmp_path)
     for name in ("robot.yaml", "left.yaml", "right.yaml"):
         Path(name).write_text("/**: {ros__parameters: {source: serial, port: /dev/ttyACM0}}")
+    Path("drive.mcap").touch()
     file, given = words[0], dict(word.split(":=", 1) for word in words[1:])
     if file == "nav2.launch.py":
         # It hands the arguments that are not for Nav2 on.

@@ -61,8 +61,12 @@ class Drive:
         position[:, :2] += x_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
         return replace(self, track=replace(self.track, position=position))
 
-    def fuse(self, rate_hz: float, noise_factor: float = 1.0) -> NDArray[np.float64]:
-        """Run the global filter with poses at a rate; return NEES/dof of x and y, squared error and yaw error, ten a second."""
+    def fuse(self, rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float = 0.0) -> NDArray[np.float64]:
+        """Run the global filter with poses at a rate; return NEES/dof of x and y, squared error and yaw error, ten a second.
+
+        `antenna_x_m` is the x of its base_link_frame in the frame of the odometry, from /tf_static: the filter moves
+        twists to this frame, with the yaw rate of its state (`prepareTwist`), and map -> odom is that of its pose there.
+        """
         ekf = Ekf(CONFIG["ekf_map"]["ros__parameters"])
         odometry, imu = self.motion.odometry, self.motion.imu
         poses = list(_at_rate(self.track, rate_hz))
@@ -70,7 +74,7 @@ class Drive:
             [(int(stamp), 0, row) for row, stamp in enumerate(odometry.stamp_ns)]
             + [(int(self.track.stamp_ns[row]), 1, row) for row in poses]
         )
-        found = []
+        errors = []
         for stamp_ns, is_pose, row in events:
             time_s = stamp_ns / 1e9
             if is_pose:
@@ -78,14 +82,18 @@ class Drive:
                 ekf.fuse("pose0", time_s, values, self.track.covariance[row, :2, :2] * noise_factor)
                 continue
             twist = dict(zip((VX, VY, VYAW), odometry.twist[row], strict=True))
+            twist[VY] += antenna_x_m * ekf.x[VYAW]
             ekf.fuse("odom0", time_s, twist, odometry.twist_covariance[row])
             ekf.fuse("imu0", time_s, {VYAW: imu.yaw_rate[row]}, np.eye(1) * imu.yaw_rate_variance[row])
             if row % 5 == 0:
-                error = ekf.x[:2] - self.motion.position[row]
-                nees = error @ np.linalg.solve(ekf.P[:2, :2], error) / 2.0
+                cosine, sine = np.cos(ekf.x[YAW]), np.sin(ekf.x[YAW])
+                G = np.eye(8)[:2]
+                G[:, YAW] = antenna_x_m * sine, -antenna_x_m * cosine
+                error = ekf.x[:2] - antenna_x_m * np.array([cosine, sine]) - self.motion.position[row]
+                nees = error @ np.linalg.solve(G @ ekf.P @ G.T, error) / 2.0
                 yaw = np.angle(np.exp(1j * (ekf.x[YAW] - self.motion.yaw[row])))
-                found.append((nees, error @ error, yaw))
-        return np.array(found)
+                errors.append((nees, error @ error, yaw))
+        return np.array(errors)
 
 
 def _at_rate(track: Track, rate_hz: float):
@@ -102,10 +110,10 @@ def _drive(seed: int) -> Drive:
     measured = [record.measurement for record in source]
     corrected = Mitigation(load_bundle(default_model_path()), Offsets(OFFSET_M)).correct(measured)
     ranges = Ranges(
-        np.array([one.stamp_ns for one in measured]),
-        np.array([source.anchors.index[one.anchor_id] for one in measured]),
-        np.array([one.range_m for one in corrected]),
-        np.array([one.variance_m2 for one in corrected]),
+        np.array([row.stamp_ns for row in measured]),
+        np.array([source.anchors.index[row.anchor_id] for row in measured]),
+        np.array([row.range_m for row in corrected]),
+        np.array([row.variance_m2 for row in corrected]),
         np.full(len(measured), np.nan),
     )
     config, motion = EstimatorConfig(source.anchors, height=Height(0.0, 0.05)), source.motion()
@@ -118,10 +126,12 @@ def drives() -> list[Drive]:
     return [_drive(seed) for seed in SEEDS]
 
 
-def errors(drives: list[Drive], rate_hz: float, noise_factor: float = 1.0) -> tuple[float, float]:
+def errors(
+    drives: list[Drive], rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float = 0.0
+) -> tuple[float, float]:
     """Return NEES/dof and RMSE of the position after the first 10 s."""
-    found = np.concatenate([drive.fuse(rate_hz, noise_factor)[100:] for drive in drives])
-    nees, square = found[:, 0].mean(), found[:, 1].mean()
+    rows = np.concatenate([drive.fuse(rate_hz, noise_factor, antenna_x_m)[100:] for drive in drives])
+    nees, square = rows[:, 0].mean(), rows[:, 1].mean()
     print(f"{rate_hz:g} positions per second, variance times {noise_factor:g}: NEES/dof {nees:.2f}", end=", ")
     print(f"position RMSE {np.sqrt(square):.3f} m")
     return float(nees), float(np.sqrt(square))
@@ -137,20 +147,29 @@ def test_the_documented_setup_is_consistent_and_20_positions_per_second_are_not(
     assert 0.5 < errors(drives, 20.0, noise_factor=20.0)[0] < 2.0
     assert rmse < 0.8 * locator_rmse(drives, "track"), "better than the ranges-only locator"
     assert rmse > 0.9 * locator_rmse(drives, "with_odometry"), "the locator with odometry is as good"
+    in_front = [drive.with_lever_arm(0.3) for drive in drives]
     print("antenna 0.3 m in front of base_link", end=": ")
-    assert errors([drive.with_lever_arm(0.3) for drive in drives], 1.0)[1] > 2.0 * rmse
+    assert errors(in_front, 1.0)[1] > 2.0 * rmse
+    print("with its transform", end=": ")
+    nees, with_transform = errors(in_front, 1.0, antenna_x_m=0.3)
+    assert 0.5 < nees < 2.0
+    assert with_transform < 1.2 * rmse
 
 
 def locator_rmse(drives: list[Drive], name: str) -> float:
-    """Return the horizontal RMSE of a track of the locator after the first 10 s."""
-    squares = []
+    """Return the horizontal RMSE of a track of the locator after the first 10 s, and print also NEES/dof."""
+    squares, nees = [], []
     for drive in drives:
         track = getattr(drive, name)
         track = track.take(track.stamp_ns >= track.stamp_ns[0] + 10 * NS_PER_S)
         stamps, position = drive.motion.odometry.stamp_ns, drive.motion.position
         true = np.column_stack([np.interp(track.stamp_ns, stamps, axis) for axis in position.T])
-        squares.append(np.sum((track.position[:, :2] - true) ** 2, axis=1).mean())
-    print(f"{name} of the locator: position RMSE {np.sqrt(np.mean(squares)):.3f} m")
+        error = (track.position[:, :2] - true)[..., None]
+        squares.append(np.sum(error**2, axis=1).mean())
+        weighted = np.linalg.solve(track.covariance[:, :2, :2], error)
+        nees.append(np.sum(error * weighted, axis=1).mean() / 2.0)
+    print(f"{name} of the locator: NEES/dof {np.mean(nees):.2f}", end=", ")
+    print(f"position RMSE {np.sqrt(np.mean(squares)):.3f} m")
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -163,9 +182,11 @@ def test_the_heading_is_found_from_any_start(drives: list[Drive], angle: int):
 
 
 def test_the_local_filter_fuses_no_position_and_the_frames_fit():
-    local, whole = (CONFIG[name]["ros__parameters"] for name in ("ekf_odom", "ekf_map"))
+    local, world = (CONFIG[name]["ros__parameters"] for name in ("ekf_odom", "ekf_map"))
     Ekf(local)
-    assert (local["world_frame"], whole["world_frame"]) == ("odom", "map")
+    assert (local["world_frame"], world["world_frame"]) == ("odom", "map")
     assert not any(name.startswith("pose") for name in local)
-    shared = set(local) - {"world_frame"}
-    assert {name: whole[name] for name in shared} == {name: local[name] for name in shared}
+    # Twists of base_link are moved to the antenna, whose positions are fused.
+    assert (local["base_link_frame"], world["base_link_frame"]) == ("base_link", "uwb_antenna_2d")
+    shared = set(local) - {"world_frame", "base_link_frame"}
+    assert {name: world[name] for name in shared} == {name: local[name] for name in shared}
