@@ -61,7 +61,9 @@ class Drive:
         position[:, :2] += x_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
         return replace(self, track=replace(self.track, position=position))
 
-    def fuse(self, rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float = 0.0) -> NDArray[np.float64]:
+    def fuse(
+        self, rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float = 0.0
+    ) -> NDArray[np.float64]:
         """Run the global filter with poses at a rate; return NEES/dof of x and y, squared error and yaw error, ten a second.
 
         `antenna_x_m` is the x of its base_link_frame in the frame of the odometry, from /tf_static: the filter moves
