@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.mitigation.early_path import NOISE_TAPS, SEARCH_TAPS
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.embedded.toolchain import Target, compile_image, require_tools
 from uwb_mitigation.mitigation.model.bundle import Bundle
@@ -30,12 +31,13 @@ _START_TIMEOUT_S = 60.0
 _PORT = re.compile(rb"char device redirected to (\S+)")
 
 
-def cut_to_window(measurement: RangeMeasurement, samples: int) -> RangeMeasurement:
-    """Reduce a measurement to the `samples` that the network reads; keep all samples if some of these are missing."""
+def cut_to_window(measurement: RangeMeasurement, samples: int, lead: int = WINDOW_LEAD) -> RangeMeasurement:
+    """Cut a CIR to the `samples` that the network reads, and `lead` taps before the first path; if some are missing, keep all."""
     cir = measurement.cir
     if not math.isfinite(cir.first_path_index):
         return measurement
-    start = math.floor(cir.first_path_index) - WINDOW_LEAD
+    start = math.floor(cir.first_path_index) - lead
+    samples += lead - WINDOW_LEAD
     values = 2 if cir.encoding is Encoding.COMPLEX_INT16 else 1
     first = values * (start - cir.start_index)
     window = cir.samples[max(first, 0) : first + values * samples]
@@ -61,6 +63,7 @@ class EmulatedFirmware:
         self._folder = tempfile.TemporaryDirectory(prefix="uwb_emulated_firmware_")
         self._encoder = FrameEncoder()
         self._samples = bundle.preprocessing.samples
+        self._lead = SEARCH_TAPS + NOISE_TAPS if bundle.card.early_path else WINDOW_LEAD
         self._process: subprocess.Popen[bytes] | None = None
         self._radio: socket.socket | None = None
         self.port = ""
@@ -75,14 +78,14 @@ class EmulatedFirmware:
     def measure(self, measurement: RangeMeasurement) -> None:
         """Send a measurement of the radio to the board; wait while the board is busy.
 
-        Like an EVB1000, the radio sends only the samples that the network reads, because the emulated UART
+        Like an EVB1000, the radio sends only the samples that the model reads, because the emulated UART
         transfers single bytes.
 
         Raises:
             UwbMitigationError: the emulator has exited.
         """
         assert self._radio is not None
-        kind, payload = messages.encode(cut_to_window(measurement, self._samples))
+        kind, payload = messages.encode(cut_to_window(measurement, self._samples, self._lead))
         try:
             self._radio.sendall(self._encoder.encode(kind, payload))
         except OSError as error:
