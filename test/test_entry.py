@@ -69,7 +69,7 @@ def test_signal_during_the_import_ends_the_process(executable: str, number: sign
 
 def test_signal_during_the_start_of_a_node_ends_it_immediately(tmp_path: Path):
     pytest.importorskip("rclpy")
-    (tmp_path / "cobs.py").write_text("import time\nprint('loading', flush=True)\ntime.sleep(600)\n")
+    (tmp_path / "serial.py").write_text("import time\nprint('loading', flush=True)\ntime.sleep(600)\n")
     process = run("driver", path=tmp_path)
     assert process.stdout.readline() == "loading\n"
     process.send_signal(signal.SIGINT)

@@ -153,7 +153,7 @@ def without(absent: Iterable[str], name: str) -> list[str]:
 @pytest.mark.parametrize(
     ("name", "needed", "words"),
     [
-        ("driver", {"pyyaml", "cobs", "pyserial"}, "replaying"),
+        ("driver", {"pyyaml", "rosbags", "pyserial"}, "replaying"),
         ("mitigator", {"pyyaml", "onnxruntime"}, "correcting with model"),
     ],
 )
