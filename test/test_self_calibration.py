@@ -252,9 +252,9 @@ def test_anchor_with_few_ranges_gets_the_common_offset(recorded):
 
 def test_area_excludes_the_mirror_image_in_a_plane():
     flat = HALL.moved(HALL.position * (1, 1, 0) + (0, 0, 2.5), HALL.sd)
-    ranges, _ = drive(flat, seconds=150, rate_hz=10.0, offset_m=0.25)
+    ranges, _ = drive(flat, seconds=150, rate_hz=10.0, offset_m=0.4)
     found = self_calibrate(flat, [ranges], area=Area((-1.0, -1.0, 0.0), (13.0, 10.0, 2.0)))
-    assert found.pair(0, 0)[0] == pytest.approx(0.25, abs=0.06)
+    assert found.pair(0, 0)[0] == pytest.approx(0.4, abs=0.06)
     assert found.fit.position[:, 2].max() < 2.5
 
 
@@ -281,7 +281,7 @@ def test_time_offset_and_lever_arm_are_estimated_with_a_localisation(recorded):
     with pytest.raises(DatasetError, match="time span of the localisation"):
         align_poses(HALL, [ranges], [late.shifted(10**13)], nothing)
     still = PosePath(path.stamp_ns, path.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(path), 1)))
-    short, nothing = ranges.take(ranges.stamp_ns < 4 * 10**9), Regressors.none(100)
+    short, nothing = ranges.take(ranges.stamp_ns < 10**10), Regressors.none(100)
     with pytest.raises(DatasetError, match="cannot be separated"):
         align_poses(HALL, [short], [still], nothing, time_offset_s=0.0, estimate_lever_arm=True)
 
@@ -289,7 +289,7 @@ def test_time_offset_and_lever_arm_are_estimated_with_a_localisation(recorded):
 def test_each_tag_has_its_own_lever_arm_and_its_own_body(recorded):
     ranges, path = recorded
     arms = np.array([[0.4, 0.0, 0.0], [-0.3, 0.2, 0.0]])
-    other, _ = drive(seconds=60, rate_hz=25.0, offset_m=0.25, seed=5)
+    other, _ = drive(seconds=150, rate_hz=10.0, offset_m=0.25, seed=5)
     bodies = [turning(path, arms[0]), turning(path, arms[1])]
     tags = [ranges, replace(other, tag_id=8)]
     nothing = Regressors.none(sum(map(len, tags)))

@@ -305,8 +305,8 @@ class _AlignmentProblem:
         offsets = self._medians(self._errors(time_offset, lever)[0])
         x = np.array([time_offset, *lever.reshape(-1), *offsets, *np.zeros(size - pairs.stop)])
         # The errors of a pair persist for about this time (see `noise_model`).
-        since = self.ranges.stamp_ns - self.ranges.stamp_ns.min()
-        group = since // round(2.0 * _MODEL.persistence_s * NS_PER_S) * self.pairs + self.pair
+        # Stamps are not relative to the first range, so that groups are the same without the ranges that are held out.
+        group = self.ranges.stamp_ns // round(2.0 * _MODEL.persistence_s * NS_PER_S) * self.pairs + self.pair
         every = np.arange(len(self.pair))
         for iteration in range(_ITERATIONS):
             arm = x[arms].reshape(lever.shape)
@@ -331,7 +331,7 @@ class _AlignmentProblem:
                 break
         # Errors persist for longer than a group, and those of the localisation are in all pairs: the sandwich estimator
         # with the scores of long blocks includes both (Liang and Zeger, Biometrika 1986).
-        block = since // round(BLOCK_S * NS_PER_S)
+        block = self.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         parts = [known & (block == number) for number in np.unique(block[known])]
         scores = np.array(
             [_normal_equations(rows[p], left[p], group[p], self.known.noise_group[p])[1] for p in parts]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -41,7 +42,7 @@ NETWORK_GROUPS = 8
 MAX_LEVER_ARM_ERROR_M = 0.2
 """A given lever arm is refused if the ranges determine one that differs more, and by four standard deviations."""
 
-NETWORK, LEVEL = "network", "level"
+NETWORK, LEVEL, POWER_GAP = "network", "level", "power gap"
 
 LEVEL_M = 0.3
 """A tag whose height changes by less drives on a level floor: the locator gets its height."""
@@ -434,7 +435,7 @@ def _level_height(position: NDArray[np.float64]) -> Height | None:
 
 
 def regressors(site: SiteData, universal: Bundle) -> Regressors:
-    """Return the regressors in addition to offsets: the universal network with CIRs, otherwise the received power."""
+    """Return the regressors in addition to offsets: the universal network with CIRs, otherwise the powers."""
     if site.has_cirs:
         predicted = network_m(float_network(universal), site.inputs)
         rows = np.where(np.isfinite(predicted) & site.has_usable_cir, predicted, 0.0)[:, None]
@@ -444,11 +445,15 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
         # Ranges without a CIR are not corrected, so they have their own standard deviation.
         group = np.where(site.has_usable_cir, np.searchsorted(edges, size), NETWORK_GROUPS)
         return Regressors((NETWORK,), rows, np.ones(1), np.array([NETWORK_SD]), group, CORRECTED_SLOW_SD_M)
-    power = site.rx_power_dbm.astype(np.float64)
-    has_power = np.isfinite(power)
-    if has_power.mean() < 0.5 or np.ptp(power[has_power]) < 1.0:
-        return Regressors.none(len(power))
-    return Regressors.one(LEVEL, np.where(has_power, power - np.median(power[has_power]), 0.0), 0.0, SLOPE_SD)
+    power_dbm = site.rx_power_dbm.astype(np.float64)
+    columns = [Regressors.none(len(power_dbm))]
+    # The line of a site (`SiteLine`) uses the same powers: otherwise the track follows the errors that it removes.
+    for name, value in ((LEVEL, power_dbm), (POWER_GAP, power_dbm - site.first_path_power_dbm)):
+        is_known = np.isfinite(value)
+        if is_known.mean() >= 0.5 and np.ptp(value[is_known]) >= 1.0:
+            centred = np.where(is_known, value - np.median(value[is_known]), 0.0)
+            columns.append(Regressors.one(name, centred, 0.0, SLOPE_SD))
+    return functools.reduce(Regressors.concat, columns)
 
 
 def _stationary_positions(calibration: SelfCalibration) -> dict[str, tuple[float, float, float]]:
