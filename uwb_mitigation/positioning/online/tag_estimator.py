@@ -187,9 +187,13 @@ class TagEstimator:
             else:
                 self.counts["backwards"] += 1
                 time_s = self._time_s
-        if self.filter is not None and time_s - self._time_s > RANGE_TIMEOUT_S:
+        gap_s = time_s - self._time_s
+        if self.filter is not None and gap_s > RANGE_TIMEOUT_S:
             self.counts["silent"] += 1
             self._restart_search(time_s)
+        elif self.filter is not None and gap_s > WINDOW_S:
+            # Not every anchor had its turn since the gap: check the geometry later.
+            self._next_check_s = time_s + WINDOW_S
         self._time_s = time_s
         self._recent.append((time_s, *measurement[1:]))
         self._states[anchor].received_s = time_s
