@@ -264,8 +264,10 @@ def displaced(ranges: Ranges, truth: TruePath, anchors: AnchorMap = HALL) -> lis
 
 def test_anchor_is_accused_only_if_another_position_explains_its_ranges():
     ranges, truth = drive(seconds=60, seed=1)
-    wrong = HALL.position + 1.5 * (np.arange(len(HALL)) == 2)[:, None] * (1.0, -1.0, 0.0)
-    assert displaced(ranges, truth, HALL.moved(wrong, HALL.sd)) == [3]
+    # The track without anchor 4 fits it worse than anchor 1, which is wrong.
+    for row, shift in ((2, (1.5, -1.5, 0.0)), (0, (1.5, 1.5, 0.0))):
+        wrong = HALL.position + (np.arange(len(HALL)) == row)[:, None] * shift
+        assert displaced(ranges, truth, HALL.moved(wrong, HALL.sd)) == [row + 1]
     assert displaced(ranges, truth) == []
     longer = ranges.range_m + 0.8 * (ranges.anchor == 2)
     assert displaced(replace(ranges, range_m=longer), truth) == []

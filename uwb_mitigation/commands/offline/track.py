@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning.batch.anchor_errors import is_displaced
+from uwb_mitigation.positioning.batch.anchor_errors import MIN_LOSS_GAIN, is_displaced
 from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, dop
 from uwb_mitigation.positioning.online.initialization import snapshot
@@ -207,14 +207,32 @@ def _residuals(
     residuals, displaced = [np.zeros(0)], False
     for initial, ranges in recorded:
         mask = ranges.anchor == row
-        if len(np.unique(ranges.anchor[~mask])) < MIN_OTHERS or not mask.any():
+        reference = np.unique(ranges.anchor[~mask])
+        if len(reference) < MIN_OTHERS or not mask.any():
             continue
-        track = Smoother(config, ranges.take(~mask)).fit(initial).track
+        track = _track_without([row], initial, ranges, config)
         position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[mask])
         residual = ranges.range_m[mask] - np.linalg.norm(position - config.anchors.position[row], axis=1)
         residuals.append(residual[np.isfinite(residual)])
-        displaced |= is_displaced(config.anchors, ranges, row, track)
+        # A displaced anchor also bends the tracks with which the others are judged: an accusation holds without each of them.
+        displaced |= is_displaced(config.anchors, ranges, row, track) and (
+            len(reference) == MIN_OTHERS
+            or all(
+                is_displaced(
+                    config.anchors,
+                    ranges,
+                    row,
+                    _track_without([row, excluded], initial, ranges, config),
+                    MIN_LOSS_GAIN / 2.0,
+                )
+                for excluded in reference.tolist()
+            )
+        )
     return np.concatenate(residuals), displaced
+
+
+def _track_without(rows: list[int], initial: Track, ranges: Ranges, config: EstimatorConfig) -> Track:
+    return Smoother(config, ranges.take(~np.isin(ranges.anchor, rows))).fit(initial).track
 
 
 def _median(residual: NDArray[np.float64]) -> float:

@@ -416,6 +416,10 @@ class AnchorRanges:
             error[self.tag == tag] -= np.median(error[self.tag == tag])
         return error
 
+    def sd_m(self, position: NDArray[np.float64]) -> float:
+        """Return the robust standard deviation of the errors for an anchor at `position`, m."""
+        return max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(self.residual_m(position)))))
+
     def loss(self, position: NDArray[np.float64], sd_m: float) -> float:
         """Return the negative log likelihood (Cauchy) for an anchor at `position`, with per-tag offsets."""
         return float(self.weight * np.log1p((self.residual_m(position) / sd_m) ** 2).sum())
@@ -431,7 +435,9 @@ class AnchorRanges:
         return np.append(solution.x, 0.0)
 
 
-def is_displaced(anchors: AnchorMap, ranges: Ranges, row: int, track: Track) -> bool:
+def is_displaced(
+    anchors: AnchorMap, ranges: Ranges, row: int, track: Track, min_gain: float = MIN_LOSS_GAIN
+) -> bool:
     """Return whether another position of an anchor explains its ranges to the track of the other anchors much better.
 
     An offset, or obstacles that lengthen some ranges, do not depend on the direction to the tag as a wrong position does.
@@ -441,6 +447,7 @@ def is_displaced(anchors: AnchorMap, ranges: Ranges, row: int, track: Track) -> 
         ranges: ranges of one tag.
         row: row of the anchor.
         track: track of the tag, estimated without this anchor.
+        min_gain: of the log likelihood.
     """
     path = TruePath(track.stamp_ns, track.position)
     antenna = path.at(ranges.stamp_ns)
@@ -449,11 +456,12 @@ def is_displaced(anchors: AnchorMap, ranges: Ranges, row: int, track: Track) -> 
     if row not in by_anchor:
         return False
     anchor_ranges, position = by_anchor[row], anchors.position[row]
-    sd_m = max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(anchor_ranges.residual_m(position)))))
+    shift = anchor_ranges.best_displacement(position, anchor_ranges.sd_m(position))
+    # The noise at the better position: at the wrong one, the displacement itself would count as noise.
+    sd_m = anchor_ranges.sd_m(position + shift)
     loss = anchor_ranges.loss(position, sd_m)
-    shift = anchor_ranges.best_displacement(position, sd_m)
     gain = loss - anchor_ranges.loss(position + shift, sd_m)
-    return float(np.linalg.norm(shift)) > MISPLACED_M and _is_better(gain, loss)
+    return float(np.linalg.norm(shift)) > MISPLACED_M and gain > max(min_gain, LARGER * loss)
 
 
 def validate_anchor_map(
@@ -496,7 +504,8 @@ def validate_anchor_map(
     suspects = [
         row
         for row in ranges
-        if np.linalg.norm(shift[row]) > MISPLACED_M and _is_better(gain[row], current_loss[row])
+        if np.linalg.norm(shift[row]) > MISPLACED_M
+        and gain[row] > max(MIN_LOSS_GAIN, LARGER * current_loss[row])
     ]
     fix = "the true positions in the anchors file (`uwb-mitigation survey` finds them)"
     best_swap: tuple[float, int, int] | None = None
@@ -520,10 +529,6 @@ def validate_anchor_map(
             f"{float(np.linalg.norm(shift[row])):.1f} m from that in the anchors file",
             valid=fix,
         )
-
-
-def _is_better(gain: float, loss: float) -> bool:
-    return gain > max(MIN_LOSS_GAIN, LARGER * loss)
 
 
 def _by_anchor(
