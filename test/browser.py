@@ -47,9 +47,18 @@ class Browser:
 
     def _load(self, url: str) -> None:
         """Open a URL, and wait for the document. Another fragment does not load it again."""
-        self.driver.get(url)
         loaded = "return document.readyState === 'complete' && location.href.startsWith(arguments[0])"
-        self.wait(url, lambda: self.run(loaded, url.partition("#")[0]))
+        next_s = 0.0
+
+        def is_loaded() -> bool:
+            nonlocal next_s
+            # A page that reloads itself at the same time cancels the navigation.
+            if time.monotonic() > next_s:
+                self.driver.get(url)
+                next_s = time.monotonic() + CALL_S / 2
+            return self.run(loaded, url.partition("#")[0])
+
+        self.wait(url, is_loaded)
 
     def resize(self, width: int, height: int) -> None:
         self.driver.execute_cdp_cmd(

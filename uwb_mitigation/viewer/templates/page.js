@@ -202,14 +202,15 @@ function start(doc) {
   titleErrors();
 
   // Recording.
-  let held = false, saved_s = 0;
-  const saveUrl = () => {
+  let held = false, savedMs = 0;
+  const saveUrl = (isPosition) => {
     const [anchor, tag] = controls.selected ?? [], at = controls.player?.position;
     const parts = {anchor, tag, t: position && at != null ? at.toFixed(2) : undefined, window: $("window")?.selectedIndex ? $("window").value : undefined};
     const text = Object.entries(parts).filter(([, value]) => value !== undefined).map(([name, value]) => `${name}=${encodeURIComponent(value)}`);
-    if (performance.now() > saved_s + 500 || !controls.player?.playing) history.replaceState(null, "", "#" + text.join("&"));
-    else return;
-    saved_s = performance.now();
+    // Browsers limit how often a page changes its URL.
+    if (isPosition && controls.player?.playing && performance.now() < savedMs + 500) return;
+    history.replaceState(null, "", "#" + text.join("&"));
+    savedMs = performance.now();
   };
   const wanted = new URLSearchParams(location.hash.slice(1));
   if (wanted.has("t") && position) { send("play", false); send("seek", Number(wanted.get("t"))); }
@@ -232,7 +233,7 @@ function start(doc) {
       send("seek", Number(position.value));
     });
     for (const name of ["step", "previous_bad", "next_bad", "largest"]) $(name).addEventListener("click", () => send(name));
-    $("window").addEventListener("change", (event) => { send("window", event.target.value); saveUrl(); });
+    $("window").addEventListener("change", (event) => { send("window", event.target.value); saveUrl(false); });
     if (wanted.has("window")) { $("window").value = wanted.get("window"); send("window", wanted.get("window")); }
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
@@ -256,9 +257,9 @@ function start(doc) {
       }
       $("speed").value = player.speed.toFixed(1);
     }
-    saveUrl();
+    saveUrl(true);
   });
-  controls.properties.selected.change.connect(saveUrl);
+  controls.properties.selected.change.connect(() => saveUrl(false));
 
   // Export.
   const quote = (value) => /[",\n]/.test(value) ? `"${String(value).replaceAll('"', '""')}"` : String(value);
