@@ -76,7 +76,7 @@ def run_ekf(
                 used_heights += 1
         state = x, P
         estimates.append(Estimate(stamp_ns, x[:3].copy(), x[3:6].copy(), P[:6, :6].copy()))
-    return Track.of(estimates)
+    return Track.from_estimates(estimates)
 
 
 def _initial(

@@ -311,7 +311,9 @@ def _with_heading(path: TruePath) -> TruePath:
 def measured_heights(truth: TruePath, seed: int) -> Heights:
     """Return ten heights per second of the true path with white noise."""
     stamps = np.arange(int(truth.stamp_ns[0]), int(truth.stamp_ns[-1]), NS_PER_S // 10)
-    height_m = truth.at(stamps)[:, 2] + np.random.default_rng(seed).normal(0.0, HEIGHT_SD_M, len(stamps))
+    height_m = truth.position_at(stamps)[:, 2] + np.random.default_rng(seed).normal(
+        0.0, HEIGHT_SD_M, len(stamps)
+    )
     known = np.isfinite(height_m)
     return Heights(stamps[known], height_m[known], np.full(int(known.sum()), HEIGHT_SD_M**2))
 

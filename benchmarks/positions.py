@@ -153,7 +153,7 @@ def _after_warm_up(run: Run) -> TruePath:
 
 
 def _availability(ranges: Ranges, truth: TruePath, track: Track) -> float:
-    due = np.isfinite(truth.at(ranges.stamp_ns)[:, 0])
+    due = np.isfinite(truth.position_at(ranges.stamp_ns)[:, 0])
     return float(np.isin(ranges.stamp_ns[due], track.stamp_ns).mean()) if due.any() else math.nan
 
 

@@ -70,7 +70,7 @@ class Drive:
     def errors(self, poses: list) -> np.ndarray:
         """Return the horizontal errors of poses."""
         stamps = [pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec for pose in poses]
-        at = self.truth.at(np.array(stamps) - self.start_ns)
+        at = self.truth.position_at(np.array(stamps) - self.start_ns)
         places = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in poses])
         return np.hypot(*(places - at[:, :2]).T)
 

@@ -152,7 +152,7 @@ def test_heights_are_read_from_each_type(tmp_path, make, seconds, height_m, vari
     assert len(heights) == seconds
     assert heights.height_m[-1] == pytest.approx(height_m)
     assert heights.variance_m2[-1] == pytest.approx(variance_m2)
-    value, _ = heights.at(np.array([500_000_000, 3_000_000_000, 60_000_000_000]))
+    value, _ = heights.height_at(np.array([500_000_000, 3_000_000_000, 60_000_000_000]))
     assert np.isfinite(value).tolist() == [True, make is not measured_range, False]
 
 

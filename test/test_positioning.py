@@ -147,7 +147,7 @@ def test_measured_heights_near_the_floor_keep_the_right_solution(seed: int):
     ranges, truth = drive(FLAT, path=flight, seed=seed, seconds=30)
     rng = np.random.default_rng(seed)
     stamps = np.arange(0, 30 * NANOSECONDS, NANOSECONDS // 10)
-    height = truth.at(stamps)[:, 2] + rng.normal(0, 0.02, len(stamps))
+    height = truth.position_at(stamps)[:, 2] + rng.normal(0, 0.02, len(stamps))
     known = np.isfinite(height)
     heights = Heights(stamps[known], height[known], np.full(known.sum(), 0.0004))
     area = Area((-4, -4, 0), (30, 4, 3))
@@ -197,7 +197,7 @@ def lagged(
             live.append(estimate)
         if i % 10 == 0 and (late := tag.smoother.estimate()) is not None:
             smoothed.append(late)
-    return Track.of(live), Track.of(smoothed)
+    return Track.from_estimates(live), Track.from_estimates(smoothed)
 
 
 def test_fixed_lag_poses_obey_area_and_measured_heights():
@@ -327,7 +327,7 @@ def test_errors_of_known_size():
 
 def test_truth_is_not_interpolated_across_gaps():
     path = TruePath(np.array([0, 1, 5]) * NANOSECONDS, np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
-    at = path.at(np.array([-1, 0, NANOSECONDS // 2, 3 * NANOSECONDS, 6 * NANOSECONDS]))
+    at = path.position_at(np.array([-1, 0, NANOSECONDS // 2, 3 * NANOSECONDS, 6 * NANOSECONDS]))
     np.testing.assert_array_equal(at[:, 0], [np.nan, 0, 0.5, np.nan, np.nan])
 
 

@@ -160,7 +160,7 @@ def test_stationary_segment_of_a_drive_is_one_position():
     ranges, _ = drive(seconds=60, rate_hz=25.0, path=path, model=NoiseModel(range_sd=0.02))
     found = find_segments([ranges])
     assert found.is_stationary.tolist() == [False, True, False]
-    stationary = found.ranges.stamp_ns[found.of == 1] / 1e9
+    stationary = found.ranges.stamp_ns[found.segment == 1] / 1e9
     assert stationary[0] == pytest.approx(20.0, abs=2.0)
     assert stationary[-1] == pytest.approx(40.0, abs=2.0)
 

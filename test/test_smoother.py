@@ -59,7 +59,7 @@ def test_smoother_agrees_with_nonlinear_least_squares():
         parts = (distance - ranges.range_m) / sd, root @ step, velocity[0] / model.speed
         return np.concatenate([part.reshape(-1) for part in parts])
 
-    start = np.stack([truth.at(knots_ns), np.zeros((len(knots_ns), 3))])
+    start = np.stack([truth.position_at(knots_ns), np.zeros((len(knots_ns), 3))])
     found = least_squares(residuals, start.reshape(-1), method="lm")
     np.testing.assert_allclose(smoothed.track.position, found.x.reshape(2, -1, 3)[0], atol=2e-3)
     covariance = np.linalg.inv(found.jac.T @ found.jac)

@@ -107,7 +107,7 @@ def test_track_is_written_evaluated_and_read_by_evo(
     (live,), (truth,) = (read_truth(out, topic).items() for topic in (ODOMETRY, ODOMETRY_TRUTH))
     assert (live[0], truth[0]) == (7, 7)
     live = live[1]
-    off = live.position - truth[1].at(live.stamp_ns)
+    off = live.position - truth[1].position_at(live.stamp_ns)
     assert np.nanmean(np.hypot(*off[:, :2].T)) < 0.2
     evo = pytest.importorskip("evo.tools.file_interface")
     read = evo.read_tum_trajectory_file(tum)

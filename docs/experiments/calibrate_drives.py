@@ -133,6 +133,7 @@ def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bo
             "walls": len(drive.plan.walls),
             "chosen": found.chosen,
             "level": found.solution.offset_level,
+            "refused": found.refusal,
             "seconds": took,
             "raw_mae": error_of(test, None, NO_OFFSETS),
             "calibrated_mae": error_of(test, bundle, found.offsets),
@@ -213,7 +214,10 @@ def main() -> None:
             )
         numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
         mean = {key: round(math.fsum(float(row[key]) for row in rows) / len(rows), 4) for key in numbers}  # type: ignore[arg-type]
-        print(json.dumps({"mean": mean}))
+        # A refused calibration is not written: the robot continues with raw ranges.
+        ratio = [1.0 if row["refused"] else row["calibrated_rmse"] / row["raw_rmse"] for row in rows]  # type: ignore[operator]
+        of_live = {"mean": round(float(np.mean(ratio)), 3), "max": round(max(ratio), 3)}
+        print(json.dumps({"mean": mean, "calibrated_to_raw_rmse": of_live}))
     if arguments.output:
         arguments.output.write_text(json.dumps(rows, indent=2) + "\n")
 

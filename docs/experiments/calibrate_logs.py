@@ -135,7 +135,7 @@ def _against_truth(
     unknown = np.full(len(value), np.nan)
     ranges = Ranges(stamp, row, np.maximum(value, 0.0), variance, unknown, measured[0].tag_id)
     track = TagEstimator(EstimatorConfig(run.anchors, NoiseModel(), height=height)).run(ranges)
-    distance = np.linalg.norm(run.truth.at(stamp) - run.anchors.position[row], axis=1)
+    distance = np.linalg.norm(run.truth.position_at(stamp) - run.anchors.position[row], axis=1)
     error = value - distance
     true = np.array([np.nanmedian(error[row == one]) for one in range(len(run.anchors))])
     return float(np.nanmean(np.abs(error))), track_errors(track, run.truth).rmse, true

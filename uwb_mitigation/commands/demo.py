@@ -104,7 +104,7 @@ def recorded(path: Path, rate: float) -> DemoPlan:
 def position_rmse(poses: list[Any], truth: list[Any]) -> float:
     """Return the horizontal RMSE (m) of poses where the truth is known."""
     (stamps, positions), (true_stamps, true_positions) = _stamped(poses), _stamped(truth)
-    offset = positions - TruePath(true_stamps, true_positions).at(stamps)
+    offset = positions - TruePath(true_stamps, true_positions).position_at(stamps)
     return float(np.sqrt(np.nanmean(np.sum(offset[:, :2] ** 2, axis=1))))
 
 

@@ -93,7 +93,7 @@ class FixedLagSmoother:
         first = known.copy()
         first.predict(first.time_s + (int(stamp[0]) - start_ns) / NS_PER_S)
         states = [(at, one) for at, one, _ in self._states if at > start_ns] or [(int(stamp[0]), first)]
-        initial = Track.of([one.estimate(at) for at, one in states])
+        initial = Track.from_estimates([one.estimate(at) for at, one in states])
         if self._heights:
             columns = zip(*self._heights, strict=True)
             config = replace(config, heights=Heights(*(np.array(column) for column in columns)))

@@ -68,7 +68,7 @@ def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErro
         truth: true positions.
         offset_ns: added to the track's stamps to get times of the truth.
     """
-    true = truth.at(track.stamp_ns + offset_ns)
+    true = truth.position_at(track.stamp_ns + offset_ns)
     known = np.isfinite(true).all(axis=1)
     if not known.any():
         return NO_ERRORS

@@ -33,9 +33,9 @@ class TimeSeries:
 
     def take(self: _Series, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> _Series:
         """Return the rows at `index`."""
-        columns = {one.name: getattr(self, one.name) for one in fields(self)}
-        taken = {name: column[index] for name, column in columns.items() if isinstance(column, np.ndarray)}
-        return replace(self, **taken)
+        columns = {column_field.name: getattr(self, column_field.name) for column_field in fields(self)}
+        selected = {name: column[index] for name, column in columns.items() if isinstance(column, np.ndarray)}
+        return replace(self, **selected)
 
     def reversed(self: _Series, end_ns: int) -> _Series:
         """Return the rows backwards in time, from `end_ns` on."""
@@ -66,10 +66,10 @@ class Ranges(TimeSeries):
     tag_id: int = 0
 
     @classmethod
-    def joined(cls, parts: Sequence[Ranges]) -> Ranges:
+    def joined(cls, groups: Sequence[Ranges]) -> Ranges:
         """Concatenate ranges; the tag id is 0."""
         names = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
-        columns: Any = (np.concatenate([getattr(one, name) for one in parts]) for name in names)
+        columns: Any = (np.concatenate([getattr(group, name) for group in groups]) for name in names)
         return cls(*columns)
 
 
@@ -127,7 +127,7 @@ class Track(TimeSeries):
             object.__setattr__(self, "yaw", np.full((len(self.stamp_ns), 5), np.nan))
 
     @classmethod
-    def of(cls, estimates: list[Estimate]) -> Track:
+    def from_estimates(cls, estimates: list[Estimate]) -> Track:
         """Return estimates as a track."""
         return cls(
             np.array([e.stamp_ns for e in estimates], np.int64),
@@ -157,24 +157,26 @@ class TruePath(TimeSeries):
     position: NDArray[np.float64]
     yaw: NDArray[np.float64] | None = None
 
-    def at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def position_at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return positions float64 (k, 3) at other times, by interpolation; NaN outside, and in gaps of over 1 s."""
         if len(self) == 0:
             return np.full((len(stamp_ns), 3), np.nan)
         # Relative: a float64 resolves seconds since the epoch to a fraction of a microsecond only.
-        own, wanted = (stamps - self.stamp_ns[0] for stamps in (self.stamp_ns, stamp_ns))
-        found = np.stack([np.interp(wanted, own, axis, np.nan, np.nan) for axis in self.position.T], axis=1)
-        after = np.clip(np.searchsorted(own, wanted), 1, max(len(own) - 1, 1))
-        if len(own) > 1:
-            found[own[after] - own[after - 1] > NS_PER_S] = np.nan
-        return found
+        own_ns, query_ns = (stamps - self.stamp_ns[0] for stamps in (self.stamp_ns, stamp_ns))
+        position = np.stack(
+            [np.interp(query_ns, own_ns, axis, np.nan, np.nan) for axis in self.position.T], axis=1
+        )
+        after = np.clip(np.searchsorted(own_ns, query_ns), 1, max(len(own_ns) - 1, 1))
+        if len(own_ns) > 1:
+            position[own_ns[after] - own_ns[after - 1] > NS_PER_S] = np.nan
+        return position
 
     def yaw_at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return yaws float64 (k,) at other times, by interpolation; NaN where unknown."""
         if self.yaw is None:
             return np.full(len(stamp_ns), np.nan)
         circle = np.stack([np.cos(self.yaw), np.sin(self.yaw), np.zeros(len(self))], axis=1)
-        cosine, sine, _ = TruePath(self.stamp_ns, circle).at(stamp_ns).T
+        cosine, sine, _ = TruePath(self.stamp_ns, circle).position_at(stamp_ns).T
         return np.asarray(np.arctan2(sine, cosine), np.float64)
 
 
@@ -190,11 +192,11 @@ class Heights(TimeSeries):
     height_m: NDArray[np.float64]
     variance_m2: NDArray[np.float64]
 
-    def at(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def height_at(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return height and variance at each stamp, linearly interpolated; NaN outside and in gaps of over 1 s."""
         columns = np.stack([self.height_m, self.variance_m2, np.zeros(len(self))], axis=1)
-        found = TruePath(self.stamp_ns, columns).at(stamp_ns)
-        return found[:, 0], found[:, 1]
+        interpolated = TruePath(self.stamp_ns, columns).position_at(stamp_ns)
+        return interpolated[:, 0], interpolated[:, 1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,11 +277,11 @@ class PosePath(TimeSeries):
         )
         stride = max(1, reach // _MAX_NEIGHBOURS)
         for step in range(-(reach // stride) * stride, reach + 1, stride):
-            here = np.arange(max(-step, 0), len(self) - max(step, 0))
-            since = (time_s[here + step] - time_s[here]) / SMOOTHED_S
+            rows = np.arange(max(-step, 0), len(self) - max(step, 0))
+            since = (time_s[rows + step] - time_s[rows]) / SMOOTHED_S
             powers = np.where(np.abs(since)[:, None] <= 1.0, since[:, None] ** np.arange(5), 0.0)
-            moments[here] += powers
-            right[here] += powers[:, :3, None] * self.position[here + step][:, None]
+            moments[rows] += powers
+            right[rows] += powers[:, :3, None] * self.position[rows + step][:, None]
         normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
         # With duplicate poses there are too few different times for a parabola.
         solvable = (moments[:, 0] >= 5.0) & (np.linalg.cond(normal) < _WORST_CONDITION)
@@ -305,21 +307,21 @@ class PosePath(TimeSeries):
         after = np.searchsorted(self.stamp_ns, stamp_ns).clip(0, len(self) - 1)
         before = np.maximum(after - 1, 0)
         span_ns = np.maximum(self.stamp_ns[after] - self.stamp_ns[before], 1)
-        part = ((stamp_ns - self.stamp_ns[before]) / span_ns).clip(0.0, 1.0)[:, None]
-        position = (1.0 - part) * self.position[before] + part * self.position[after]
+        fraction = ((stamp_ns - self.stamp_ns[before]) / span_ns).clip(0.0, 1.0)[:, None]
+        position = (1.0 - fraction) * self.position[before] + fraction * self.position[after]
         first, second = self.orientation[before], self.orientation[after]
         second = np.where(np.einsum("ni,ni->n", first, second)[:, None] < 0.0, -second, second)
-        return position, Rotation.from_quat((1.0 - part) * first + part * second)
+        return position, Rotation.from_quat((1.0 - fraction) * first + fraction * second)
 
-    def at(
+    def poses_at(
         self, stamp_ns: NDArray[np.int64], later_s: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions (k, 3) and rotation matrices (k, 3, 3) at stamps + `later_s`; NaN outside and in gaps > `GAP_S`."""
-        wanted = stamp_ns + round(later_s * NS_PER_S)
-        after = np.searchsorted(self.stamp_ns, wanted).clip(1, len(self) - 1)
+        query_ns = stamp_ns + round(later_s * NS_PER_S)
+        after = np.searchsorted(self.stamp_ns, query_ns).clip(1, len(self) - 1)
         gap = self.stamp_ns[after] - self.stamp_ns[after - 1] > GAP_S * NS_PER_S
-        unknown = (wanted < self.stamp_ns[0]) | (wanted > self.stamp_ns[-1]) | gap
-        position, rotation = self.interpolated(wanted)
+        unknown = (query_ns < self.stamp_ns[0]) | (query_ns > self.stamp_ns[-1]) | gap
+        position, rotation = self.interpolated(query_ns)
         matrices = rotation.as_matrix()
         position[unknown], matrices[unknown] = np.nan, np.nan
         return position, matrices

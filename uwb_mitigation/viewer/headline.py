@@ -51,7 +51,7 @@ def position_errors(
     rows = track[(track[:, 0] >= begin_s) & (track[:, 0] <= end_s)]
     truth = truth[np.argsort(truth[:, 0], kind="stable")]
     path = TruePath(np.rint(truth[:, 0] * NS_PER_S).astype(np.int64), truth[:, 1:3])
-    error_m = np.hypot(*(rows[:, 1:3] - path.at(np.rint(rows[:, 0] * NS_PER_S).astype(np.int64))).T)
+    error_m = np.hypot(*(rows[:, 1:3] - path.position_at(np.rint(rows[:, 0] * NS_PER_S).astype(np.int64))).T)
     is_known = np.isfinite(error_m)
     if not is_known.any():
         return None

@@ -211,7 +211,7 @@ def _residuals(
         if len(reference) < MIN_OTHERS or not mask.any():
             continue
         track = _track_without([row], initial, ranges, config)
-        position = TruePath(track.stamp_ns, track.position).at(ranges.stamp_ns[mask])
+        position = TruePath(track.stamp_ns, track.position).position_at(ranges.stamp_ns[mask])
         residual = ranges.range_m[mask] - np.linalg.norm(position - config.anchors.position[row], axis=1)
         residuals.append(residual[np.isfinite(residual)])
         # A displaced anchor also bends the tracks with which the others are judged: an accusation holds without each of them.

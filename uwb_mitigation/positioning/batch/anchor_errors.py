@@ -21,6 +21,7 @@ from uwb_mitigation.positioning.batch.joint_fit import (
     FAR_S,
     JointFit,
     Observations,
+    Start,
     fit_joint,
     observations_of,
 )
@@ -127,11 +128,11 @@ def check_motion(fit: JointFit) -> None:
             f"the tag moves by {spread:.1f} m only: its position and the offset cannot be separated",
             valid=f"a drive of {MOVES_M:g} m or more, or tags at several positions",
         )
-    independent = float(fit.observations.share.sum())
+    independent = float(fit.observations.independent.sum())
     needed = MIN_INDEPENDENT + 1.5 * fit.config.dims * int(fit.observations.is_stationary.sum())
     if independent < needed:
         raise DatasetError(
-            f"{len(fit.observations.of)} ranges, {independent:.0f} of them independent: too few",
+            f"{len(fit.observations.observation_index)} ranges, {independent:.0f} of them independent: too few",
             valid=f"{needed:.0f} or more: a longer drive, or more anchors at each position",
         )
 
@@ -146,9 +147,8 @@ def mirrored(fit: JointFit) -> NDArray[np.bool_]:
     normal[axes] = np.linalg.svd(used[:, axes] - centre[axes])[2][-1]
     image = fit.position - 2.0 * ((fit.position - centre) @ normal)[:, None] * normal
     corrected = observations.range_m - observations.rows @ fit.parameters
-    fixed = replace(observations, range_m=corrected, rows=np.zeros((len(observations), 0)))
     try:
-        refit = fit_joint(config, fixed, Regressors.none(len(observations)), image, scale_m=fit.scale_m)
+        refit = fit.positions_only(corrected, Start(image))
     except DatasetError:
         return np.zeros(len(fit.segment_loss), np.bool_)
     is_distinct = np.linalg.norm(refit.position - fit.position, axis=1) > MOVES_M
@@ -171,18 +171,9 @@ def check_height(fit: JointFit) -> None:
         return
     best_gain, best_m = MIN_LOSS_GAIN, height.value
     for change_m in HEIGHTS_M[np.abs(HEIGHTS_M) > 3.0 * height.sd].tolist():
-        other = replace(config, height=replace(height, value=height.value + change_m))
+        changed = replace(config, height=replace(height, value=height.value + change_m))
         try:
-            refit = fit_joint(
-                other,
-                fit.observations,
-                fit.prior,
-                fit.position,
-                fit.parameters,
-                scale_m=fit.scale_m,
-                around=fit.position,
-                near=True,
-            )
+            refit = fit_joint(changed, fit.observations, fit.prior, fit.start(), fit.scale_m)
         except DatasetError:
             continue
         if fit.loss - refit.loss > best_gain:
@@ -207,7 +198,8 @@ def check_anchor_positions(segments: Segments, fit: JointFit, first_positions: F
     """
     observations = fit.observations
     misfit = float(
-        (observations.share * (np.abs(fit.residual_m) > MISFIT_M)).sum() / observations.share.sum()
+        (observations.independent * (np.abs(fit.residual_m) > MISFIT_M)).sum()
+        / observations.independent.sum()
     )
     if misfit > MISFIT_SHARE:
         check_swapped(segments, fit.config, fit.prior, first_positions, fit.scale_m)
@@ -270,11 +262,8 @@ def _displaced(row: int, segments: Segments, fit: JointFit) -> tuple[float, floa
                 replace(config, anchors=displaced),
                 replace(observations, rows=rows),
                 prior,
-                position,
-                np.concatenate([parameters, np.zeros(2)]),
-                scale_m=fit.scale_m,
-                around=position,
-                near=True,
+                Start(position, np.concatenate([parameters, np.zeros(2)]), is_close=True, is_prior=True),
+                fit.scale_m,
             )
             position, parameters, step = refit.position, refit.parameters[:-2], refit.parameters[-2:]
             anchor_position = displaced.position.copy()
@@ -307,18 +296,18 @@ def _swapped(
         position, has_position = first_positions(swapped, trial, columns.rows @ columns.mean)
         if not has_position.any():
             return _NO_POSITION_LOSS
-        ranges_with_position = has_position[trial.of]
+        ranges_with_position = has_position[trial.segment]
         observations = observations_of(
             trial.select(has_position), columns.select_rows(ranges_with_position), config.model
         )
         try:
             refit = fit_joint(
-                swapped, observations, columns.select_rows(ranges_with_position), position, scale_m=scale
+                swapped, observations, columns.select_rows(ranges_with_position), Start(position), scale
             )
         except DatasetError:
             return _NO_POSITION_LOSS
         used = float(ranges_with_position.mean())
-        return used * refit.loss / float(observations.share.sum()) + (1.0 - used) * _NO_POSITION_LOSS
+        return used * refit.loss / float(observations.independent.sum()) + (1.0 - used) * _NO_POSITION_LOSS
 
     order = np.arange(len(config.anchors))
     limit = (1.0 - LARGER) * loss(order) - MIN_MEAN_GAIN
@@ -363,7 +352,7 @@ def leave_one_out_residual(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[
         try:
             refit = fit.without_anchors(anchor_group, observations.rows @ fit.parameters)
             covariance = refit.covariances()
-        except (DatasetError, np.linalg.LinAlgError):
+        except DatasetError:
             continue
         mask = np.isin(observations.anchor, anchor_group)
         received = np.zeros(len(observations.time_s), np.bool_)
@@ -375,7 +364,7 @@ def leave_one_out_residual(fit: JointFit) -> tuple[NDArray[np.float64], NDArray[
         sd_of_group = np.sqrt(np.einsum("ni,nij,nj->n", unit, covariance[knot], unit))
         sd_of_group[~(_gap_s(observations, received)[knot] <= FAR_S)] = np.nan
         sd[mask] = sd_of_group
-    return distance[observations.of], sd[observations.of]
+    return distance[observations.observation_index], sd[observations.observation_index]
 
 
 def _gap_s(observations: Observations, received: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -450,7 +439,7 @@ def is_displaced(
         min_gain: of the log likelihood.
     """
     path = TruePath(track.stamp_ns, track.position)
-    antenna = path.at(ranges.stamp_ns)
+    antenna = path.position_at(ranges.stamp_ns)
     is_used = np.isfinite(antenna).all(axis=1) & (ranges.anchor == row)
     by_anchor = _by_anchor(ranges, np.zeros(len(ranges), np.intp), antenna, is_used)
     if row not in by_anchor:

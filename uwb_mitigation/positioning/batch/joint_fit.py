@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution
+from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution, gauss_newton
 from uwb_mitigation.positioning.batch.motion_segments import Segments
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import CORRECTED_SLOW_SD_M, NoiseModel, Regressors, scatter_of
@@ -53,11 +52,11 @@ class Observations:
     Attributes:
         knot, anchor: int (n,), of each observation; knots of one segment are contiguous.
         ahead_s: float64 (n,), time of the observation after its knot.
-        range_m, share: float64 (n,); the share is the number of independent ranges in an observation.
+        range_m, independent: float64 (n,); the latter is the number of independent ranges in an observation.
         relative_height: float64 (n,), the height of the tag above the common one.
         rows: float64 (n, q), of the parameters.
         noise_group: int (n,), observations whose errors have the same standard deviation have the same number, from 0.
-        of: int (n,), the observation of each of the original ranges (r,).
+        observation_index: int (r,), the observation of each of the original ranges.
         knot_segment: int (K,). time_s: float64 (K,), of each knot in its segment. is_stationary: bool (s,).
     """
 
@@ -65,11 +64,11 @@ class Observations:
     anchor: NDArray[np.intp]
     ahead_s: NDArray[np.float64]
     range_m: NDArray[np.float64]
-    share: NDArray[np.float64]
+    independent: NDArray[np.float64]
     relative_height: NDArray[np.float64]
     rows: NDArray[np.float64]
     noise_group: NDArray[np.intp]
-    of: NDArray[np.intp]
+    observation_index: NDArray[np.intp]
     knot_segment: NDArray[np.intp]
     time_s: NDArray[np.float64]
     is_stationary: NDArray[np.bool_]
@@ -83,69 +82,96 @@ class Observations:
         return self.knot_segment[self.knot]
 
     def without(self, left_out: NDArray[np.bool_]) -> Observations:
-        """Return the same knots without those observations (n,); `of` becomes invalid."""
-        kept = ~left_out
-        columns = ("knot", "anchor", "ahead_s", "range_m", "share", "relative_height", "rows", "noise_group")
-        return replace(self, **{name: getattr(self, name)[kept] for name in columns})
+        """Return the same knots without those observations (n,); `observation_index` becomes invalid."""
+        is_used = ~left_out
+        columns = (
+            "knot",
+            "anchor",
+            "ahead_s",
+            "range_m",
+            "independent",
+            "relative_height",
+            "rows",
+            "noise_group",
+        )
+        return replace(self, **{name: getattr(self, name)[is_used] for name in columns})
 
 
 def observations_of(segments: Segments, parameters: Regressors, model: NoiseModel) -> Observations:
     """Return the observations of ranges that depend on parameters."""
     ranges, rows, noise_group = segments.ranges, parameters.rows, parameters.noise_group
-    knot, ahead, share = np.zeros(len(ranges), np.intp), np.zeros(len(ranges)), np.ones(len(ranges))
+    knot, ahead_s, independent = np.zeros(len(ranges), np.intp), np.zeros(len(ranges)), np.ones(len(ranges))
     knot_segment: list[NDArray[np.intp]] = []
     times: list[NDArray[np.float64]] = []
-    edges = np.searchsorted(segments.of, np.arange(len(segments) + 1))
-    known = 0
+    edges = np.searchsorted(segments.segment, np.arange(len(segments) + 1))
+    num_knots = 0
     for number in range(len(segments)):
-        own = slice(edges[number], edges[number + 1])
+        rows_of_segment = slice(edges[number], edges[number + 1])
         if segments.is_stationary[number]:
             time_s = np.zeros(1)
-            knot[own] = known
+            knot[rows_of_segment] = num_knots
         else:
-            since = (ranges.stamp_ns[own] - ranges.stamp_ns[own][0]) / NS_PER_S
-            index, of = np.unique(np.rint(since / KNOT_S).astype(np.int64), return_inverse=True)
+            since = (ranges.stamp_ns[rows_of_segment] - ranges.stamp_ns[rows_of_segment][0]) / NS_PER_S
+            index, slot = np.unique(np.rint(since / KNOT_S).astype(np.int64), return_inverse=True)
             time_s = index * KNOT_S
-            knot[own], ahead[own] = known + of, since - time_s[of]
-            share[own] = _share(ranges.anchor[own], max(float(since[-1]), KNOT_S), model.persistence_s)
+            knot[rows_of_segment], ahead_s[rows_of_segment] = num_knots + slot, since - time_s[slot]
+            independent[rows_of_segment] = _independent_share(
+                ranges.anchor[rows_of_segment], max(float(since[-1]), KNOT_S), model.persistence_s
+            )
         knot_segment.append(np.full(len(time_s), number))
         times.append(time_s)
-        known += len(time_s)
-    in_stationary = segments.is_stationary[segments.of]
+        num_knots += len(time_s)
+    in_stationary = segments.is_stationary[segments.segment]
     # One observation for each pair of a position at rest, and one for each other range.
-    of_pair = segments.of * 1024 + ranges.anchor
+    of_pair = segments.segment * 1024 + ranges.anchor
     key = np.where(in_stationary, of_pair, len(segments) * 1024 + np.arange(len(ranges)))
-    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    _, first, observation_index = np.unique(key, return_index=True, return_inverse=True)
     columns = np.column_stack([ranges.range_m, segments.relative_height, noise_group, rows])
     shared = columns[first]
-    order = np.argsort(of, kind="stable")
+    order = np.argsort(observation_index, kind="stable")
     for observation, group in enumerate(
-        np.split(order, np.searchsorted(of[order], np.arange(1, len(first))))
+        np.split(order, np.searchsorted(observation_index[order], np.arange(1, len(first))))
     ):
         if len(group) > 1:
             shared[observation] = np.median(columns[group], axis=0)
     return Observations(
         knot=knot[first],
         anchor=ranges.anchor[first],
-        ahead_s=ahead[first],
+        ahead_s=ahead_s[first],
         range_m=shared[:, 0],
-        share=share[first],
+        independent=independent[first],
         relative_height=shared[:, 1],
         rows=shared[:, 3:],
         noise_group=shared[:, 2].astype(np.intp),
-        of=of,
+        observation_index=observation_index,
         knot_segment=np.concatenate(knot_segment),
         time_s=np.concatenate(times),
         is_stationary=segments.is_stationary,
     )
 
 
-def _share(anchor: NDArray[np.intp], seconds: float, persistence_s: float) -> NDArray[np.float64]:
+def _independent_share(anchor: NDArray[np.intp], seconds: float, persistence_s: float) -> NDArray[np.float64]:
     """Return the share of an independent range: a Gauss-Markov process has one per two time constants."""
-    _, of, count = np.unique(anchor, return_inverse=True, return_counts=True)
+    _, slot, count = np.unique(anchor, return_inverse=True, return_counts=True)
     independent = np.maximum(seconds / (2.0 * persistence_s), 1.0)
-    share: NDArray[np.float64] = np.minimum(1.0, independent / count)[of]
-    return share
+    independent_share: NDArray[np.float64] = np.minimum(1.0, independent / count)[slot]
+    return independent_share
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Where a fit starts.
+
+    Attributes:
+        position: float64 (K, 3), of the knots. parameters: float64 (q,); None: the mean of the prior.
+        is_close: this is a solution of nearly the same problem.
+        is_prior: the positions are also a prior, with `AROUND_M`.
+    """
+
+    position: NDArray[np.float64]
+    parameters: NDArray[np.float64] | None = None
+    is_close: bool = False
+    is_prior: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,11 +207,11 @@ class JointFit:
     def covariances(self) -> NDArray[np.float64]:
         """Return the covariances of the positions, float64 (K, 3, 3)."""
         d, height = self.config.dims, self.config.height
-        found = np.zeros((len(self.position), 3, 3))
-        found[:, :d, :d] = self._solution.covariances(d)
+        covariance = np.zeros((len(self.position), 3, 3))
+        covariance[:, :d, :d] = self._solution.covariances(d)
         if height is not None:
-            found[:, 2, 2] = height.sd**2
-        return found
+            covariance[:, 2, 2] = height.sd**2
+        return covariance
 
     def antenna_position(self) -> NDArray[np.float64]:
         """Return the position of the tag's antenna at each observation, float64 (n, 3), m."""
@@ -197,56 +223,40 @@ class JointFit:
         position[:, 2] += observations.relative_height
         return position
 
+    def start(self) -> Start:
+        """Return this solution as the start and the prior of nearly the same problem."""
+        return Start(self.position, self.parameters, is_close=True, is_prior=True)
+
     def without(self, left_out: NDArray[np.bool_]) -> JointFit:
         """Fit again without those observations, bool (n,), starting here."""
-        observations, start = self.observations.without(left_out), self.position
-        return fit_joint(
-            self.config, observations, self.prior, start, self.parameters, around=start, near=True
-        )
+        return fit_joint(self.config, self.observations.without(left_out), self.prior, self.start())
+
+    def positions_only(self, range_m: NDArray[np.float64], start: Start) -> JointFit:
+        """Fit the positions only, to other ranges of the observations, float64 (n,), m."""
+        fixed = replace(self.observations, range_m=range_m, rows=np.zeros((len(range_m), 0)))
+        return fit_joint(self.config, fixed, Regressors.none(len(range_m)), start, self.scale_m)
 
     def without_anchors(self, rows: NDArray[np.intp], correction_m: NDArray[np.float64]) -> JointFit:
         """Fit the positions only, to the other anchors' ranges minus a correction, float64 (n,)."""
-        corrected = replace(
-            self.observations,
-            range_m=self.observations.range_m - correction_m,
-            rows=np.zeros((len(self.observations), 0)),
-        )
-        observations = corrected.without(np.isin(self.observations.anchor, rows))
-        return fit_joint(
-            self.config,
-            observations,
-            Regressors.none(len(observations)),
-            self.position,
-            scale_m=self.scale_m,
-            around=self.position,
-            near=True,
+        left_out = np.isin(self.observations.anchor, rows)
+        observations = self.observations.without(left_out)
+        corrected_m = (self.observations.range_m - correction_m)[~left_out]
+        return replace(self, observations=observations).positions_only(
+            corrected_m, replace(self.start(), parameters=None)
         )
 
 
-def fit_segments(
-    config: EstimatorConfig,
-    segments: Segments,
-    prior: Regressors,
-    position: NDArray[np.float64],
-    parameters: NDArray[np.float64] | None = None,
-    *,
-    near: bool = False,
-) -> JointFit:
+def fit_segments(config: EstimatorConfig, segments: Segments, prior: Regressors, start: Start) -> JointFit:
     """Fit positions, tracks and parameters to the ranges of segments; as `fit_joint`."""
-    observations = observations_of(segments, prior, config.model)
-    return fit_joint(config, observations, prior, position, parameters, near=near)
+    return fit_joint(config, observations_of(segments, prior, config.model), prior, start)
 
 
 def fit_joint(
     config: EstimatorConfig,
     observations: Observations,
     prior: Regressors,
-    position: NDArray[np.float64],
-    parameters: NDArray[np.float64] | None = None,
-    *,
+    start: Start,
     scale_m: NDArray[np.float64] | None = None,
-    around: NDArray[np.float64] | None = None,
-    near: bool = False,
 ) -> JointFit:
     """Fit positions, tracks and parameters to observations.
 
@@ -254,113 +264,127 @@ def fit_joint(
         config: anchors, noise model, height and area.
         observations: each knot has one or more.
         prior: mean and standard deviation of the parameters; its rows are those of the observations.
-        position: float64 (K, 3), roughly right, to start from.
-        parameters: to start from; None: the mean of the prior.
+        start: roughly right.
         scale_m: float64 (g,), of the residuals; None: estimated.
-        around: float64 (K, 3), prior of the positions, with `AROUND_M`; None: no prior.
-        near: the start is a solution of nearly the same problem.
 
     Raises:
         DatasetError: the ranges do not determine the solution.
     """
-    d, model, problem = config.dims, config.model, _JointProblem(config, observations, prior, around)
-    x = np.zeros((len(observations.time_s), 2 * d))
-    x[:, :d] = position[:, :d]
-    shared = prior.mean.copy() if parameters is None else parameters
-    kinds = int(observations.noise_group.max(initial=0)) + 1
-    scale = np.full(kinds, _FIRST_SCALE_M) if scale_m is None else scale_m
-    solution: Solution | None = None
-    try:
-        for iteration in range(_ITERATIONS):
-            unit, error = problem.residuals(x, shared)
-            if scale_m is None and (iteration or parameters is not None):
-                found = np.maximum(scatter_of(error, observations.noise_group, kinds), LEAST_SCALE_M)
-                scale = found if near else np.maximum(found, 0.5 * scale)
-            z = error / scale[observations.noise_group]
-            robust = model.weight(z)
-            if iteration < _HUBER_ITERATIONS and not near:
-                robust = np.minimum(1.0, 1.0 / np.maximum(np.abs(z), 1e-9))
-            weight = robust * observations.share / scale[observations.noise_group] ** 2
-            solution = problem.linearised(x, shared, unit, error, weight).solve()
-            step = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
-            x, shared = solution.x, solution.shared
-            if not np.isfinite(step) or step > 1e6:
-                raise np.linalg.LinAlgError
-            if step < _CONVERGED_M and (near or iteration > _HUBER_ITERATIONS + 2):
-                break
-    except np.linalg.LinAlgError as error_:
-        raise DatasetError(
-            "the ranges do not determine where the tags were", valid="more ranges, or anchors"
-        ) from error_
-    assert solution is not None
-    unit, error = problem.residuals(x, shared)
-    z = error / scale[observations.noise_group]
-    losses = np.bincount(
-        observations.segment, model.loss(z) * observations.share, minlength=len(observations.is_stationary)
+    problem = _JointProblem(config, observations, prior, start, scale_m)
+    min_iterations = 1 if start.is_close else _HUBER_ITERATIONS + 4
+    gauss_newton(
+        problem.improve, iterations=_ITERATIONS, converged=_CONVERGED_M, min_iterations=min_iterations
     )
-    loss = losses.astype(np.float64)
-    position, velocity = np.full((len(x), 3), problem.level), np.zeros((len(x), 3))
-    position[:, :d], velocity[:, :d] = x[:, :d], x[:, d:]
-    weight = model.weight(z) * observations.share / scale[observations.noise_group] ** 2
-    covariance = problem.covariance(solution, unit, weight)
-    return JointFit(
-        config, observations, prior, position, velocity, shared, covariance, error, scale, loss, solution
-    )
+    return problem.result()
 
 
 class _JointProblem:
-    """The linearised problem of `fit_joint`."""
+    """The linearised problem of `fit_joint`, and its solution so far."""
 
     def __init__(
         self,
         config: EstimatorConfig,
         observations: Observations,
         prior: Regressors,
-        around: NDArray[np.float64] | None,
+        start: Start,
+        scale_m: NDArray[np.float64] | None,
     ) -> None:
-        self._config, self._links, self._prior = config, observations, prior
-        centre = config.anchors.position.mean(axis=0)
-        self._around = np.tile(centre, (len(observations.time_s), 1)) if around is None else around
-        self._nearness = _NO_PRIOR if around is None else 1.0 / AROUND_M**2
-        self.level = 0.0 if config.height is None else config.height.value
+        self._config, self._observations, self._prior, self._start = config, observations, prior, start
+        self._has_scale = scale_m is not None
+        num_groups = int(observations.noise_group.max(initial=0)) + 1
+        self._scale_m = np.full(num_groups, _FIRST_SCALE_M) if scale_m is None else scale_m
+        self._level_m = 0.0 if config.height is None else config.height.value
+        knots, d = len(observations.time_s), config.dims
+        self._x = np.zeros((knots, 2 * d))
+        self._x[:, :d] = start.position[:, :d]
+        self._parameters = prior.mean.copy() if start.parameters is None else start.parameters
+        self._solution: Solution | None = None
 
-    def covariance(
+    def improve(self, iteration: int) -> float:
+        """Linearise and solve; return the largest change of a position, m."""
+        noise_group, start = self._observations.noise_group, self._start
+        unit, error_m = self._residuals()
+        if not self._has_scale and (iteration or start.parameters is not None):
+            scale_m = np.maximum(scatter_of(error_m, noise_group, len(self._scale_m)), LEAST_SCALE_M)
+            self._scale_m = scale_m if start.is_close else np.maximum(scale_m, 0.5 * self._scale_m)
+        z = error_m / self._scale_m[noise_group]
+        robust = self._config.model.weight(z)
+        if iteration < _HUBER_ITERATIONS and not start.is_close:
+            robust = np.minimum(1.0, 1.0 / np.maximum(np.abs(z), 1e-9))
+        self._solution = self._linearised(unit, error_m, self._weight(robust)).solve()
+        d, before = self._config.dims, self._x
+        self._x, self._parameters = self._solution.x, self._solution.shared
+        return float(np.abs(self._x[:, :d] - before[:, :d]).max())
+
+    def result(self) -> JointFit:
+        """Return the solution."""
+        assert self._solution is not None
+        d, model, observations = self._config.dims, self._config.model, self._observations
+        unit, error_m = self._residuals()
+        z = error_m / self._scale_m[observations.noise_group]
+        loss = np.bincount(
+            observations.segment,
+            model.loss(z) * observations.independent,
+            minlength=len(observations.is_stationary),
+        )
+        position, velocity = np.full((len(self._x), 3), self._level_m), np.zeros((len(self._x), 3))
+        position[:, :d], velocity[:, :d] = self._x[:, :d], self._x[:, d:]
+        return JointFit(
+            config=self._config,
+            observations=observations,
+            prior=self._prior,
+            position=position,
+            velocity=velocity,
+            parameters=self._parameters,
+            covariance=self._covariance(self._solution, unit, self._weight(model.weight(z))),
+            residual_m=error_m,
+            scale_m=self._scale_m,
+            segment_loss=loss.astype(np.float64),
+            _solution=self._solution,
+        )
+
+    def _weight(self, robust: NDArray[np.float64]) -> NDArray[np.float64]:
+        observations = self._observations
+        weight: NDArray[np.float64] = (
+            robust * observations.independent / self._scale_m[observations.noise_group] ** 2
+        )
+        return weight
+
+    def _covariance(
         self, solution: Solution, unit: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
-        observations = self._links
+        observations = self._observations
         problem = LeastSquares(len(observations.time_s), 2 * self._config.dims, observations.rows.shape[1])
         rows = solution.reduced(problem.add(*self._rows(problem, unit), 0.0, 1.0))
         # The errors of stationary positions are independent, so that the residuals show most of them.
         is_stationary = observations.is_stationary[observations.segment]
         slow_sd_m = np.where(is_stationary, CORRECTED_SLOW_SD_M, self._prior.slow_sd_m)
         gain = (weight * slow_sd_m)[:, None] * rows @ solution.shared_covariance
-        chunk = (observations.time_s[observations.knot] // SLOW_S).astype(np.intp)
-        _, of = np.unique(
-            np.stack([observations.segment, chunk, observations.anchor]), axis=1, return_inverse=True
+        interval = (observations.time_s[observations.knot] // SLOW_S).astype(np.intp)
+        _, slot = np.unique(
+            np.stack([observations.segment, interval, observations.anchor]), axis=1, return_inverse=True
         )
-        summed = np.zeros((int(of.max(initial=0)) + 1, observations.rows.shape[1]))
-        np.add.at(summed, of.reshape(-1), gain)
-        found: NDArray[np.float64] = SD_INFLATION**2 * solution.shared_covariance + summed.T @ summed
-        return found
+        summed = np.zeros((int(slot.max(initial=0)) + 1, observations.rows.shape[1]))
+        np.add.at(summed, slot.reshape(-1), gain)
+        covariance: NDArray[np.float64] = SD_INFLATION**2 * solution.shared_covariance + summed.T @ summed
+        return covariance
 
-    def residuals(
-        self, x: NDArray[np.float64], shared: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _residuals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return unit vectors (n, 3) from anchors to tags, and residuals (n,)."""
-        d, observations = self._config.dims, self._links
-        at = x[observations.knot]
-        tag = np.full((len(at), 3), self.level)
-        tag[:, :d] = at[:, :d] + observations.ahead_s[:, None] * at[:, d:]
+        d, observations = self._config.dims, self._observations
+        x = self._x[observations.knot]
+        tag = np.full((len(x), 3), self._level_m)
+        tag[:, :d] = x[:, :d] + observations.ahead_s[:, None] * x[:, d:]
         tag[:, 2] += observations.relative_height
         unit, distance = unit_vectors(tag, self._config.anchors.position[observations.anchor])
-        return unit, observations.range_m - distance - observations.rows @ shared
+        return unit, observations.range_m - distance - observations.rows @ self._parameters
 
     def _rows(
         self, problem: LeastSquares, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Return the columns and derivatives of each observation: of position and velocity, and of the parameters."""
-        d, observations = self._config.dims, self._links
+        d, observations = self._config.dims, self._observations
         n, q = observations.rows.shape
         shared = np.broadcast_to(problem.of_shared(range(q)), (n, q))
         columns = np.concatenate([problem.of_knot(observations.knot[:, None], range(2 * d)), shared], axis=1)
@@ -369,32 +393,29 @@ class _JointProblem:
             [level, observations.ahead_s[:, None] * level, observations.rows], axis=1
         )
 
-    def linearised(
-        self,
-        x: NDArray[np.float64],
-        shared: NDArray[np.float64],
-        unit: NDArray[np.float64],
-        error: NDArray[np.float64],
-        weight: NDArray[np.float64],
+    def _linearised(
+        self, unit: NDArray[np.float64], error_m: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> LeastSquares:
-        d, observations, model = self._config.dims, self._links, self._config.model
-        problem = LeastSquares(len(x), 2 * d, len(shared))
+        d, observations, model = self._config.dims, self._observations, self._config.model
+        x, parameters = self._x, self._parameters
+        problem = LeastSquares(len(x), 2 * d, len(parameters))
         columns, rows = self._rows(problem, unit)
         # The unknowns are solved for, not their changes: motion and priors are linear in them.
-        target = error + np.einsum("nc,nc->n", rows, np.append(x.reshape(-1), shared)[columns])
+        target = error_m + np.einsum("nc,nc->n", rows, np.append(x.reshape(-1), parameters)[columns])
         problem.add(columns, rows, target, weight)
         connected = np.flatnonzero(np.diff(observations.knot_segment) == 0)
         problem.add_motion(connected, np.diff(observations.time_s)[connected], d, model.acceleration**2)
-        if len(shared):
+        if len(parameters):
             problem.add_prior(
-                problem.of_shared(range(len(shared))), self._prior.mean, self._prior.information
+                problem.of_shared(range(len(parameters))), self._prior.mean, self._prior.information
             )
         first = np.flatnonzero(np.diff(observations.knot_segment, prepend=-1))
-        speed = np.where(
-            observations.is_stationary[observations.knot_segment[first]], _STATIONARY, model.speed
-        )
-        every = np.arange(len(x))
+        is_stationary = observations.is_stationary[observations.knot_segment[first]]
+        speed = np.where(is_stationary, _STATIONARY, model.speed)
+        knots, centre = np.arange(len(x)), self._config.anchors.position.mean(axis=0)
+        prior_position = self._start.position if self._start.is_prior else np.tile(centre, (len(x), 1))
+        information = 1.0 / AROUND_M**2 if self._start.is_prior else _NO_PRIOR
         for axis in range(d):
-            problem.add_prior(problem.of_knot(every, axis), self._around[:, axis], self._nearness)
+            problem.add_prior(problem.of_knot(knots, axis), prior_position[:, axis], information)
             problem.add_prior(problem.of_knot(first, d + axis), 0.0, 1.0 / speed**2)
         return problem

@@ -7,16 +7,58 @@ equations are banded, with a border for the shared unknowns:
     [ C'  G ] [ t ] = [ g ]
 
 LAPACK's banded Cholesky factorisation solves A in K b^3 operations, and the Schur complement of A the rest.
+
+`gauss_newton` is the loop of all nonlinear problems: linearise with robust weights, solve, repeat.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import csr_matrix, vstack
+
+from uwb_mitigation.errors import DatasetError
+
+_DIVERGED = 1e6
+
+
+@contextmanager
+def _singular_is_undetermined() -> Iterator[None]:
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise DatasetError(
+            "the ranges do not determine the positions", valid="more ranges, or anchors"
+        ) from error
+
+
+@_singular_is_undetermined()
+def gauss_newton(
+    improve: Callable[[int], float], *, iterations: int, converged: float, min_iterations: int = 1
+) -> None:
+    """Improve a solution until it changes little.
+
+    Args:
+        improve: gets the number of the iteration, linearises the problem at its solution, with robust weights, and replaces
+            the solution; returns the largest change, for example in m.
+        iterations: maximum number.
+        converged: change at which the solution is good enough.
+        min_iterations: minimum number, for problems whose weights change at first.
+
+    Raises:
+        DatasetError: the ranges do not determine the solution.
+    """
+    for iteration in range(iterations):
+        change = improve(iteration)
+        if not change < _DIVERGED:
+            raise np.linalg.LinAlgError
+        if change < converged and iteration + 1 >= min_iterations:
+            return
 
 
 class LeastSquares:
@@ -110,8 +152,8 @@ class LeastSquares:
             band[below, : n - below] = a.diagonal(-below)
         factor = cholesky_banded(band, lower=True, check_finite=False)
         border = normal[:n, n:].toarray()
-        both = np.column_stack([right[:n], border])
-        solved = cho_solve_banded((factor, True), both, overwrite_b=True, check_finite=False)
+        columns = np.column_stack([right[:n], border])
+        solved = cho_solve_banded((factor, True), columns, overwrite_b=True, check_finite=False)
         x, y = solved[:, 0], solved[:, 1:]
         schur = normal[n:, n:].toarray() - border.T @ y
         covariance = np.linalg.inv((schur + schur.T) / 2.0) if q else np.zeros((0, 0))
@@ -136,31 +178,35 @@ class Solution:
     def reduced(self, jacobian: csr_matrix) -> NDArray[np.float64]:
         """Return the derivatives (n, q) of rows with respect to the shared unknowns, with the knots adapted to these."""
         n = len(self._y)
-        found: NDArray[np.float64] = jacobian[:, n:].toarray() - jacobian[:, :n] @ self._y
-        return found
+        rows: NDArray[np.float64] = jacobian[:, n:].toarray() - jacobian[:, :n] @ self._y
+        return rows
 
+    @_singular_is_undetermined()
     def covariances(self, first: int) -> NDArray[np.float64]:
         """Return the marginal covariance of each knot's `first` unknowns, float64 (K, first, first).
 
         The blocks of the inverse of a block-tridiagonal matrix come from a sweep in each direction. The border adds the
         effect of the shared unknowns' covariance.
+
+        Raises:
+            DatasetError: the ranges do not determine the knots.
         """
         knots, b = self.x.shape
         i, j = np.indices((b, b))
-        at = np.arange(knots)[:, None, None] * b
-        diagonal = self._band[np.abs(i - j), at + np.minimum(i, j)]
-        beside = self._band[b + j - i, at[:-1] + i]
-        ahead = np.zeros((knots, b, b))
+        row = np.arange(knots)[:, None, None] * b
+        diagonal = self._band[np.abs(i - j), row + np.minimum(i, j)]
+        beside = self._band[b + j - i, row[:-1] + i]
+        forward = np.zeros((knots, b, b))
         for k in range(1, knots):
-            e = beside[k - 1]
-            ahead[k] = e.T @ np.linalg.solve(diagonal[k - 1] - ahead[k - 1], e)
-        found = np.empty((knots, first, first))
-        back = np.zeros((b, b))
+            coupling = beside[k - 1]
+            forward[k] = coupling.T @ np.linalg.solve(diagonal[k - 1] - forward[k - 1], coupling)
+        covariance = np.empty((knots, first, first))
+        backward = np.zeros((b, b))
         for k in range(knots - 1, -1, -1):
-            found[k] = np.linalg.inv(diagonal[k] - ahead[k] - back)[:first, :first]
+            covariance[k] = np.linalg.inv(diagonal[k] - forward[k] - backward)[:first, :first]
             if k:
-                e = beside[k - 1]
-                back = e @ np.linalg.solve(diagonal[k] - back, e.T)
+                coupling = beside[k - 1]
+                backward = coupling @ np.linalg.solve(diagonal[k] - backward, coupling.T)
         y = self._y.reshape(knots, b, -1)[:, :first]
-        found += np.einsum("kiq,qr,kjr->kij", y, self.shared_covariance, y)
-        return found
+        covariance += np.einsum("kiq,qr,kjr->kij", y, self.shared_covariance, y)
+        return covariance

@@ -35,7 +35,7 @@ class Segments:
         ranges: in the order of the segments, each in the order of time; `tag_id` is meaningless.
         tag: int (n,), index of the tag of each range.
         row: int (n,), row in the ranges of that tag.
-        of: int (n,), segment of each range, from 0.
+        segment: int (n,), of each range, from 0.
         is_stationary: bool (s,), whether each segment is stationary.
         relative_height: float64 (n,), the height of the tag above the common one at each range.
     """
@@ -43,7 +43,7 @@ class Segments:
     ranges: Ranges
     tag: NDArray[np.intp]
     row: NDArray[np.intp]
-    of: NDArray[np.intp]
+    segment: NDArray[np.intp]
     is_stationary: NDArray[np.bool_]
     relative_height: NDArray[np.float64]
 
@@ -53,15 +53,15 @@ class Segments:
 
     def select(self, is_selected: NDArray[np.bool_]) -> Segments:
         """Return only these segments, bool (s,)."""
-        return self.select_ranges(is_selected[self.of])
+        return self.select_ranges(is_selected[self.segment])
 
     def select_ranges(self, is_selected: NDArray[np.bool_]) -> Segments:
         """Return only these ranges, bool (n,), and the segments that contain them."""
-        numbers, of = np.unique(self.of[is_selected], return_inverse=True)
+        numbers, segment = np.unique(self.segment[is_selected], return_inverse=True)
         columns = (
             self.tag[is_selected],
             self.row[is_selected],
-            of,
+            segment,
             self.is_stationary[numbers],
             self.relative_height[is_selected],
         )
@@ -73,17 +73,19 @@ def find_segments(tags: Sequence[Ranges]) -> Segments:
 
     A tag may be moved between positions at rest only without ranging, during a pause of more than `GAP_S`.
     """
-    tag, row, of, stationary = [], [], [], list[bool]()
+    tag, row, segment, stationary = [], [], [], list[bool]()
     for number, ranges in enumerate(tags):
         for piece, is_stationary in _segments(ranges):
             tag.append(np.full(len(piece), number))
             row.append(piece)
-            of.append(np.full(len(piece), len(stationary)))
+            segment.append(np.full(len(piece), len(stationary)))
             stationary.append(is_stationary)
     tag_of, row_of = np.concatenate(tag), np.concatenate(row)
-    kept_ranges = [one.take(row_of[tag_of == number]) for number, one in enumerate(tags)]
+    kept_ranges = [tag_ranges.take(row_of[tag_of == number]) for number, tag_ranges in enumerate(tags)]
     columns = Ranges.joined(kept_ranges)
-    return Segments(columns, tag_of, row_of, np.concatenate(of), np.array(stationary), np.zeros(len(columns)))
+    return Segments(
+        columns, tag_of, row_of, np.concatenate(segment), np.array(stationary), np.zeros(len(columns))
+    )
 
 
 def _segments(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
@@ -92,11 +94,11 @@ def _segments(ranges: Ranges) -> list[tuple[NDArray[np.intp], bool]]:
     # Ignore pauses: pairs may have been recorded one after the other.
     if _is_sparse(ranges, rows) or _is_stationary(ranges, rows):
         return [(rows, True)]
-    parts = np.split(rows, np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * NS_PER_S) + 1)
-    return [segment for part in parts for segment in _parts(ranges, part)]
+    pieces = np.split(rows, np.flatnonzero(np.diff(ranges.stamp_ns) > GAP_S * NS_PER_S) + 1)
+    return [segment for piece in pieces for segment in _split_at_stops(ranges, piece)]
 
 
-def _parts(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], bool]]:
+def _split_at_stops(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], bool]]:
     """Divide a segment without gaps at the start and end of stationary parts."""
     if _is_sparse(ranges, rows) or _is_stationary(ranges, rows):
         return [(rows, True)]
@@ -109,20 +111,20 @@ def _parts(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArray[np.intp
         noise_group[k] = _is_stationary(ranges, rows[starts[k] : starts[k + 2]], least=2)
     still = noise_group | np.concatenate([[False], noise_group[:-1]])
     edges = np.flatnonzero(np.diff(still)) + 1
-    found: list[tuple[NDArray[np.intp], bool]] = []
+    segments: list[tuple[NDArray[np.intp], bool]] = []
     moving: list[NDArray[np.intp]] = []
     for run in np.split(np.arange(bins), edges):
         piece = rows[starts[run[0]] : starts[run[-1] + 1]]
         if still[run[0]] and len(run) * BIN_S >= LEAST_S and _is_stationary(ranges, piece):
             if moving:
-                found.append((np.concatenate(moving), False))
+                segments.append((np.concatenate(moving), False))
                 moving = []
-            found.append((piece, True))
+            segments.append((piece, True))
         elif len(piece):
             moving.append(piece)
     if moving:
-        found.append((np.concatenate(moving), False))
-    return found
+        segments.append((np.concatenate(moving), False))
+    return segments
 
 
 def _is_sparse(ranges: Ranges, rows: NDArray[np.intp]) -> bool:
@@ -134,9 +136,9 @@ def _is_stationary(ranges: Ranges, rows: NDArray[np.intp], least: int = FEW) -> 
     """Return whether the ranges of most anchors scatter only by noise."""
     anchor, value = ranges.anchor[rows], ranges.range_m[rows]
     spread = []
-    for one in np.unique(anchor):
-        own = value[anchor == one]
-        if len(own) >= least:
-            spread.append(MAD_TO_SD * float(np.median(np.abs(own - np.median(own)))))
+    for row in np.unique(anchor):
+        anchor_ranges = value[anchor == row]
+        if len(anchor_ranges) >= least:
+            spread.append(MAD_TO_SD * float(np.median(np.abs(anchor_ranges - np.median(anchor_ranges)))))
     # While a tag moves, its ranges to two anchors may be constant, but not to three.
     return len(spread) >= 3 and float(np.quantile(spread, 0.8)) < STILL_M

@@ -167,11 +167,11 @@ def align_poses(
 def _poses_at(
     paths: Sequence[PosePath], tag: NDArray[np.intp], stamp_ns: NDArray[np.int64], later_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return `PosePath.at` for the path of each tag (n,)."""
+    """Return `PosePath.poses_at` for the path of each tag (n,)."""
     position, rotation = np.zeros((len(tag), 3)), np.zeros((len(tag), 3, 3))
     for number, path in enumerate(paths):
         own = tag == number
-        position[own], rotation[own] = path.at(stamp_ns[own], later_s)
+        position[own], rotation[own] = path.poses_at(stamp_ns[own], later_s)
     return position, rotation
 
 

@@ -25,7 +25,7 @@ from uwb_mitigation.positioning.batch.anchor_errors import (
     mirrored,
     position_scatter,
 )
-from uwb_mitigation.positioning.batch.joint_fit import KNOT_S, SLOW_S, JointFit, fit_segments
+from uwb_mitigation.positioning.batch.joint_fit import KNOT_S, SLOW_S, JointFit, Start, fit_segments
 from uwb_mitigation.positioning.batch.motion_segments import Segments, find_segments
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
@@ -113,7 +113,7 @@ class SelfCalibration:
             DatasetError: the other ranges do not determine them.
         """
         left_out_observations = np.ones(len(self.fit.observations), np.bool_)
-        left_out_observations[self.fit.observations.of[~left_out]] = False
+        left_out_observations[self.fit.observations.observation_index[~left_out]] = False
         return replace(self, fit=self.fit.without(left_out_observations))
 
     def value(self, name: str) -> tuple[float, float]:
@@ -210,7 +210,7 @@ def self_calibrate(
         solver.config = replace(config, height=Height(height.value, height_sd_m))
     fit = solver.fit_common_offset()
     level, fit, individual_sd = solver.with_own_offsets(fit)
-    fit = fit_segments(solver.config, solver.segments, fit.prior, fit.position, fit.parameters)
+    fit = fit_segments(solver.config, solver.segments, fit.prior, Start(fit.position, fit.parameters))
     # The hypotheses of another height and of another anchor position compete with that of own offsets.
     alternative = solver.with_free_offsets(fit)
     check_anchor_positions(solver.segments, alternative, first_positions)
@@ -270,7 +270,7 @@ class _Solver:
         self._position, has_position = first_positions(config, self.segments, expected + offset)
         common = Regressors.one("offset", np.ones(len(expected)), offset, COMMON_SD_M)
         self.common = replace(common.concat(extra), noise_group=extra.noise_group)
-        used = float(has_position[self.segments.of].mean())
+        used = float(has_position[self.segments.segment].mean())
         if used < MIN_POSITION_SHARE:
             scale_m = np.full(int(extra.noise_group.max(initial=0)) + 1, START_SD_M)
             check_swapped(self.segments, config, self.common, first_positions, scale_m)
@@ -287,7 +287,7 @@ class _Solver:
         self._select(has_position)
 
     def _select(self, is_selected: NDArray[np.bool_]) -> None:
-        self.common = self.common.select_rows(is_selected[self.segments.of])
+        self.common = self.common.select_rows(is_selected[self.segments.segment])
         self.segments = self.segments.select(is_selected)
 
     def fit_common_offset(self) -> JointFit:
@@ -297,7 +297,7 @@ class _Solver:
             DatasetError: the track is ambiguous, or position and offset cannot be separated.
         """
         # The positions contain no knots of segments that were left out.
-        fit = fit_segments(self.config, self.segments, self.common, self._position)
+        fit = fit_segments(self.config, self.segments, self.common, Start(self._position))
         ambiguous = mirrored(fit)
         if ambiguous.all():
             raise DatasetError(
@@ -311,7 +311,7 @@ class _Solver:
             )
             position = fit.position[~ambiguous[fit.observations.knot_segment]]
             self._select(~ambiguous)
-            fit = fit_segments(self.config, self.segments, self.common, position)
+            fit = fit_segments(self.config, self.segments, self.common, Start(position))
         check_motion(fit)
         self.common_sd = float(np.sqrt(fit.covariance[0, 0]))
         return fit
@@ -352,9 +352,9 @@ class _Solver:
         missing = {name: rows for name, rows in members.items() if name not in fit.prior.names}
         if not missing:
             return fit
-        own = own_offset_columns(missing, OWN_SD_M, fit.prior.noise_group)
-        start = np.append(fit.parameters, np.zeros(len(missing)))
-        return fit_segments(self.config, self.segments, fit.prior.concat(own), fit.position, start, near=True)
+        columns = own_offset_columns(missing, OWN_SD_M, fit.prior.noise_group)
+        start = Start(fit.position, np.append(fit.parameters, np.zeros(len(missing))), is_close=True)
+        return fit_segments(self.config, self.segments, fit.prior.concat(columns), start)
 
     def without_offset(self, result: SelfCalibration) -> SelfCalibration:
         """Return the solution with an offset of zero, because the estimate is not significant."""
@@ -365,8 +365,8 @@ class _Solver:
         )
         common, fit = self.common, result.fit
         zero = replace(common, mean=np.append(0.0, common.mean[1:]), sd=np.append(1e-4, common.sd[1:]))
-        start = np.append(0.0, fit.parameters[1 : len(zero.names)])
-        fit = fit_segments(self.config, self.segments, zero, fit.position, start)
+        start = Start(fit.position, np.append(0.0, fit.parameters[1 : len(zero.names)]))
+        fit = fit_segments(self.config, self.segments, zero, start)
         return replace(result, fit=fit, level="one", common_offset_m=float(np.hypot(value, sd)))
 
 
@@ -388,11 +388,13 @@ def candidates(segments: Segments) -> list[tuple[str, dict[str, NDArray[np.bool_
     row, tag = segments.ranges.anchor, segments.tag
     tried = [("anchor", {f"anchor {anchor}": row == anchor for anchor in np.unique(row).tolist()})]
     # The offset of a tag that stays at one position can hardly be separated from this position.
-    num_segments = {number: len(np.unique(segments.of[tag == number])) for number in np.unique(tag).tolist()}
+    num_segments = {
+        number: len(np.unique(segments.segment[tag == number])) for number in np.unique(tag).tolist()
+    }
     several = [
         number
         for number, count in num_segments.items()
-        if count > 1 or not segments.is_stationary[segments.of[tag == number][0]]
+        if count > 1 or not segments.is_stationary[segments.segment[tag == number][0]]
     ]
     if len(several) > 1:
         tried.append(("tag", {f"tag {number}": tag == number for number in several}))
@@ -427,9 +429,9 @@ def with_own_offsets(
     count = len(members)
 
     def with_groups(names: list[str], sd: float) -> JointFit:
-        own = own_offset_columns({name: members[name] for name in names}, sd, fit.prior.noise_group)
-        start = np.append(fit.parameters, np.zeros(len(names)))
-        return fit_segments(fit.config, segments, fit.prior.concat(own), fit.position, start, near=True)
+        columns = own_offset_columns({name: members[name] for name in names}, sd, fit.prior.noise_group)
+        start = Start(fit.position, np.append(fit.parameters, np.zeros(len(names))), is_close=True)
+        return fit_segments(fit.config, segments, fit.prior.concat(columns), start)
 
     trial = with_groups(list(members), OWN_SD_M)
     # Deviations from their mean: the mean is the common offset.
@@ -504,7 +506,9 @@ def _moments(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np
     ranges = segments.ranges
     window = (ranges.stamp_ns - ranges.stamp_ns[0]) // round(WINDOW_S * NS_PER_S)
     key = np.where(
-        segments.is_stationary[segments.of], -1 - segments.of, window * len(segments) + segments.of
+        segments.is_stationary[segments.segment],
+        -1 - segments.segment,
+        window * len(segments) + segments.segment,
     )
     for group in rng.permutation(np.unique(key)).tolist():
         row, value = _medians(ranges, np.flatnonzero(key == group), expected_m)
@@ -531,7 +535,7 @@ def first_positions(
     """Return initial positions float64 (K, 3) at the knots of the segments that have any; which these are, bool (s,)."""
     position: list[NDArray[np.float64]] = []
     has_position = np.zeros(len(segments), np.bool_)
-    edges = np.searchsorted(segments.of, np.arange(len(segments) + 1))
+    edges = np.searchsorted(segments.segment, np.arange(len(segments) + 1))
     for number in range(len(segments)):
         rows = np.arange(edges[number], edges[number + 1])
         if segments.is_stationary[number]:

@@ -223,7 +223,7 @@ class Smoother:
             columns = problem.of_shared(range(problem.shared - 3 * m, problem.shared))
             problem.add_prior(columns, shift, 1.0 / sd**2)
         if self._heights is not None:
-            value, variance = self._heights.at(self._origin_ns + self._knots_ns)
+            value, variance = self._heights.height_at(self._origin_ns + self._knots_ns)
             known = np.flatnonzero(np.isfinite(value))
             if len(known):
                 problem.add_prior(problem.of_knot(known, 2), value[known], 1.0 / variance[known])

@@ -460,4 +460,4 @@ def run_estimator(
         estimate = add(TagRange(*row))
         if estimate is not None:
             estimates.append(estimate)
-    return Track.of(estimates)
+    return Track.from_estimates(estimates)

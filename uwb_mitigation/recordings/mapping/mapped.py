@@ -349,7 +349,7 @@ class MappedRecording(Source):
                 path = TruePath(rows["stamp"][order], position[order] + offset)
                 self.truth = path if len(self.truth) == 0 else self.truth
                 selected = np.flatnonzero(in_files & (values["tag"] == tag))
-                for name, coordinate in zip(_TAG, path.at(values["stamp"][selected]).T, strict=True):
+                for name, coordinate in zip(_TAG, path.position_at(values["stamp"][selected]).T, strict=True):
                     values[name][selected] = coordinate
 
     def _warn(self) -> None:

@@ -163,7 +163,7 @@ def read_site(
                     shift_ns = end_of_previous - stamp_ns + RECORDING_GAP_NS
             height_m = math.nan
             if heights_of_recording is not None:
-                height_m = float(heights_of_recording.at(np.array([stamp_ns]))[0][0])
+                height_m = float(heights_of_recording.height_at(np.array([stamp_ns]))[0][0])
             table.add(record.measurement, stamp_ns + shift_ns, height_m)
         shifts.append(shift_ns or 0)
     return table.to_site(tuple(shifts))

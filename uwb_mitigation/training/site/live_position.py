@@ -112,7 +112,7 @@ def _errors(
         path = TruePath(ranges.stamp_ns[has_reference], reference[rows[has_reference]])
         index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1
         has_position = track.stamp_ns[index] == ranges.stamp_ns
-        difference = track.position[index] - path.at(ranges.stamp_ns)
+        difference = track.position[index] - path.position_at(ranges.stamp_ns)
         axes = slice(0, 3 if prior.height is None and heights is None else 2)
         error[rows[has_position]] = np.linalg.norm(difference[:, axes], axis=1)[has_position]
     return error

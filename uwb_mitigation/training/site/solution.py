@@ -215,8 +215,8 @@ class _RangesOnly:
         return SiteSolution(
             rows=self._rows,
             true_m=calibration.pseudo_m[labelled],
-            antenna_position=calibration.fit.antenna_position()[observations.of][labelled],
-            segment=segments.of[labelled],
+            antenna_position=calibration.fit.antenna_position()[observations.observation_index][labelled],
+            segment=segments.segment[labelled],
             stationary=segments.is_stationary,
             pairs=pairs,
             offsets=self._offsets(pairs),
@@ -242,10 +242,10 @@ class _RangesOnly:
         anchors = len(np.unique(fit.observations.anchor))
         # The track follows errors: of m ranges with d unknowns, (m - d) / m of the variance remains in the residuals.
         redundancy = max(1.0 - fit.config.dims / anchors, 0.25)
-        joint_m = fit.residual_m[fit.observations.of][labelled] / math.sqrt(redundancy)
+        joint_m = fit.residual_m[fit.observations.observation_index][labelled] / math.sqrt(redundancy)
         corrected_m = (
             self._calibration.segments.ranges.range_m
-            - (fit.observations.rows @ fit.parameters)[fit.observations.of]
+            - (fit.observations.rows @ fit.parameters)[fit.observations.observation_index]
         )
         residual_m = (corrected_m - self._calibration.pseudo_m)[labelled]
         of_joint, of_residuals = (
@@ -268,7 +268,9 @@ class _RangesOnly:
     def offset_changes_without(self, held_out: NDArray[np.intp]) -> dict[tuple[int, int], float]:
         """See `SiteSolution`."""
         calibration, labelled = self._calibration, self._labelled
-        refit = calibration.raw_only(_whole_segments(labelled[held_out], labelled, calibration.segments.of))
+        refit = calibration.raw_only(
+            _whole_segments(labelled[held_out], labelled, calibration.segments.segment)
+        )
         return {
             self._ids(tag, row): refit.pair(tag, row)[0] - calibration.pair(tag, row)[0]
             for tag, row in calibration.pairs()
@@ -460,7 +462,7 @@ def _stationary_positions(calibration: SelfCalibration) -> dict[str, tuple[float
     """Return the positions of stationary tags, see `SiteSolution.stationary_positions`."""
     stationary = np.flatnonzero(calibration.fit.observations.is_stationary).tolist()
     tag_of_segment = dict(
-        zip(calibration.segments.of.tolist(), calibration.segments.tag.tolist(), strict=True)
+        zip(calibration.segments.segment.tolist(), calibration.segments.tag.tolist(), strict=True)
     )
     positions = Counter(tag_of_segment[segment] for segment in stationary)
     number: Counter[int] = Counter()
