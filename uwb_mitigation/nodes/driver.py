@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
@@ -59,12 +58,8 @@ class Driver(ManagedNode):
 
     def open(self) -> None:
         # Each function checks its parameters, opens its source, and returns the factory of its feed.
-        if self._has_radios:
-            self._make_feed = self._prepare_radios()
-        elif self.value("source") == "topic":
-            self._make_feed = self._prepare_topics()
-        else:
-            self._make_feed = self._prepare_replay()
+        other = self._prepare_topics if self.value("source") == "topic" else self._prepare_replay
+        self._make_feed = self._prepare_radios() if self._has_radios else other()
 
     def begin(self) -> None:
         assert self._make_feed is not None
@@ -94,14 +89,7 @@ class Driver(ManagedNode):
         source.read_settings(self.value)
         corrections = self.value("source") == "serial"
         self._output = output = RangePublisher(self, self._consumer, corrections=corrections, recording=False)
-        return lambda: RadioFeed(
-            source,
-            self.value,
-            output.publish_range,
-            output.publish_correction,
-            self.now_ns,
-            self.get_logger(),
-        )
+        return lambda: RadioFeed(source, self.value, output, self.now_ns, self.get_logger())
 
     def _prepare_topics(self) -> Callable[[], SourceHandle]:
         # Mapping files need pandas and pydantic, which the other sources do not.
@@ -125,8 +113,7 @@ class Driver(ManagedNode):
             # Other sources do not need the readers of bags.
             from uwb_mitigation.nodes.feeds.robot_messages import RobotMessages
 
-            names = [name.strip() for name in self.value("robot_topics").split(",")]
-            robot = RobotMessages(self, Path(self.value("path")).expanduser(), names)
+            robot = RobotMessages(self)
         # A node that publishes /clock must not wait for /clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         clock = steady if self.value("publish_clock") else self.get_clock()

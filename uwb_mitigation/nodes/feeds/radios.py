@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, Protocol
 
+from uwb_mitigation.nodes.feeds.publishing import RangePublisher
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.radios.port import OnEvent, PortMessage, RadioPort
@@ -58,8 +59,7 @@ class RadioFeed:
     Args:
         source: kind of the radios.
         value: returns a parameter's value.
-        on_range: publishes a range; called by one thread at a time.
-        on_correction: publishes a range that the board has corrected.
+        output: called by one thread at a time.
         now_ns: the clock of the stamps.
         logger: with `info`, `warning` and `error`, as rclpy's.
 
@@ -71,13 +71,11 @@ class RadioFeed:
         self,
         source: RadioSource,
         value: ValueReader,
-        on_range: Callable[[RangeMeasurement], None],
-        on_correction: Callable[[Correction], None],
+        output: RangePublisher,
         now_ns: Callable[[], int],
         logger: Any,
     ) -> None:
-        self._source, self._now_ns, self._logger = source, now_ns, logger
-        self._on_range, self._on_correction = on_range, on_correction
+        self._source, self._output, self._now_ns, self._logger = source, output, now_ns, logger
         self._ranges = 0
         self._meter = diagnostics.RateMonitor(now_ns)
         self._publishing = threading.Lock()
@@ -119,10 +117,10 @@ class RadioFeed:
             case RangeMeasurement() | Correction():
                 with self._publishing:
                     if isinstance(event, Correction):
-                        self._on_correction(event)
+                        self._output.publish_correction(event)
                     else:
                         self._ranges += 1
-                        self._on_range(event)
+                        self._output.publish_range(event)
                     self._meter.add(self._now_ns() - event.stamp_ns)
             case PortMessage(level=level, text=text):
                 # rclpy allows only one severity for each line of code.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +33,19 @@ class RobotMessages:
     the replay publishes them.
 
     Args:
-        node: the driver; the publishers exist until its `close`.
-        path: the bag.
-        topics: names; those that the bag does not contain, or with another type, are ignored.
+        node: the driver; the publishers exist until its `close`. Its parameter `path` is the bag. Names in `robot_topics` that
+            the bag does not contain, or with another type, are ignored.
 
     Raises:
         RecordingError: the bag cannot be read.
         MissingDependencyError: a message type is not installed.
     """
 
-    def __init__(self, node: ManagedNode, path: Path, topics: Iterable[str]) -> None:
-        self._path, self._node = path, node
-        recorded = BagReader(path).topics
+    def __init__(self, node: ManagedNode) -> None:
+        self._path, self._node = Path(node.value("path")).expanduser(), node
+        recorded, names = BagReader(self._path).topics, node.value("robot_topics").replace(" ", "").split(",")
         self._types = {
-            name: endpoints.message_type(recorded[name]) for name in topics if recorded.get(name) in _TYPES
+            name: endpoints.message_type(recorded[name]) for name in names if recorded.get(name) in _TYPES
         }
         self._publishers = {name: self._create_publisher(name) for name in self._types}
 
