@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import os
@@ -13,16 +14,18 @@ import pytest
 from bag_material import write_corrected
 from command_line import run
 from conftest import REPOSITORY
-from drives import HALL, NANOSECONDS, circuit, drive, wrapped
+from drives import HALL, NANOSECONDS, Robot, circuit, drive, wrapped
 
 from benchmarks.position_data import real_runs, simulated_runs
 from benchmarks.positions import evaluate
+from uwb_mitigation.commands import positioning
 from uwb_mitigation.commands.offline import track as tracking
 from uwb_mitigation.commands.offline.track import held_out, track_tag
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.nodes.support.parameter_tables import TABLES
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.formats import open_recording
@@ -214,6 +217,7 @@ def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path):
             "--json", str(report), "--tum", str(tum), folder=tmp_path,
         )  # fmt: skip
         assert ran.returncode == 0, ran.stderr
+        assert ("lever arm of the antenna unknown" in ran.stderr) == bool(options)
         results.append(json.loads(report.read_text()))
     without, with_odometry, with_imu = results
     assert without["live"]["heading_rmse_deg"] is None
@@ -250,6 +254,27 @@ def test_unusable_odometry_options_are_refused(
     )
     assert ran.returncode != 0
     assert excerpt in ran.stderr
+
+
+@pytest.mark.parametrize("yaw_sign", [1.0, -1.0])
+def test_odometry_that_contradicts_the_ranges_is_reported(yaw_sign: float):
+    robot = Robot(seconds=40)
+    assert robot.config.robot is not None
+    odometry = robot.odometry
+    twist = odometry.twist * (1.0, 1.0, yaw_sign)
+    odometry = replace(odometry, pose=np.full_like(odometry.pose, np.nan), twist=twist)
+    ranges = robot.ranges(seconds=40)
+    truth = TruePath(ranges.stamp_ns, circuit(ranges.stamp_ns / NANOSECONDS))
+    config = replace(robot.config, robot=RobotData(odometry))
+    warnings = track_tag(recording_of(ranges, truth), config).warnings
+    assert any("odometry contradicted" in warning for warning in warnings) == (yaw_sign < 0.0)
+
+
+def test_commands_and_node_use_the_acceleration_of_the_model():
+    defaults = {parameter.name: parameter.default for parameter in TABLES["locator"]}
+    assert defaults["acceleration"] == NoiseModel().acceleration
+    for command in (positioning.track, positioning.survey):
+        assert inspect.signature(command).parameters["acceleration"].default == NoiseModel().acceleration
 
 
 def recording_of(ranges: Ranges, truth: TruePath) -> TagRecording:

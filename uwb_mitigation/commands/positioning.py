@@ -81,7 +81,7 @@ OffsetOption = Annotated[
 AccelerationOption = Annotated[
     float,
     typer.Option(
-        help="Agility of the tags: 1 for robots, people and drones, less for slow vehicles. Square root of the spectral "
+        help="Agility of the tags: 0.8 for robots, people and drones, less for slow vehicles. Square root of the spectral "
         "density of the acceleration, m/s^1.5."
     ),
 ]
@@ -126,7 +126,7 @@ def track(
         ),
     ] = None,
     stamp_offset: OffsetOption = 0.0,
-    acceleration: AccelerationOption = 1.0,
+    acceleration: AccelerationOption = 0.8,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -200,7 +200,7 @@ def survey(
     height_topic: HeightTopicOption = None,
     area: AreaOption = None,
     stamp_offset: OffsetOption = 0.0,
-    acceleration: AccelerationOption = 1.0,
+    acceleration: AccelerationOption = 0.8,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -300,9 +300,16 @@ def _robot_of(
     from uwb_mitigation.recordings.bag.pose_paths import read_lever_arm, read_range_frame
 
     if arm is None:
-        arm = read_lever_arm(bag, BASE_LINK, read_range_frame(bag)) or (0.0, 0.0, 0.0)
+        frame = read_range_frame(bag)
+        arm = read_lever_arm(bag, BASE_LINK, frame)
+        if arm is None and frame.lstrip("/") != BASE_LINK:
+            antenna = frame or "the antenna (ranges without frame_id)"
+            warn(
+                f"lever arm of the antenna unknown, 0,0,0 is used: no transform from {BASE_LINK} to {antenna} in the bag. Set "
+                "--lever-arm X,Y,Z"
+            )
     motion = read_odometry(bag, odometry)
-    return RobotData(motion, None if imu is None else read_imu(bag, imu), arm)
+    return RobotData(motion, None if imu is None else read_imu(bag, imu), arm or (0.0, 0.0, 0.0))
 
 
 def _show_tracks(tracks: list[TagTracks]) -> None:

@@ -115,6 +115,11 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
             f"no position for {without_position:.0%} of the ranges, because several positions explain them or too few anchors "
             "were received. Give a height or an area"
         )
+    if robot is not None and (times := robot.tag.counts["odometry wrong"]):
+        warnings.append(
+            f"odometry contradicted the ranges {times} times and was not used then: wheels that slip, a robot moved by hand, "
+            "wrong axes, scale or signs"
+        )
     warnings += _smoothing_warnings(errors["live"], errors["smoothed"])
     return TagTracks(recording, **tracks, errors=errors, hdop=hdop, warnings=warnings)
 

@@ -214,7 +214,7 @@ LOCATOR = (
               low=-1e4, high=1e4, unit="m"),
     Parameter("height_sd", 0.1, "Standard deviation of that height.", low=0.001, high=100.0, unit="m"),
     Parameter("area", "", "Area of possible tag positions, X,Y,Z,X,Y,Z: two corners of a box, m. Empty: unlimited."),
-    Parameter("acceleration", 1.0, "Process noise: change of the speed of tags; 1 for robots, people and drones.",
+    Parameter("acceleration", 0.8, "Process noise: change of the speed of tags; 0.8 for robots, people and drones.",
               low=0.001, high=1000.0, unit="m/s^1.5"),
     Parameter("range_sd", 0.1, "Standard deviation of ranges without a variance.",
               low=0.001, high=100.0, unit="m"),
