@@ -83,7 +83,7 @@ def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ..
 def test_help_fits_80_columns_and_needs_no_checkout(words: tuple[str, ...], tmp_path: Path):
     done = run(*words, "--help", folder=tmp_path, columns=80)
     assert done.returncode == 0
-    assert not re.search(r"<str>|docs/|\.md\b|…", done.stdout)
+    assert not re.search(r"<str>|<bool>|docs/|\.md\b|…", done.stdout)
     wrapped_examples = [line for line in done.stdout.splitlines() if re.match(r" (-|/)", line)]
     assert wrapped_examples == []
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
+from conftest import REPOSITORY
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from rich.console import Console
 
-from uwb_mitigation.nodes.monitor import RangeStatistics, summary
+from uwb_mitigation.nodes.monitor import RangeStatistics, live_table, summary
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status, Truth
 from uwb_mitigation.types.ros.codec import MeasurementKey
 
@@ -55,3 +57,25 @@ def test_summary_without_data_shows_no_nan():
     shown = console.export_text()
     assert "0 ranges received" in shown
     assert "nan" not in shown
+
+
+@pytest.mark.parametrize("width", [80, 60])
+def test_table_with_units_fits_the_terminal_and_omits_columns(width: int):
+    statistics = RangeStatistics()
+    console = Console(width=width, record=True)
+    key = MeasurementKey(0, 101, 1, 0)
+    result = CorrectedRange(2.923, 3.4, 0.477, 0.069, Status.OK, CorrectedBy.HOST, 1)
+    statistics.add_truth(key, Truth(3.0, "NLOS"))
+    statistics.add_corrected(key, result, 0.001)
+    console.print(live_table(statistics, "", console.width))
+    shown = console.export_text()
+    words = re.findall(r"[a-zA-Z]+", shown)
+    assert {"corrected", "sigma", "true", "status", "OK"} <= set(words)
+    assert ("label" in words) == (width == 80)
+    if width == 80:
+        quote = (REPOSITORY / "docs" / "tutorials" / "first_steps.md").read_text()
+        (header,) = re.findall(r"┏[^│]*rate[^│]*┩\n", quote)
+        assert header in shown
+    statistics.pairs[1, 101].truth = None
+    console.print(live_table(statistics, ""))
+    assert "true" not in console.export_text()

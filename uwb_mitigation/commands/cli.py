@@ -108,7 +108,8 @@ def _reflow_help(command: Any) -> None:
     command.help = "\n\n".join(
         f"[none]{text}[/none]" if text.startswith(" ") else text.replace("\n", " ") for text in paragraphs
     )
-    for parameter in command.params:
+    # The parameters include --help, which typer creates when it is first needed.
+    for parameter in command.get_params(command.context_class(command)):
         if getattr(parameter, "is_flag", False):
             parameter.metavar = " "  # otherwise typer shows flags as `<bool>`
     for subcommand in getattr(command, "commands", {}).values():

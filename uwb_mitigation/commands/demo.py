@@ -155,13 +155,13 @@ def watch(plan: DemoPlan, console: Console) -> list[str]:
             nodes.start("driver", *plan.parameters, "wait_for_subscribers:=2")
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while nodes.running:
-                    live.update(live_table(statistics, title))
+                    live.update(live_table(statistics, title, console.width))
                     time.sleep(1 / REFRESH_HZ)
                 # The last corrected ranges may arrive after the end of the driver.
                 deadline = time.monotonic() + SETTLE_S
                 while statistics.missing and time.monotonic() < deadline:
                     time.sleep(0.05)
-                live.update(live_table(statistics, title))
+                live.update(live_table(statistics, title, console.width))
         console.print(summary(statistics))
         if len(poses) > 1 and len(truth) > 1:
             console.print(

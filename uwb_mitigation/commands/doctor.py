@@ -46,7 +46,7 @@ class Finding(NamedTuple):
 def doctor(json: JsonOption = None) -> None:
     """Check the installation. The exit code is 1 if something is broken."""
     findings = list(examine())
-    table = Table("", "state", Column(overflow="fold"))
+    table = Table("component", "state", Column("details", overflow="fold"))
     for name, state, detail in findings:
         table.add_row(name, {"ok": "[green]ok", "broken": "[red]broken"}.get(state, state), escape(detail))
     console.out.print(table)

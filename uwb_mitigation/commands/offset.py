@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
+from dataclasses import asdict
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -108,7 +109,11 @@ def _id(name: str, text: str) -> int:
 def _show(estimate: OffsetEstimate) -> None:
     from uwb_mitigation.commands.support.console import print_line, show_table, warn
 
-    accepted = [placement for placement in estimate.placements if not placement.refused]
+    accepted = [
+        {**asdict(placement), "placement": PurePath(placement.placement).name}
+        for placement in estimate.placements
+        if not placement.refused
+    ]
     columns = {
         "anchor": "anchor_id:id",
         "tag": "tag_id:id",

@@ -134,27 +134,49 @@ def _text(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
-def live_table(statistics: RangeStatistics, title: str) -> Table:
-    """Return a table with one row for each anchor-tag pair."""
+def live_table(statistics: RangeStatistics, title: str, width: int = 80) -> Table:
+    """Return a table with one row for each anchor-tag pair, which fits into `width` columns if ids are short."""
     table = Table(title=title, title_justify="left")
-    for column in ("anchor", "tag", "Hz", "raw", "corrected", "sigma", "true", "status", "label"):
-        table.add_column(
-            column, justify="left" if column in ("status", "label") else "right", overflow="fold"
-        )
+    columns = [
+        "anchor",
+        "tag",
+        "rate\nHz",
+        "raw\nm",
+        "corrected\nm",
+        "sigma\nm",
+        "status",
+        "true\nm",
+        "label",
+    ]
+    omitted: set[str] = set()
+    if all(pair.truth is None for pair in statistics.pairs.copy().values()):
+        omitted |= {"true\nm", "label"}
+    if width < 80:
+        omitted |= {"rate\nHz", "label"}
+    for column in columns:
+        if column not in omitted:
+            table.add_column(
+                column,
+                justify="left" if column in ("status", "label") else "right",
+                overflow="fold",
+                no_wrap=column not in ("anchor", "tag"),
+            )
     for (anchor, tag), pair in sorted(statistics.pairs.copy().items()):
         corrected, truth = pair.corrected, pair.truth
         if corrected is None:
             continue
         sigma_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
         true_m = math.nan if truth is None else truth.range_m
-        table.add_row(
+        cells = (
             format_id(anchor),
             format_id(tag),
             _text(pair.rate_hz(), 1),
-            *map(_text, (corrected.range_raw_m, corrected.range_m, sigma_m, true_m)),
+            *map(_text, (corrected.range_raw_m, corrected.range_m, sigma_m)),
             Text(corrected.status.name, style="green" if corrected.status is Status.OK else "yellow"),
+            _text(true_m),
             "" if truth is None else truth.label,
         )
+        table.add_row(*(cell for column, cell in zip(columns, cells, strict=True) if column not in omitted))
     return table
 
 
@@ -172,8 +194,8 @@ def summary(statistics: RangeStatistics) -> Group:
         p50, p99 = statistics.latency_ms(50), statistics.latency_ms(99)
         lines.append(Text(f"latency from stamp to corrected range: p50 {p50:.2f} ms, p99 {p99:.2f} ms"))
     if statistics.errors:
-        table = Table(title="mean absolute error, m", title_justify="left")
-        for column in ("label", "ranges", "raw MAE", "corrected MAE", "ratio"):
+        table = Table(title="Mean absolute error (MAE)", title_justify="left")
+        for column in ("label", "ranges", "raw MAE, m", "corrected MAE, m", "ratio"):
             table.add_column(column, justify="left" if column == "label" else "right")
         for label, errors in [*sorted(statistics.errors.items()), ("all", sum(statistics.errors.values()))]:
             if label == "all":
@@ -195,7 +217,7 @@ def run_monitor() -> None:
         with spinning_node(Monitor) as monitor:
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while not stop.wait(1 / REFRESH_HZ):
-                    live.update(live_table(monitor.statistics, "UWB ranges"))
+                    live.update(live_table(monitor.statistics, "UWB ranges", console.width))
             console.print(summary(monitor.statistics))
     except UwbMitigationError as error:
         sys.exit(f"error: {error}")

@@ -109,7 +109,7 @@ def show_table(
     if len(rows) > max_rows:
         print_line(f"and {len(rows) - max_rows} more rows")
     if omitted:
-        print_line(f"In wider terminals and with --json: {', '.join(omitted)}")
+        print_line(f"In wider terminals and with --json: {'; '.join(omitted)}")
 
 
 def _value(row: Any, key: str) -> Any:

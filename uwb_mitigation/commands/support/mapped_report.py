@@ -150,4 +150,4 @@ def _show_errors(errors: Any) -> None:
         [f"{start:+.2f} to {stop:+.2f}", str(count), "#" * round(_BAR * count / max(counts.max(), 1))]
         for count, start, stop in zip(counts.tolist(), edges[:-1], edges[1:], strict=True)
     ]
-    show_table(f"Errors (measured - true) of {len(errors)} ranges", ("error m", "ranges", ""), rows, left=1)
+    show_table(f"Errors (measured - true) of {len(errors)} ranges", ("error, m", "ranges", ""), rows, left=1)

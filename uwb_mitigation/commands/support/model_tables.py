@@ -52,8 +52,8 @@ def show_trained(trained: TrainedBundle) -> None:
     if "int8" in trained.validation.errors:
         rows = trained.validation.statistics().items()
         show_table(
-            f"{trained.validation.folds}-fold cross-validation by configuration, m",
-            ("", "MAE", "std", "p95"),
+            f"{trained.validation.folds}-fold cross-validation by configuration",
+            ("", "MAE, m", "std, m", "p95, m"),
             [(_ROWS[name], *values.values()) for name, values in rows],
         )
     before, baseline = min((mae, name) for name, mae in trained.baseline_mae_m.items())
@@ -92,8 +92,8 @@ def show_comparison(result: Comparison) -> None:
 
     show_table(
         f"{result.configurations} configurations, {result.folds} splits by {result.group.value}, "
-        f"mean of {result.seeds} seeds, MAE in m",
-        ("", "MAE", "std", "95 % interval", *(label or "no label" for label in labels)),
+        f"MAE in m, mean of {result.seeds} seeds",
+        ("", "all, m", "std, m", "95 % interval, m", *(f"{label or 'no label'}, m" for label in labels)),
         [
             (row.name, row.mae_mean, row.mae_std, "{:.3f}-{:.3f}".format(*row.ci95), *row.by_label.values())
             for row in result.rows
@@ -116,7 +116,9 @@ def show_comparison(result: Comparison) -> None:
 def show_held_out(held_out: Mapping[str, Mapping[str, ErrorStatistics]]) -> None:
     """Show the table of `train-universal`."""
     rows = [(row, *(statistics.mae for statistics in by.values())) for row, by in held_out.items()]
-    show_table("MAE in held-out simulated buildings, m", ("", *held_out["raw"]), rows)
+    show_table(
+        "MAE in held-out simulated buildings", ("", *(f"{label}, m" for label in held_out["raw"])), rows
+    )
 
 
 def show_bundle(bundle: Bundle) -> None:
@@ -130,8 +132,8 @@ def show_accuracy(result: Accuracy) -> None:
     after = result.corrected
     rows: list[tuple[object, ...]] = [("all", result.n, result.raw.mae, after.mae, after.std, after.p95)]
     rows += [(label or "no label", *values, "", "") for label, values in result.by_label.items()]
-    columns = ("", "n", "raw MAE", "corrected MAE", "std", "p95")
-    show_table(f"{result.n} ranges, model {result.model_id:08x}, m", columns, rows)
+    columns = ("", "ranges", "raw MAE, m", "corrected MAE, m", "std, m", "p95, m")
+    show_table(f"{result.n} ranges, model {result.model_id:08x}", columns, rows, optional=columns[4:])
     for status, count in result.statuses.items():
         if status != "OK":
             print_line(f"{status}: {count} ranges not corrected")
