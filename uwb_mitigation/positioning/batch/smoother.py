@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution
+from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution, gauss_newton
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.robot_estimator import make_estimator
@@ -57,8 +57,8 @@ class Smoothed:
 def knots_of(stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Return the knots, int64 (K,) ns since the first stamp, and the knot of each stamp, int (n,)."""
     spacing = round(KNOT_S * NS_PER_S)
-    number, of = np.unique((stamp_ns - stamp_ns[0] + spacing // 2) // spacing, return_inverse=True)
-    return number * spacing, of
+    number, knot = np.unique((stamp_ns - stamp_ns[0] + spacing // 2) // spacing, return_inverse=True)
+    return number * spacing, knot
 
 
 class Smoother:
@@ -92,13 +92,13 @@ class Smoother:
         self._d = config.dims
         # Anchors without ranges have no persisting errors to estimate.
         self._used, self._slot = np.unique(ranges.anchor, return_inverse=True)
-        self._known = anchors.position
+        self._anchor_position = anchors.position
         self._around, self._spread = around or (anchors.position, np.repeat(anchors.sd[:, None], 3, axis=1))
         self._ranges = ranges
         self._origin_ns = int(ranges.stamp_ns[0])
-        self._knots_ns, self._of = knots_of(ranges.stamp_ns)
+        self._knots_ns, self._knot = knots_of(ranges.stamp_ns)
         self._time_s = self._knots_ns / NS_PER_S
-        self._ahead_s = (ranges.stamp_ns - self._origin_ns - self._knots_ns[self._of]) / NS_PER_S
+        self._ahead_s = (ranges.stamp_ns - self._origin_ns - self._knots_ns[self._knot]) / NS_PER_S
         self._variance = model.variances(ranges.variance_m2)
         median = np.array([np.median(self._variance[self._slot == s]) for s in range(len(self._used))])
         self._persisting = (1.0 - model.white) * median
@@ -108,6 +108,8 @@ class Smoother:
         # A common offset, and one of each anchor.
         self._offset_sd = np.array([model.offset_sd, *[model.pair_sd] * len(self._used)])
         self._heights = config.heights if config.height is None else None
+        self._x, self._shared = np.zeros((0, 0)), np.zeros(0)
+        self._solution: Solution | None = None
 
     def fit(self, initial: Track, iterations: int = _ITERATIONS) -> Smoothed:
         """Return the track, starting from one that is roughly right.
@@ -115,90 +117,82 @@ class Smoother:
         Raises:
             DatasetError: the ranges do not determine it.
         """
-        knots, d, p = len(self._time_s), self._d, len(self._offset_sd)
-        stamp = (initial.stamp_ns - self._origin_ns) / NS_PER_S
-        x = np.zeros((knots, 2 * d + len(self._used)))
-        for axis in range(d):
-            x[:, axis] = np.interp(self._time_s, stamp, initial.position[:, axis])
+        stamp_s = (initial.stamp_ns - self._origin_ns) / NS_PER_S
+        self._x = np.zeros((len(self._time_s), 2 * self._d + len(self._used)))
+        for axis in range(self._d):
+            self._x[:, axis] = np.interp(self._time_s, stamp_s, initial.position[:, axis])
         extra = (self._height is not None) + (3 * len(self._used) if self._find else 0)
-        shared = np.zeros(p + extra)
-        solution: Solution | None = None
-        try:
-            for _ in range(iterations):
-                solution = self._linearised(x, shared).solve()
-                step = float(np.abs(solution.x[:, :d] - x[:, :d]).max())
-                x, shared = solution.x, solution.shared
-                if not np.isfinite(step):
-                    raise np.linalg.LinAlgError
-                if step < _CONVERGED_M:
-                    break
-            assert solution is not None
-            covariances = solution.covariances(2 * d)
-        except np.linalg.LinAlgError as error:
-            raise DatasetError(
-                "the ranges do not determine a track", valid="more ranges, or anchors"
-            ) from error
-        height, anchors = self._split(shared)
+        self._shared = np.zeros(len(self._offset_sd) + extra)
+        gauss_newton(self._improve, iterations=iterations, converged=_CONVERGED_M)
+        return self._result()
+
+    def _improve(self, iteration: int) -> float:
+        """Linearise and solve; return the largest change of a position, m."""
+        self._solution, d, before = self._linearised().solve(), self._d, self._x
+        self._x, self._shared = self._solution.x, self._solution.shared
+        return float(np.abs(self._x[:, :d] - before[:, :d]).max())
+
+    def _result(self) -> Smoothed:
+        assert self._solution is not None
+        x, knots, d, p = self._x, len(self._x), self._d, len(self._offset_sd)
+        height, anchors = self._split()
         position, velocity = np.full((knots, 3), height), np.zeros((knots, 3))
         position[:, :d], velocity[:, :d] = x[:, :d], x[:, d : 2 * d]
-        full = np.zeros((knots, 6, 6))
+        covariance = np.zeros((knots, 6, 6))
         axes = [*range(d), *range(3, 3 + d)]
-        full[np.ix_(range(knots), axes, axes)] = covariances
+        covariance[np.ix_(range(knots), axes, axes)] = self._solution.covariances(2 * d)
         if self._height is not None:
-            full[:, 2, 2] = solution.shared_covariance[p, p]
-        _, residual = self._residuals(x, shared)
+            covariance[:, 2, 2] = self._solution.shared_covariance[p, p]
         anchor_covariance = np.diag(self._spread.reshape(-1) ** 2)
         if self._find:
-            own = (3 * self._used[:, None] + np.arange(3)).reshape(-1)
-            at = len(shared) - len(own)
-            anchor_covariance[np.ix_(own, own)] = solution.shared_covariance[at:, at:]
+            axes_of_used = (3 * self._used[:, None] + np.arange(3)).reshape(-1)
+            of_anchors = self._solution.shared_covariance[-len(axes_of_used) :, -len(axes_of_used) :]
+            anchor_covariance[np.ix_(axes_of_used, axes_of_used)] = of_anchors
         return Smoothed(
-            Track(self._origin_ns + self._knots_ns, position, velocity, full),
+            Track(self._origin_ns + self._knots_ns, position, velocity, covariance),
             anchors,
             anchor_covariance.reshape(len(anchors), 3, len(anchors), 3),
-            residual,
+            self._residuals()[1],
         )
 
-    def _split(self, shared: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def _split(self) -> tuple[float, NDArray[np.float64]]:
         """Return the height (0 if it is not shared) and the positions of all anchors (m, 3)."""
-        height, anchors = 0.0, self._known.copy()
+        shared, height, anchors = self._shared, 0.0, self._anchor_position.copy()
         if self._height is not None:
             height = self._height.value + shared[len(self._offset_sd)]
         if self._find:
             anchors[self._used] += shared[-3 * len(self._used) :].reshape(-1, 3)
         return height, anchors
 
-    def _residuals(
-        self, x: NDArray[np.float64], shared: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _residuals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return unit vectors (n, 3) from anchor to tag, and residuals (n,) that include persisting errors."""
-        d = self._d
-        height, anchors = self._split(shared)
-        at = x[self._of]
-        tag = np.full((len(at), 3), height)
-        tag[:, :d] = at[:, :d] + self._ahead_s[:, None] * at[:, d : 2 * d]
+        d, shared, x = self._d, self._shared, self._x[self._knot]
+        height, anchors = self._split()
+        tag = np.full((len(x), 3), height)
+        tag[:, :d] = x[:, :d] + self._ahead_s[:, None] * x[:, d : 2 * d]
         unit, distance = unit_vectors(tag, anchors[self._ranges.anchor])
         return unit, self._ranges.range_m - distance - shared[0] - shared[1 + self._slot]
 
-    def _linearised(self, x: NDArray[np.float64], shared: NDArray[np.float64]) -> LeastSquares:
-        d, model, of, slot = self._d, self._model, self._of[:, None], self._slot[:, None]
+    def _linearised(self) -> LeastSquares:
+        d, model, knot, slot = self._d, self._model, self._knot[:, None], self._slot[:, None]
+        x, shared = self._x, self._shared
         knots, p = len(x), len(self._offset_sd)
         problem = LeastSquares(knots, x.shape[1], len(shared))
-        unit, residual = self._residuals(x, shared)
-        error = problem.of_knot(of, 2 * d + slot)
-        columns = [problem.of_knot(of, range(2 * d)), error, problem.of_shared(slot * (0, 1) + (0, 1))]
-        values = [unit[:, :d], self._ahead_s[:, None] * unit[:, :d], np.ones((len(of), 3))]
+        unit, residual = self._residuals()
+        error = problem.of_knot(knot, 2 * d + slot)
+        columns = [problem.of_knot(knot, range(2 * d)), error, problem.of_shared(slot * (0, 1) + (0, 1))]
+        values = [unit[:, :d], self._ahead_s[:, None] * unit[:, :d], np.ones((len(knot), 3))]
         if self._height is not None:
-            columns.append(np.full((len(of), 1), problem.of_shared(p)))
+            columns.append(np.full((len(knot), 1), problem.of_shared(p)))
             values.append(unit[:, 2:])
         if self._find:
             columns.append(problem.of_shared(len(shared) - 3 * len(self._used) + 3 * slot + np.arange(3)))
             values.append(-unit)
         # The unknowns are solved for, not their changes: motion and priors are linear in them.
-        both, row = np.concatenate(columns, axis=1), np.concatenate(values, axis=1)
-        target = residual - x[self._of, 2 * d + self._slot]
-        target += np.einsum("nc,nc->n", row, np.append(x.reshape(-1), shared)[both])
-        problem.add(both, row, target, model.weight(residual / np.sqrt(self._variance)) / self._white)
+        column, row = np.concatenate(columns, axis=1), np.concatenate(values, axis=1)
+        target = residual - x[self._knot, 2 * d + self._slot]
+        target += np.einsum("nc,nc->n", row, np.append(x.reshape(-1), shared)[column])
+        problem.add(column, row, target, model.weight(residual / np.sqrt(self._variance)) / self._white)
 
         dt, every = np.diff(self._time_s), np.arange(knots - 1)
         problem.add_motion(every, dt, d, model.acceleration**2)
@@ -218,15 +212,16 @@ class Smoother:
             problem.of_shared(range(first, p)), 0.0, 1.0 / np.maximum(self._offset_sd[first:], 1e-6) ** 2
         )
         if self._find:
-            shift = (self._around - self._known)[self._used].reshape(-1)
+            shift = (self._around - self._anchor_position)[self._used].reshape(-1)
             sd = np.maximum(self._spread[self._used].reshape(-1), 1e-6)
             columns = problem.of_shared(range(problem.shared - 3 * m, problem.shared))
             problem.add_prior(columns, shift, 1.0 / sd**2)
         if self._heights is not None:
             value, variance = self._heights.height_at(self._origin_ns + self._knots_ns)
-            known = np.flatnonzero(np.isfinite(value))
-            if len(known):
-                problem.add_prior(problem.of_knot(known, 2), value[known], 1.0 / variance[known])
+            is_finite = np.isfinite(value)
+            if is_finite.any():
+                columns = problem.of_knot(np.flatnonzero(is_finite), 2)
+                problem.add_prior(columns, value[is_finite], 1.0 / variance[is_finite])
         if self._after is None:
             if self._height is not None:
                 problem.add_prior(problem.of_shared(p), 0.0, 1.0 / self._height.sd**2)
@@ -234,14 +229,14 @@ class Smoother:
             problem.add_prior(problem.of_knot(0, range(2 * d, 2 * d + m)), 0.0, 1.0 / self._persisting)
             return
         index = [*range(d), *range(3, 3 + d), *(FIRST_ERROR + self._used), OFFSET]
-        at = [*problem.of_knot(0, range(2 * d + m)), problem.of_shared(0)]
+        column = [*problem.of_knot(0, range(2 * d + m)), problem.of_shared(0)]
         state = self._after.x.copy()
         if self._height is not None:
-            index, at = [*index, 2], [*at, problem.of_shared(p)]
+            index, column = [*index, 2], [*column, problem.of_shared(p)]
             state[2] -= self._height.value
         information = np.linalg.inv(self._after.P[np.ix_(index, index)] + 1e-9 * np.eye(len(index)))
         root = np.linalg.cholesky((information + information.T) / 2.0).T
-        problem.add(np.tile(at, (len(index), 1)), root, root @ state[index], 1.0)
+        problem.add(np.tile(column, (len(index), 1)), root, root @ state[index], 1.0)
 
 
 def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
@@ -261,12 +256,12 @@ def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
         imu=config.robot.imu and config.robot.imu.reversed(end_ns),
     )
     track = make_estimator(replace(config, heights=heights, robot=robot)).run(ranges.reversed(end_ns))
-    later = _at(track, (end_ns - stamp_ns)[backwards])
+    later = _states_at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
-    state, covariance, spread = _fused(_at(live, stamp_ns), later)
+    state, covariance, spread = _fused(_states_at(live, stamp_ns), later)
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
-    found = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
+    is_known = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
     yaw = _fused_yaw(_yaw_at(live, stamp_ns), _yaw_at(track, end_ns - stamp_ns))
     batch = None
     # The batch smoother has no odometry.
@@ -277,7 +272,7 @@ def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
         state, covariance, more = fused_with_batch(state, covariance, batch)
         spread += more
     position = state[:, :3] if config.area is None else config.area.clip(state[:, :3])
-    return Track(stamp_ns, position, state[:, 3:], covariance + spread, yaw).take(found)
+    return Track(stamp_ns, position, state[:, 3:], covariance + spread, yaw).take(is_known)
 
 
 def fused_with_batch(
@@ -288,17 +283,17 @@ def fused_with_batch(
     Returns:
         As `_fused`.
     """
-    own = np.concatenate([batch.position, batch.velocity], axis=1)
-    own_covariance = batch.covariance + np.diag([BATCH_BIAS_M**2] * 3 + [0.0] * 3)
-    apart = (own - state)[:, :3]
-    expected = _regular((covariance + own_covariance)[:, :3, :3])
-    squared = np.einsum("ni,ni->n", apart, np.linalg.solve(expected, apart[..., None])[..., 0])
+    batch_state = np.concatenate([batch.position, batch.velocity], axis=1)
+    batch_covariance = batch.covariance + np.diag([BATCH_BIAS_M**2] * 3 + [0.0] * 3)
+    difference = (batch_state - state)[:, :3]
+    expected = _regular((covariance + batch_covariance)[:, :3, :3])
+    squared = np.einsum("ni,ni->n", difference, np.linalg.solve(expected, difference[..., None])[..., 0])
     # If it contradicts the filters, it is in another optimum.
-    own_covariance *= np.fmax(squared / 3.0, 1.0)[:, None, None]
-    return _fused((state, covariance), (own, own_covariance))
+    batch_covariance *= np.fmax(squared / 3.0, 1.0)[:, None, None]
+    return _fused((state, covariance), (batch_state, batch_covariance))
 
 
-def _at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _states_at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """States float64 (k, 6) and covariances (k, 6, 6) predicted from the latest estimates; NaN without a recent one."""
     if len(track) == 0:
         return np.full((len(stamp_ns), 6), np.nan), np.full((len(stamp_ns), 6, 6), np.nan)
@@ -316,26 +311,26 @@ def _at(track: Track, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64],
 
 def _yaw_at(track: Track, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return yaws and their variances (k, 2) between the estimates around each stamp; NaN where one is unknown."""
-    found = np.full((len(stamp_ns), 2), np.nan)
+    yaws = np.full((len(stamp_ns), 2), np.nan)
     if len(track) > 1:
         after = np.searchsorted(track.stamp_ns, stamp_ns).clip(1, len(track) - 1)
         span_ns = track.stamp_ns[after] - track.stamp_ns[after - 1]
-        part = ((stamp_ns - track.stamp_ns[after - 1]) / np.maximum(span_ns, 1)).clip(0.0, 1.0)
+        fraction = ((stamp_ns - track.stamp_ns[after - 1]) / np.maximum(span_ns, 1)).clip(0.0, 1.0)
         first, second = track.yaw[after - 1], track.yaw[after]
-        found[:, 0] = first[:, 0] + part * _wrapped(second[:, 0] - first[:, 0])
-        found[:, 1] = np.maximum(first[:, 4], second[:, 4])
-        found[span_ns > _OLDEST_NS] = np.nan
-    return found
+        yaws[:, 0] = first[:, 0] + fraction * _wrapped(second[:, 0] - first[:, 0])
+        yaws[:, 1] = np.maximum(first[:, 4], second[:, 4])
+        yaws[span_ns > _OLDEST_NS] = np.nan
+    return yaws
 
 
-def _fused_yaw(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fused_yaw(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Fuse yaws and variances (k, 2) by covariance intersection, as `_fused`; return the columns of `Track.yaw`."""
-    (a, p), (b, q) = one.T, other.T
-    apart, weight = _wrapped(b - a), q / (p + q)
-    both = np.isfinite(apart)
-    yaw = np.where(both, a + (1.0 - weight) * apart, np.where(np.isfinite(a), a, b))
-    variance = 1.0 / (weight / p + (1.0 - weight) / q) + weight * (1.0 - weight) * apart**2
-    variance = np.where(both, variance, np.where(np.isfinite(a), p, q))
+    (a, p), (b, q) = first.T, second.T
+    difference, weight = _wrapped(b - a), q / (p + q)
+    has_both = np.isfinite(difference)
+    yaw = np.where(has_both, a + (1.0 - weight) * difference, np.where(np.isfinite(a), a, b))
+    variance = 1.0 / (weight / p + (1.0 - weight) / q) + weight * (1.0 - weight) * difference**2
+    variance = np.where(has_both, variance, np.where(np.isfinite(a), p, q))
     zero = np.where(np.isfinite(yaw), 0.0, np.nan)
     return np.stack([_wrapped(yaw), zero, zero, zero, variance], axis=1)
 
@@ -345,28 +340,28 @@ def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _fused(
-    one: tuple[NDArray[np.float64], NDArray[np.float64]],
-    other: tuple[NDArray[np.float64], NDArray[np.float64]],
+    first: tuple[NDArray[np.float64], NDArray[np.float64]],
+    second: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Fuse states (k, 6) with covariances (k, 6, 6) by covariance intersection; where one is NaN, take the other.
 
     Returns:
         States, covariances, and the spread of the two means (k, 6, 6), as in a mixture: where they differ, one is wrong.
     """
-    (a, p), (b, q) = one, other
+    (a, p), (b, q) = first, second
     state, covariance = np.where(np.isfinite(a), a, b), np.where(np.isfinite(p), p, q)
     spread = np.zeros_like(covariance)
-    both = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    p, q = _regular(p[both]), _regular(q[both])
+    has_both = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    p, q = _regular(p[has_both]), _regular(q[has_both])
     trace = [np.einsum("nii->n", c[:, :3, :3]) for c in (p, q)]
     weight = (trace[1] / (trace[0] + trace[1]))[:, None, None]
-    of_p, of_q = weight * np.linalg.inv(p), (1.0 - weight) * np.linalg.inv(q)
-    found = np.linalg.inv(of_p + of_q)
-    covariance[both] = found
-    apart = a[both] - b[both]
-    spread[both] = weight * (1.0 - weight) * np.einsum("ni,nj->nij", apart, apart)
-    weighted = of_p @ a[both][..., None] + of_q @ b[both][..., None]
-    state[both] = (found @ weighted)[..., 0]
+    information_p, information_q = weight * np.linalg.inv(p), (1.0 - weight) * np.linalg.inv(q)
+    fused = np.linalg.inv(information_p + information_q)
+    covariance[has_both] = fused
+    difference = a[has_both] - b[has_both]
+    spread[has_both] = weight * (1.0 - weight) * np.einsum("ni,nj->nij", difference, difference)
+    weighted = information_p @ a[has_both][..., None] + information_q @ b[has_both][..., None]
+    state[has_both] = (fused @ weighted)[..., 0]
     return state, covariance, spread
 
 

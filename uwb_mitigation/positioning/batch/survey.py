@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.batch.least_squares import gauss_newton
 from uwb_mitigation.positioning.batch.smoother import Smoothed, Smoother
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, unit_vectors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
@@ -111,7 +112,7 @@ def survey(
     Raises:
         DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
     """
-    guesses, model, used, needed = config.anchors, config.model, np.unique(ranges.anchor), config.dims + 1
+    guesses, used, needed = config.anchors, np.unique(ranges.anchor), config.dims + 1
     if len(used) < needed:
         raise DatasetError(f"{len(used)} anchors were received", valid=f"{needed} or more for a survey")
     if anchor_rank(guesses.position[used]) is AnchorRank.LINE:
@@ -119,60 +120,60 @@ def survey(
     deviations = np.array(
         [sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())]
     )
-    identity = np.arange(len(guesses))
-
-    def fit(order: NDArray[np.intp]) -> tuple[Smoothed, float]:
-        start = guesses.moved(guesses.position[order], deviations)
-        found = _fit(replace(config, anchors=start), ranges)
-        sd = np.sqrt(model.variances(ranges.variance_m2))
-        return found, float(model.loss(found.residual_m / sd).mean())
-
-    order = _unswap(config, ranges, off_m)
-    found, loss = fit(identity)
-    if (order != identity).any():
-        # In a square, swapped opposite anchors are the mirror image of the right ones: ranges cannot distinguish the two.
-        exchanged, lower = fit(order)
-        here, mirror = (
-            _misfit(fitted.anchors[used], guesses.position[used], mirrored=side)
-            for fitted, side in ((found, False), (exchanged, True))
-        )
-        there = _misfit(exchanged.anchors[used], guesses.position[order][used], mirrored=False)
-        limit = _AS_WELL * off_m
-        better = lower < loss - _SWAP_GAIN or here > max(limit, _AS_WELL * there)
-        if better and mirror > limit:
-            found, loss = exchanged, lower
-        else:
-            order = identity
-    swapped = np.flatnonzero(order != identity).tolist()
-    sd = np.sqrt(np.einsum("ijij->i", found.anchor_covariance) / 3.0)
-    moved = displacements(found.anchors[used], guesses.position[used])
-    distance = np.zeros(len(guesses))
+    fit, loss, order = _fit_best_order(config, ranges, deviations, off_m)
+    swapped = np.flatnonzero(order != np.arange(len(order))).tolist()
+    free = [row for row in used.tolist() if row not in fixed]
     # A drive at constant height hardly determines heights: they are those of the guesses.
     axes = slice(0, config.dims)
-    distance[used] = np.linalg.norm(moved[:, axes], axis=1)
-    relative = np.linalg.norm(_relative_sd(found.anchors, found.anchor_covariance)[:, axes], axis=1)
-    misplaced = [int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative[row])]
-    alternatives = {
-        row: other
-        for row in used.tolist()
-        if row not in fixed
-        for other in [_alternative(config, found, ranges, row)]
-        if other is not None
-    }
+    distance = np.zeros(len(guesses))
+    distance[used] = np.linalg.norm(displacements(fit.anchors[used], guesses.position[used])[:, axes], axis=1)
+    relative_sd = np.linalg.norm(_relative_sd(fit.anchors, fit.anchor_covariance)[:, axes], axis=1)
+    sd = np.sqrt(np.einsum("ijij->i", fit.anchor_covariance) / 3.0)
+    alternatives = {row: _alternative(config, fit, ranges, row) for row in free}
     plain, mirror = (
-        _misfit(found.anchors[used], guesses.position[order][used], mirrored=side) for side in (False, True)
+        _misfit(fit.anchors[used], guesses.position[order][used], mirrored=side) for side in (False, True)
     )
     return SurveyResult(
-        guesses.moved(found.anchors, np.maximum(sd, 1e-3)),
-        distance,
-        misplaced,
-        [(swapped[0], swapped[1])] if swapped else [],
-        found.track,
-        loss,
-        alternatives,
-        [row for row in used.tolist() if row not in fixed and relative[row] > MISPLACED_M],
-        not fixed and mirror < _AS_WELL * max(plain, TAPE_M),
+        anchors=guesses.moved(fit.anchors, np.maximum(sd, 1e-3)),
+        moved_m=distance,
+        misplaced=[
+            int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative_sd[row])
+        ],
+        swapped=[(swapped[0], swapped[1])] if swapped else [],
+        track=fit.track,
+        loss=loss,
+        alternatives={row: position for row, position in alternatives.items() if position is not None},
+        undetermined=[row for row in free if relative_sd[row] > MISPLACED_M],
+        mirrored=not fixed and mirror < _AS_WELL * max(plain, TAPE_M),
     )
+
+
+def _fit_best_order(
+    config: EstimatorConfig, ranges: Ranges, deviations: NDArray[np.float64], off_m: float
+) -> tuple[Smoothed, float, NDArray[np.intp]]:
+    """Return the fit with the better order of the guesses (as given, or a pair swapped), its loss, and the order."""
+    guesses, model, used = config.anchors, config.model, np.unique(ranges.anchor)
+
+    def fit_order(order: NDArray[np.intp]) -> tuple[Smoothed, float]:
+        start = guesses.moved(guesses.position[order], deviations)
+        fit = _fit(replace(config, anchors=start), ranges)
+        sd = np.sqrt(model.variances(ranges.variance_m2))
+        return fit, float(model.loss(fit.residual_m / sd).mean())
+
+    identity, order = np.arange(len(guesses)), _unswap(config, ranges, off_m)
+    fit, loss = fit_order(identity)
+    if (order == identity).all():
+        return fit, loss, identity
+    # In a square, swapped opposite anchors are the mirror image of the right ones: ranges cannot distinguish the two.
+    swapped_fit, swapped_loss = fit_order(order)
+    misfit = _misfit(fit.anchors[used], guesses.position[used], mirrored=False)
+    mirrored_misfit = _misfit(swapped_fit.anchors[used], guesses.position[used], mirrored=True)
+    swapped_misfit = _misfit(swapped_fit.anchors[used], guesses.position[order][used], mirrored=False)
+    limit = _AS_WELL * off_m
+    is_better = swapped_loss < loss - _SWAP_GAIN or misfit > max(limit, _AS_WELL * swapped_misfit)
+    if is_better and mirrored_misfit > limit:
+        return swapped_fit, swapped_loss, order
+    return fit, loss, identity
 
 
 def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
@@ -189,23 +190,23 @@ def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
     around = np.repeat(start.sd[:, None], 3, axis=1)
     if config.height is not None:
         around[:, 2] = np.minimum(around[:, 2], TAPE_M)
-    variance, known, fit = config.model.variances(ranges.variance_m2), start, None
+    variance, anchors, fit = config.model.variances(ranges.variance_m2), start, None
     for step in _STEPS_M:
         fit = Smoother(
-            replace(config, anchors=known),
+            replace(config, anchors=anchors),
             replace(ranges, variance_m2=np.maximum(variance, step**2)),
             find_anchors=True,
             around=(start.position, around),
         ).fit(track)
-        track, known = fit.track, known.moved(fit.anchors, start.sd)
+        track, anchors = fit.track, anchors.moved(fit.anchors, start.sd)
     assert fit is not None
     return fit
 
 
-def _misfit(found: NDArray[np.float64], guessed: NDArray[np.float64], *, mirrored: bool) -> float:
+def _misfit(position: NDArray[np.float64], guess: NDArray[np.float64], *, mirrored: bool) -> float:
     """Return the horizontal RMS distance between estimated anchors (m, 3), or their mirror image, and the guesses."""
     side = -1.0 if mirrored else 1.0
-    return float(np.sqrt(np.mean(displacements(found * (side, 1.0, 1.0), guessed)[:, :2] ** 2)))
+    return float(np.sqrt(np.mean(displacements(position * (side, 1.0, 1.0), guess)[:, :2] ** 2)))
 
 
 def _alternative(
@@ -215,43 +216,47 @@ def _alternative(
 
     Candidate: the mirror image beyond the track's plane (with a constant height: its line in plan), refined for this track.
     """
-    own = ranges.anchor == row
+    is_of_anchor = ranges.anchor == row
     track, axes, model = fit.track, config.dims, config.model
     tag = np.stack(
-        [np.interp(ranges.stamp_ns[own], track.stamp_ns, axis) for axis in track.position.T], axis=1
+        [np.interp(ranges.stamp_ns[is_of_anchor], track.stamp_ns, axis) for axis in track.position.T], axis=1
     )
     centre = tag.mean(axis=0)
     normal = np.zeros(3)
     normal[:axes] = np.linalg.svd((tag - centre)[:, :axes], full_matrices=False)[2][-1]
     anchor = fit.anchors[row]
-    other = anchor - 2.0 * float((anchor - centre) @ normal) * normal
-    found_m = np.linalg.norm(tag - anchor, axis=1)
-    sd = np.sqrt(model.variances(ranges.variance_m2[own]))
+    position = anchor - 2.0 * float((anchor - centre) @ normal) * normal
+    sd = np.sqrt(model.variances(ranges.variance_m2[is_of_anchor]))
     # Residuals of the fit, with what it attributes to offsets: the other position has to explain the same ranges.
-    range_m = found_m + fit.residual_m[own]
-    for _ in range(10):
-        unit, expected = unit_vectors(other, tag)
+    range_m = np.linalg.norm(tag - anchor, axis=1) + fit.residual_m[is_of_anchor]
+
+    def improve(iteration: int) -> float:
+        unit, expected = unit_vectors(position, tag)
         z = (range_m - expected) / sd
         slope = (unit / sd[:, None])[:, :axes]
         weighted = slope * model.weight(z)[:, None]
-        other[:axes] += np.linalg.solve(weighted.T @ slope + np.eye(axes), weighted.T @ z)
-    worse = float(model.loss((range_m - np.linalg.norm(other - tag, axis=1)) / sd).mean())
-    here = float(model.loss(fit.residual_m[own] / sd).mean())
-    return other if worse < here + _SAME_LOSS and np.linalg.norm(other - anchor) > MISPLACED_M else None
+        step = np.linalg.solve(weighted.T @ slope + np.eye(axes), weighted.T @ z)
+        position[:axes] += step
+        return float(np.abs(step).max())
+
+    gauss_newton(improve, iterations=10, converged=1e-3)
+    loss = float(model.loss((range_m - np.linalg.norm(position - tag, axis=1)) / sd).mean())
+    is_equal = loss < float(model.loss(fit.residual_m[is_of_anchor] / sd).mean()) + _SAME_LOSS
+    return position if is_equal and np.linalg.norm(position - anchor) > MISPLACED_M else None
 
 
-def displacements(found: NDArray[np.float64], guessed: NDArray[np.float64]) -> NDArray[np.float64]:
+def displacements(position: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the displacement of each anchor (m, 3) from its guess, after alignment with the guesses.
 
     The alignment, a translation and a rotation about the vertical, is a robust fit: one misplaced anchor does not displace the
     others.
     """
-    weight = np.ones(len(found))
-    off = found - guessed
+    weight = np.ones(len(position))
+    off = position - guess
     for _ in range(30):
         total = weight.sum()
-        a, b = (weight @ found) / total, (weight @ guessed) / total
-        p, q = found - a, guessed - b
+        a, b = (weight @ position) / total, (weight @ guess) / total
+        p, q = position - a, guess - b
         cross = weight @ (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
         along = weight @ (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1])
         angle = np.arctan2(cross, along)
@@ -270,13 +275,13 @@ def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64])
         covariance: float64 (m, 3, m, 3).
     """
     m = len(position)
-    whole = np.zeros((m, 3, 4))
-    whole[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    rigid = np.zeros((m, 3, 4))
+    rigid[:, [0, 1, 2], [0, 1, 2]] = 1.0
     centred = position - position.mean(axis=0)
-    whole[:, 0, 3], whole[:, 1, 3] = -centred[:, 1], centred[:, 0]
-    basis, _ = np.linalg.qr(whole.reshape(3 * m, 4))
-    left = np.eye(3 * m) - basis @ basis.T
-    spread = np.diag(left @ covariance.reshape(3 * m, 3 * m) @ left).reshape(m, 3)
+    rigid[:, 0, 3], rigid[:, 1, 3] = -centred[:, 1], centred[:, 0]
+    basis, _ = np.linalg.qr(rigid.reshape(3 * m, 4))
+    projection = np.eye(3 * m) - basis @ basis.T
+    spread = np.diag(projection @ covariance.reshape(3 * m, 3 * m) @ projection).reshape(m, 3)
     sd: NDArray[np.float64] = np.sqrt(spread)
     return sd
 
@@ -305,6 +310,6 @@ def _unswap(config: EstimatorConfig, ranges: Ranges, off_m: float) -> NDArray[np
     for a, b in itertools.combinations(np.unique(trial.anchor).tolist(), 2):
         swapped = identity.copy()
         swapped[[a, b]] = b, a
-        if (found := loss(swapped)) < best - _SWAP_GAIN:
-            best, order = found, swapped
+        if (swapped_loss := loss(swapped)) < best - _SWAP_GAIN:
+            best, order = swapped_loss, swapped
     return order
