@@ -50,7 +50,7 @@ class FixedLagSmoother:
 
     def add(
         self,
-        known: RangeFilter,
+        range_filter: RangeFilter,
         stamp_ns: int,
         anchor: int,
         range_m: float,
@@ -62,11 +62,11 @@ class FixedLagSmoother:
             self.clear()
         self._ranges.append((stamp_ns, anchor, range_m, variance_m2))
         if not self._states or stamp_ns - self._states[-1][0] >= _EVERY_S * NS_PER_S:
-            self._states.append((stamp_ns, known.copy(), estimate))
+            self._states.append((stamp_ns, range_filter.copy(), estimate))
         oldest = stamp_ns - round((LAG_S + _BEFORE_S + _EVERY_S) * NS_PER_S)
-        for kept in (self._states, self._ranges, self._heights):
-            while kept and kept[0][0] < oldest:
-                kept.popleft()
+        for history in (self._states, self._ranges, self._heights):
+            while history and history[0][0] < oldest:
+                history.popleft()
 
     def clear(self) -> None:
         """Reset all states: the tag was lost."""
@@ -81,19 +81,21 @@ class FixedLagSmoother:
 
         if not self._states or len(self._ranges) < 2:
             return None
-        config, (start_ns, known, _) = self._config, self._states[0]
-        wanted_ns = self._ranges[-1][0] - round(LAG_S * NS_PER_S)
+        config, (start_ns, range_filter, _) = self._config, self._states[0]
+        query_ns = self._ranges[-1][0] - round(LAG_S * NS_PER_S)
         after = [row for row in self._ranges if row[0] > start_ns]
-        if start_ns > wanted_ns or len(after) < 2:
+        if start_ns > query_ns or len(after) < 2:
             return None
         # Errors persist for a second: at a high rate a part of the ranges contains the same information.
         after = after[:: math.ceil(len(after) / _MAX_RANGES)]
         stamp, anchor, range_m, variance = (np.array(column) for column in zip(*after, strict=True))
         ranges = Ranges(stamp, anchor, range_m, variance, np.full(len(after), np.nan))
-        first = known.copy()
+        first = range_filter.copy()
         first.predict(first.time_s + (int(stamp[0]) - start_ns) / NS_PER_S)
-        states = [(at, one) for at, one, _ in self._states if at > start_ns] or [(int(stamp[0]), first)]
-        initial = Track.from_estimates([one.estimate(at) for at, one in states])
+        states = [(stamp_ns, state) for stamp_ns, state, _ in self._states if stamp_ns > start_ns] or [
+            (int(stamp[0]), first)
+        ]
+        initial = Track.from_estimates([state.estimate(stamp_ns) for stamp_ns, state in states])
         if self._heights:
             columns = zip(*self._heights, strict=True)
             config = replace(config, heights=Heights(*(np.array(column) for column in columns)))
@@ -101,21 +103,21 @@ class FixedLagSmoother:
             track = Smoother(config, ranges, after=first).fit(initial, _ITERATIONS).track
         except DatasetError:
             return None
-        at = int(np.abs(track.stamp_ns - wanted_ns).argmin())
-        batch = track.take(slice(at, at + 1))
-        batch.position[:] += (wanted_ns - int(track.stamp_ns[at])) / NS_PER_S * batch.velocity
-        live_ns, live, estimate = [state for state in self._states if state[0] <= wanted_ns][-1]
-        after_s = (wanted_ns - live_ns) / NS_PER_S
+        nearest = int(np.abs(track.stamp_ns - query_ns).argmin())
+        batch = track.take(slice(nearest, nearest + 1))
+        batch.position[:] += (query_ns - int(track.stamp_ns[nearest])) / NS_PER_S * batch.velocity
+        live_ns, live, estimate = [state for state in self._states if state[0] <= query_ns][-1]
+        after_s = (query_ns - live_ns) / NS_PER_S
         if estimate.heading is None:
             live = live.copy()
             live.predict(live.time_s + after_s)
-            mean, own = live.x[:6], live.P[:6, :6]
+            mean, covariance = live.x[:6], live.P[:6, :6]
         else:
             moved = estimate.position + after_s * estimate.velocity
-            mean, own = np.concatenate([moved, estimate.velocity]), estimate.covariance
-        state, covariance, spread = fused_with_batch(mean[None], own[None], batch)
+            mean, covariance = np.concatenate([moved, estimate.velocity]), estimate.covariance
+        state, covariance, spread = fused_with_batch(mean[None], covariance[None], batch)
         position = state[0, :3] if config.area is None else config.area.clip(state[0, :3])
-        return Estimate(wanted_ns, position, state[0, 3:], (covariance + spread)[0], estimate.heading)
+        return Estimate(query_ns, position, state[0, 3:], (covariance + spread)[0], estimate.heading)
 
 
 @dataclass(slots=True)
@@ -200,11 +202,11 @@ class MultiTagEstimator:
             tag = self.tags[tag_id] = self._new_tag(tag_id)
         estimate = tag.best.add(measurement)
         tag.latest_ns = stamp_ns
-        known = tag.estimator.filter
-        if known is None:
+        range_filter = tag.estimator.filter
+        if range_filter is None:
             tag.smoother.clear()
         elif estimate is not None:
-            tag.smoother.add(known, stamp_ns, row, range_m, variance_m2, estimate)
+            tag.smoother.add(range_filter, stamp_ns, row, range_m, variance_m2, estimate)
         return tag, estimate
 
     def _new_tag(self, tag_id: int) -> TagState:
@@ -216,32 +218,32 @@ class MultiTagEstimator:
 
     def warnings(self) -> list[str]:
         """Return warnings for the diagnostics; empty: none."""
-        found = []
+        warnings = []
         if self.unknown_anchors:
             names = ", ".join(format_id(identity) for identity in sorted(self.unknown_anchors)[:5])
-            found.append(f"ranges of anchors that are not in the anchors file: {names}")
+            warnings.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
             if not estimator.is_initialized:
-                found.append(f"{name}: {self._unknown_reason(estimator)}")
+                warnings.append(f"{name}: {self._unknown_reason(estimator)}")
             if tag.robot is not None:
                 if tag.robot.odometry.at(tag.latest_ns) is None:
-                    found.append(
+                    warnings.append(
                         f"{name}: no odometry at the times of the ranges: estimated from ranges only"
                     )
                 elif tag.robot.rejects_odometry:
-                    found.append(
+                    warnings.append(
                         f"{name}: odometry contradicts the ranges (slip, or moved by hand): not used"
                     )
             contradicting = [self.anchors.anchors[row] for row in estimator.disagreeing()]
-            found += [
+            warnings += [
                 f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
                 for anchor in contradicting
             ]
             dop = estimator.dop()
             if dop is not None and dop.hdop > 10.0:
-                found.append(f"{name}: poor geometry, HDOP {dop.hdop:.0f}")
-        return found
+                warnings.append(f"{name}: poor geometry, HDOP {dop.hdop:.0f}")
+        return warnings
 
     def _unknown_reason(self, estimator: TagEstimator) -> str:
         rows = estimator.received_anchors(RANGE_TIMEOUT_S)
@@ -256,7 +258,7 @@ class MultiTagEstimator:
 
     def diagnostics(self) -> dict[str, object]:
         """Return the values for the diagnostics."""
-        found: dict[str, object] = {
+        values: dict[str, object] = {
             "anchors": len(self.anchors),
             "tags": len(self.tags),
             "ranges not valid": self.invalid,
@@ -264,8 +266,8 @@ class MultiTagEstimator:
         }
         for tag in self.tags.values():
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
-            counts, known = estimator.counts, estimator.filter
-            found |= {
+            counts, range_filter = estimator.counts, estimator.filter
+            values |= {
                 f"{name} candidates": estimator.candidates,
                 f"{name} anchors used": len(estimator.received_anchors()),
                 f"{name} found, lost, silent": f"{counts['found']}, {counts['lost']}, {counts['silent']}",
@@ -274,7 +276,7 @@ class MultiTagEstimator:
                 f"{name} innovation square": f"{estimator.innovation_square:.2f}",
             }
             if tag.robot is not None:
-                found |= {
+                values |= {
                     f"{name} heading": tag.robot.heading,
                     f"{name} heading found, odometry missing, wrong": ", ".join(
                         str(counts[key]) for key in ("heading found", "odometry missing", "odometry wrong")
@@ -282,11 +284,11 @@ class MultiTagEstimator:
                     "odometry rejected": tag.robot.odometry.rejected,
                 }
             dop = estimator.dop()
-            if dop is not None and known is not None:
-                levels = protection_levels(known.estimate(0).covariance)
-                found |= {
+            if dop is not None and range_filter is not None:
+                levels = protection_levels(range_filter.estimate(0).covariance)
+                values |= {
                     f"{name} HDOP": f"{dop.hdop:.2f}",
                     f"{name} VDOP": f"{dop.vdop:.2f}",
                     f"{name} protection level m": ", ".join(f"{level:.2f}" for level in levels),
                 }
-        return found
+        return values

@@ -81,11 +81,11 @@ class Offsets:
                 what = f"sd = {sd!r:.60} m of anchor {format_id(anchor)}, tag {format_id(tag)}"
                 raise ParameterError(what, where=where, valid=f"more than 0, at most {MAX_OFFSET_M:g} m")
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Offsets):
+    def __eq__(self, value: object) -> bool:
+        if not isinstance(value, Offsets):
             return NotImplemented
-        left, right = ((o.default, o.anchors, o.tags, o.pairs) for o in (self, other))
-        return left == right
+        first, second = ((item.default, item.anchors, item.tags, item.pairs) for item in (self, value))
+        return first == second
 
     def __hash__(self) -> int:
         return hash((self.default, *(frozenset(o.items()) for o in (self.anchors, self.tags, self.pairs))))

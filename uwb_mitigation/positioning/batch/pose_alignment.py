@@ -7,13 +7,15 @@ clocks and delays. Both, and the offset of each pair, are estimated from the ran
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.batch.least_squares import gauss_newton
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors, scatter_of
 from uwb_mitigation.types.anchors import AnchorMap
@@ -44,6 +46,7 @@ MIN_SD_M = 0.01
 """Minimum standard deviation of white noise and of persisting errors."""
 
 _ITERATIONS = 40
+_CONVERGED = 1e-5
 _FIXED_SD = 1e-9
 _SMALL_M = 0.02
 _MODEL = NoiseModel(long=1.5, short=1.5)
@@ -73,13 +76,15 @@ class PoseAlignment:
 
     def pair(self, tag: int, row: int, anchor_sd_m: float) -> tuple[float, float]:
         """Return the offset of a pair, m, and its standard deviation, which includes the anchor's position error."""
-        at = self.pairs.index((tag, row))
-        return float(self.offset_m[at]), math.hypot(float(self.offset_sd_m[at]), anchor_sd_m / math.sqrt(2.0))
+        number = self.pairs.index((tag, row))
+        return float(self.offset_m[number]), math.hypot(
+            float(self.offset_sd_m[number]), anchor_sd_m / math.sqrt(2.0)
+        )
 
     def as_json(self) -> dict[str, object]:
         """Return values for JSON; null = not observable. Lever arm of the first tag, and of all tags by their ids."""
         arms = self.lever_arm_m.tolist()
-        sds = [[None if math.isnan(sd) else sd for sd in own] for own in self.lever_arm_sd_m.tolist()]
+        sds = [[None if math.isnan(sd) else sd for sd in arm_sd] for arm_sd in self.lever_arm_sd_m.tolist()]
         return {
             "time_offset_s": self.time_offset_s,
             "time_offset_sd_s": self.time_offset_sd_s,
@@ -94,7 +99,7 @@ def align_poses(
     anchors: AnchorMap,
     tags: Sequence[Ranges],
     paths: Sequence[PosePath],
-    known: Regressors,
+    regressors: Regressors,
     *,
     time_offset_s: float | None = None,
     lever_arms_m: NDArray[np.float64] | None = None,
@@ -106,7 +111,7 @@ def align_poses(
         anchors: positions of the anchors.
         tags: ranges of each tag.
         paths: for each tag, the path of the robot that carries it.
-        known: as many rows as there are ranges, one tag after the other.
+        regressors: as many rows as there are ranges, one tag after the other.
         time_offset_s: if known.
         lever_arms_m: float64 (T, 3), of each tag; None: zero.
         estimate_lever_arm: start from these arms and estimate them.
@@ -114,54 +119,59 @@ def align_poses(
     Raises:
         DatasetError: too few ranges are within the localisation's times, or arms and offsets cannot be separated.
     """
-    ranges = Ranges.joined(tags)
-    tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
     if (fewest := min(map(len, paths))) < 2:
         raise DatasetError(f"{fewest} poses of the localisation", valid="two or more")
-    pairs, of_pair = np.unique(np.stack([tag, ranges.anchor]), axis=1, return_inverse=True)
-    chosen = np.arange(len(ranges))
-    if len(chosen) > MAX_RANGES:
-        chosen = np.sort(np.random.default_rng(1).choice(chosen, MAX_RANGES, replace=False))
-    smoothed = [path.smoothed() for path in paths]
-    anchor = anchors.position[ranges.anchor]
-    problem = _AlignmentProblem(
-        ranges, tag, of_pair.reshape(-1), anchor, known, smoothed, pairs.shape[1]
-    ).take(chosen)
-    levers = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
-    start, free = levers, np.full(levers.shape, estimate_lever_arm)
-    time_offset, free_time_offset = time_offset_s, time_offset_s is None
-    if time_offset is None:
-        time_offset, start = problem.likely(levers, estimate_lever_arm)
-    time_offset, lever, offset, sd = problem.solve(time_offset, start, levers, free_time_offset, free)
-    if estimate_lever_arm:
-        lever_sd = sd[1 : 1 + levers.size].reshape(levers.shape)
-        free = lever_sd < SEPARATED_M
-        if not free[:, :2].all():
-            raise DatasetError(
-                "lever arm and offsets cannot be separated: the standard deviation of the arm is "
-                f"{lever_sd[:, :2].max():.2f} m",
-                valid="--lever-arm or a transform in the bag instead of --estimate-lever-arm, or a drive with more turns",
-            )
-        if not free.all():
-            # A level drive does not observe the height of the arm: it would trade off against the offsets.
-            start = np.where(free, lever, levers)
-            time_offset, lever, offset, sd = problem.solve(time_offset, start, levers, free_time_offset, free)
-    position, rotation = _poses_at(paths, tag, ranges.stamp_ns, time_offset)
-    antenna = position + np.einsum("nij,nj->ni", rotation, lever[tag])
-    distance = np.linalg.norm(antenna - anchor, axis=1)
-    _check_enough(int(np.isfinite(distance).sum()), free_time_offset or estimate_lever_arm)
-    lever_sd = np.where(free, sd[1 : 1 + levers.size].reshape(levers.shape), np.nan)
+    problem, pairs = _AlignmentProblem.of_tags(anchors, tags, paths, regressors)
+    given_arms = np.zeros((len(tags), 3)) if lever_arms_m is None else lever_arms_m
+    start = _Alignment(
+        time_offset_s or 0.0, given_arms, time_offset_s is None, np.full(given_arms.shape, estimate_lever_arm)
+    )
+    alignment = problem.fit(start, given_arms)
+    time_offset, lever_arm = alignment.time_offset_s, alignment.lever_arm_m
+    position, rotation = _poses_at(paths, problem.tag, problem.ranges.stamp_ns, time_offset)
+    antenna = position + np.einsum("nij,nj->ni", rotation, lever_arm[problem.tag])
+    distance = np.linalg.norm(antenna - problem.anchor, axis=1)
+    _check_enough(int(np.isfinite(distance).sum()), start.has_unknowns)
+    lever_arm_sd = np.where(alignment.is_free_arm, alignment.lever_arm_sd_m, np.nan)
     return PoseAlignment(
         time_offset_s=time_offset,
-        time_offset_sd_s=float(sd[0]) if free_time_offset else 0.0,
-        lever_arm_m=lever,
-        lever_arm_sd_m=lever_sd if estimate_lever_arm else np.zeros(levers.shape),
-        pairs=tuple((int(a), int(b)) for a, b in pairs.T),
-        offset_m=offset,
-        offset_sd_m=sd[1 + levers.size :][: pairs.shape[1]],
+        time_offset_sd_s=float(alignment.sd[0]) if start.is_free_time else 0.0,
+        lever_arm_m=lever_arm,
+        lever_arm_sd_m=lever_arm_sd if estimate_lever_arm else np.zeros(given_arms.shape),
+        pairs=pairs,
+        offset_m=alignment.offset_m,
+        offset_sd_m=alignment.sd[1 + given_arms.size :][: len(pairs)],
         position=antenna,
         distance_m=distance,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Alignment:
+    """Unknowns of an alignment, or where its fit starts.
+
+    Attributes:
+        time_offset_s: as in `PoseAlignment`. lever_arm_m: (T, 3).
+        is_free_time: whether the time offset is estimated. is_free_arm: bool (T, 3), whether each coordinate is.
+        offset_m: of the pairs. sd: of time offset, lever arms, offsets and regressors, in this order.
+    """
+
+    time_offset_s: float
+    lever_arm_m: NDArray[np.float64]
+    is_free_time: bool
+    is_free_arm: NDArray[np.bool_]
+    offset_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    sd: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def has_unknowns(self) -> bool:
+        """Whether more than offsets is estimated."""
+        return self.is_free_time or bool(self.is_free_arm.any())
+
+    @property
+    def lever_arm_sd_m(self) -> NDArray[np.float64]:
+        """Standard deviations of the lever arms, (T, 3)."""
+        return self.sd[1 : 1 + self.lever_arm_m.size].reshape(self.lever_arm_m.shape)
 
 
 def _poses_at(
@@ -170,8 +180,8 @@ def _poses_at(
     """Return `PosePath.poses_at` for the path of each tag (n,)."""
     position, rotation = np.zeros((len(tag), 3)), np.zeros((len(tag), 3, 3))
     for number, path in enumerate(paths):
-        own = tag == number
-        position[own], rotation[own] = path.poses_at(stamp_ns[own], later_s)
+        is_of_tag = tag == number
+        position[is_of_tag], rotation[is_of_tag] = path.poses_at(stamp_ns[is_of_tag], later_s)
     return position, rotation
 
 
@@ -193,13 +203,56 @@ class _AlignmentProblem:
     tag: NDArray[np.intp]
     pair: NDArray[np.intp]
     anchor: NDArray[np.float64]
-    known: Regressors
+    regressors: Regressors
     paths: Sequence[PosePath]
-    pairs: int
+    num_pairs: int
+
+    @classmethod
+    def of_tags(
+        cls, anchors: AnchorMap, tags: Sequence[Ranges], paths: Sequence[PosePath], regressors: Regressors
+    ) -> tuple[_AlignmentProblem, tuple[tuple[int, int], ...]]:
+        """Return the problem of all ranges, and its pairs."""
+        ranges = Ranges.joined(tags)
+        tag = np.repeat(np.arange(len(tags)), list(map(len, tags)))
+        pairs, pair = np.unique(np.stack([tag, ranges.anchor]), axis=1, return_inverse=True)
+        position, smoothed = anchors.position[ranges.anchor], [path.smoothed() for path in paths]
+        problem = cls(ranges, tag, pair.reshape(-1), position, regressors, smoothed, pairs.shape[1])
+        return problem, tuple((int(number), int(row)) for number, row in pairs.T)
 
     def take(self, index: NDArray[np.intp]) -> _AlignmentProblem:
         columns = {name: getattr(self, name)[index] for name in ("tag", "pair", "anchor")}
-        return replace(self, ranges=self.ranges.take(index), known=self.known.select_rows(index), **columns)
+        return replace(
+            self, ranges=self.ranges.take(index), regressors=self.regressors.select_rows(index), **columns
+        )
+
+    def fit(self, start: _Alignment, given_arms: NDArray[np.float64]) -> _Alignment:
+        """Search the time offset if it is unknown, and fit; coordinates of the arms that are not observable are as given.
+
+        Raises:
+            DatasetError: see `align_poses`.
+        """
+        problem, estimates_arm = self, bool(start.is_free_arm.any())
+        if len(self.ranges) > MAX_RANGES:
+            chosen = np.random.default_rng(1).choice(len(self.ranges), MAX_RANGES, replace=False)
+            problem = self.take(np.sort(chosen))
+        if start.is_free_time:
+            time_offset_s, arms = problem.likely(given_arms, estimates_arm)
+            start = replace(start, time_offset_s=time_offset_s, lever_arm_m=arms)
+        alignment = problem.solve(start, given_arms)
+        if not estimates_arm:
+            return alignment
+        is_observable = alignment.lever_arm_sd_m < SEPARATED_M
+        if not is_observable[:, :2].all():
+            raise DatasetError(
+                "lever arm and offsets cannot be separated: the standard deviation of the arm is "
+                f"{alignment.lever_arm_sd_m[:, :2].max():.2f} m",
+                valid="--lever-arm or a transform in the bag instead of --estimate-lever-arm, or a drive with more turns",
+            )
+        if is_observable.all():
+            return alignment
+        # A level drive does not observe the height of the arm: it would trade off against the offsets.
+        arms = np.where(is_observable, alignment.lever_arm_m, given_arms)
+        return problem.solve(replace(alignment, lever_arm_m=arms, is_free_arm=is_observable), given_arms)
 
     def likely(self, lever: NDArray[np.float64], free_lever: bool) -> tuple[float, NDArray[np.float64]]:
         """Return the time offset with which the ranges agree best, and its lever arms.
@@ -210,14 +263,16 @@ class _AlignmentProblem:
             DatasetError: too few ranges are within the localisation's times.
         """
         count = min(len(self.ranges), SEARCHED)
-        few = self.take(np.linspace(0, len(self.ranges) - 1, count).astype(int))
+        subset = self.take(np.linspace(0, len(self.ranges) - 1, count).astype(int))
         best = (math.inf, 0.0, lever)
         for time_offsets in (COARSE_OFFSETS_S, FINE_OFFSETS_S):
             for time_offset in (best[1] + time_offsets).tolist():
-                arm = few._lever_arm(time_offset, lever) if free_lever else lever
-                left = np.abs(few._centred(time_offset, arm)[0])
-                if np.isfinite(left).sum() >= MIN_RANGES:
-                    best = min(best, (float(np.nanmedian(left)), time_offset, arm), key=lambda one: one[0])
+                arm = subset._lever_arm(time_offset, lever) if free_lever else lever
+                residual = np.abs(subset._centred(time_offset, arm)[0])
+                if np.isfinite(residual).sum() >= MIN_RANGES:
+                    best = min(
+                        best, (float(np.nanmedian(residual)), time_offset, arm), key=operator.itemgetter(0)
+                    )
         if not math.isfinite(best[0]):
             raise DatasetError(
                 "too few ranges are within the time span of the localisation",
@@ -228,27 +283,28 @@ class _AlignmentProblem:
     def _lever_arm(self, time_offset: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the lever arms for a time offset: least absolute deviations, by reweighting."""
         for _ in range(LEVER_STEPS):
-            left, rows = self._centred(time_offset, lever)
-            known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
-            if int(known.sum()) < MIN_RANGES:
+            residual, rows = self._centred(time_offset, lever)
+            is_used = np.isfinite(residual) & np.isfinite(rows).all(axis=1)
+            if int(is_used.sum()) < MIN_RANGES:
                 return lever
             lever = lever.copy()
-            for tag in np.unique(self.tag[known]):
-                own = known & (self.tag == tag)
-                weight = 1.0 / np.maximum(np.abs(left[own]), _SMALL_M)
+            for tag in np.unique(self.tag[is_used]):
+                is_of_tag = is_used & (self.tag == tag)
+                weight = 1.0 / np.maximum(np.abs(residual[is_of_tag]), _SMALL_M)
                 information = float(weight.sum()) * _SMALL_M**2 / LEVER_SD_M**2
-                normal = rows[own].T @ (weight[:, None] * rows[own]) + information * np.eye(3)
-                right = rows[own].T @ (weight * left[own]) - information * lever[tag]
+                normal = rows[is_of_tag].T @ (weight[:, None] * rows[is_of_tag]) + information * np.eye(3)
+                right = rows[is_of_tag].T @ (weight * residual[is_of_tag]) - information * lever[tag]
                 lever[tag] += np.linalg.solve(normal, right)
         return lever
 
-    def _medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
-        found = np.zeros(self.pairs)
+    def medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the median of each pair, of errors (n,)."""
+        median = np.zeros(self.num_pairs)
         for pair in np.unique(self.pair[np.isfinite(error)]):
-            found[pair] = np.nanmedian(error[self.pair == pair])
-        return found
+            median[pair] = np.nanmedian(error[self.pair == pair])
+        return median
 
-    def _errors(
+    def errors(
         self, time_offset: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return range minus distance and known corrections (n,), and derivatives of the distance by the lever arm (n, 3)."""
@@ -256,96 +312,114 @@ class _AlignmentProblem:
         unit, distance = unit_vectors(
             position + np.einsum("nij,nj->ni", rotation, lever[self.tag]), self.anchor
         )
-        error = self.ranges.range_m - self.known.rows @ self.known.mean - distance
+        error = self.ranges.range_m - self.regressors.rows @ self.regressors.mean - distance
         return error, np.einsum("ni,nij->nj", unit, rotation)
 
     def _centred(
         self, time_offset: float, lever: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return `_errors` minus the median error of each pair."""
-        error, rows = self._errors(time_offset, lever)
-        return error - self._medians(error)[self.pair], rows
+        """Return `errors` minus the median error of each pair."""
+        error, rows = self.errors(time_offset, lever)
+        return error - self.medians(error)[self.pair], rows
 
-    def solve(
-        self,
-        time_offset: float,
-        lever: NDArray[np.float64],
-        expected: NDArray[np.float64],
-        free_time_offset: bool,
-        free_lever: NDArray[np.bool_],
-    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Fit by Gauss-Newton, from a time offset and lever arms.
+    def solve(self, start: _Alignment, given_arms: NDArray[np.float64]) -> _Alignment:
+        """Fit by Gauss-Newton; `given_arms` (T, 3) is the prior of the lever arms."""
+        fit = _AlignmentFit(self, start, given_arms)
+        gauss_newton(fit.improve, iterations=_ITERATIONS, converged=_CONVERGED, min_iterations=5)
+        return fit.result()
 
-        Args:
-            time_offset: start value, s.
-            lever: start values of the lever arms, float64 (T, 3), m.
-            expected: prior of the lever arms.
-            free_time_offset: whether the time offset is estimated.
-            free_lever: whether each coordinate of the arms is estimated, bool (T, 3).
 
-        Returns:
-            Time offset, lever arms, offsets of the pairs, and the standard deviations of all in this order.
+class _AlignmentFit:
+    """The unknowns x of an alignment so far: time offset, lever arms, offsets of the pairs, and regressors."""
+
+    def __init__(
+        self, problem: _AlignmentProblem, start: _Alignment, given_arms: NDArray[np.float64]
+    ) -> None:
+        self._problem, self._start, self._given_arms = problem, start, given_arms
+        size, num_pairs, prior = given_arms.size, problem.num_pairs, problem.regressors
+        self._arms, self._pairs = slice(1, 1 + size), slice(1 + size, 1 + size + num_pairs)
+        time_sd = TIME_OFFSET_SD_S if start.is_free_time else _FIXED_SD
+        arm_sd = np.where(start.is_free_arm.reshape(-1), LEVER_SD_M, _FIXED_SD)
+        sd = np.concatenate([[time_sd], arm_sd, np.full(num_pairs, OFFSET_SD_M), prior.sd])
+        self._information = 1.0 / sd**2
+        # The means of the regressors are subtracted already.
+        no_offsets, no_change = np.zeros(num_pairs), np.zeros(len(prior.mean))
+        mean_s = 0.0 if start.is_free_time else start.time_offset_s
+        self._mean = np.concatenate([[mean_s], given_arms.reshape(-1), no_offsets, no_change])
+        offsets = problem.medians(problem.errors(start.time_offset_s, start.lever_arm_m)[0])
+        self._x = np.concatenate([[start.time_offset_s], start.lever_arm_m.reshape(-1), offsets, no_change])
+        # The errors of a pair persist for about this time (see `noise_model`). Stamps are not relative to the first range, so
+        # that groups are the same without the ranges that are held out.
+        interval = problem.ranges.stamp_ns // round(2.0 * _MODEL.persistence_s * NS_PER_S)
+        self._group = interval * num_pairs + problem.pair
+
+    def improve(self, iteration: int) -> float:
+        """Linearise and solve; return the largest change."""
+        rows, residual_m, is_used = self._linearised()
+        normal, right = self._normal_equations(rows, residual_m, is_used)
+        self._covariance = np.linalg.inv(normal + np.diag(self._information))
+        step = self._covariance @ (right + self._information * (self._mean - self._x))
+        step[0] = np.clip(step[0], -0.3, 0.3)
+        self._x = self._x + step
+        return float(np.abs(step).max())
+
+    def result(self) -> _Alignment:
+        """Return the unknowns and their standard deviations.
+
+        Errors persist for longer than a group, and those of the localisation are in all pairs: the sandwich estimator with the
+        scores of long blocks includes both (Liang and Zeger, Biometrika 1986).
         """
-        arms = slice(1, 1 + lever.size)
-        pairs = slice(arms.stop, arms.stop + self.pairs)
-        size = pairs.stop + len(self.known.mean)
-        prior_sd = np.concatenate(
+        rows, residual_m, is_used = self._linearised()
+        block = self._problem.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
+        scores = np.array(
             [
-                [TIME_OFFSET_SD_S if free_time_offset else _FIXED_SD],
-                np.where(free_lever.reshape(-1), LEVER_SD_M, _FIXED_SD),
-                np.full(self.pairs, OFFSET_SD_M),
-                self.known.sd,
+                self._normal_equations(rows, residual_m, is_used & (block == number))[1]
+                for number in np.unique(block[is_used])
             ]
         )
-        information = 1.0 / prior_sd**2
-        # The means of the regressors are subtracted already.
-        mean = np.array(
-            [0.0 if free_time_offset else time_offset, *expected.reshape(-1), *np.zeros(size - arms.stop)]
+        num_blocks = max(len(scores), 2)
+        robust = self._covariance @ (scores.T @ scores) @ self._covariance * (num_blocks / (num_blocks - 1))
+        return replace(
+            self._start,
+            time_offset_s=float(self._x[0]),
+            lever_arm_m=np.where(self._start.is_free_arm, self._arm, self._given_arms),
+            offset_m=self._x[self._pairs].copy(),
+            sd=SD_INFLATION * np.sqrt(np.diag(self._covariance) + np.diag(robust)),
         )
-        offsets = self._medians(self._errors(time_offset, lever)[0])
-        x = np.array([time_offset, *lever.reshape(-1), *offsets, *np.zeros(size - pairs.stop)])
-        # The errors of a pair persist for about this time (see `noise_model`).
-        # Stamps are not relative to the first range, so that groups are the same without the ranges that are held out.
-        group = self.ranges.stamp_ns // round(2.0 * _MODEL.persistence_s * NS_PER_S) * self.pairs + self.pair
-        every = np.arange(len(self.pair))
-        for iteration in range(_ITERATIONS):
-            arm = x[arms].reshape(lever.shape)
-            error, of_arm = self._errors(x[0], arm)
-            after, before = (self._errors(x[0] + by, arm)[0] for by in (SLOPE_S, -SLOPE_S))
-            rows = np.zeros((len(error), size))
-            rows[:, 0] = (before - after) / (2.0 * SLOPE_S)
-            rows[every[:, None], 1 + 3 * self.tag[:, None] + np.arange(3)] = of_arm
-            rows[every, pairs.start + self.pair] = 1.0
-            rows[:, pairs.stop :] = self.known.rows
-            left = error - x[pairs][self.pair] - self.known.rows @ x[pairs.stop :]
-            known = np.isfinite(left) & np.isfinite(rows).all(axis=1)
-            _check_enough(int(known.sum()), free_time_offset or bool(free_lever.any()))
-            normal, right = _normal_equations(
-                rows[known], left[known], group[known], self.known.noise_group[known]
-            )
-            covariance = np.linalg.inv(normal + np.diag(information))
-            step = covariance @ (right + information * (mean - x))
-            step[0] = np.clip(step[0], -0.3, 0.3)
-            x = x + step
-            if float(np.abs(step).max()) < 1e-5 and iteration > 3:
-                break
-        # Errors persist for longer than a group, and those of the localisation are in all pairs: the sandwich estimator
-        # with the scores of long blocks includes both (Liang and Zeger, Biometrika 1986).
-        block = self.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
-        parts = [known & (block == number) for number in np.unique(block[known])]
-        scores = np.array(
-            [_normal_equations(rows[p], left[p], group[p], self.known.noise_group[p])[1] for p in parts]
-        )
-        blocks = max(len(scores), 2)
-        robust = covariance @ (scores.T @ scores) @ covariance * (blocks / (blocks - 1))
-        sd = SD_INFLATION * np.sqrt(np.diag(covariance) + np.diag(robust))
-        arm = np.where(free_lever, x[arms].reshape(lever.shape), expected)
-        return float(x[0]), arm, x[pairs].copy(), sd
+
+    @property
+    def _arm(self) -> NDArray[np.float64]:
+        return self._x[self._arms].reshape(self._given_arms.shape)
+
+    def _linearised(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Return derivatives (n, q), residuals (n,), and which ranges have a pose.
+
+        Raises:
+            DatasetError: too few.
+        """
+        problem, x = self._problem, self._x
+        error_m, arm_rows = problem.errors(x[0], self._arm)
+        after, before = (problem.errors(x[0] + shift_s, self._arm)[0] for shift_s in (SLOPE_S, -SLOPE_S))
+        rows, index = np.zeros((len(error_m), len(x))), np.arange(len(error_m))
+        rows[:, 0] = (before - after) / (2.0 * SLOPE_S)
+        rows[index[:, None], 1 + 3 * problem.tag[:, None] + np.arange(3)] = arm_rows
+        rows[index, self._pairs.start + problem.pair] = 1.0
+        rows[:, self._pairs.stop :] = problem.regressors.rows
+        residual_m = error_m - x[self._pairs][problem.pair] - problem.regressors.rows @ x[self._pairs.stop :]
+        is_used = np.isfinite(residual_m) & np.isfinite(rows).all(axis=1)
+        _check_enough(int(is_used.sum()), self._start.has_unknowns)
+        return rows, residual_m, is_used
+
+    def _normal_equations(
+        self, rows: NDArray[np.float64], residual_m: NDArray[np.float64], is_used: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        noise_group = self._problem.regressors.noise_group[is_used]
+        return _normal_equations(rows[is_used], residual_m[is_used], self._group[is_used], noise_group)
 
 
 def _normal_equations(
     rows: NDArray[np.float64],
-    left_m: NDArray[np.float64],
+    residual_m: NDArray[np.float64],
     group: NDArray[np.intp],
     noise_group: NDArray[np.intp],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -357,35 +431,35 @@ def _normal_equations(
 
     Args:
         rows: float64 (n, q), derivative of each range by each unknown.
-        left_m: float64 (n,), residuals.
+        residual_m: float64 (n,), residuals.
         group: int (n,), ranges whose errors persist together have the same number.
         noise_group: int (n,), ranges whose errors have the same standard deviation have the same number, from 0.
     """
     order = np.argsort(group, kind="stable")
-    rows, left_m, group, noise_group = rows[order], left_m[order], group[order], noise_group[order]
+    rows, residual_m, group, noise_group = rows[order], residual_m[order], group[order], noise_group[order]
     starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
     count = np.diff(np.append(starts, len(group)))
-    of = np.repeat(np.arange(len(starts)), count)
+    slot = np.repeat(np.arange(len(starts)), count)
     kinds = int(noise_group.max(initial=0)) + 1
 
-    middle = np.array([np.median(part) for part in np.split(left_m, starts[1:])])
-    within = left_m - middle[of]
+    middle = np.array([np.median(values) for values in np.split(residual_m, starts[1:])])
+    within = residual_m - middle[slot]
     # Of n values around their own median: n - 1 are left.
-    several = count[of] > 1
-    larger = np.sqrt(count / np.maximum(count - 1.0, 1.0))[of]
+    several = count[slot] > 1
+    larger = np.sqrt(count / np.maximum(count - 1.0, 1.0))[slot]
     white = np.full(kinds, MIN_SD_M)
     if several.any():
         white = np.maximum(scatter_of((within * larger)[several], noise_group[several], kinds), MIN_SD_M)
     weight = _MODEL.weight(within / white[noise_group]) / white[noise_group] ** 2
     total = np.add.reduceat(weight, starts)
-    both = np.concatenate([rows, left_m[:, None]], axis=1)
-    shared = np.add.reduceat(both * weight[:, None], starts) / total[:, None]
-    apart = both - shared[of]
-    scaled = apart * weight[:, None]
-    kind = np.array([int(np.median(part)) for part in np.split(noise_group, starts[1:])])
+    augmented = np.concatenate([rows, residual_m[:, None]], axis=1)
+    shared = np.add.reduceat(augmented * weight[:, None], starts) / total[:, None]
+    within_group = augmented - shared[slot]
+    weighted = within_group * weight[:, None]
+    kind = np.array([int(np.median(values)) for values in np.split(noise_group, starts[1:])])
     spread = scatter_of(shared[:, -1], kind, kinds)[kind]
     persists = np.sqrt(np.maximum(spread**2 - 1.0 / total, MIN_SD_M**2))
     variance = persists**2 + 1.0 / total
     of_group = _MODEL.weight(shared[:, -1] / np.sqrt(variance)) / variance
-    outer = scaled.T @ apart + (shared * of_group[:, None]).T @ shared
+    outer = weighted.T @ within_group + (shared * of_group[:, None]).T @ shared
     return outer[:-1, :-1], outer[:-1, -1]

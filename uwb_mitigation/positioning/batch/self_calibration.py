@@ -211,11 +211,7 @@ def self_calibrate(
     fit = solver.fit_common_offset()
     level, fit, individual_sd = solver.with_own_offsets(fit)
     fit = fit_segments(solver.config, solver.segments, fit.prior, Start(fit.position, fit.parameters))
-    # The hypotheses of another height and of another anchor position compete with that of own offsets.
-    alternative = solver.with_free_offsets(fit)
-    check_anchor_positions(solver.segments, alternative, first_positions)
-    if heights_m is None:
-        check_height(alternative)
+    solver.check_geometry(fit, has_constant_height=heights_m is None)
     result = SelfCalibration(
         segments=solver.segments,
         fit=fit,
@@ -226,16 +222,13 @@ def self_calibrate(
     if not any(result.applied(*pair)[0] for pair in result.pairs()) or solver.common_sd > MAX_COMMON_SD_M:
         result = solver.without_offset(result)
     pseudo, pseudo_sd = leave_one_out_residual(result.fit)
-    scatter = (
-        position_scatter(result.fit, np.zeros(len(result.fit.observations))),
-        _held_out_scatter(result.fit),
-    )
+    raw_scatter_m = position_scatter(result.fit, np.zeros(len(result.fit.observations)))
     return replace(
         result,
         notes=tuple(solver.notes),
         pseudo_m=pseudo,
         pseudo_sd_m=pseudo_sd,
-        position_scatter_m=scatter,
+        position_scatter_m=(raw_scatter_m, _held_out_scatter(result.fit)),
     )
 
 
@@ -346,15 +339,23 @@ class _Solver:
             level = "pair"
         return level, fit, individual_sd
 
-    def with_free_offsets(self, fit: JointFit) -> JointFit:
-        """Return a fit with an own offset for each anchor, whether significant or not."""
+    def check_geometry(self, fit: JointFit, *, has_constant_height: bool) -> None:
+        """Refuse anchor positions and heights that contradict the ranges.
+
+        These hypotheses compete with that of an own offset of each anchor, whether significant or not.
+
+        Raises:
+            DatasetError: names the anchors, or the better height.
+        """
         _, members = candidates(self.segments)[0]
         missing = {name: rows for name, rows in members.items() if name not in fit.prior.names}
-        if not missing:
-            return fit
-        columns = own_offset_columns(missing, OWN_SD_M, fit.prior.noise_group)
-        start = Start(fit.position, np.append(fit.parameters, np.zeros(len(missing))), is_close=True)
-        return fit_segments(self.config, self.segments, fit.prior.concat(columns), start)
+        if missing:
+            columns = own_offset_columns(missing, OWN_SD_M, fit.prior.noise_group)
+            start = Start(fit.position, np.append(fit.parameters, np.zeros(len(missing))), is_close=True)
+            fit = fit_segments(self.config, self.segments, fit.prior.concat(columns), start)
+        check_anchor_positions(self.segments, fit, first_positions)
+        if has_constant_height:
+            check_height(fit)
 
     def without_offset(self, result: SelfCalibration) -> SelfCalibration:
         """Return the solution with an offset of zero, because the estimate is not significant."""

@@ -206,7 +206,7 @@ def calibrate_site(
     solution: SiteSolution,
     *,
     seed: int,
-    on_progress: Progress = lambda stage, share: None,
+    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteCalibration:
     """Select a model for the ranges and offsets of a solution.
 
@@ -255,7 +255,7 @@ def _select_model(
         return np.array([-changes.get(pair, 0.0) for pair in pairs])
 
     errors = held_out_site_errors(
-        data, candidates, seed, offset_change, lambda share: on_progress("selecting the model", share)
+        data, candidates, seed, offset_change, lambda fraction: on_progress("selecting the model", fraction)
     )
     live = live_errors(site, solution, errors.by_segment, _variances(raw, errors, solution.residual_scale))
     chosen = errors.select(live)

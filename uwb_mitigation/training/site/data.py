@@ -103,11 +103,11 @@ class SiteData:
         segment_start_ns = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
         np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
         elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / NS_PER_S
-        part = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
+        interval = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
         fold = np.where(is_stationary, 0, elapsed_s // FOLD_S).astype(int)
         names = [
             f"segment {s}.{f}/{c}/tag {t}/anchor {a}"
-            for s, f, c, t, a in zip(segment, fold, part, tag, ranges.anchor, strict=True)
+            for s, f, c, t, a in zip(segment, fold, interval, tag, ranges.anchor, strict=True)
         ]
         anchor_ids = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
         return Dataset(

@@ -65,7 +65,7 @@ def held_out_site_errors(
     candidates: Sequence[Candidate],
     seed: int,
     offset_change: Callable[[NDArray[np.intp]], NDArray[np.float64]],
-    on_share: Callable[[float], None] = lambda share: None,
+    on_share: Callable[[float], None] = lambda fraction: None,
 ) -> SiteErrors:
     """Cross-validate models over segments of the track, and over anchors.
 

@@ -154,7 +154,7 @@ def solve_without_truth(
     height: Height | None,
     area: Area | None,
     height_sd_m: float = 0.1,
-    on_progress: Progress = lambda stage, share: None,
+    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteSolution:
     """Solve for true ranges and offsets from ranges only, without ground truth.
 
@@ -284,7 +284,7 @@ def solve_with_truth(
     localisation: Localisation,
     *,
     height: Height | None = None,
-    on_progress: Progress = lambda stage, share: None,
+    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteSolution:
     """Solve for true ranges and offsets with the poses of a localisation.
 
@@ -379,13 +379,13 @@ class _WithLocalisation:
         change_m = np.abs(estimated.lever_arm_m - alignment.lever_arm_m)[:, :2]
         limit_m = np.maximum(MAX_LEVER_ARM_ERROR_M, 4.0 * estimated.lever_arm_sd_m[:, :2])
         for tag in np.flatnonzero((change_m > limit_m).any(axis=1)).tolist():
-            given, better = (
+            given_arm, better_arm = (
                 ", ".join(f"{value:.2f}" for value in arms[tag, :2].tolist())
                 for arms in (alignment.lever_arm_m, estimated.lever_arm_m)
             )
             raise DatasetError(
-                f"tag {format_id(self._site.tags[tag].tag_id)}: the lever arm ({given}) m contradicts the ranges: they fit "
-                f"({better}) m",
+                f"tag {format_id(self._site.tags[tag].tag_id)}: the lever arm ({given_arm}) m contradicts the ranges: they fit "
+                f"({better_arm}) m",
                 valid="--lever-arm X,Y,Z, a transform in the bag, or --estimate-lever-arm",
             )
 
