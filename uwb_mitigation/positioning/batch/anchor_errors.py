@@ -475,48 +475,38 @@ def validate_anchor_map(
     ranges = _by_anchor(all_ranges, tag, antenna, is_used)
     if not ranges:
         return
-    spread = np.concatenate(
-        [anchor_ranges.residual_m(anchors.position[row]) for row, anchor_ranges in ranges.items()]
-    )
-    sd_m = max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(spread))))
-    current_loss = {
-        row: anchor_ranges.loss(anchors.position[row], sd_m) for row, anchor_ranges in ranges.items()
-    }
-    shift = {
-        row: anchor_ranges.best_displacement(anchors.position[row], sd_m)
-        for row, anchor_ranges in ranges.items()
-    }
-    gain = {
-        row: current_loss[row] - anchor_ranges.loss(anchors.position[row] + shift[row], sd_m)
-        for row, anchor_ranges in ranges.items()
-    }
+    position = {row: anchors.position[row] for row in ranges}
+    residuals = [anchor_ranges.residual_m(position[row]) for row, anchor_ranges in ranges.items()]
+    sd_m = max(MIN_SD_M, MAD_TO_SD * float(np.median(np.abs(np.concatenate(residuals)))))
+    loss, shift_m, gain = dict[int, float](), dict[int, float](), dict[int, float]()
+    for row, anchor_ranges in ranges.items():
+        shift = anchor_ranges.best_displacement(position[row], sd_m)
+        loss[row], shift_m[row] = anchor_ranges.loss(position[row], sd_m), float(np.linalg.norm(shift))
+        gain[row] = loss[row] - anchor_ranges.loss(position[row] + shift, sd_m)
     suspects = [
         row
         for row in ranges
-        if np.linalg.norm(shift[row]) > MISPLACED_M
-        and gain[row] > max(MIN_LOSS_GAIN, LARGER * current_loss[row])
+        if shift_m[row] > MISPLACED_M and gain[row] > max(MIN_LOSS_GAIN, LARGER * loss[row])
     ]
-    fix = "the true positions in the anchors file (`uwb-mitigation survey` finds them)"
-    best_swap: tuple[float, int, int] | None = None
+    swaps = []
     for a, b in itertools.combinations(suspects, 2):
-        swapped = ranges[a].loss(anchors.position[b], sd_m) + ranges[b].loss(anchors.position[a], sd_m)
-        swap_gain = current_loss[a] + current_loss[b] - swapped
+        swapped_loss = ranges[a].loss(position[b], sd_m) + ranges[b].loss(position[a], sd_m)
+        swap_gain = loss[a] + loss[b] - swapped_loss
         # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
-        is_swap = swap_gain > (1.0 - LARGER) * (gain[a] + gain[b])
-        if is_swap and (best_swap is None or swap_gain > best_swap[0]):
-            best_swap = swap_gain, a, b
-    if best_swap is not None:
-        first, second = (anchors.anchors[row] for row in best_swap[1:])
+        if swap_gain > (1.0 - LARGER) * (gain[a] + gain[b]):
+            swaps.append((swap_gain, a, b))
+    if swaps:
+        first, second = (anchors.anchors[row] for row in max(swaps)[1:])
         raise DatasetError(
             f"anchors {first} and {second} contradict the localisation: the ranges fit if these anchors are swapped",
-            valid=fix,
+            valid=_FIX,
         )
     if suspects:
         row = max(suspects, key=gain.__getitem__)
         raise DatasetError(
-            f"anchor {anchors.anchors[row]} contradicts the localisation: the ranges fit a position "
-            f"{float(np.linalg.norm(shift[row])):.1f} m from that in the anchors file",
-            valid=fix,
+            f"anchor {anchors.anchors[row]} contradicts the localisation: the ranges fit a position {shift_m[row]:.1f} m "
+            "from that in the anchors file",
+            valid=_FIX,
         )
 
 
