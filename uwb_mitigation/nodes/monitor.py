@@ -167,7 +167,7 @@ def live_table(statistics: RangeStatistics, title: str, width: int = 80) -> Tabl
             continue
         sigma_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
         true_m = math.nan if truth is None else truth.range_m
-        cells = (
+        cells: tuple[str | Text, ...] = (
             format_id(anchor),
             format_id(tag),
             _text(pair.rate_hz(), 1),

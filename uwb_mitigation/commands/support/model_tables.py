@@ -98,6 +98,7 @@ def show_comparison(result: Comparison) -> None:
             (row.name, row.mae_mean, row.mae_std, "{:.3f}-{:.3f}".format(*row.ci95), *row.by_label.values())
             for row in result.rows
         ],
+        optional=("95 % interval, m", "std, m"),
     )
     kept = ", ".join(f"{share:.0%}: {mae:.3f}" for share, mae in result.rejection)
     print_line(
