@@ -43,6 +43,9 @@ SEGMENT_S = 2.0
 SPEED_M_PER_S = 0.5
 """A segment is a metre of the route: clusters stay the same within it, fading changes."""
 
+ROBOT_FRAME = "base_link"
+"""Frame of the ranges of a robot: its antenna is at its origin."""
+
 FIRST_TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
 
@@ -107,7 +110,7 @@ class Simulated(Source):
                 device_time=round(stamp_ns * DEVICE_TICK_HZ / 1e9) % DEVICE_TIME_WRAP,
                 range_m=float(distance[i] + reception.error_m[i]),
                 cir=_cir(reception, i),
-                frame_id=f"simulated_anchor_{anchor_id}",
+                frame_id=f"simulated_anchor_{anchor_id}" if exchanges.tag_yaw is None else ROBOT_FRAME,
             )
             condition = label(bool(pairs.path.crossings[i]), bool(reception.direct_above_threshold[i]))
             truth = Truth(float(distance[i]), condition, exchanges.configuration[i])
