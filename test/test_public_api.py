@@ -13,7 +13,15 @@ import pytest
 from conftest import REPOSITORY
 
 import uwb_mitigation
-from uwb_mitigation import Mitigation, RangeMeasurement, Record, TagLocator, load_model, to_dataframe
+from uwb_mitigation import (
+    Mitigation,
+    RangeMeasurement,
+    Record,
+    SiteCalibration,
+    TagLocator,
+    load_model,
+    to_dataframe,
+)
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -25,13 +33,13 @@ EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `drive.mcap` and `anchors.yaml`."""
+    """A folder with `drive.mcap`, `site.mcap` and `anchors.yaml`."""
     path = tmp_path_factory.mktemp("drive")
-    source = SimulatedSource(seed=1, count=400)
-    with BagWriter(path / "drive.mcap", {"simulated": "true"}) as bag:
-        for record in source:
-            bag.write(record)
-    save_anchors(path / "anchors.yaml", source.anchors)
+    for name, count in (("drive", 400), ("site", 3000)):
+        with BagWriter(path / f"{name}.mcap", {"simulated": "true"}) as bag:
+            for record in SimulatedSource(seed=1, count=count):
+                bag.write(record)
+    save_anchors(path / "anchors.yaml", SimulatedSource().anchors)
     return path
 
 
@@ -71,7 +79,14 @@ def test_loading_a_model_writes_no_file_to_the_home_folder(tmp_path: Path):
 @pytest.mark.parametrize("number", range(len(EXAMPLES)))
 def test_examples_of_the_page_run(number: int, folder: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(folder)
-    exec(compile(EXAMPLES[number], f"{PAGE.name}, example {number + 1}", "exec"), {})
+    names: dict[str, object] = {}
+    exec(compile(EXAMPLES[number], f"{PAGE.name}, example {number + 1}", "exec"), names)
+    if "calibrate" in names:
+        site = names["site"]
+        assert isinstance(site, SiteCalibration)
+        assert site.calibrated_mae_m < 0.5 * site.raw_mae_m
+        assert site.offsets.lookup(np.array([101]), np.array([1])) == pytest.approx(0.22, abs=0.15)
+        assert load_model(folder / "site.onnx").model_id
 
 
 def samples(measurement: RangeMeasurement) -> np.ndarray:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.tag_locator import TagLocator
     from uwb_mitigation.recordings.dataframe import to_dataframe
     from uwb_mitigation.recordings.formats import open_recording
+    from uwb_mitigation.training.site.calibration import SiteCalibration, calibrate
     from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
     from uwb_mitigation.types.measurement import Cir, CorrectedRange, RangeMeasurement, Record, Status
     from uwb_mitigation.types.offsets import Offsets
@@ -43,9 +44,11 @@ __all__ = [
     "Offsets",
     "RangeMeasurement",
     "Record",
+    "SiteCalibration",
     "Status",
     "TagLocator",
     "UwbMitigationError",
+    "calibrate",
     "load_anchors",
     "load_model",
     "open_recording",
@@ -62,9 +65,11 @@ _MODULES = {
     "Offsets": "types.offsets",
     "RangeMeasurement": "types.measurement",
     "Record": "types.measurement",
+    "SiteCalibration": "training.site.calibration",
     "Status": "types.measurement",
     "TagLocator": "positioning.tag_locator",
     "UwbMitigationError": "errors",
+    "calibrate": "training.site.calibration",
     "load_anchors": "types.anchors",
     "load_model": "mitigation.model.shipped",
     "open_recording": "recordings.formats",

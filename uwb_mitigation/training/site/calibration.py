@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,15 +15,24 @@ from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.fit.candidates import FittedModel, site_models
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
 from uwb_mitigation.training.fit.selection import MIN_GAIN
-from uwb_mitigation.training.site.data import SiteData
+from uwb_mitigation.training.site.data import SiteData, read_site
 from uwb_mitigation.training.site.live_position import RAW, LiveError, live_errors
 from uwb_mitigation.training.site.selection import SiteErrors, held_out_site_errors
-from uwb_mitigation.training.site.solution import Pairs, Progress, SiteSolution, usable_ranges
+from uwb_mitigation.training.site.solution import (
+    Pairs,
+    Progress,
+    SiteSolution,
+    solve_without_truth,
+    usable_ranges,
+)
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import Offsets, dump_offsets
 
 MIN_LABELLED = 40
@@ -198,6 +208,31 @@ def _json_pair(pair: tuple[float, float]) -> list[float | None]:
 def offsets_file(bundle: Path) -> Path:
     """Return the path of the offsets file that belongs to the bundle of a site."""
     return bundle.with_suffix(".offsets.yaml")
+
+
+def calibrate(
+    recordings: Iterable[Iterable[Record]],
+    anchors: AnchorMap,
+    model: Bundle,
+    *,
+    height_m: float | None = None,
+) -> SiteCalibration:
+    """Calibrate a site from drives, without true positions of the tags.
+
+    The same as `uwb-mitigation calibrate`, except that a calibration that does not help is returned: see `refusal`.
+
+    Args:
+        recordings: records of each drive, in the order of time.
+        anchors: surveyed positions of the anchors.
+        model: bundle to start from, such as `load_model("universal")`.
+        height_m: constant height of the tags' antennas in the frame of the anchors; None: unknown.
+
+    Raises:
+        DatasetError: the drives do not determine the calibration, or an anchor position is wrong.
+    """
+    site = read_site(recordings, anchors, model.card)
+    height = None if height_m is None else Height(height_m)
+    return calibrate_site(site, model, solve_without_truth(site, model, height=height, area=None), seed=0)
 
 
 def calibrate_site(
