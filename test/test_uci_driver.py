@@ -92,7 +92,10 @@ def open_pair(links: Path) -> list[PortEvents]:
     ]
 
 
-def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(boards: EmulatedUciBoards, tmp_path: Path):
+def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
+    boards: EmulatedUciBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(uci, "PERIOD_S", 1.0)
     tag, anchor = open_pair(tmp_path / "uci")
     with tag:
         with anchor:
@@ -103,7 +106,7 @@ def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(boards: EmulatedU
             assert "antenna delay" in tag.port.report().warning
             boards.set_faults(UciFaults())
             wait_until(lambda: tag.port.report().warning == "")
-        wait_until(lambda: tag.port.report().warning.startswith("no range for 3."))
+        wait_until(lambda: tag.port.report().warning.startswith("no range for 1."))
         assert "reception timeout: are the other boards on" in tag.port.report().warning
 
 
