@@ -63,10 +63,10 @@ def run_ekf(
             state = _initial(start.position[index], height, offset_sd_m)
             dt = 0.0
         x, P = _predict(*state, dt, level=height is not None)
-        away = x[:3] - anchors.position[row]
-        distance = max(math.sqrt(away @ away), 0.05)
+        vector = x[:3] - anchors.position[row]
+        distance = max(math.sqrt(vector @ vector), 0.05)
         H = np.zeros(7)
-        H[:3], H[_OFFSET] = away / distance, float(offset_sd_m > 0.0)
+        H[:3], H[_OFFSET] = vector / distance, float(offset_sd_m > 0.0)
         x, P = _update(x, P, H, range_m - distance - H[_OFFSET] * x[_OFFSET], float(R))
         if heights is not None:
             while used_heights < len(heights) and heights.stamp_ns[used_heights] <= stamp_ns:

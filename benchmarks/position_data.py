@@ -168,7 +168,7 @@ def real_runs(data: Path) -> tuple[list[RunSource], list[dict[str, str]]]:
 
 def mapping_of(name: str) -> str | None:
     """Return the longest name of a shipped mapping in the name of a folder; None: none."""
-    names = [one for one in shipped_mappings() if one in name.lower().replace("-", "_")]
+    names = [shipped for shipped in shipped_mappings() if shipped in name.lower().replace("-", "_")]
     if not names and "starloc" in name.lower().replace("-", "").replace("_", ""):
         return "starloc"
     return max(names, key=len, default=None)
@@ -206,10 +206,10 @@ def _sources_of(path: Path, folder: Path, mapping: str) -> Iterator[tuple[tuple[
     for tag in tags:
         is_tag = recording.values["tag"] == tag
         true = np.stack([recording.values[f"tag {axis}"][is_tag] for axis in "xyz"])
-        known = true[:, np.isfinite(true).all(axis=0)]
-        if known.shape[1] < MIN_TRUE_POSITIONS:
+        true_positions = true[:, np.isfinite(true).all(axis=0)]
+        if true_positions.shape[1] < MIN_TRUE_POSITIONS:
             raise RecordingError(f"tag {tag} has no true positions", where=str(path))
-        is_level = mapping in HEIGHTS or float(known[2].std()) < LEVEL_M
+        is_level = mapping in HEIGHTS or float(true_positions[2].std()) < LEVEL_M
         run = name if len(tags) == 1 else f"{name}, tag {tag}"
         for sensor in (False,) if is_level else (False, True):
             arguments = (str(path), mapping, tag, is_level, sensor)
@@ -260,9 +260,9 @@ def load_real(set_name: str, name: str, path: str, mapping: str, tag: int, level
     rows = np.array([anchors.index[anchor] for anchor in values["anchor"][usable].tolist()], np.intp)
     unknown = np.full(n, np.nan)
     ranges = Ranges(stamps, rows, values["range"][usable], unknown, values["rx_power"][usable], tag)
-    known = np.isfinite(position).all(axis=1)
-    _, first = np.unique(stamps[known], return_index=True)
-    truth = TruePath(stamps[known][first], position[known][first])
+    has_truth = np.isfinite(position).all(axis=1)
+    _, first = np.unique(stamps[has_truth], return_index=True)
+    truth = TruePath(stamps[has_truth][first], position[has_truth][first])
     if mapping == "hanyang":
         ranges = replace(ranges, stamp_ns=stamps - round(HANYANG_TIME_OFFSET_S * NS_PER_S))
         truth = hanyang_window(recording.truth, Path(path).name)
@@ -314,8 +314,8 @@ def measured_heights(truth: TruePath, seed: int) -> Heights:
     height_m = truth.position_at(stamps)[:, 2] + np.random.default_rng(seed).normal(
         0.0, HEIGHT_SD_M, len(stamps)
     )
-    known = np.isfinite(height_m)
-    return Heights(stamps[known], height_m[known], np.full(int(known.sum()), HEIGHT_SD_M**2))
+    has_truth = np.isfinite(height_m)
+    return Heights(stamps[has_truth], height_m[has_truth], np.full(int(has_truth.sum()), HEIGHT_SD_M**2))
 
 
 def load_tutorial(set_name: str, name: str) -> Run:

@@ -167,15 +167,15 @@ def _ratio(tracks: dict[str, tuple[Track, float]], truth: TruePath) -> dict[str,
         row: scores(track.take(np.isin(track.stamp_ns, stamps)), truth) for row, track in compared.items()
     }
     errors["raw_least_squares"] = scores(tracks["raw_least_squares"][0], truth)
-    known = {row: error for row, error in errors.items() if error is not None}
-    if "raw_locator" not in known or len(known) < 2:
+    compared_errors = {row: error for row, error in errors.items() if error is not None}
+    if "raw_locator" not in compared_errors or len(compared_errors) < 2:
         return {"best_baseline": None, "ratio_to_best_baseline": None}
-    locator = known.pop("raw_locator")
-    best = min(known, key=lambda row: float(known[row]["rmse_m"]))
-    best_3d = min(error["rmse_3d_m"] for error in known.values())
+    locator = compared_errors.pop("raw_locator")
+    best = min(compared_errors, key=lambda row: float(compared_errors[row]["rmse_m"]))
+    best_3d = min(error["rmse_3d_m"] for error in compared_errors.values())
     return {
         "best_baseline": best,
-        "ratio_to_best_baseline": locator["rmse_m"] / known[best]["rmse_m"],
+        "ratio_to_best_baseline": locator["rmse_m"] / compared_errors[best]["rmse_m"],
         "ratio_3d_to_best_baseline": locator["rmse_3d_m"] / best_3d,
     }
 
@@ -290,14 +290,14 @@ def measure(
             pool.submit(evaluate, source, calibrate=calibrate): number
             for number, source in enumerate(sources)
         }
-        for done, future in enumerate(as_completed(futures), 1):
+        for num_finished, future in enumerate(as_completed(futures), 1):
             number = futures[future]
             name = f"{sources[number].set_name} {sources[number].name}"
             try:
                 results[number] = future.result()
             except Exception as error:  # The other runs continue.
                 skipped.append({"path": name, "reason": f"{type(error).__name__}: {error}"})
-            advance(name, done / len(sources))
+            advance(name, num_finished / len(sources))
     sets = [results[number] for number in sorted(results)]
     ambiguous = ambiguous_drives() if simulated else []
     return {"sets": sets, "ambiguous": ambiguous, "summary": summarize(sets, ambiguous), "skipped": skipped}
@@ -317,14 +317,14 @@ def summarize(sets: Sequence[dict[str, Any]], ambiguous: Sequence[dict[str, Any]
 
 def _summary_of(sets: Sequence[dict[str, Any]]) -> dict[str, Any]:
     def values(read: Callable[[dict[str, Any]], Any]) -> list[float]:
-        found = []
+        present = []
         for entry in sets:
             try:
                 value = read(entry)
             except KeyError:
                 continue
-            found += [] if value is None else [float(value)]
-        return found or [math.nan]
+            present += [] if value is None else [float(value)]
+        return present or [math.nan]
 
     def row(entry: dict[str, Any], name: str, score: str = "rmse_m") -> float:
         return float(entry["rows"][name][score])

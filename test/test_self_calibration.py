@@ -117,7 +117,7 @@ def test_ranges_with_larger_errors_have_lower_weights(recorded):
 def test_dozen_unknown_positions_determine_offset_and_line():
     anchors, tags, truth = places_at_rest()
     power = np.concatenate([one.rx_power_dbm for one in tags])
-    level = Regressors.one("level", power + 88, 0.0, SLOPE_SD)
+    level = Regressors.single("level", power + 88, 0.0, SLOPE_SD)
     found = self_calibrate(anchors, tags, level, height=LEVEL)
     assert found.segments.is_stationary.all()
     assert found.value("offset")[0] == pytest.approx(0.1, abs=0.06)

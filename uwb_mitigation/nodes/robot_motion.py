@@ -141,7 +141,7 @@ class OdometryInput:
 
     def twist(self, stamp_ns: int) -> BodyTwist:
         """Return the velocity of the base at a time; unobserved without odometry, or just after it started."""
-        if self.path.at(stamp_ns) is None or self.path.twist is None:
+        if self.path.point_at(stamp_ns) is None or self.path.twist is None:
             return BodyTwist()
         return BodyTwist(*self.path.twist, *self.path.twist_variance)
 

@@ -227,7 +227,7 @@ class MultiTagEstimator:
             if not estimator.is_initialized:
                 warnings.append(f"{name}: {self._unknown_reason(estimator)}")
             if tag.robot is not None:
-                if tag.robot.odometry.at(tag.latest_ns) is None:
+                if tag.robot.odometry.point_at(tag.latest_ns) is None:
                     warnings.append(
                         f"{name}: no odometry at the times of the ranges: estimated from ranges only"
                     )

@@ -105,8 +105,8 @@ class NoiseModel:
 
     def variances(self, published_m2: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `variance` of each range, float64 (n,)."""
-        known = np.isfinite(published_m2) & (published_m2 > 0.0)
-        return np.where(known, published_m2, self.range_sd**2)
+        is_known = np.isfinite(published_m2) & (published_m2 > 0.0)
+        return np.where(is_known, published_m2, self.range_sd**2)
 
 
 MAD_TO_SD = 1.4826
@@ -124,12 +124,12 @@ def scatter_of(
         noise_group: int (n,), the kind of each. A kind with fewer than `MIN_ALIKE` errors gets the value of all errors.
         kinds: number of kinds.
     """
-    found = np.full(kinds, MAD_TO_SD * float(np.median(np.abs(error_m))))
+    scatter_m = np.full(kinds, MAD_TO_SD * float(np.median(np.abs(error_m))))
     for kind in range(kinds):
-        own = error_m[noise_group == kind]
-        if len(own) >= MIN_ALIKE:
-            found[kind] = MAD_TO_SD * float(np.median(np.abs(own)))
-    return found
+        errors_of_kind = error_m[noise_group == kind]
+        if len(errors_of_kind) >= MIN_ALIKE:
+            scatter_m[kind] = MAD_TO_SD * float(np.median(np.abs(errors_of_kind)))
+    return scatter_m
 
 
 NETWORK_SD = 0.03
@@ -166,7 +166,7 @@ class Regressors:
     slow_sd_m: float = SLOW_SD_M
 
     @classmethod
-    def one(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
+    def single(cls, name: str, row: NDArray[np.float64], mean: float, sd: float) -> Regressors:
         """Return a single parameter with the derivatives float64 (n,); all ranges have errors of the same kind."""
         return cls((name,), row[:, None], np.array([mean]), np.array([sd]), np.zeros(len(row), np.intp))
 
@@ -196,13 +196,13 @@ class Regressors:
             sd=self.sd[is_selected],
         )
 
-    def concat(self, other: Regressors) -> Regressors:
+    def concat(self, appended: Regressors) -> Regressors:
         """Return these parameters followed by the others; `noise_group` is unchanged."""
         return Regressors(
-            self.names + other.names,
-            np.concatenate([self.rows, other.rows], axis=1),
-            np.concatenate([self.mean, other.mean]),
-            np.concatenate([self.sd, other.sd]),
+            self.names + appended.names,
+            np.concatenate([self.rows, appended.rows], axis=1),
+            np.concatenate([self.mean, appended.mean]),
+            np.concatenate([self.sd, appended.sd]),
             self.noise_group,
-            min(self.slow_sd_m, other.slow_sd_m),
+            min(self.slow_sd_m, appended.slow_sd_m),
         )

@@ -261,7 +261,7 @@ class _Solver:
         check_units(config, self.segments, expected)
         offset = likely_offset(config, self.segments, expected)
         self._position, has_position = first_positions(config, self.segments, expected + offset)
-        common = Regressors.one("offset", np.ones(len(expected)), offset, COMMON_SD_M)
+        common = Regressors.single("offset", np.ones(len(expected)), offset, COMMON_SD_M)
         self.common = replace(common.concat(extra), noise_group=extra.noise_group)
         used = float(has_position[self.segments.segment].mean())
         if used < MIN_POSITION_SHARE:

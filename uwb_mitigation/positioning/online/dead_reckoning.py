@@ -51,7 +51,7 @@ class PathPoint(NamedTuple):
         source: number of changes of the source of the yaw: wheels if even, IMU if odd.
     """
 
-    part: int
+    segment: int
     x: float = 0.0
     y: float = 0.0
     yaw: float = 0.0
@@ -89,7 +89,7 @@ class DeadReckoning:
         self.twist: tuple[float, float, float] | None = None
         self.twist_variance = (SPEED_SD**2, YAW_RATE_SD**2)
         self._samples: deque[_Sample] = deque(maxlen=_NUM_SAMPLES)
-        self._part = 0
+        self._segment = 0
         # Stamp, yaw rate and its variance, integrated yaw, and yaw of the latest message.
         self._imu: tuple[int, float, float, float, float] | None = None
         self._imu_yaw: float | None = None
@@ -124,25 +124,19 @@ class DeadReckoning:
             return
         imu_yaw = self._yaw_of_imu(stamp_ns)
         if last is None or not 0 < gap_ns <= ODOMETRY_TIMEOUT_S * NS_PER_S:
-            self._part += 1
+            self._segment += 1
             self._samples.clear()
-            self._samples.append(_Sample(stamp_ns, PathPoint(self._part), (0.0,) * 8, pose))
+            self._samples.append(_Sample(stamp_ns, PathPoint(self._segment), (0.0,) * 8, pose))
             self._imu_yaw, self.twist = imu_yaw, None
             return
         dt = gap_ns / NS_PER_S
         if pose is not None and last.pose is not None:
-            moved = _relative(last.pose, pose)
-            poses = (moved[0] / dt, moved[1] / dt, moved[2] / dt)
-            if (
-                math.hypot(poses[0], poses[1]) <= 2.0 * speed + JUMP_SPEED
-                and abs(poses[2]) <= 2.0 * abs(yaw_rate) + JUMP_YAW_RATE
-            ):
-                vx, vy, yaw_rate = poses
-                speed = math.hypot(vx, vy)
+            vx, vy, yaw_rate = _twist_of_poses(last.pose, pose, dt, (vx, vy, yaw_rate))
+            speed = math.hypot(vx, vy)
         of_speed = _known_variance(max(twist_variance[:2]), SPEED_SD)
         of_yaw_rate = _known_variance(twist_variance[2], YAW_RATE_SD)
         drift, turn_sd = WHEEL_DRIFT * speed, WHEEL_TURN
-        share = 2.0 * CORRELATION_S * MOTION_SHARE**2
+        slip_density = 2.0 * CORRELATION_S * MOTION_SHARE**2
         yaw_density = of_yaw_rate * dt + 2.0 * CORRELATION_S * TURN_SHARE**2 * yaw_rate**2
         source = last.point.source + last.point.source % 2
         if imu_yaw is not None and self._imu_yaw is not None and self._imu is not None:
@@ -153,16 +147,9 @@ class DeadReckoning:
         self.twist, self.twist_variance = (vx, vy, yaw_rate), (of_speed, of_yaw_rate)
         middle = last.point.yaw + 0.5 * yaw_rate * dt
         cosine, sine = math.cos(middle), math.sin(middle)
-        rates = (
-            cosine * vx - sine * vy,
-            sine * vx + cosine * vy,
-            yaw_rate,
-            speed,
-            drift,
-            turn_sd * yaw_rate,
-            of_speed * dt + share * speed**2,
-            yaw_density,
-        )
+        position_density = of_speed * dt + slip_density * speed**2
+        velocity = (cosine * vx - sine * vy, sine * vx + cosine * vy, yaw_rate)
+        rates = (*velocity, speed, drift, turn_sd * yaw_rate, position_density, yaw_density)
         point = _moved(last.point, rates, dt)._replace(source=source)
         self._samples.append(_Sample(stamp_ns, point, rates, pose))
 
@@ -190,17 +177,17 @@ class DeadReckoning:
                 self._imu_yaw = None
         self._imu = stamp_ns, yaw_rate, _known_variance(variance, YAW_RATE_SD), turned, yaw
 
-    def at(self, stamp_ns: int) -> PathPoint | None:
+    def point_at(self, stamp_ns: int) -> PathPoint | None:
         """Return the path at a time, by interpolation, or by extrapolation of the latest motion; None: unknown."""
-        found = self._before(stamp_ns)
-        return None if found is None else _moved(found[0].point, found[1], found[2])
+        latest = self._before(stamp_ns)
+        return None if latest is None else _moved(latest[0].point, latest[1], latest[2])
 
     def pose_at(self, stamp_ns: int) -> tuple[float, float, float] | None:
         """Return x, y and yaw in the frame of the odometry at a time; None: unknown, or messages without a pose."""
-        found = self._before(stamp_ns)
-        if found is None:
+        latest = self._before(stamp_ns)
+        if latest is None:
             return None
-        sample, rates, dt = found
+        sample, rates, dt = latest
         if sample.pose is None:
             return None
         x, y, yaw = sample.pose
@@ -234,6 +221,19 @@ def _known_variance(variance: float, default_sd: float) -> float:
     return variance if 0.0 < variance < _MAX_VARIANCE else default_sd**2
 
 
+def _twist_of_poses(
+    before: Sequence[float], after: Sequence[float], dt: float, twist: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Return the mean twist between two poses, or `twist` of the message if the poses jump."""
+    dx, dy, dyaw = _relative(before, after)
+    speed, yaw_rate = math.hypot(dx, dy) / dt, abs(dyaw) / dt
+    # False for NaN.
+    is_continuous = (
+        speed <= 2.0 * math.hypot(*twist[:2]) + JUMP_SPEED and yaw_rate <= 2.0 * abs(twist[2]) + JUMP_YAW_RATE
+    )
+    return (dx / dt, dy / dt, dyaw / dt) if is_continuous else twist
+
+
 def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:
     """Return the displacement in the axes halfway between two poses, and the rotation."""
     dyaw = math.remainder(after[2] - before[2], math.tau)
@@ -244,6 +244,6 @@ def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, f
 
 
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float) -> PathPoint:
-    part, *values, source = point
+    segment, *values, source = point
     moved = (value + rate * dt for value, rate in zip(values, rates, strict=True))
-    return PathPoint._make((part, *moved, source))
+    return PathPoint._make((segment, *moved, source))

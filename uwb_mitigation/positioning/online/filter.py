@@ -100,9 +100,9 @@ class RangeFilter:
 
     def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
-        away = self.state.x[:3] - self._anchors[anchor]
-        distance = math.sqrt(away @ away)
-        self.state.H[:3] = away / max(distance, SHORTEST_M)
+        vector = self.state.x[:3] - self._anchors[anchor]
+        distance = math.sqrt(vector @ vector)
+        self.state.H[:3] = vector / max(distance, SHORTEST_M)
         return self.state.update_range(anchor, range_m - distance, variance_m2)
 
     def update_height(self, height_m: float, variance_m2: float) -> float:

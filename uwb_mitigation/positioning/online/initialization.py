@@ -70,7 +70,7 @@ def candidate_positions(
     if len(range_m) < dims:
         return []
     x = _starts(anchors, range_m, height)
-    problem = _Trilateration.of(len(x), anchors, range_m, sd_m, model, height)
+    problem = _Trilateration.for_starts(len(x), anchors, range_m, sd_m, model, height)
     x, cost, gradient, hessian = problem.descend(x)
     # Discard starts that have not converged, unless no start has converged.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
@@ -82,8 +82,8 @@ def candidate_positions(
         keep = np.isfinite(cost)
         excess = x - area.clip(x)
         squared = np.einsum("ni,ni->n", excess, np.einsum("nij,nj->ni", hessian, excess))
-        near = (np.linalg.norm(excess, axis=1) < _NEAR_WALL_M) | (squared < IMPLAUSIBLE)
-        keep &= near
+        is_near = (np.linalg.norm(excess, axis=1) < _NEAR_WALL_M) | (squared < IMPLAUSIBLE)
+        keep &= is_near
         if not keep.any():
             return []
         outside = np.flatnonzero(keep & (excess != 0.0).any(axis=1))
@@ -120,7 +120,7 @@ class _Trilateration:
     information: NDArray[np.float64]
 
     @classmethod
-    def of(
+    def for_starts(
         cls,
         count: int,
         anchors: NDArray[np.float64],
@@ -135,17 +135,17 @@ class _Trilateration:
             mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
         return cls(anchors, range_m, sd_m, model, mean, information)
 
-    def at(self, rows: NDArray[np.intp]) -> _Trilateration:
+    def select_positions(self, rows: NDArray[np.intp]) -> _Trilateration:
         """Return the same ranges with the priors of those positions."""
         return replace(self, mean=self.mean[rows], information=self.information[rows])
 
     def with_walls(
-        self, rows: NDArray[np.intp], wall: NDArray[np.float64], held: NDArray[np.bool_]
+        self, rows: NDArray[np.intp], wall: NDArray[np.float64], is_held: NDArray[np.bool_]
     ) -> _Trilateration:
         """Return `at`, with the coordinates `held` bool (n, 3) at the boundary."""
-        own = self.at(rows)
-        information = np.where(held, 1.0 / _WALL_SD_M**2, own.information)
-        return replace(own, mean=np.where(held, wall, own.mean), information=information)
+        selected = self.select_positions(rows)
+        information = np.where(is_held, 1.0 / _WALL_SD_M**2, selected.information)
+        return replace(selected, mean=np.where(is_held, wall, selected.mean), information=information)
 
     def descend(
         self, x: NDArray[np.float64]
@@ -157,12 +157,12 @@ class _Trilateration:
             diagonal = np.einsum("nii->ni", hessian)
             damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
             trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
-            found = self.linearised(trial)
-            better = found[0] <= cost
+            trial_values = self.linearised(trial)
+            better = trial_values[0] <= cost
             x = np.where(better[:, None], trial, x)
-            cost = np.where(better, found[0], cost)
-            gradient = np.where(better[:, None], found[1], gradient)
-            hessian = np.where(better[:, None, None], found[2], hessian)
+            cost = np.where(better, trial_values[0], cost)
+            gradient = np.where(better[:, None], trial_values[1], gradient)
+            hessian = np.where(better[:, None, None], trial_values[2], hessian)
             damping = np.clip(np.where(better, damping / 4.0, damping * 8.0), 1e-8, 1e8)
         return x, cost, gradient, hessian
 
@@ -170,14 +170,14 @@ class _Trilateration:
         self, x: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return loss (n,), its gradient (n, 3), a Gauss-Newton Hessian (n, 3, 3), and weighted rows (n, k, 3) at x."""
-        away = x[:, None] - self.anchors
-        distance = np.sqrt(np.einsum("nki,nki->nk", away, away))
+        vector = x[:, None] - self.anchors
+        distance = np.sqrt(np.einsum("nki,nki->nk", vector, vector))
         z = (self.range_m - distance) / self.sd_m
-        slope = away / np.maximum(distance, 1e-6)[..., None] / self.sd_m[..., None]
+        slope = vector / np.maximum(distance, 1e-6)[..., None] / self.sd_m[..., None]
         rows = slope * self.model.weight(z)[..., None]
-        apart = x - self.mean
-        pull = self.information * apart
-        cost = self.model.loss(z).sum(axis=1) + 0.5 * np.einsum("ni,ni->n", pull, apart)
+        offset = x - self.mean
+        pull = self.information * offset
+        cost = self.model.loss(z).sum(axis=1) + 0.5 * np.einsum("ni,ni->n", pull, offset)
         gradient = pull - np.einsum("nki,nk->ni", rows, z)
         hessian = np.einsum("nki,nkj->nij", rows, slope)
         hessian[:, [0, 1, 2], [0, 1, 2]] += self.information
@@ -185,15 +185,15 @@ class _Trilateration:
 
 
 def _same(position: NDArray[np.float64], candidate: CandidatePosition) -> bool:
-    apart = position - candidate.position
-    return bool(apart @ apart < 0.25 or apart @ np.linalg.solve(candidate.covariance, apart) < 4.0)
+    offset = position - candidate.position
+    return bool(offset @ offset < 0.25 or offset @ np.linalg.solve(candidate.covariance, offset) < 4.0)
 
 
 def _starts(
     anchors: NDArray[np.float64], range_m: NDArray[np.float64], height: Height | None
 ) -> NDArray[np.float64]:
     order = np.argsort(range_m)[:2]
-    found = [anchors.mean(axis=0, keepdims=True) + 0.1]
+    start_groups = [anchors.mean(axis=0, keepdims=True) + 0.1]
     for i in order:
         if height is not None:
             # Not along the axes: anchors are often aligned with one, where two mirror images meet in a saddle point.
@@ -205,8 +205,8 @@ def _starts(
             angle, up = np.pi * (1.0 + 5.0**0.5) * k, 1.0 - 2.0 * k / _SPHERE
         level = np.sqrt(1.0 - up * up)
         direction = np.stack([level * np.cos(angle), level * np.sin(angle), up], axis=1)
-        found.append(anchors[i] + max(float(range_m[i]), 0.1) * direction)
-    starts = np.concatenate(found)
+        start_groups.append(anchors[i] + max(float(range_m[i]), 0.1) * direction)
+    starts = np.concatenate(start_groups)
     if height is not None:
         starts[:, 2] = height.value
     return starts
@@ -226,7 +226,7 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
     range_m, sd_m = np.where(present, latest, 0.0), np.where(present, 1.0, np.inf)
     reach = np.nanmedian(latest, axis=1, keepdims=True) if len(latest) else np.zeros((0, 1))
     exact = None if height is None else Height(height.value, 1e-4)
-    problem = _Trilateration.of(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
+    problem = _Trilateration.for_starts(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
     best, least = np.zeros((len(latest), 3)), np.full(len(latest), np.inf)
     sides = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -0.5]]) + 0.01
     for side in sides:
@@ -247,12 +247,12 @@ def _latest(count: int, ranges: Ranges) -> tuple[NDArray[np.int64], NDArray[np.f
     number = (ranges.stamp_ns - ranges.stamp_ns[:1]) // every
     # The last range of each interval.
     ends = np.flatnonzero(np.diff(number, append=number[-1:] + 1)) if len(number) else np.zeros(0, np.intp)
-    found = np.full((len(ends), count), np.nan)
+    range_at_end = np.full((len(ends), count), np.nan)
     for row in range(count):
-        own = np.flatnonzero(ranges.anchor == row)
-        before = np.searchsorted(own, ends, side="right") - 1
-        some = before >= 0
-        last = own[before[some]]
-        age = ranges.stamp_ns[ends[some]] - ranges.stamp_ns[last]
-        found[some, row] = np.where(age <= _FRESH_S * NS_PER_S, ranges.range_m[last], np.nan)
-    return ranges.stamp_ns[ends], found
+        selected = np.flatnonzero(ranges.anchor == row)
+        before = np.searchsorted(selected, ends, side="right") - 1
+        has_range = before >= 0
+        last = selected[before[has_range]]
+        age = ranges.stamp_ns[ends[has_range]] - ranges.stamp_ns[last]
+        range_at_end[has_range, row] = np.where(age <= _FRESH_S * NS_PER_S, ranges.range_m[last], np.nan)
+    return ranges.stamp_ns[ends], range_at_end

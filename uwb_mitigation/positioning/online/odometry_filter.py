@@ -122,11 +122,11 @@ class OdometryFilter:
     def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
         arm_x, arm_y = self._arm()
-        away = self.state.x[:3] - self._anchors[anchor]
-        away += (arm_x, arm_y, self._lever_arm[2])
-        distance = math.sqrt(away @ away)
+        vector = self.state.x[:3] - self._anchors[anchor]
+        vector += (arm_x, arm_y, self._lever_arm[2])
+        distance = math.sqrt(vector @ vector)
         H = self.state.H
-        H[:3] = away / max(distance, SHORTEST_M)
+        H[:3] = vector / max(distance, SHORTEST_M)
         H[YAW] = H[1] * arm_x - H[0] * arm_y
         return self.state.update_range(anchor, range_m - distance, variance_m2)
 

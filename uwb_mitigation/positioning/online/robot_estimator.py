@@ -43,10 +43,9 @@ SAME_YAW = math.radians(20.0)
 SEPARATION_S = 2.0
 """Averaging time of the separation of the two solutions."""
 
-EQUAL_SEPARATION, REJECTED_SEPARATION = 1.5, 3.0
+EQUAL_SEPARATION, REJECTED_SEPARATION = 2.0, 4.0
 """Mean squared separation, relative to the covariance, at which both solutions have equal weights, and from which the odometry is
-rejected. Two would be the mean for independent solutions; these two have their ranges in common."""
-
+rejected. Two is its mean if the odometry had no errors, and the ranges-only solution those of its covariance."""
 
 VERIFIED_SEPARATION = 1.0
 """After a rejection the odometry is reported as wrong until the separation is smaller."""
@@ -88,7 +87,7 @@ class RobotEstimator:
     def __init__(self, config: EstimatorConfig, odometry: DeadReckoning | None = None) -> None:
         self.tag, self.odometry = TagEstimator(config), odometry or DeadReckoning()
         self._config, self._area, self._robot = config, config.area, config.robot or RobotData()
-        self._known: OdometryFilter | None = None
+        self._heading_filter: OdometryFilter | None = None
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
         self.rejects_odometry = False
@@ -109,7 +108,7 @@ class RobotEstimator:
     @property
     def heading(self) -> str:
         """The state of the heading as text: known, unknown, or the number of hypotheses."""
-        if self._known is not None:
+        if self._heading_filter is not None:
             return "known"
         return f"{len(self._yaws)} hypotheses" if self._yaws else "unknown"
 
@@ -126,9 +125,9 @@ class RobotEstimator:
             add(recorded_ns, *values)
         estimate = self.tag.add(measurement)
         self._update_headings(measurement)
-        if estimate is None or self._known is None:
+        if estimate is None or self._heading_filter is None:
             return estimate
-        return self._mixture(estimate, self._known)
+        return self._mixture(estimate, self._heading_filter)
 
     def run(self, ranges: Ranges) -> Track:
         """Process recorded ranges, and heights and motion of the config; return an estimate for each range with one."""
@@ -136,10 +135,15 @@ class RobotEstimator:
 
     def predict_at(self, stamp_ns: int) -> Estimate | None:
         """Predict position and heading at a time after the latest range; None: not known."""
-        estimate, point = self.tag.predict_at(stamp_ns), self.odometry.at(stamp_ns)
-        if estimate is None or self._known is None or point is None or point.part != self._known.point.part:
+        estimate, point = self.tag.predict_at(stamp_ns), self.odometry.point_at(stamp_ns)
+        if (
+            estimate is None
+            or self._heading_filter is None
+            or point is None
+            or point.segment != self._heading_filter.point.segment
+        ):
             return estimate
-        predicted = self._known.copy()
+        predicted = self._heading_filter.copy()
         predicted.advance(self.tag.seconds(stamp_ns), point)
         if self._area is not None:
             predicted.confine(self._area)
@@ -161,9 +165,9 @@ class RobotEstimator:
             recorded += [(stamp_ns, self.odometry.add, values) for stamp_ns, *values in rows]
         return recorded
 
-    def _mixture(self, ranges_only: Estimate, known: OdometryFilter) -> Estimate:
+    def _mixture(self, ranges_only: Estimate, heading_filter: OdometryFilter) -> Estimate:
         """Return the mean of both solutions; its covariance includes their difference."""
-        estimate = known.estimate(ranges_only.stamp_ns, self.odometry)
+        estimate = heading_filter.estimate(ranges_only.stamp_ns, self.odometry)
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         delta = ranges_only.position - estimate.position
@@ -180,8 +184,8 @@ class RobotEstimator:
 
     def _update_headings(self, measurement: TagRange) -> None:
         tag = self.tag
-        time_s, point = tag.seconds(measurement.stamp_ns), self.odometry.at(measurement.stamp_ns)
-        if point is None or (self._yaws and point.part != self._yaws[0].filter.point.part):
+        time_s, point = tag.seconds(measurement.stamp_ns), self.odometry.point_at(measurement.stamp_ns)
+        if point is None or (self._yaws and point.segment != self._yaws[0].filter.point.segment):
             if self._yaws:
                 self._reset_heading("odometry missing")
             return
@@ -196,17 +200,16 @@ class RobotEstimator:
                 hypothesis.filter.confine(self._area)
             hypothesis.loss += self._config.model.student_loss(z) + math.log(sd)
         self._prune()
-        if self._known is not None and tag.filter is not None:
-            self._update_separation(self._known, dt)
+        if self._heading_filter is not None and tag.filter is not None:
+            self._update_separation(self._heading_filter, dt)
 
-    def _update_separation(self, known: OdometryFilter, dt: float) -> None:
+    def _update_separation(self, heading_filter: OdometryFilter, dt: float) -> None:
         filter_ = self.tag.filter
         assert filter_ is not None
-        x, y = known.antenna_xy
+        x, y = heading_filter.antenna_xy
         dx, dy = x - float(filter_.x[0]), y - float(filter_.x[1])
         (a, b), (_, c) = filter_.P[:2, :2].tolist()
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
-        separation /= filter_.state.covariance_scale()
         self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
         self._rejections *= math.exp(-max(dt, 0.0) / FORGIVEN_S)
         if self._separation < VERIFIED_SEPARATION:
@@ -220,7 +223,7 @@ class RobotEstimator:
         """Start filters at the position of the ranges-only filter when the robot drives."""
         if self.tag.filter is None:
             return
-        if self._begin is None or self._begin.part != point.part:
+        if self._begin is None or self._begin.segment != point.segment:
             self._begin = point
         if point.distance_m - self._begin.distance_m < START_M:
             return
@@ -250,14 +253,14 @@ class RobotEstimator:
                     plausible.append(hypothesis)
             self._yaws = plausible
         best = self._yaws[0].filter
-        if self._known is None and len(self._yaws) == 1 and best.yaw_variance < KNOWN_YAW_SD**2:
-            self._known = best
+        if self._heading_filter is None and len(self._yaws) == 1 and best.yaw_variance < KNOWN_YAW_SD**2:
+            self._heading_filter = best
             # Not verified yet.
             self._separation = EQUAL_SEPARATION
             self.tag.counts["heading found"] += 1
 
     def _reset_heading(self, reason: str | None) -> None:
         """Continue with ranges only, for a reason to count."""
-        self._known, self._begin, self._separation, self._yaws = None, None, 0.0, []
+        self._heading_filter, self._begin, self._separation, self._yaws = None, None, 0.0, []
         if reason is not None:
             self.tag.counts[reason] += 1

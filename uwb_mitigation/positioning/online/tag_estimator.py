@@ -265,12 +265,12 @@ class TagEstimator:
                 # The linear update moves the position too far: search again with the known height.
                 self._restart_search(self._time_s - WINDOW_S)
 
-    def _follow(self, known: RangeFilter, measurement: TagRange) -> None:
-        known.predict(self._time_s)
+    def _follow(self, filter_: RangeFilter, measurement: TagRange) -> None:
+        filter_.predict(self._time_s)
         # The first position contains the errors of the ranges of its window.
-        known.state.estimates_errors = self._time_s >= self._found_s + WINDOW_S
-        z, _ = known.update(*measurement[1:])
-        self._confine(known)
+        filter_.state.estimates_errors = self._time_s >= self._found_s + WINDOW_S
+        z, _ = filter_.update(*measurement[1:])
+        self._confine(filter_)
         limited = max(-10.0, min(10.0, z))
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
@@ -285,9 +285,9 @@ class TagEstimator:
             if 2 * num_contradicting >= len(received):
                 self.counts["lost"] += 1
                 self._restart_search(self._time_s - WINDOW_S)
-        self._check_mirror(known)
+        self._check_mirror(filter_)
 
-    def _check_mirror(self, known: RangeFilter) -> None:
+    def _check_mirror(self, filter_: RangeFilter) -> None:
         """Withhold positions from the mirror on, until the image is excluded again: the tag may have crossed it, or not."""
         if self._mirror is None:
             if self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
@@ -295,12 +295,12 @@ class TagEstimator:
             self.is_ambiguous = False
             return
         center, normal = self._mirror
-        variance = float(normal @ known.P[:3, :3] @ normal) * known.state.covariance_scale()
-        distance = abs(float((known.position - center) @ normal))
+        variance = float(normal @ filter_.P[:3, :3] @ normal) * filter_.state.covariance_scale()
+        distance = abs(float((filter_.position - center) @ normal))
         is_near = distance < MIRROR_SD * math.sqrt(max(variance, 0.0))
         if is_near and not self.is_ambiguous:
             self._ambiguous_s = self._time_s
-        self.is_ambiguous = is_near or (self.is_ambiguous and not self._excludes_mirror(known))
+        self.is_ambiguous = is_near or (self.is_ambiguous and not self._excludes_mirror(filter_))
 
     def _mirror_of(self, rows: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return a point and the normal of the line or plane in which anchors mirror positions; None: they exclude the image."""
@@ -323,21 +323,21 @@ class TagEstimator:
                 return None
         return center, normal
 
-    def _excludes_mirror(self, known: RangeFilter) -> bool:
+    def _excludes_mirror(self, filter_: RangeFilter) -> bool:
         """Whether the area excludes the mirror image of a position."""
         if self._mirror is None:
             return True
         if self._area is None:
             return False
         center, normal = self._mirror
-        image = known.position - 2.0 * float((known.position - center) @ normal) * normal
+        image = filter_.position - 2.0 * float((filter_.position - center) @ normal) * normal
         excess = float(np.linalg.norm(image - self._area.clip(image)))
-        return excess > EXCLUDED_SD * math.sqrt(float(np.linalg.eigvalsh(known.P[:3, :3])[-1]))
+        return excess > EXCLUDED_SD * math.sqrt(float(np.linalg.eigvalsh(filter_.P[:3, :3])[-1]))
 
-    def _confine(self, known: RangeFilter) -> None:
+    def _confine(self, filter_: RangeFilter) -> None:
         """Keep a filter inside the area."""
         if self._area is not None:
-            known.confine(self._area.low, self._area.high)
+            filter_.confine(self._area.low, self._area.high)
 
     def _recent_height(self) -> Height | None:
         """The constant height, or that of the last second's measurements; None: unknown."""
@@ -381,9 +381,9 @@ class TagEstimator:
         height = self._recent_height()
         if len(range_m) < (2 if height is not None else 3):
             return
-        found = candidate_positions(anchors, range_m, sd_m, self._model, height=height, area=self._area)
-        if found and len(found) <= _MAX_CANDIDATES:
-            self._start(found, 1.0 + self._model.offset_sd**2 / float(np.median(sd_m)) ** 2)
+        candidates = candidate_positions(anchors, range_m, sd_m, self._model, height=height, area=self._area)
+        if candidates and len(candidates) <= _MAX_CANDIDATES:
+            self._start(candidates, 1.0 + self._model.offset_sd**2 / float(np.median(sd_m)) ** 2)
 
     def _window(self) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
         """Return rows (k,), median ranges (k,) and their standard deviations (k,) of the last second's anchors."""
@@ -400,10 +400,10 @@ class TagEstimator:
             )
         return np.array(rows, np.intp), np.array(ranges), np.array(sds)
 
-    def _start(self, found: list[CandidatePosition], inflation: float) -> None:
+    def _start(self, candidates: list[CandidatePosition], inflation: float) -> None:
         """Start a filter at each position; the covariances are inflated for the common offset."""
         model, height = self._model, self._height
-        for candidate in found:
+        for candidate in candidates:
             position, covariance = candidate.position.copy(), candidate.covariance * inflation
             # The tag has moved since the middle of the window.
             covariance[[0, 1, 2], [0, 1, 2]] += (model.speed * WINDOW_S / 2.0) ** 2
@@ -420,7 +420,7 @@ class TagEstimator:
         """Remove candidates that are implausible or equal; follow the last one."""
         best = min(hypothesis.loss for hypothesis in self._hypotheses)
         plausible: list[_PositionHypothesis] = []
-        for hypothesis in sorted(self._hypotheses, key=lambda one: one.loss):
+        for hypothesis in sorted(self._hypotheses, key=lambda hypothesis: hypothesis.loss):
             position = hypothesis.filter.position
             if hypothesis.loss <= best + IMPLAUSIBLE and all(
                 np.linalg.norm(position - better.filter.position) > _SAME_M for better in plausible

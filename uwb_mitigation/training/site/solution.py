@@ -454,7 +454,7 @@ def regressors(site: SiteData, universal: Bundle) -> Regressors:
         is_known = np.isfinite(value)
         if is_known.mean() >= 0.5 and np.ptp(value[is_known]) >= 1.0:
             centred = np.where(is_known, value - np.median(value[is_known]), 0.0)
-            columns.append(Regressors.one(name, centred, 0.0, SLOPE_SD))
+            columns.append(Regressors.single(name, centred, 0.0, SLOPE_SD))
     return functools.reduce(Regressors.concat, columns)
 
 
