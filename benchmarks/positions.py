@@ -300,10 +300,10 @@ def measure(
             advance(name, num_finished / len(sources))
     sets = [results[number] for number in sorted(results)]
     ambiguous = ambiguous_drives() if simulated else []
-    return {"sets": sets, "ambiguous": ambiguous, "summary": summarize(sets, ambiguous), "skipped": skipped}
+    return {"sets": sets, "ambiguous": ambiguous, "summary": summarise(sets, ambiguous), "skipped": skipped}
 
 
-def summarize(sets: Sequence[dict[str, Any]], ambiguous: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summarise(sets: Sequence[dict[str, Any]], ambiguous: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the figures that summarise all runs, and those of each set."""
     names = list(dict.fromkeys(entry["name"] for entry in sets))
     by_set = {name: _summary_of([entry for entry in sets if entry["name"] == name]) for name in names}

@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.fit.quantization import quantize_network
+from uwb_mitigation.training.fit.quantisation import quantise_network
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement, Record, Truth
 
 LINE = LinearBiasModel(*(float(np.float32(value)) for value in (-5.0, -0.0691, -0.0126)))
@@ -51,7 +51,7 @@ def windows(count: int, samples: int, seed: int = 0) -> np.ndarray:
 def random_int8(architecture: Remnet, seed: int = 0, *, exact: bool = True) -> Int8Weights:
     """Return a quantised network. Without `exact`, its scales suit neither the firmware nor all processors."""
     weights = random_weights(architecture, seed)
-    return quantize_network(weights, windows(64, architecture.samples, seed), exact=exact)
+    return quantise_network(weights, windows(64, architecture.samples, seed), exact=exact)
 
 
 def card(architecture: Remnet, *, quantised: bool = True, **changes: object) -> ModelCard:

@@ -24,7 +24,9 @@ from uwb_mitigation.commands.doctor import LIBRARIES, MODULES
 
 NAME = "uwb_mitigation"
 MESSAGES = "uwb_mitigation_msgs"
-EXECUTABLES = set(re.findall(r'"([\w-]+) = uwb_mitigation\.commands\.entry:', (REPOSITORY / "setup.py").read_text()))
+EXECUTABLES = set(
+    re.findall(r'"([\w-]+) = uwb_mitigation\.commands\.entry:', (REPOSITORY / "setup.py").read_text())
+)
 NOT_ON_PYPI = {"launch", "launch_ros", "tf2_msgs"}
 """ROS packages that are not in an ament index without ROS."""
 

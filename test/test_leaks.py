@@ -43,13 +43,13 @@ RECIPE = Recipe(Remnet(SAMPLES, modules=1, filters=4), QUICK, QUICK)
 LEARNERS = {
     (comparison, "fit"),
     (comparison, "calibration_inputs"),
-    (comparison, "quantize_network"),
+    (comparison, "quantise_network"),
     (fitting, "fit"),
     (candidates, "fit_new_model"),
     (train, "fit_new_model"),
     (train, "fit_with_card"),
     (train, "calibration_inputs"),
-    (train, "quantize_network"),
+    (train, "quantise_network"),
     (train, "site_card"),
     (linear_fit, "fit_linear_bias"),
     (linear_fit, "fit_constant"),
@@ -58,8 +58,8 @@ LEARNERS = {
     (baselines, "ridge"),
     (baselines, "gradient_boosting"),
     (model_card, "fit_intervals"),
-    (experiment, "calibrate_quantization"),
-    (experiment, "quantize_network"),
+    (experiment, "calibrate_quantisation"),
+    (experiment, "quantise_network"),
 }
 
 
@@ -162,13 +162,13 @@ def test_no_row_of_the_comparison_was_fitted_on_its_test_data(data, watch):
         "linear_fit.fit_linear_bias",
         "model_card.fit_intervals",
     )
-    watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantize_network")
+    watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantise_network")
 
 
 def test_cross_validation_fits_and_calibrates_without_the_fold(data, watch):
     found = train.cross_validate(data, RECIPE, 3, 0)
     watch.called(
-        "fitting.fit", "train.calibration_inputs", "train.quantize_network", "linear_fit.fit_linear_bias"
+        "fitting.fit", "train.calibration_inputs", "train.quantise_network", "linear_fit.fit_linear_bias"
     )
     for split in splits.by_configuration(data.configurations, 3, 0):
         expected = data.error_m[split.test] - np.median(data.error_m[split.train])
@@ -202,7 +202,7 @@ def test_protocol_fits_and_calibrates_on_its_training_part(data, watch, tmp_path
     wanted = experiment.list_tasks(["remnet", "mlp"], [SAMPLES], seeds=1)
     with watch.without(parts(data).test.names):
         experiment.run_experiment(parts(data), tmp_path, wanted, QUICK)
-    watch.called("experiment.calibrate_quantization", "fitting.fit")
+    watch.called("experiment.calibrate_quantisation", "fitting.fit")
     watch.called("baselines.los_median", "baselines.overall_median", "linear_fit.fit_linear_bias")
 
 
@@ -245,4 +245,4 @@ def test_command_trains_on_the_training_part(data, watch, monkeypatch, tmp_path)
     quick = ("--networks", "remnet", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
     with watch.without(data.rows(in_room_2(data)).names):
         typed(data, monkeypatch, "paper", "protocol", "--data", "x", "-o", tmp_path, *quick)
-    watch.called("experiment.calibrate_quantization")
+    watch.called("experiment.calibrate_quantisation")

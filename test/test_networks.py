@@ -13,7 +13,7 @@ from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, save_bundle, session_options
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.weights import FloatWeights
-from uwb_mitigation.training.fit.quantization import quantize_network
+from uwb_mitigation.training.fit.quantisation import quantise_network
 
 torch = pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
@@ -85,7 +85,7 @@ def test_weights_go_in_and_out_unchanged(shape):
 
 @pytest.mark.parametrize("shape", [Mlp(157), Mlp(8, (5,)), Mlp(33, (64, 7, 9))])
 def test_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
-    weights = quantize_network(mlp_weights(shape), windows(100, shape.samples), exact=False)
+    weights = quantise_network(mlp_weights(shape), windows(100, shape.samples), exact=False)
     session = onnxruntime.InferenceSession(
         graph.int8_model(weights), session_options(), providers=["CPUExecutionProvider"]
     )
@@ -99,7 +99,7 @@ def test_int8_mlp_equals_onnx_runtime_on_every_bit(shape):
 def test_mlp_bundle_loads_and_runs(tmp_path, quantised):
     shape = Mlp(16, (12, 8))
     weights = mlp_weights(shape)
-    integers = quantize_network(weights, windows(50, 16), exact=False)
+    integers = quantise_network(weights, windows(50, 16), exact=False)
     model = graph.int8_model(integers) if quantised else graph.float_model(weights)
     save_bundle(tmp_path / "mlp.onnx", model, card(shape, quantised=quantised))
     bundle = load_bundle(tmp_path / "mlp.onnx")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
 from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
-from uwb_mitigation.training.fit.quantization import quantize_network
+from uwb_mitigation.training.fit.quantisation import quantise_network
 
 
 def remnet(samples: int, first_kernel: int, modules: int = 3, seed: int = 0) -> Int8Weights:
@@ -27,7 +27,7 @@ def remnet(samples: int, first_kernel: int, modules: int = 3, seed: int = 0) -> 
     weight[HEAD] = random.normal(0, 0.05, (architecture.features, 1)).astype(np.float32)
     bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
     calibration = random.gamma(0.5, 0.5, (64, samples)).astype(np.float32)
-    return quantize_network(FloatWeights(architecture, weight, bias), calibration)
+    return quantise_network(FloatWeights(architecture, weight, bias), calibration)
 
 
 def mlp(samples: int = 157, seed: int = 0) -> Int8Weights:
@@ -42,7 +42,7 @@ def mlp(samples: int = 157, seed: int = 0) -> Int8Weights:
     weight[HEAD] = random.normal(0, 0.2, (architecture.features, 1)).astype(np.float32)
     bias[HEAD] = random.normal(0, 0.1, 1).astype(np.float32)
     calibration = random.gamma(0.5, 0.5, (64, samples)).astype(np.float32)
-    return quantize_network(FloatWeights(architecture, weight, bias), calibration)
+    return quantise_network(FloatWeights(architecture, weight, bias), calibration)
 
 
 def rounding_windows(samples: int, input_scale: np.float32, count: int, seed: int = 1) -> NDArray[np.float32]:

@@ -114,9 +114,9 @@ def train(
     chosen_scaling = Scaling(scaling)
     if per_configuration < 1:
         raise ParameterError(f"per-configuration = {per_configuration}", valid="at least 1")
-    given: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
-    given = {key: value for key, value in given.items() if value is not None}
-    options = FitOptions(**given)
+    set_options: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
+    set_options = {key: value for key, value in set_options.items() if value is not None}
+    options = FitOptions(**set_options)
     architecture = Remnet(samples=samples, first_kernel=first_kernel)
     check_output(output, force)
     with needs_torch():
@@ -131,7 +131,7 @@ def train(
     with console.stage_bars() as on_progress:
         job = training.TrainingJob(dataset, name, output, folds, on_progress)
         if source is None:
-            network_only = replace(candidates.NETWORK_ONLY, **given)
+            network_only = replace(candidates.NETWORK_ONLY, **set_options)
             recipe = candidates.Recipe(
                 architecture, options, network_only, per_configuration=per_configuration
             )
@@ -164,15 +164,15 @@ def quantise(
     """
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.training.data import recordings
-    from uwb_mitigation.training.fit import quantization
+    from uwb_mitigation.training.fit import quantisation
 
     source = load_bundle(model)
-    quantization.check(source, percentile)
+    quantisation.check(source, percentile)
     check_output(output)
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
     console.show_skipped(dataset.skipped)
-    quantised = quantization.quantize_bundle(source, dataset, percentile, output)
+    quantised = quantisation.quantise_bundle(source, dataset, percentile, output)
     bundle, difference = quantised.bundle, quantised.difference_m
     model_tables.show_bundle(bundle)
     console.out.print(

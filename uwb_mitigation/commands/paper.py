@@ -128,10 +128,10 @@ def protocol(
         raise ParameterError(
             "not a folder", where=str(output), valid="a folder; it is created if it does not exist"
         )
-    parts = _parts(data, max(lengths), scaling, split)
+    split_data = _split_data(data, max(lengths), scaling, split)
     with console.share_bar(f"{len(tasks)} networks") as update:
         result = experiment.run_experiment(
-            parts, output, tasks, options, _workers(workers), update, _command()
+            split_data, output, tasks, options, _workers(workers), update, _command()
         )
     _show_experiment(result)
     console.write_json(json, result.model_dump(mode="json"))
@@ -176,7 +176,7 @@ def report(
         f"{page}: {len(result.tables)} tables, {len(result.figures)} figures, {len(study.dataset)} measurements"
     ]
     lines += [f"{name}: some values are not measured; the page contains the command" for name in gaps]
-    lines += [f"{part}: no results. Run: {command}" for part, command in result.lacking.items()]
+    lines += [f"{figure}: no results. Run: {command}" for figure, command in result.lacking.items()]
     console.out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
@@ -185,22 +185,22 @@ def _command() -> str:
     return shlex.join(["uwb-mitigation", *sys.argv[1:]])
 
 
-def _parts(path: Path, samples: int, scaling: ScalingName, split: str) -> Parts:
+def _split_data(path: Path, samples: int, scaling: ScalingName, split: str) -> Parts:
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-    from uwb_mitigation.training.paper import data as parts
+    from uwb_mitigation.training.paper import data as paper_data
 
     preprocessing = Preprocessing(samples, Scaling(scaling))
     with console.reading() as on_record:
-        name, _, dataset = parts.load_paper_data(path, preprocessing, on_record)
+        name, _, dataset = paper_data.load_paper_data(path, preprocessing, on_record)
     console.show_skipped(dataset.skipped)
-    return parts.split_dataset(name, dataset, split)
+    return paper_data.split_dataset(name, dataset, split)
 
 
 def _lengths(text: str) -> list[int]:
     from uwb_mitigation.mitigation.preprocessing import Preprocessing
 
     try:
-        lengths = [int(part) for part in text.split(",")]
+        lengths = [int(length) for length in text.split(",")]
     except ValueError:
         raise ParameterError(
             f"windows {text!r}", valid="numbers separated by commas, such as 157,64"
@@ -210,10 +210,10 @@ def _lengths(text: str) -> list[int]:
     return list(dict.fromkeys(lengths))
 
 
-def _workers(given: int | None) -> int:
-    if given is not None and not 1 <= given <= 256:
-        raise ParameterError(f"{given} workers", valid="1 to 256")
-    return given or os.cpu_count() or 1
+def _workers(requested: int | None) -> int:
+    if requested is not None and not 1 <= requested <= 256:
+        raise ParameterError(f"{requested} workers", valid="1 to 256")
+    return requested or os.cpu_count() or 1
 
 
 def _make_folder(path: Path) -> None:

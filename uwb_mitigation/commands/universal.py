@@ -74,7 +74,7 @@ def train_universal(
             plan,
             output.stem,
             workers or os.cpu_count() or 1,
-            lambda share, what: bar.update(task, completed=share, description=what),
+            lambda fraction, what: bar.update(task, completed=fraction, description=what),
         )
     if float_output is not None:
         save_bundle(

@@ -58,8 +58,8 @@ class Driver(ManagedNode):
 
     def open(self) -> None:
         # Each function checks its parameters, opens its source, and returns the factory of its feed.
-        other = self._prepare_topics if self.value("source") == "topic" else self._prepare_replay
-        self._make_feed = self._prepare_radios() if self._has_radios else other()
+        prepare = self._prepare_topics if self.value("source") == "topic" else self._prepare_replay
+        self._make_feed = self._prepare_radios() if self._has_radios else prepare()
 
     def begin(self) -> None:
         assert self._make_feed is not None

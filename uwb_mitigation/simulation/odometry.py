@@ -124,11 +124,13 @@ def yaw_along_route(route: tuple[Point, ...], travelled_m: NDArray[np.float64]) 
     lap_turn = direction[-1] - direction[0]
     integral = np.concatenate([[0.0], np.cumsum(direction[:-1] * np.diff(reached))])
 
-    def integrated(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def integrated(distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the integral of the direction from 0."""
-        lap, rest = np.divmod(at, reached[-1])
+        lap, distance_in_lap = np.divmod(distance_m, reached[-1])
         laps = lap * integral[-1] + lap_turn * reached[-1] * lap * (lap - 1.0) / 2.0
-        return np.asarray(laps + np.interp(rest, reached, integral) + lap * lap_turn * rest)
+        return np.asarray(
+            laps + np.interp(distance_in_lap, reached, integral) + lap * lap_turn * distance_in_lap
+        )
 
     half = _CORNER_M / 2.0
     mean: NDArray[np.float64] = (integrated(travelled_m + half) - integrated(travelled_m - half)) / _CORNER_M
@@ -138,11 +140,11 @@ def yaw_along_route(route: tuple[Point, ...], travelled_m: NDArray[np.float64]) 
 def _slips(n: int, rng: np.random.Generator) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return whether the wheels slip at each stamp, and the error of the yaw rate, rad/s."""
     slips, turn = np.zeros(n, bool), np.zeros(n)
-    at = rng.exponential(SLIP_EVERY_S)
-    while (first := round(at * RATE_HZ)) < n:
-        own = slice(first, first + round(SLIP_S * RATE_HZ))
-        slips[own], turn[own] = True, rng.normal(0.0, SLIP_TURN_SD)
-        at += SLIP_S + rng.exponential(SLIP_EVERY_S)
+    time_s = rng.exponential(SLIP_EVERY_S)
+    while (first := round(time_s * RATE_HZ)) < n:
+        slipping = slice(first, first + round(SLIP_S * RATE_HZ))
+        slips[slipping], turn[slipping] = True, rng.normal(0.0, SLIP_TURN_SD)
+        time_s += SLIP_S + rng.exponential(SLIP_EVERY_S)
     return slips, turn
 
 

@@ -355,8 +355,8 @@ def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) ->
     shape = _PULSE_TABLE[phase[row, path]]
     value = gain[row, path]
     result = np.empty((n, TAPS), np.complex64)
-    for part, weight in ((result.real, value.real), (result.imag, value.imag)):
-        part[:] = np.bincount(where, (shape * weight[:, None]).ravel(), n * TAPS).reshape(n, TAPS)
+    for component, weight in ((result.real, value.real), (result.imag, value.imag)):
+        component[:] = np.bincount(where, (shape * weight[:, None]).ravel(), n * TAPS).reshape(n, TAPS)
     return result
 
 

@@ -93,14 +93,14 @@ def _furnished(name: str, size: Point) -> Room:
     An obstacle attenuates only the direct path: the reflections keep their power, and the first of them is
     delayed.
     """
-    share = mean_free_path_m(size) / mean_free_path_m(FLAT.size)
+    size_ratio = mean_free_path_m(size) / mean_free_path_m(FLAT.size)
     los = replace(
         RESIDENTIAL_LOS,
         name=f"{name}, LOS",
-        cluster_decay_ns=share * RESIDENTIAL_LOS.cluster_decay_ns,
-        ray_decay_ns=share * RESIDENTIAL_LOS.ray_decay_ns,
+        cluster_decay_ns=size_ratio * RESIDENTIAL_LOS.cluster_decay_ns,
+        ray_decay_ns=size_ratio * RESIDENTIAL_LOS.ray_decay_ns,
     )
-    delay_ns = share * RESIDENTIAL_NLOS.first_cluster_delay_ns
+    delay_ns = size_ratio * RESIDENTIAL_NLOS.first_cluster_delay_ns
     nlos = replace(los, name=f"{name}, NLOS", first_cluster_delay_ns=delay_ns)
     return Room(name, size, los, nlos)
 

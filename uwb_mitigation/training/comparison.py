@@ -20,7 +20,7 @@ from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, cover
 from uwb_mitigation.training.fit import candidates
 from uwb_mitigation.training.fit.candidates import Recipe, linear_bias_m, network_m
 from uwb_mitigation.training.fit.fitting import fit
-from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize_network
+from uwb_mitigation.training.fit.quantisation import calibration_inputs, quantise_network
 
 INNER_FOLDS = 4
 """Folds of the training part, by configuration, for calibrating the intervals."""
@@ -94,7 +94,7 @@ class Comparison:
             "coverage68": coverage68,
             "coverage95": coverage95,
             "coverage_by_label": {label: row for label, row in table(self.coverage).items() if label},
-            "rejection": [{"rejected": share, "mae": mae} for share, mae in self.rejection],
+            "rejection": [{"rejected": fraction, "mae": mae} for fraction, mae in self.rejection],
             "passed_through": self.passed_through,
             "without_levels": self.without_levels,
             "universal_coverage": None
@@ -155,7 +155,8 @@ def compare_models(
         rows=tuple(rows),
         coverage=_coverage(dataset.labels, final, variance, wide_variance),
         rejection=tuple(
-            (share, mae_after_rejection(final.ravel(), variance.ravel(), share)) for share in REJECTED
+            (fraction, mae_after_rejection(final.ravel(), variance.ravel(), fraction))
+            for fraction in REJECTED
         ),
         passed_through=float(np.mean([seed_result.passed_through for seed_result in held_out_by_seed])),
         without_levels=without_levels,
@@ -208,7 +209,7 @@ def _hold_out(
         linear_bias = linear_bias_m(card.linear_bias, test)
         outputs = [("shipped_float", network_m(network, test.inputs).astype(np.float32))]
         if dataset.has_cirs:
-            integers = quantize_network(network, calibration_inputs(train_data, seed), exact=False)
+            integers = quantise_network(network, calibration_inputs(train_data, seed), exact=False)
             outputs.append(("shipped_int8", IntegerNetwork(integers).predict_m(test.inputs)))
         for name, output in outputs:
             corrections = zero_shot.correct_with_card(test, card, (linear_bias + output).astype(np.float32))
@@ -237,5 +238,5 @@ def _baselines(
     yield "mlp", network_m(fit(Mlp(samples=samples), subset.inputs, subset.error_m, options), test.inputs)
     network_only = fit(Remnet(samples=samples), subset.inputs, subset.error_m, options)
     yield "remnet_float", network_m(network_only, test.inputs)
-    integers = quantize_network(network_only, calibration_inputs(train_data, seed), exact=False)
+    integers = quantise_network(network_only, calibration_inputs(train_data, seed), exact=False)
     yield "remnet_int8", IntegerNetwork(integers).predict_m(test.inputs)

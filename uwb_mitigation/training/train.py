@@ -26,7 +26,7 @@ from uwb_mitigation.training.fit import selection as selections
 from uwb_mitigation.training.fit.candidates import Candidate, Recipe, fit_new_model, linear_bias_m
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.fit.quantization import calibration_inputs, quantize_network
+from uwb_mitigation.training.fit.quantisation import calibration_inputs, quantise_network
 from uwb_mitigation.training.fit.selection import NESTED, Selection
 
 AUTO = "auto"
@@ -115,7 +115,7 @@ class TrainingJob:
     name: str
     output: Path
     folds: int
-    on_progress: Progress = lambda what, share: None
+    on_progress: Progress = lambda what, fraction: None
 
 
 def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -> TrainedBundle:
@@ -145,7 +145,7 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
             return _write_selected(job, selection, universal, recipe.fit, ("raw", models.CONSTANT))
     recipe = recipe.for_candidate(recipe_name)
     total = recipe.fit.epochs * (folds + 1)
-    on_epoch = selections.step_counter(total, lambda share: job.on_progress("training", share))
+    on_epoch = selections.step_counter(total, lambda fraction: job.on_progress("training", fraction))
     validation = cross_validate(dataset, recipe, folds, seed, on_epoch, quantised=dataset.has_cirs)
     fitted = fit_new_model(dataset, recipe, seed, on_epoch)
     card = site_card(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
@@ -191,7 +191,7 @@ def _select(job: TrainingJob, candidates: Sequence[Candidate], seed: int) -> Sel
         candidates,
         min(job.folds, len(job.dataset.names)),
         seed,
-        lambda share: job.on_progress("choosing", share),
+        lambda fraction: job.on_progress("choosing", fraction),
         min_gain=selections.COLD_START_MIN_GAIN if has_cold_start else selections.MIN_GAIN,
     )
 
@@ -260,7 +260,7 @@ def cross_validate(
             errors["l1_line"][fold.test] = residual
         errors["float"][fold.test] = residual - is_finite * floating.predict_m(fitted.network, test.inputs)
         if quantised:
-            integers = quantize_network(fitted.network, calibration_inputs(train, seed), exact=False)
+            integers = quantise_network(fitted.network, calibration_inputs(train, seed), exact=False)
             errors["int8"][fold.test] = residual - is_finite * IntegerNetwork(integers).predict_m(test.inputs)
     return CrossValidation(dataset, errors, folds, seed)
 

@@ -38,7 +38,7 @@ from uwb_mitigation.training.fit.fitting import fit
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias_to_rows
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.fit.quantization import quantize_network
+from uwb_mitigation.training.fit.quantisation import quantise_network
 from uwb_mitigation.training.fit.selection import step_counter
 
 CALIBRATION_INPUTS = 512
@@ -92,12 +92,12 @@ def train_universal_model(
     plan: TrainingPlan,
     name: str,
     workers: int,
-    on_share: Callable[[float, str], None] = lambda share, what: None,
+    on_share: Callable[[float, str], None] = lambda fraction, what: None,
 ) -> UniversalModel:
     """Train the model of `plan`. The result does not depend on `workers`; `on_share` gets the step and its progress."""
     preprocessing = Preprocessing(plan.samples, plan.scaling)
     total_blocks = plan.blocks + plan.held_out_blocks
-    count_block = step_counter(total_blocks, lambda share: on_share(0.2 * share, "simulating"))
+    count_block = step_counter(total_blocks, lambda fraction: on_share(0.2 * fraction, "simulating"))
     # With levels, other boards and sites are detected as out of distribution. Without, train on them.
     wide_share = 0.0 if plan.scaling is Scaling.PREAMBLE else WIDE_SHARE
     # Augmentation needs the levels, even if the scaling removes them.
@@ -120,7 +120,7 @@ def train_universal_model(
         radio=plan.radio,
         wide_share=wide_share,
     )
-    count_epoch = step_counter(plan.fit.epochs, lambda share: on_share(0.2 + 0.75 * share, "training"))
+    count_epoch = step_counter(plan.fit.epochs, lambda fraction: on_share(0.2 + 0.75 * fraction, "training"))
     options = replace(plan.fit, seed=plan.seed)
     # The network does not correct missed direct paths: nothing in its window shows them.
     early_m = train_data.early_path_m
@@ -134,7 +134,7 @@ def train_universal_model(
         vary=_vary_levels if plan.scaling is Scaling.PREAMBLE else _vary_amplitudes,
     )
     subset = network_data.inputs[:: max(1, len(network_data) // CALIBRATION_INPUTS)]
-    integers = quantize_network(network, scaled_calibration_inputs(subset, plan.scaling))
+    integers = quantise_network(network, scaled_calibration_inputs(subset, plan.scaling))
     on_share(1.0, "evaluating")
     return _evaluate(plan, name, network, integers, train_data, held_out)
 
@@ -222,4 +222,4 @@ def _description(
 def _balanced_rows(labels: NDArray[np.str_]) -> NDArray[np.intp]:
     """Return rows with each condition equally often: its frequency at a site is unknown, and the intervals must be valid in all of them."""
     conditions = [np.flatnonzero(labels == label) for label in np.unique(labels)]
-    return np.concatenate([part[: min(map(len, conditions))] for part in conditions])
+    return np.concatenate([batch[: min(map(len, conditions))] for batch in conditions])

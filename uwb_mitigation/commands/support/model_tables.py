@@ -100,10 +100,10 @@ def show_comparison(result: Comparison) -> None:
         ],
         optional=("95 % interval, m", "std, m"),
     )
-    kept = ", ".join(f"{share:.0%}: {mae:.3f}" for share, mae in result.rejection)
+    after_rejection = ", ".join(f"{fraction:.0%}: {mae:.3f}" for fraction, mae in result.rejection)
     print_line(
         f"{'shipped_int8' if 'shipped_int8' in names else 'shipped_float'}: coverage of the 68 % and 95 % intervals: {covered(result.coverage)}\n"
-        f"MAE after rejecting the share of ranges with the largest variances: {kept}\n"
+        f"MAE after rejecting the share of ranges with the largest variances: {after_rejection}\n"
         f"not corrected, because out of distribution: {result.passed_through:.1%}"
     )
     if result.without_levels:

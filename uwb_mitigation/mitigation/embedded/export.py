@@ -87,8 +87,8 @@ def compare_with_reference(bundle: Bundle) -> int:
     """Return the number of golden vectors for which ONNX Runtime and the integer reference are not bit-identical."""
     weights = graph.int8_weights(bundle.model, bundle.architecture)
     windows = golden_windows(pack(weights))
-    given, expected = Session(bundle).predict_m(windows), IntegerNetwork(weights).predict_m(windows)
-    return int(np.sum(given.view(np.uint32) != expected.view(np.uint32)))
+    host_m, expected = Session(bundle).predict_m(windows), IntegerNetwork(weights).predict_m(windows)
+    return int(np.sum(host_m.view(np.uint32) != expected.view(np.uint32)))
 
 
 def render(network: PackedNetwork, card: ModelCard, model_id: int, golden: Golden) -> str:
@@ -96,19 +96,19 @@ def render(network: PackedNetwork, card: ModelCard, model_id: int, golden: Golde
 
     Floats have nine significant digits, so that they are read back with the same bits.
     """
-    parts = [
+    sections = [
         f"/* {_comment(card.name)}, model {model_id:08x}, written by `uwb-mitigation board export-c`. */",
         "#ifndef UWB_MODEL_H\n#define UWB_MODEL_H\n",
         '#include "uwb_mitigation.h"\n',
     ]
-    parts += _remnet(network) if network.modules else _mlp(network)
-    parts.append(_array("int8_t", "uwb_head_weights", network.head_weights))
+    sections += _remnet(network) if network.modules else _mlp(network)
+    sections.append(_array("int8_t", "uwb_head_weights", network.head_weights))
     if card.ood_bands is not None:
-        parts.append(_ood_bands(card.ood_bands))
-    parts.append(_model(network, card, model_id))
-    parts.append(_golden(golden))
-    parts.append("#endif")
-    return "\n".join(parts) + "\n"
+        sections.append(_ood_bands(card.ood_bands))
+    sections.append(_model(network, card, model_id))
+    sections.append(_golden(golden))
+    sections.append("#endif")
+    return "\n".join(sections) + "\n"
 
 
 def _remnet(network: PackedNetwork) -> Iterable[str]:

@@ -205,15 +205,15 @@ def _channels(
     low, high = accumulator_range(weight, bias)
     constants = np.empty((2, len(bias)), np.int32)
     for channel, scale in enumerate(scales):
-        found = solve_requantisation(scale, int(low[channel]), int(high[channel]))
-        if found is None:
+        requantisation = solve_requantisation(scale, int(low[channel]), int(high[channel]))
+        if requantisation is None:
             raise ModelError(
                 f"channel {channel} has no exact integer requantisation (scale {scale!r}, "
                 f"accumulators {low[channel]} to {high[channel]})",
                 where=name,
                 valid=_REMEDY,
             )
-        constants[:, channel] = _UNIT * int(bias[channel]) + found.offset, found.multiplier
+        constants[:, channel] = _UNIT * int(bias[channel]) + requantisation.offset, requantisation.multiplier
     return Channels(*constants)
 
 

@@ -107,7 +107,7 @@ def int8_model(weights: Int8Weights) -> bytes:
         written = _as_written(layer, weights.weight[layer])
         dense = layer != HEAD and written.ndim == 2
         names = []
-        for part, integers, unit, along in (
+        for parameter, integers, unit, along in (
             ("weight", written, scale, int(dense)),
             ("bias", weights.bias[layer], accumulator, 0),
         ):
@@ -116,11 +116,11 @@ def int8_model(weights: Int8Weights) -> bytes:
                 graph.node(
                     "DequantizeLinear",
                     [
-                        graph.constant(f"{layer}.{part}", integers),
-                        graph.constant(f"{layer}.{part}.scale", unit),
-                        graph.constant(f"{layer}.{part}.zero", np.zeros(np.shape(unit), integers.dtype)),
+                        graph.constant(f"{layer}.{parameter}", integers),
+                        graph.constant(f"{layer}.{parameter}.scale", unit),
+                        graph.constant(f"{layer}.{parameter}.zero", np.zeros(np.shape(unit), integers.dtype)),
                     ],
-                    f"{layer}.{part}.dequantised",
+                    f"{layer}.{parameter}.dequantised",
                     **axis,
                 )
             )

@@ -220,9 +220,9 @@ def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
         ceiling = np.where(k < _LEVELS, unit - 1 - scaled, 2**40).min(axis=1, initial=2**40)
         for index in np.flatnonzero(floor <= ceiling).tolist():
             offset = min(max(int(unit) // 2, int(floor[index])), int(ceiling[index]))
-            found = Sum(alpha + shift, beta + int(steps_around[index]), offset)
-            if np.array_equal(found.table(), table):
-                return found
+            best = Sum(alpha + shift, beta + int(steps_around[index]), offset)
+            if np.array_equal(best.table(), table):
+                return best
     return None
 
 

@@ -71,7 +71,7 @@ def activation_tensors(architecture: Architecture) -> tuple[str, ...]:
     names = ["input", "first"]
     for module in range(1, architecture.modules + 1):
         prefix = f"module{module}"
-        names += [f"{prefix}.{part}" for part in ("residual", "sum", "reduce", "skip")]
+        names += [f"{prefix}.{parameter}" for parameter in ("residual", "sum", "reduce", "skip")]
         names.append(prefix)
     return tuple(names)
 
@@ -94,8 +94,8 @@ def layer_inputs(architecture: Architecture) -> dict[str, str]:
 
 def sum_operands(tensor: str) -> tuple[str, str]:
     """Return the two operands of `moduleN.sum` or `moduleN`."""
-    module, _, part = tensor.partition(".")
-    if not part:
+    module, _, parameter = tensor.partition(".")
+    if not parameter:
         return f"{module}.reduce", f"{module}.skip"
     number = int(module.removeprefix("module"))
     return f"{module}.residual", "first" if number == 1 else f"module{number - 1}"
@@ -121,8 +121,10 @@ def _check_shapes(
 ) -> None:
     for name, weight_shape in weight_shapes(architecture).items():
         bias_shape = (1,) if name == HEAD else weight_shape[:1]
-        for part, arrays, shape in (("weight", weight, weight_shape), ("bias", bias, bias_shape)):
+        for parameter, arrays, shape in (("weight", weight, weight_shape), ("bias", bias, bias_shape)):
             if name not in arrays:
-                raise ModelError(f"no {part} of layer {name}")
+                raise ModelError(f"no {parameter} of layer {name}")
             if arrays[name].shape != shape:
-                raise ModelError(f"{part} of layer {name} has shape {arrays[name].shape}", valid=f"{shape}")
+                raise ModelError(
+                    f"{parameter} of layer {name} has shape {arrays[name].shape}", valid=f"{shape}"
+                )

@@ -80,9 +80,9 @@ def vary_receiver(inputs: Tensor, generator: torch.Generator) -> Tensor:
     taps = [(lower.long() + step).clamp(0, samples - 1) for step in (0, 1)]
     amplitude = inputs * inputs
     shifted = (1 - fraction) * amplitude.gather(1, taps[0]) + fraction * amplitude.gather(1, taps[1])
-    share = uniform(*NEIGHBOUR_SHARES)
+    neighbour_share = uniform(*NEIGHBOUR_SHARES)
     padded = torch.nn.functional.pad(shifted, (1, 1), mode="replicate")
-    filtered = (1 - 2 * share) * shifted + share * (padded[:, :-2] + padded[:, 2:])
+    filtered = (1 - 2 * neighbour_share) * shifted + neighbour_share * (padded[:, :-2] + padded[:, 2:])
     limit = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.4, 1.0), torch.ones(n, 1))
     clipped = torch.minimum(filtered.clamp(min=0), limit * filtered.amax(1, keepdim=True))
     end = torch.where(uniform(0, 1) < DAMAGED_SHARE, uniform(0.2, 1.0) * samples, torch.full((n, 1), samples))

@@ -91,15 +91,15 @@ class Dataset:
         return replace(self, range_m=self.range_m + by_m, error_m=self.error_m + by_m)
 
     @classmethod
-    def joined(cls, parts: Sequence[Dataset]) -> Dataset:
+    def joined(cls, datasets: Sequence[Dataset]) -> Dataset:
         """Concatenate parts with the same preprocessing; columns that a part does not have are left out."""
-        values = {name: [getattr(part, name) for part in parts] for name in _COLUMNS}
+        values = {name: [getattr(dataset, name) for dataset in datasets] for name in _COLUMNS}
         columns: dict[str, Any] = {
             name: np.concatenate(arrays)
             for name, arrays in values.items()
             if all(array is not None for array in arrays)
         }
-        return cls(parts[0].preprocessing, **columns)
+        return cls(datasets[0].preprocessing, **columns)
 
     def with_early_paths(self, predicted_m: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the output of a network, (n,), m, with missed direct paths in place of it."""

@@ -57,10 +57,10 @@ def load_inputs(
         RecordingError, DatasetError: it cannot be read, or no CIR is usable.
     """
     with formats.open_recording(path) as source:
-        found = datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
-    if not found.has_cirs:
+        dataset = datasets.build_dataset(map(_with_configuration, source), preprocessing, on_record)
+    if not dataset.has_cirs:
         raise DatasetError("the recording has no CIRs", where=str(path))
-    return found
+    return dataset
 
 
 def _with_configuration(record: Record) -> Record:

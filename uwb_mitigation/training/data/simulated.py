@@ -35,13 +35,13 @@ def building_dataset(
     of `workers` (processes); `on_block` is called after each block. `radio`, `wide_share`: see `block_of`.
     """
     simulate = partial(_block, seed, preprocessing, radio, wide_share)
-    parts = []
+    blocks_of_ranges = []
     # Do not fork: the caller may run threads (torch, a progress bar).
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        for part in pool.imap(simulate, range(blocks)):
-            parts.append(part)
+        for block in pool.imap(simulate, range(blocks)):
+            blocks_of_ranges.append(block)
             on_block()
-    return replace(Dataset.joined(parts), radios=(radio.kind,), segments=(radio.segment,))
+    return replace(Dataset.joined(blocks_of_ranges), radios=(radio.kind,), segments=(radio.segment,))
 
 
 def _block(

@@ -77,8 +77,8 @@ def bootstrap_interval(
 
     Percentile bootstrap (Efron and Tibshirani, "An Introduction to the Bootstrap", chapter 13) over clusters.
     """
-    _, of, count = np.unique(configurations, return_inverse=True, return_counts=True)
-    total = np.bincount(of, np.abs(error_m))
+    _, configuration_index, count = np.unique(configurations, return_inverse=True, return_counts=True)
+    total = np.bincount(configuration_index, np.abs(error_m))
     drawn = np.random.default_rng(0).integers(0, len(count), (2000, len(count)))
     low, high = np.percentile(total[drawn].sum(axis=1) / count[drawn].sum(axis=1), (2.5, 97.5))
     return float(low), float(high)

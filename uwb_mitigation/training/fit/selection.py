@@ -101,7 +101,7 @@ def select_nested(
     candidates: Sequence[Candidate],
     folds: int,
     seed: int,
-    on_share: Callable[[float], None] = lambda share: None,
+    on_share: Callable[[float], None] = lambda fraction: None,
     *,
     min_gain: float = MIN_GAIN,
 ) -> Selection:

@@ -137,14 +137,14 @@ def _numbers(cells: pd.Series, column: str, where: str) -> NDArray[np.float64]:
 
 def _amplitudes(cells: pd.Series, where: str) -> NDArray[np.float64]:
     """CIRs as float64 (n, 157)."""
-    found, valid = np.zeros((len(cells), CIR_SAMPLES)), np.zeros(len(cells), np.bool_)
+    samples, valid = np.zeros((len(cells), CIR_SAMPLES)), np.zeros(len(cells), np.bool_)
     for row, cell in enumerate(cells):
         values = np.asarray(cell, object if isinstance(cell, (list, tuple)) else None)
         is_numeric = values.dtype.kind in "biuf" or all(
             isinstance(v, (int, float, np.number)) for v in values.flat
         )
         if values.shape == (CIR_SAMPLES,) and is_numeric:
-            found[row] = values
-            valid[row] = np.isfinite(found[row]).all() and np.abs(found[row]).max() < 1e20
+            samples[row] = values
+            valid[row] = np.isfinite(samples[row]).all() and np.abs(samples[row]).max() < 1e20
     _check(valid, "CIR", where, f"{CIR_SAMPLES} finite amplitudes")
-    return found
+    return samples

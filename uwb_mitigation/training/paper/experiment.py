@@ -28,7 +28,7 @@ from uwb_mitigation.training.fit import fitting
 from uwb_mitigation.training.fit.candidates import fit_line, linear_bias_m
 from uwb_mitigation.training.fit.model_card import card_of
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.fit.quantization import MSE, quantize_network
+from uwb_mitigation.training.fit.quantisation import MSE, quantise_network
 from uwb_mitigation.training.paper import published
 from uwb_mitigation.training.paper.data import Parts, fingerprint
 from uwb_mitigation.training.paper.jobs import run_jobs
@@ -53,7 +53,7 @@ VARIANCE_FOLDS = 5
 CALIBRATIONS: Mapping[str, float | None] = dict(
     zip(("max", "p99.99", "p99.9", "p99", "mse"), (100.0, 99.99, 99.9, 99.0, MSE), strict=True)
 )
-"""{name: percentile of `quantize_network`} to choose activation scales by."""
+"""{name: percentile of `quantise_network`} to choose activation scales by."""
 
 CALIBRATION_INPUTS, CHECK_INPUTS = 512, 1024
 _BATCH = 1024
@@ -100,12 +100,12 @@ def list_tasks(networks: Sequence[str], windows: Sequence[int], seeds: int) -> l
 
 
 def run_experiment(
-    parts: Parts,
+    data_split: Parts,
     folder: Path,
     tasks: Sequence[Task],
     options: FitOptions = PAPER,
     workers: int = 1,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
     command: str = "",
 ) -> ExperimentResults:
     """Train, optimise, quantise and test every task, and write `protocol.json`.
@@ -122,9 +122,11 @@ def run_experiment(
     except OSError as error:
         raise UwbMitigationError(f"cannot be created: {error.strerror}", where=str(folder)) from error
     settings = replace(options, seed=0)
-    run_fingerprint = fingerprint(json.dumps(asdict(settings), sort_keys=True), parts.train, parts.test)
+    run_fingerprint = fingerprint(
+        json.dumps(asdict(settings), sort_keys=True), data_split.train, data_split.test
+    )
     trained = run_jobs(
-        _Worker(parts, folder, options),
+        _Worker(data_split, folder, options),
         {task.name: task for task in tasks},
         folder / JOURNAL,
         run_fingerprint,
@@ -133,14 +135,14 @@ def run_experiment(
         on_progress=on_progress,
     )
     result = ExperimentResults(
-        data=parts.data,
-        split=parts.split,
+        data=data_split.data,
+        split=data_split.split,
         command=command,
-        train=len(parts.train),
-        test=len(parts.test),
+        train=len(data_split.train),
+        test=len(data_split.test),
         options=settings,
         models=tuple(TrainedModel.model_validate(model) for model in trained.values()),
-        baselines=baselines_of(parts.train, parts.test),
+        baselines=baselines_of(data_split.train, data_split.test),
     )
     write_atomically(folder / RESULTS, result.model_dump_json(indent=1) + "\n")
     return result
@@ -148,27 +150,27 @@ def run_experiment(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Worker:
-    parts: Parts
+    data_split: Parts
     folder: Path
     options: FitOptions
 
     def __call__(self, task: Task) -> dict[str, Any]:
         options = replace(self.options, seed=task.seed)
-        return train_task(task, self.parts.shorten_windows(task.samples), self.folder, options).model_dump(
-            mode="json"
-        )
+        return train_task(
+            task, self.data_split.shorten_windows(task.samples), self.folder, options
+        ).model_dump(mode="json")
 
 
-def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> TrainedModel:
-    """Train one network from random weights to int8, on parts with the task's windows; raises as `fit` and `quantize_network`."""
-    train, test, architecture = parts.train, parts.test, task.architecture
+def train_task(task: Task, data_split: Parts, folder: Path, options: FitOptions) -> TrainedModel:
+    """Train one network from random weights to int8, on data with the task's windows; raises as `fit` and `quantise_network`."""
+    train, test, architecture = data_split.train, data_split.test, task.architecture
     start = time.perf_counter()
     fields: dict[str, Any] = {}
     weights = fitting.fit(architecture, train.inputs, train.error_m, options)
     training_s = time.perf_counter() - start
     files = {form: folder / f"{task.name}_{form}.onnx" for form in FORMS}
-    card = paper_card(task.name, architecture, parts, options)
-    maes, best, integers = calibrate_quantization(weights, train.inputs, train.error_m, options.seed)
+    card = paper_card(task.name, architecture, data_split, options)
+    maes, best, integers = calibrate_quantisation(weights, train.inputs, train.error_m, options.seed)
     save_bundle(files["float"], graph.float_model(weights), card)
     # Use only optimisations that do not depend on the processor, so that the file runs on other ones.
     settings = session_options()
@@ -199,7 +201,7 @@ def train_task(task: Task, parts: Parts, folder: Path, options: FitOptions) -> T
     )
 
 
-def calibrate_quantization(
+def calibrate_quantisation(
     weights: FloatWeights, inputs: NDArray[np.float32], targets: NDArray[np.floating], seed: int
 ) -> tuple[dict[str, float], str, Int8Weights]:
     """Quantise with every one of `CALIBRATIONS` on inputs (n, K) of the training part, and keep the best.
@@ -208,7 +210,7 @@ def calibrate_quantization(
         MAE of each on training inputs that it was not calibrated on, m; the best; its network.
 
     Raises:
-        DatasetError: fewer than two inputs. ModelError: see `quantize_network`.
+        DatasetError: fewer than two inputs. ModelError: see `quantise_network`.
     """
     if len(inputs) < 2:
         raise DatasetError(f"{len(inputs)} inputs for calibration and check", valid="at least 2")
@@ -217,10 +219,10 @@ def calibrate_quantization(
     calibration, check_rows = inputs[order[:count]], order[count : count + CHECK_INPUTS]
     maes = {}
     for name, percentile in CALIBRATIONS.items():
-        network = IntegerNetwork(quantize_network(weights, calibration, percentile, exact=False))
+        network = IntegerNetwork(quantise_network(weights, calibration, percentile, exact=False))
         maes[name] = float(np.abs(targets[check_rows] - network.predict_m(inputs[check_rows])).mean())
     best = min(maes, key=lambda name: maes[name])
-    return maes, best, quantize_network(weights, calibration, CALIBRATIONS[best])
+    return maes, best, quantise_network(weights, calibration, CALIBRATIONS[best])
 
 
 def _session(path: Path, settings: onnxruntime.SessionOptions) -> onnxruntime.InferenceSession:
@@ -237,11 +239,11 @@ def _predict_m(path: Path, inputs: NDArray[np.float32], *, fuse: bool) -> NDArra
         settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     session = _session(path, settings)
     name = session.get_inputs()[0].name
-    parts = [
+    batches_m = [
         session.run(None, {name: inputs[start : start + _BATCH, None, :]})[0][:, 0]
         for start in range(0, len(inputs), _BATCH)
     ]
-    return np.concatenate([np.zeros(0, np.float32), *parts])
+    return np.concatenate([np.zeros(0, np.float32), *batches_m])
 
 
 def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
@@ -268,7 +270,7 @@ def baselines_of(train: Dataset, test: Dataset) -> tuple[Baseline, ...]:
     return (*rows, row("line", np.nan_to_num(linear_bias_m(line, test))))
 
 
-def paper_card(name: str, architecture: Architecture, parts: Parts, options: FitOptions) -> ModelCard:
+def paper_card(name: str, architecture: Architecture, data_split: Parts, options: FitOptions) -> ModelCard:
     """Return the card of a float network without a linear bias model that was fitted to the whole training part.
 
     Its variance comes from a second network, fitted to a fifth of the training configurations and tested on the others.
@@ -277,19 +279,19 @@ def paper_card(name: str, architecture: Architecture, parts: Parts, options: Fit
     Raises:
         DatasetError: the training part has only one configuration; see also `fit`.
     """
-    train = parts.train
+    train = data_split.train
     folds = min(VARIANCE_FOLDS, len(train.names))
     fold = splits.by_configuration(train.configurations, folds, options.seed)[0]
     small_part, other_part = train.rows(fold.test), train.rows(fold.train)
     network = fitting.fit(architecture, small_part.inputs, small_part.error_m, options)
     residual_m = other_part.error_m - floating.predict_m(network, other_part.inputs)
     training = {
-        "data": parts.data,
-        "split": parts.split,
+        "data": data_split.data,
+        "split": data_split.split,
         "seed": options.seed,
         "recipe": asdict(options),
         "measurements": len(train),
-        "tested_on": len(parts.test),
+        "tested_on": len(data_split.test),
         "variance": f"of a network fitted to 1 of {folds} parts of the training configurations, on the others",
     }
     return card_of(name, architecture, train, LinearBiasModel(0.0), other_part, residual_m, training)

@@ -24,7 +24,7 @@ def run_jobs(
     *,
     cost: Callable[[Job], float],
     workers: int = 1,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> dict[str, dict[str, Any]]:
     """Return {name: result} of all jobs, in the order of `jobs`.
 

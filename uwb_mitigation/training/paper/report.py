@@ -193,7 +193,7 @@ def _data_table(study: Study) -> ReportTable:
     labels = study.labels
 
     def row(name: str, selected: NDArray[np.bool_], published_rows: int | None = None) -> tuple[Cell, ...]:
-        part = PartErrors.of(study.dataset.error_m[selected], study.dataset.error_m[selected])
+        raw_errors = PartErrors.of(study.dataset.error_m[selected], study.dataset.error_m[selected])
         is_test_room = name == ROOMS[TEST_ROOM]
         return (
             Cell(name, "head"),
@@ -203,8 +203,8 @@ def _data_table(study: Study) -> ReportTable:
                 "{:.4f}",
                 "paper",
             ),
-            tables.number_cell(part.n, "{:,}", "measured"),
-            *tables.number_cells((part.mae_raw, part.sigma_raw), "{:.4f}", "measured"),
+            tables.number_cell(raw_errors.n, "{:,}", "measured"),
+            *tables.number_cells((raw_errors.mae_raw, raw_errors.sigma_raw), "{:.4f}", "measured"),
         )
 
     rows = []
@@ -270,7 +270,7 @@ def principal_components(inputs: NDArray[np.floating]) -> tuple[NDArray[np.float
 
 def _components(study: Study, letter: str) -> Picture:
     points, explained = principal_components(study.dataset.inputs)
-    share = " + ".join(f"{100 * part:.0f}" for part in explained)
+    percentages = " + ".join(f"{100 * fraction:.0f}" for fraction in explained)
     selected = np.arange(len(points))
     if len(selected) > figures.MAX_POINTS:
         selected = np.sort(np.random.default_rng(0).choice(len(selected), figures.MAX_POINTS, replace=False))
@@ -284,7 +284,7 @@ def _components(study: Study, letter: str) -> Picture:
         f"Three-dimensional scatter plot of {len(selected)} channel impulse responses along their first three principal "
         f"components, from two sides, coloured by {kind} ({len(names)} groups).",
         f"{len(selected):,} of {len(points):,} windows of {study.dataset.inputs.shape[1]} amplitudes. "
-        f"The components contain {share} % of the variance.",
+        f"The components contain {percentages} % of the variance.",
         "the three indoor rooms lie close together, apart from outdoor and through-the-wall measurements."
         if letter == "a"
         else "materials lie in different regions; heavier ones, such as metal, are concentrated and distant "
@@ -331,7 +331,10 @@ def _over_k(trainings: ExperimentResults, provenance: Provenance) -> Picture:
         figures.over_k(boxes, spreads, paper_mae, published.WINDOWS),
         {
             "boxes": {name.replace("\n", " "): box for name, box in boxes.items()},
-            "left": {str(k): {name: asdict(one) for name, one in of.items()} for k, of in spreads.items()},
+            "left": {
+                str(k): {name: asdict(spread) for name, spread in by_network.items()}
+                for k, by_network in spreads.items()
+            },
             "paper_mae": {str(k): mae for k, mae in paper_mae.items()},
         },
         provenance,

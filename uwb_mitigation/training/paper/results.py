@@ -73,8 +73,8 @@ class ErrorsByCondition(_Entry):
     ) -> ErrorsByCondition:
         """Return the statistics of errors, shape (n,), before and after correction."""
         los = labels == "LOS"
-        parts = {"all": np.ones(len(labels), np.bool_), "los": los, "nlos": ~los & (labels != "")}
-        return cls(**{name: PartErrors.of(error_m[rows], residual_m[rows]) for name, rows in parts.items()})
+        subsets = {"all": np.ones(len(labels), np.bool_), "los": los, "nlos": ~los & (labels != "")}
+        return cls(**{name: PartErrors.of(error_m[rows], residual_m[rows]) for name, rows in subsets.items()})
 
 
 class TrainedModel(_Entry):

@@ -207,7 +207,7 @@ def _networks(trainings: ExperimentResults) -> list[_Row]:
     """Return heads, parameters, models and published values of the paper's networks and of all other trained ones."""
     rows = []
     for network, samples in dict.fromkeys(
-        [*_ROWS, *((one.network, one.samples) for one in trainings.models)]
+        [*_ROWS, *((model.network, model.samples) for model in trainings.models)]
     ):
         models = trainings.of(network, samples)
         heads = [Cell(NAMES.get(network, network), "head"), Cell(str(samples), "head")]

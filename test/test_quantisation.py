@@ -13,7 +13,7 @@ from uwb_mitigation.mitigation.model.bundle import load_bundle, save_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.requantisation import nudge
 from uwb_mitigation.mitigation.model.shipped import SHIPPED, shipped_model_path
-from uwb_mitigation.training.fit.quantization import quantize_network
+from uwb_mitigation.training.fit.quantisation import quantise_network
 
 SHAPE = Remnet(samples=32)
 
@@ -22,7 +22,7 @@ SHAPE = Remnet(samples=32)
 def test_int8_is_close_to_float(samples):
     shape = Remnet(samples=samples)
     weights = random_weights(shape)
-    integers = quantize_network(weights, windows(200, samples, seed=1), exact=False)
+    integers = quantise_network(weights, windows(200, samples, seed=1), exact=False)
     unseen = windows(200, samples, seed=2)
     expected = floating.predict_m(weights, unseen)
     difference = np.abs(IntegerNetwork(integers).predict_m(unseen) - expected)
@@ -30,12 +30,12 @@ def test_int8_is_close_to_float(samples):
 
 
 def test_weights_have_seven_bits():
-    integers = quantize_network(random_weights(SHAPE), windows(10, 32), exact=False)
+    integers = quantise_network(random_weights(SHAPE), windows(10, 32), exact=False)
     assert all(np.abs(weight).max() == 63 for weight in integers.weight.values())
 
 
 def test_quantised_integers_are_exact_for_the_firmware():
-    integers = quantize_network(random_weights(Remnet(samples=8)), windows(50, 8))
+    integers = quantise_network(random_weights(Remnet(samples=8)), windows(50, 8))
     again = nudge(integers)
     assert dict(again.activation_scale) == dict(integers.activation_scale)
     for name in integers.weight:
@@ -56,7 +56,7 @@ def test_network_with_dead_filters_can_be_quantised():
     weights.weight["module2.skip"][5] = 0
     weights.weight[HEAD][:] = 0
     inputs = windows(30, 32)
-    integers = quantize_network(weights, inputs, exact=False)
+    integers = quantise_network(weights, inputs, exact=False)
     expected = np.full(30, weights.bias[HEAD][0])
     assert np.allclose(IntegerNetwork(integers).predict_m(inputs), expected, atol=1e-3)
 
@@ -67,7 +67,7 @@ def test_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
     weights.weight[layer][:] *= np.float32(1e-7)
     weights.bias[layer][:] *= np.float32(1e-7)
     inputs = windows(50, 8)
-    computed = IntegerNetwork(quantize_network(weights, inputs)).predict_m(inputs)
+    computed = IntegerNetwork(quantise_network(weights, inputs)).predict_m(inputs)
     expected = floating.predict_m(weights, inputs)
     assert np.abs(computed - expected).mean() < 0.25 * expected.std()
 
@@ -77,4 +77,4 @@ def test_layer_with_tiny_weights_can_be_quantised_for_all_processors(layer):
 )
 def test_invalid_calibration_inputs_are_refused(inputs):
     with pytest.raises(DatasetError, match="calibration inputs"):
-        quantize_network(random_weights(SHAPE), inputs.astype(np.float32))
+        quantise_network(random_weights(SHAPE), inputs.astype(np.float32))

@@ -37,12 +37,12 @@ CALIBRATION_PER_CONFIGURATION = 40
 
 
 def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
-    """Return inputs of every configuration for `quantize_network`."""
+    """Return inputs of every configuration for `quantise_network`."""
     rows = splits.subsample(dataset.configurations, CALIBRATION_PER_CONFIGURATION, seed)
     return dataset.inputs[rows]
 
 
-def quantize_network(
+def quantise_network(
     weights: FloatWeights,
     calibration: NDArray[np.float32],
     percentile: float | None = 100.0,
@@ -82,8 +82,8 @@ def quantize_network(
         integers[name] = rounded.astype(np.int8)
         bias = np.rint(weights.bias[name].astype(float) / (scale[reads[name]] * weight_scale[name]))
         biases[name] = np.clip(bias, limits.min, limits.max).astype(np.int32)
-    quantized = Int8Weights(architecture, integers, weight_scale, biases, scale)
-    return nudge(quantized) if exact else quantized
+    quantised = Int8Weights(architecture, integers, weight_scale, biases, scale)
+    return nudge(quantised) if exact else quantised
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +95,7 @@ class Quantised:
 
 
 def check(source: Bundle, percentile: float) -> None:
-    """Check the arguments of `quantize_bundle` before data is read; raises the same errors."""
+    """Check the arguments of `quantise_bundle` before data is read; raises the same errors."""
     if source.quantised:
         raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
     if not source.card.needs_cir:
@@ -106,16 +106,16 @@ def check(source: Bundle, percentile: float) -> None:
         raise ParameterError(f"percentile = {percentile}", valid="90 to 100")
 
 
-def quantize_bundle(source: Bundle, dataset: Dataset, percentile: float, output: Path) -> Quantised:
+def quantise_bundle(source: Bundle, dataset: Dataset, percentile: float, output: Path) -> Quantised:
     """Quantise a float bundle with the data that it was trained on, and write it.
 
     Raises:
-        ModelError: it is quantised already; see also `quantize_network`. ParameterError: `percentile` is below 90.
+        ModelError: it is quantised already; see also `quantise_network`. ParameterError: `percentile` is below 90.
     """
     check(source, percentile)
     inputs = calibration_inputs(dataset, seed=0)
     network = graph.float_weights(source.model, source.architecture)
-    integers = quantize_network(network, inputs, percentile)
+    integers = quantise_network(network, inputs, percentile)
     difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
     card = replace(source.card, name=output.stem, quantised=True)
     return Quantised(save_bundle(output, graph.int8_model(integers), card), difference)
