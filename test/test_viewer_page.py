@@ -24,6 +24,9 @@ from PIL import Image
 from benchmarks.equipment.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.geometry import dop
+from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.types.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
@@ -593,16 +596,26 @@ def test_dark_page_and_labels_are_readable(browser: Browser, view: View, server:
         browser.wait("a hint", lambda: "scroll the table sideways" in browser.text())
 
 
-def test_raw_fix_and_innovation_follow_from_raw_ranges() -> None:
+def test_raw_positions_are_those_of_the_locator_on_raw_ranges() -> None:
     scene = Scene()
     anchors = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}
     scene.set_anchors({key: AnchorPosition(*place, 0.0) for key, place in anchors.items()})
-    scene.add_pose("tag", Pose(4.0, 3.0, 0.0))
-    for anchor, (x, y) in anchors.items():
-        raw_m = math.hypot(5.0 - x, 2.0 - y)
-        scene.add_sample((anchor, 7), Sample(1000.0, raw_m, 5.5, 0.1, Status.OK))
-    scene.add_sample((1, 7), Sample(1000.3, math.hypot(5.0, 2.0), 5.5, 0.1, Status.OK))
-    assert scene.tracks["tag", TrackKind.RAW].points[-1][1:3] == pytest.approx((5.0, 2.0), abs=1e-3)
+    estimator = TagEstimator(
+        EstimatorConfig(AnchorMap([Anchor(key, (*place, 0.0)) for key, place in anchors.items()]))
+    )
+    expected = {}
+    for step in range(120):
+        row, time_s = step % 4, 1000.0 + step / 40.0
+        scene.add_pose("tag", Pose(4.0, 3.0, 0.0, stamp_s=time_s))
+        estimator.add(TagHeight(0.0, 0.01))
+        x, y = anchors[row + 1]
+        raw_m = math.hypot(5.0 - x, 2.0 - y) + (0.5 if row == 2 else 0.0)
+        scene.add_sample((row + 1, 7), Sample(time_s, raw_m, 5.5, 0.1, Status.OK))
+        if (estimate := estimator.add(TagRange(round(time_s * 1e9), row, raw_m))) is not None:
+            expected[time_s] = estimate.position
+    for stamp_s, *position, _ in scene.tracks["tag", TrackKind.RAW].points:
+        assert position == pytest.approx(expected[stamp_s], abs=1e-6)
+    assert position[:2] == pytest.approx((5.0, 2.0), abs=0.3)
     assert scene.pairs[2, 7].samples[-1].innovation_m == pytest.approx(0.5)
 
 

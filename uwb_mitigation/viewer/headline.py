@@ -97,7 +97,7 @@ def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
     if (view := scene.tracks.get((name, TrackKind.CORRECTED))) and len(view.points):
         now_s = float(view.points[-1][0]) + scene.age_s(view)
         interval = now_s - HISTORY_S, now_s
-        cards = _position_cards(partial(_track, tracks, name), interval, now_s, RECENT, "raw, least squares")
+        cards = _position_cards(partial(_track, tracks, name), interval, now_s, RECENT, "raw + locator")
     raw_m, corrected_m = (scene.error_sums_m / max(scene.errors, 1)).tolist()
     return cards + _range_cards(
         {"raw": raw_m, "": corrected_m} if scene.errors else {}, scene.not_ok, scene.ranges, LIVE

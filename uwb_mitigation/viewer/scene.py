@@ -18,9 +18,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, CorrectedRange, Encoding, Status, Truth
 from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.poses import tag_frame
+from uwb_mitigation.types.stamps import NS_PER_S
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_ANCHORS = 256, 64, 64, 256
@@ -52,8 +56,8 @@ SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 50.0)
 """Speeds of a player, recorded seconds per second."""
 STEP_M, STEP_S, CELL_M = 0.02, 0.09, 0.5
 """Distance and time between points of a live track: closer points are skipped, unless a point is 0.5 s old; cell of the heat map."""
-RAW_FIX_S, RAW_AGE_S = 0.2, 0.5
-"""Interval of the positions from raw ranges, and maximum age of their ranges."""
+HEIGHT_VARIANCE_M2 = 0.01
+"""Of the published height, for the positions from raw ranges."""
 STATISTICS = 100
 """Number of latest ranges in the statistics of a pair."""
 
@@ -247,11 +251,10 @@ class Pose:
 
 @dataclass(slots=True)
 class TagView:
-    """A tag's latest pose, its time of reception on the scene's clock, and the stamp of its last raw fix."""
+    """A tag's latest pose and its time of reception on the scene's clock."""
 
     pose: Pose | None = None
     received_s: float = math.nan
-    raw_fix_s: float = -math.inf
 
 
 TrackPoint = tuple[float, float, float, float, float]
@@ -332,6 +335,8 @@ class Scene:
         self.ranges = self.not_ok = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
         self.tags: BoundedDict[str, TagView] = BoundedDict(MAX_TAGS)
+        # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
+        self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
         self.tracks: BoundedDict[tuple[str, TrackKind], TrackView] = BoundedDict(4 * MAX_TAGS)
         self.is_indexed = False
         self.heat: BoundedDict[tuple[int, int], list[float]] = BoundedDict(MAX_CELLS)
@@ -426,7 +431,7 @@ class Scene:
         self.revision += 1
 
     def _compare_with_position(self, pair: Pair, sample: Sample) -> None:
-        """Compute what a range and the position of its tag yield together: innovation, heat map, raw fix."""
+        """Compute what a range and the position of its tag yield together: innovation, heat map, raw position."""
         anchor, tag = self.anchors.get(pair[0]), self.tag_of(pair[1])
         pose = None if tag is None else tag.pose
         if tag is None or pose is None or self.age_s(tag) > NO_DATA_S:
@@ -437,34 +442,34 @@ class Scene:
             return
         height_m = finite_or_zero(pose.z - anchor.z)
         sample.innovation_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
-        if sample.time_s >= tag.raw_fix_s + RAW_FIX_S or sample.time_s < tag.raw_fix_s:
-            tag.raw_fix_s = sample.time_s
-            self._add_raw_fix(pair[1], pose, sample.time_s)
+        if not self.is_indexed:
+            self._locate_raw(pair, pose, sample)
 
-    def _add_raw_fix(self, tag_id: int, pose: Pose, time_s: float) -> None:
-        rows = []
-        for (anchor_id, pair_tag), history in self.pairs.items():
-            anchor, latest = self.anchors.get(anchor_id), history.latest
-            if pair_tag == tag_id and anchor and latest and abs(time_s - latest.time_s) <= RAW_AGE_S:
-                height_m = finite_or_zero(pose.z - anchor.z)
-                rows.append((anchor.x, anchor.y, height_m, latest.raw_m))
-        fixes = np.array([row for row in rows if 0.0 <= row[3] < MAX_RANGE_M])
-        if len(fixes) < 3:
+    def _locate_raw(self, pair: Pair, pose: Pose, sample: Sample) -> None:
+        """Filter the raw ranges of a tag as the locator filters the corrected ones, at the height of the locator."""
+        if not (0.0 <= sample.raw_m < MAX_RANGE_M and math.isfinite(sample.time_s)):
             return
-        x = np.array([pose.x, pose.y])
-        for _ in range(5):
-            offset = x - fixes[:, :2]
-            distance = np.maximum(np.hypot(np.hypot(*offset.T), fixes[:, 2]), 1e-6)
-            step = np.linalg.lstsq(offset / distance[:, None], fixes[:, 3] - distance, rcond=0.05)[0]
-            x = x + step
-        name = tag_frame(tag_id)
-        point = (time_s, float(x[0]), float(x[1]), math.nan, math.nan)
-        self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
+        if pair[1] not in self._raw_locators:
+            self._raw_locators.add(pair[1], (TagEstimator(EstimatorConfig(self._anchor_map)), math.nan))
+        estimator, height_s = self._raw_locators[pair[1]]
+        if pose.stamp_s != height_s and math.isfinite(pose.z):
+            self._raw_locators[pair[1]] = estimator, pose.stamp_s
+            estimator.add(TagHeight(pose.z, HEIGHT_VARIANCE_M2))
+        row = self._anchor_map.index[pair[0]]
+        estimate = estimator.add(TagRange(round(sample.time_s * NS_PER_S), row, sample.raw_m))
+        if estimate is not None:
+            name = tag_frame(pair[1])
+            point = (sample.time_s, *estimate.position.tolist(), math.nan)
+            self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
 
     def set_anchors(self, anchors: dict[int, AnchorPosition]) -> None:
         plausible = ((id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y))
-        self.anchors = dict(islice(plausible, MAX_ANCHORS))
+        anchors_before, self.anchors = self.anchors, dict(islice(plausible, MAX_ANCHORS))
         self.revision += 1
+        if self.anchors and self.anchors != anchors_before:
+            places = [Anchor(id_, (p.x, p.y, finite_or_zero(p.z))) for id_, p in self.anchors.items()]
+            self._anchor_map = AnchorMap(places)
+            self._raw_locators.clear()
 
     def set_node_status(self, name: str, report: NodeStatus) -> None:
         self.node_statuses.add(name[:MAX_TEXT], replace(report, message=report.message[:MAX_TEXT]))
@@ -487,6 +492,7 @@ class Scene:
     def clear(self) -> None:
         """Remove everything except the anchors."""
         self._latest.clear()
+        self._raw_locators.clear()
         self.tags.clear()
         self.tracks.clear()
         if not self.is_indexed:
