@@ -423,9 +423,10 @@ class Page:
         for track in tracks:
             places += np.percentile(track[:, 1:3], (2, 98), axis=0).tolist() if len(track) else []
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
-        # Without anchors, leave a margin in which the tag can move.
-        margin = 0.0 if scene.anchors or not places else MARGIN_M
-        low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        # A margin for ellipses and labels; without anchors, one in which the tag can move.
+        margin = 0.05 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
+        low, high = low - margin, high + margin
         self._models.extent.data = {name: [float(low[i]), float(high[i])] for i, name in enumerate("xy")}
 
     def _draw_rays(self, scene: Scene) -> None:
