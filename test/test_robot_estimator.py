@@ -419,20 +419,26 @@ def _twisted(robot: Robot, change) -> RobotData:
     )
 
 
-@pytest.mark.parametrize("change", [(1.0, 1.0, -1.0), (0.5, 0.5, 1.0), (-1.0, 1.0, 1.0)])
+@pytest.mark.parametrize("change", [(1.0, 1.0, -1.0), (0.5, 0.5, 1.0)])
 def test_wrong_odometry_is_not_worse_than_ranges_only(change):
     robot = Robot(seconds=90.0)
     ranges = robot.ranges(seconds=90.0)
     alone = robot.errors(TagEstimator(replace(robot.config, robot=None)).run(ranges), 5.0)[0]
     wrong = replace(robot.config, robot=_twisted(robot, lambda twist: twist * change))
     mixed = robot.errors(RobotEstimator(wrong).run(ranges), 5.0)[0]
-    assert rms(mixed) <= 1.05 * rms(alone)
+    assert rms(mixed) <= 1.02 * rms(alone)
 
 
-def test_heading_survives_two_minutes_at_rest():
+@pytest.mark.parametrize("is_white", [False, True])
+def test_heading_survives_two_minutes_at_rest(is_white: bool):
     robot = Robot(stand=(20.0, 140.0), seconds=160.0)
+    ranges = robot.ranges(seconds=160.0)
+    if is_white:
+        antenna = robot.antenna(ranges.stamp_ns / NANOSECONDS)
+        error = np.random.default_rng(1).normal(0.1, 0.1, len(ranges))
+        ranges.range_m[:] = np.linalg.norm(antenna - HALL.position[ranges.anchor], axis=1) + error
     estimator = RobotEstimator(robot.config)
-    track = estimator.run(robot.ranges(seconds=160.0))
+    track = estimator.run(ranges)
     assert estimator.tag.counts["odometry wrong"] == 0
     _, of_yaw, sd = robot.errors(track, 15.0)
     assert len(of_yaw) == (track.stamp_ns >= 15 * NANOSECONDS).sum()
