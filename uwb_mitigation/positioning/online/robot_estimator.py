@@ -171,7 +171,8 @@ class RobotEstimator:
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         delta = ranges_only.position - estimate.position
-        covariance = estimate.covariance.copy()
+        # The state of this method is new: it can be changed in place.
+        covariance = estimate.covariance
         covariance[:3, :3] *= weight
         covariance[:3, :3] += (1.0 - weight) * ranges_only.covariance[:3, :3]
         covariance[:3, :3] += weight * (1.0 - weight) * np.multiply.outer(delta, delta)
@@ -179,8 +180,10 @@ class RobotEstimator:
         if self._area is not None:
             position = self._area.clip(position)
         assert estimate.heading is not None
-        heading = Heading(estimate.heading.yaw, estimate.heading.covariance * (weight, weight, weight, 1.0))
-        return replace(estimate, position=position, covariance=covariance, heading=heading)
+        yaw_covariance = estimate.heading.covariance
+        yaw_covariance[:3] *= weight
+        heading = Heading(estimate.heading.yaw, yaw_covariance)
+        return Estimate(estimate.stamp_ns, position, estimate.velocity, covariance, heading)
 
     def _update_headings(self, measurement: TagRange) -> None:
         tag = self.tag
@@ -212,9 +215,11 @@ class RobotEstimator:
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
         self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
         self._rejections *= math.exp(-max(dt, 0.0) / FORGIVEN_S)
-        if self._separation < VERIFIED_SEPARATION:
+        # Large range errors move the ranges-only solution away from correct odometry, too.
+        scale = max(filter_.state.covariance_scale(), 1.0)
+        if self._separation < VERIFIED_SEPARATION * scale:
             self.rejects_odometry = False
-        if self._separation > REJECTED_SEPARATION:
+        if self._separation > REJECTED_SEPARATION * scale:
             self._reset_heading("odometry wrong")
             self._rejections += 1.0
             self.rejects_odometry = True
