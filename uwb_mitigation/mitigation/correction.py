@@ -156,7 +156,16 @@ class Corrector(ABC):
     def correct_arrays(
         self, range_m: Any, cir: Any, first_path_index: Any, **fields: Any
     ) -> CorrectedColumns:
-        """Return n corrected ranges as arrays; the arguments are those of `RangeColumns.from_arrays`.
+        """Return n corrected ranges as arrays: `range_m` and `variance_m2` in metres and m^2, `status` as numbers.
+
+        Args:
+            range_m: float (n,), measured ranges.
+            cir: complex (n, m), accumulator samples; or real (n, m), their magnitudes. Integers of 16 bits remain unchanged;
+                other values are rounded to 1/30,000 of the largest sample of the range.
+            first_path_index: float (n,), index in `cir` of the first path, sub-sample; NaN = unknown.
+            **fields: numbers, or arrays (n,): `preamble_count`, accumulated symbols (0 = unknown); `rx_power_dbm` and
+                `first_path_power_dbm`, levels (NaN = unknown); `tag_id` and `anchor_id`, integers that select offsets.
+                For all CIRs: `radio` and `segment`.
 
         Raises:
             ParameterError: the shapes are inconsistent.

@@ -250,15 +250,7 @@ class RangeColumns:
     ) -> RangeColumns:
         """Return the columns of n ranges from arrays; numbers are valid for all ranges.
 
-        Args:
-            range_m: float (n,), measured ranges.
-            cir: complex (n, m), accumulator samples; or real (n, m), their magnitudes. Integers of 16 bits remain unchanged;
-                other values are rounded to 1/30,000 of the largest sample of the range.
-            first_path_index: float (n,), index in `cir` of the first path, sub-sample; NaN = unknown.
-            preamble_count: (n,), accumulated preamble symbols; 0 = unknown.
-            rx_power_dbm: float (n,), receive levels; NaN = unknown.
-            first_path_power_dbm: float (n,), first-path levels; NaN = unknown.
-            **constants: `radio` and `segment` of all CIRs; `tag_id` and `anchor_id`, integers (n,), which select offsets.
+        The arguments are those of `Mitigation.correct_arrays`.
 
         Raises:
             ParameterError: the arrays have other shapes.
