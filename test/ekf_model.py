@@ -58,13 +58,13 @@ class Ekf:
         assert len(config) == 15
         rows = [row for row, selected in zip(range(8), np.take(config, PLANAR), strict=True) if selected]
         assert sum(config) == len(rows), "values that are not in the plane"
-        kept = [at for at, row in enumerate(values) if row in rows]
-        assert len(kept) == len(rows), f"{sensor} does not measure all selected values"
+        columns = [column for column, row in enumerate(values) if row in rows]
+        assert len(columns) == len(rows), f"{sensor} does not measure all selected values"
         if self.time_s is not None and time_s > self.time_s:
             self._predict(time_s - self.time_s)
         self.time_s = time_s if self.time_s is None else max(time_s, self.time_s)
-        z, R = np.array(list(values.values()))[kept], R[np.ix_(kept, kept)]
-        H = np.eye(8)[list(np.array(list(values))[kept])]
+        z, R = np.array(list(values.values()))[columns], R[np.ix_(columns, columns)]
+        H = np.eye(8)[list(np.array(list(values))[columns])]
         K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
         self.x = self.x + K @ (z - H @ self.x)
         residual = np.eye(8) - K @ H

@@ -97,8 +97,8 @@ def typed(page: Path) -> list[list[str]]:
     """Return the command lines in the code blocks of a page as words, without comments and line continuations."""
     blocks = BLOCK.findall(page.read_text(encoding="utf-8"))
     lines = "\n".join(fenced or indented for fenced, indented in blocks).replace("\\\n", " ").splitlines()
-    found = [shlex.split(line, comments=True) for line in lines if COMMAND.match(line)]
-    return [[*ALIKE.get(words[0], [words[0].removeprefix(".venv/bin/")]), *words[1:]] for words in found]
+    commands = [shlex.split(line, comments=True) for line in lines if COMMAND.match(line)]
+    return [[*ALIKE.get(words[0], [words[0].removeprefix(".venv/bin/")]), *words[1:]] for words in commands]
 
 
 def lines_of(*start: str) -> list:
@@ -124,8 +124,8 @@ def check_options(command: Any, words: list[str]) -> None:
     while hasattr(command, "commands"):
         assert words[0] in command.commands
         command, words = command.commands[words[0]], words[1:]
-    known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
-    assert {word.partition("=")[0] for word in words if word.startswith("-")} <= known | {"--help"}
+    names = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
+    assert {word.partition("=")[0] for word in words if word.startswith("-")} <= names | {"--help"}
 
 
 @pytest.mark.parametrize("words", lines_of("make"))
@@ -154,11 +154,13 @@ def check_node(words: list[str]) -> None:
     """Check the words after `ros2 run uwb_mitigation`."""
     node, *options = words
     assert node in NODES
-    given = [option for flag, option in pairwise(options) if flag == "-p"]
-    check_parameters(node, {name: yaml.safe_load(value) for name, value in (g.split(":=") for g in given)})
+    pairs = [option for flag, option in pairwise(options) if flag == "-p"]
+    check_parameters(
+        node, {name: yaml.safe_load(value) for name, value in (pair.split(":=") for pair in pairs)}
+    )
     remapped = [option.split(":=")[0] for flag, option in pairwise(options) if flag == "-r"]
     assert set(remapped) <= {"__node", "uwb/range_raw", "uwb/range_corrected", "uwb/pose"}
-    values = [*given, *(option for flag, option in pairwise(options) if flag in ("-r", "--params-file"))]
+    values = [*pairs, *(option for flag, option in pairwise(options) if flag in ("-r", "--params-file"))]
     assert set(options) <= {"--ros-args", "-p", "-r", "--params-file", *values}
 
 
@@ -183,23 +185,26 @@ def test_launch_commands_start_nodes(
     for name in ("robot.yaml", "left.yaml", "right.yaml"):
         Path(name).write_text("/**: {ros__parameters: {source: serial, port: /dev/ttyACM0}}")
     Path("drive.mcap").touch()
-    file, given = words[0], dict(word.split(":=", 1) for word in words[1:])
+    file, values = words[0], dict(word.split(":=", 1) for word in words[1:])
     if file == "nav2.launch.py":
         # It hands the arguments that are not for Nav2 on.
-        own = {entity.values[0] for entity in generate(file) if entity.kind == "argument"}
-        assert {"map", "params_file"} <= own & set(given)
-        file, given = "uwb.launch.py", {"locate": "true"} | {n: v for n, v in given.items() if n not in own}
-    assert launch(generate, file, **given)
+        nav2 = {entity.values[0] for entity in generate(file) if entity.kind == "argument"}
+        assert {"map", "params_file"} <= nav2 & set(values)
+        file, values = (
+            "uwb.launch.py",
+            {"locate": "true"} | {n: v for n, v in values.items() if n not in nav2},
+        )
+    assert launch(generate, file, **values)
 
 
 def test_parameter_files_on_pages_contain_known_parameters():
-    found = [
+    files = [
         yaml.safe_load(block)
         for page in PAGES
         for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(), re.M | re.S)
     ]
-    assert any("/**" in file for file in found)
-    for file in found:
+    assert any("/**" in file for file in files)
+    for file in files:
         if "/**" in file:  # otherwise another file, such as anchors
             check_parameters("pipeline", file["/**"]["ros__parameters"])
 
@@ -261,10 +266,10 @@ def test_templates_use_everything_that_can_be_generated():
 def test_language_check_finds_expressions_in_text(tmp_path: Path, name: str, text: str, lines: list[int]):
     (tmp_path / name).write_text(text, encoding="utf-8")
     command = [sys.executable, generated.DOCS / "style" / "check_words.py", tmp_path / name]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    found = re.findall(rf"{re.escape(name)}:(\d+): ", done.stdout)
-    assert sorted(map(int, found)) == lines
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert checked.returncode == 1
+    numbers = re.findall(rf"{re.escape(name)}:(\d+): ", checked.stdout)
+    assert sorted(map(int, numbers)) == lines
 
 
 # The built site.
@@ -280,10 +285,10 @@ def site() -> Path:
 
 def test_code_blocks_fit_on_a_screen_of_1280_pixels(browser: Browser, site: Path):
     wide = "return [...document.querySelectorAll('pre')].filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.textContent)"
-    found = {}
+    wide_blocks = {}
     for folder in ("tutorials", "guides", "background"):
         for page in sorted((site / folder).glob("*.html")):
             browser.open(page.as_uri(), 1280)
             if blocks := browser.run(wide):
-                found[page.name] = blocks
-    assert found == {}
+                wide_blocks[page.name] = blocks
+    assert wide_blocks == {}

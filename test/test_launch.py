@@ -43,7 +43,7 @@ def generate(monkeypatch: pytest.MonkeyPatch):
         },
         "launch.substitutions": {
             "LaunchConfiguration": Configuration,
-            "PathJoinSubstitution": lambda parts: parts,
+            "PathJoinSubstitution": lambda segments: segments,
         },
         "launch_ros": {},
         "launch_ros.actions": {"Node": record("node"), "PushRosNamespace": record("push")},
@@ -65,11 +65,11 @@ def described(generate, file: str) -> tuple[dict, object]:
     return arguments, function.function
 
 
-def launch(generate, file: str, **given: str) -> list:
+def launch(generate, file: str, **overrides: str) -> list:
     """Return the nodes that a launch file starts with the given arguments."""
     arguments, nodes_of = described(generate, file)
-    assert set(given) <= set(arguments)
-    return nodes_of(values_of(arguments) | given)
+    assert set(overrides) <= set(arguments)
+    return nodes_of(values_of(arguments) | overrides)
 
 
 def values_of(arguments: dict) -> dict[str, str]:
@@ -93,15 +93,15 @@ def settings(node) -> dict[str, object]:
 
 
 def test_both_nodes_start_with_their_arguments_and_are_respawned(generate):
-    given = {"source": "serial", "port": "/dev/ttyACM0", "model": "mine.onnx", "namespace": "left"}
-    driver, mitigator = launch(generate, "uwb.launch.py", **given, log_level="debug", use_sim_time="True")
+    overrides = {"source": "serial", "port": "/dev/ttyACM0", "model": "mine.onnx", "namespace": "left"}
+    driver, mitigator = launch(generate, "uwb.launch.py", **overrides, log_level="debug", use_sim_time="True")
     assert (driver.executable, mitigator.executable) == ("driver", "mitigator")
     assert settings(driver) == {"source": "serial", "port": "/dev/ttyACM0", "use_sim_time": True}
     assert settings(mitigator) == {"model": "mine.onnx", "use_sim_time": True}
     for node in (driver, mitigator):
         assert (node.namespace, node.respawn, node.ros_arguments) == ("left", True, ["--log-level", "debug"])
         assert node.parameters[0] == str(REPOSITORY / "params" / f"{node.executable}.yaml")
-    assert not any(node.respawn for node in launch(generate, "uwb.launch.py", **given, respawn="false"))
+    assert not any(node.respawn for node in launch(generate, "uwb.launch.py", **overrides, respawn="false"))
 
 
 def test_one_process_accepts_the_arguments_of_both_nodes(generate):
@@ -119,11 +119,11 @@ def test_one_process_accepts_the_arguments_of_both_nodes(generate):
 
 
 def test_viewer_starts_if_requested(generate):
-    given = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
-    *_, viewer = launch(generate, "uwb.launch.py", **given, one_process="true")
+    overrides = {"source": "simulated", "anchors": "a.yaml", "viewer": "true"}
+    *_, viewer = launch(generate, "uwb.launch.py", **overrides, one_process="true")
     assert (viewer.executable, viewer.name, viewer.respawn) == ("viewer", "viewer", True)
     assert settings(viewer) == {"anchors": "a.yaml", "use_sim_time": False}
-    *_, locator, viewer = launch(generate, "uwb.launch.py", **given, locate="true")
+    *_, locator, viewer = launch(generate, "uwb.launch.py", **overrides, locate="true")
     assert settings(locator)["anchors"] == "a.yaml"
     assert settings(viewer) == {"use_sim_time": False}, "the locator publishes them"
     nodes = launch(generate, "uwb.launch.py", source="simulated")
@@ -135,9 +135,9 @@ def test_displays_start_if_they_are_installed(generate, tmp_path: Path, monkeypa
     with pytest.raises(RuntimeError, match=r"rviz:=true needs rviz2.*ros-jazzy-rviz2"):
         launch(generate, "uwb.launch.py", rviz="true")
     for package in ("rviz2", "foxglove_bridge"):
-        share = tmp_path / "share" / package
-        share.mkdir(parents=True)
-        (share / "package.xml").touch()
+        package_share = tmp_path / "share" / package
+        package_share.mkdir(parents=True)
+        (package_share / "package.xml").touch()
     rviz, bridge = launch(generate, "uwb.launch.py", rviz="true", foxglove="true")
     assert (rviz.executable, bridge.executable) == ("rviz2", "foxglove_bridge")
     assert rviz.arguments == ["-d", ["share/uwb_mitigation", "rviz", "uwb.rviz"]]
@@ -145,8 +145,8 @@ def test_displays_start_if_they_are_installed(generate, tmp_path: Path, monkeypa
 
 @pytest.mark.parametrize("one_process", ["false", "true"])
 def test_finished_recording_is_not_replayed(generate, one_process: str, tmp_path: Path):
-    given = {"source": "mcap", "path": str(tmp_path), "one_process": one_process}
-    respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **given)}
+    overrides = {"source": "mcap", "path": str(tmp_path), "one_process": one_process}
+    respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **overrides)}
     assert respawning == (
         {"pipeline": False} if one_process == "true" else {"driver": False, "mitigator": True}
     )
@@ -154,14 +154,16 @@ def test_finished_recording_is_not_replayed(generate, one_process: str, tmp_path
 
 @pytest.mark.parametrize("text", ["0xdeca010203040506", "'0xdeca010203040506'"])
 def test_64_bit_address_reaches_the_driver_as_a_string(generate, text: str):
-    given = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
-    (driver,) = (node for node in launch(generate, "uwb.launch.py", **given) if node.executable == "driver")
+    overrides = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
+    (driver,) = (
+        node for node in launch(generate, "uwb.launch.py", **overrides) if node.executable == "driver"
+    )
     for name in ("radio.address", "radio.anchors"):
         assert settings(driver)[name] == "0xdeca010203040506"
 
 
 def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
-    given = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
+    overrides = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
     arguments, _ = described(generate, "uwb.launch.py")
     examples = {"frame_id": "1234", "radio.address": "34", "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True",
                 "viewer_port": "8080", "locator_rate": "20", "rate": "2", "radio.pan": "7", "area": "0,0,0,9,9,3"}  # fmt: skip
@@ -170,7 +172,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         for row in table:
             assert {row.name, f"{node}_{row.name}"} & set(arguments), row
     nodes = {
-        node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **given, **examples)
+        node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **overrides, **examples)
     }
     assert nodes["driver"]["frame_id"] == "1234", "a text stays a string"
     expected = {
@@ -192,7 +194,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
 
 
 @pytest.mark.parametrize(
-    ("given", "excerpt"),
+    ("overrides", "excerpt"),
     [
         ({"source": "mcpa", "path": "a.mcap"}, "source = 'mcpa'"),
         ({"source": "simulated", "locate": "yess"}, "locate:=yess"),
@@ -209,9 +211,9 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
         ({"source": "uci", "path": "absent.uci"}, "path = absent.uci: no such file"),
     ],
 )
-def test_invalid_argument_stops_the_launch(generate, given: dict[str, str], excerpt: str):
+def test_invalid_argument_stops_the_launch(generate, overrides: dict[str, str], excerpt: str):
     with pytest.raises(RuntimeError, match=excerpt):
-        launch(generate, "uwb.launch.py", **given)
+        launch(generate, "uwb.launch.py", **overrides)
 
 
 class Context(dict):
@@ -320,14 +322,14 @@ def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(gen
     groups = [entity.values[0] for entity in entities if entity.kind == "group"]
     context = {"odometry": "odom", "namespace": "robot1", "params_file": "nav2.yaml"}
     included = {group[-1].values[0][0]: group for group in groups}
-    assert {share: group[-1].values[0][1:] for share, group in included.items()} == {
+    assert {package_share: group[-1].values[0][1:] for package_share, group in included.items()} == {
         "share/uwb_mitigation": ["launch", "uwb.launch.py"],
         "share/nav2_bringup": ["launch", "navigation_launch.py"],
     }
     pushed, navigation = included["share/nav2_bringup"]
     assert (pushed.kind, pushed.values[0].perform(context)) == ("push", "robot1")
-    given = {name: value.perform(context) for name, value in navigation.launch_arguments}
-    assert given == {"namespace": "robot1", "params_file": "nav2.yaml"}
+    overrides = {name: value.perform(context) for name, value in navigation.launch_arguments}
+    assert overrides == {"namespace": "robot1", "params_file": "nav2.yaml"}
     nodes = [entity for entity in entities if entity.kind == "node"]
     assert [node.executable for node in nodes] == ["map_server", "lifecycle_manager"]
     assert {node.namespace.perform(context) for node in nodes} == {"robot1"}
@@ -335,11 +337,11 @@ def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(gen
     assert nodes[1].parameters[1]["node_names"] == [nodes[0].name]
     # The arguments for the locator, as uwb.launch.py understands them.
     (group,) = included["share/uwb_mitigation"]
-    given = {
+    overrides = {
         name: value if isinstance(value, str) else value.perform(context)
         for name, value in group.launch_arguments
     }
-    (locator,) = launch(generate, "uwb.launch.py", **given, anchors="a.yaml")
+    (locator,) = launch(generate, "uwb.launch.py", **overrides, anchors="a.yaml")
     assert locator.namespace == "robot1"
     assert settings(locator) == {
         "publish_tf": True,

@@ -169,14 +169,14 @@ def test_same_ticks_give_the_same_stamp_after_the_estimate_has_moved():
 def test_step_of_the_host_clock_is_followed(step_s):
     clock = DeviceClock()
     for step in range(50):
-        at = EPOCH + step * SECOND // 10
-        clock.exchange(at, step * 100_000 + 100, step * 100_000 + 100, at + 200_000)
-        clock.stamp(step * 100_000, at)
+        time_ns = EPOCH + step * SECOND // 10
+        clock.exchange(time_ns, step * 100_000 + 100, step * 100_000 + 100, time_ns + 200_000)
+        clock.stamp(step * 100_000, time_ns)
 
-    at = EPOCH + 5 * SECOND + step_s * SECOND
-    clock.exchange(at, 5_000_100, 5_000_100, at + 200_000)
+    time_ns = EPOCH + 5 * SECOND + step_s * SECOND
+    clock.exchange(time_ns, 5_000_100, 5_000_100, time_ns + 200_000)
 
-    assert clock.stamp(5_010_000, at + 20_000_000) == pytest.approx(at + 10_000_000, abs=1e6)
+    assert clock.stamp(5_010_000, time_ns + 20_000_000) == pytest.approx(time_ns + 10_000_000, abs=1e6)
 
 
 def test_jump_of_the_board_clock_yields_no_past_stamp():

@@ -54,22 +54,22 @@ def test_encoder_numbers_its_frames_and_wraps_at_32_bits():
 def test_splitting_of_the_stream_does_not_matter(sent, noise, sizes):
     stream = noise + b"".join(map(encode_frame, sent)) + noise + b"\0"
     uncut, cut = FrameDecoder(), FrameDecoder()
-    received, at, turn = [], 0, 0
-    while at < len(stream):
+    received, position, turn = [], 0, 0
+    while position < len(stream):
         size = sizes[turn % len(sizes)]
-        received += cut.feed(stream[at : at + size])
-        at += size
+        received += cut.feed(stream[position : position + size])
+        position += size
         turn += 1
 
     assert received == uncut.feed(stream)
     assert cut.counts == uncut.counts
 
 
-@pytest.mark.parametrize("at", range(1, len(encode_frame(A)) - 1))
-def test_flipped_bit_loses_only_its_frame(at):
+@pytest.mark.parametrize("position", range(1, len(encode_frame(A)) - 1))
+def test_flipped_bit_loses_only_its_frame(position):
     for bit in range(8):
         wire = bytearray(encode_frame(A))
-        wire[at] ^= 1 << bit
+        wire[position] ^= 1 << bit
         assert decode(bytes(wire) + encode_frame(B)) == [B]
 
 
@@ -78,8 +78,8 @@ def test_endless_frame_is_counted_once_and_decoding_resumes(chunk):
     stream = b"\1" * 20_000 + encode_frame(A)
     decoder = FrameDecoder()
     received = []
-    for at in range(0, len(stream), chunk):
-        received += decoder.feed(stream[at : at + chunk])
+    for position in range(0, len(stream), chunk):
+        received += decoder.feed(stream[position : position + chunk])
 
     assert received == [A]
     assert decoder.counts.oversize == 1

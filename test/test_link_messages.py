@@ -64,9 +64,9 @@ def test_payload_may_grow_at_its_end_unless_its_tail_runs_to_the_end(message):
 
 def test_samples_are_found_after_fields_of_a_later_revision():
     kind, payload = messages.encode(measurement([1, -2, 3, -4]))
-    at = layout.PAYLOADS[MessageType.RANGE_CIR].offsets()["samples_offset"]
+    offset_start = layout.PAYLOADS[MessageType.RANGE_CIR].offsets()["samples_offset"]
     grown = bytearray(payload[:72] + b"newfield" + payload[72:])
-    struct.pack_into("<H", grown, at, 80)
+    struct.pack_into("<H", grown, offset_start, 80)
 
     assert messages.decode(kind, bytes(grown)).cir.samples.tolist() == [1, -2, 3, -4]
 

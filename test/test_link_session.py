@@ -83,7 +83,7 @@ class Bench:
         self.booted = self.now
         self.board = Board(IDENTITY, HalfMetre(), boot_id=boot_id, **board)
 
-    def seen(self, kind: type) -> list[Event]:
+    def received(self, kind: type) -> list[Event]:
         return [event for event in self.events if isinstance(event, kind)]
 
 
@@ -132,14 +132,14 @@ def test_lost_request_for_a_mode_is_repeated():
     bench.run(800, deaf=True)
     bench.run(600)
 
-    assert bench.seen(ModeChanged) == [ModeChanged(Mode.DEVICE)]
+    assert bench.received(ModeChanged) == [ModeChanged(Mode.DEVICE)]
 
 
 def test_board_without_a_model_refuses_to_correct_and_is_asked_once():
     bench = Bench(BoardSession(mode=Mode.DEVICE))
     bench.run(3000)
 
-    assert bench.seen(ModeRefused) == [ModeRefused(Mode.DEVICE, Mode.HOST)]
+    assert bench.received(ModeRefused) == [ModeRefused(Mode.DEVICE, Mode.HOST)]
     assert [type(event) for event in bench.measure(1)] == [RangeMeasurement]
 
 
@@ -151,8 +151,8 @@ def test_board_that_keeps_its_mode_is_reported_as_refusing():
     bench.board = Correcting(IDENTITY, HalfMetre())
     bench.run(1000)
 
-    assert bench.seen(ModeRefused) == [ModeRefused(Mode.HOST, Mode.DEVICE)]
-    assert bench.seen(ModeChanged) == []
+    assert bench.received(ModeRefused) == [ModeRefused(Mode.HOST, Mode.DEVICE)]
+    assert bench.received(ModeChanged) == []
 
 
 def test_mode_is_requested_again_after_a_reset():
@@ -200,7 +200,7 @@ def test_board_times_out_after_3_s_and_reconnects():
         bench.now += 10 * MS
         bench.events += bench.session.tick(bench.now, EPOCH + bench.now)
         bench.session.outgoing()
-    assert bench.seen(Disconnected) == [Disconnected(Loss.TIMEOUT)]
+    assert bench.received(Disconnected) == [Disconnected(Loss.TIMEOUT)]
     assert bench.session.idle_ns(bench.now) > 3000 * MS
 
     bench.board = sleeping
@@ -213,8 +213,8 @@ def test_status_once_a_second_keeps_a_board_without_measurements_connected():
     bench = connected()
     bench.run(20_000)
 
-    assert bench.seen(Disconnected) == []
-    assert len(bench.seen(BoardStatus)) >= 19
+    assert bench.received(Disconnected) == []
+    assert len(bench.received(BoardStatus)) >= 19
 
 
 def test_boot_id_reveals_a_reset_and_restarts_the_clock():
@@ -223,7 +223,7 @@ def test_boot_id_reveals_a_reset_and_restarts_the_clock():
     bench.reboot()
     bench.host_hears(bench.board.hello(0))
 
-    assert bench.events[-2:] == [Disconnected(Loss.RESET), bench.seen(Connected)[-1]]
+    assert bench.events[-2:] == [Disconnected(Loss.RESET), bench.received(Connected)[-1]]
     bench.run(1000)
     took_place = EPOCH + bench.now
     (event,) = bench.measure(1, late_ns=20 * MS)
@@ -237,7 +237,7 @@ def test_frame_numbers_reveal_a_reset_whose_hello_is_lost():
     bench.board.hello(0)
     for sequence in range(3):
         bench.measure(sequence)
-    assert bench.seen(Disconnected) == [Disconnected(Loss.OUT_OF_SEQUENCE)]
+    assert bench.received(Disconnected) == [Disconnected(Loss.OUT_OF_SEQUENCE)]
 
     bench.run(100)
 

@@ -109,8 +109,8 @@ def test_modem_manager_ignores_the_boards():
     rules = (REPOSITORY / "udev" / "60-uwb-mitigation.rules").read_text(encoding="utf-8")
     ignored = [line for line in rules.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
     for vendor, product in (("0483", "5740"), ("2341", "805a")):
-        wanted = (f'ATTRS{{idVendor}}=="{vendor}"', f'ATTRS{{idProduct}}=="{product}"')
-        assert any(all(match in line for match in wanted) for line in ignored), vendor
+        matches = (f'ATTRS{{idVendor}}=="{vendor}"', f'ATTRS{{idProduct}}=="{product}"')
+        assert any(all(match in line for match in matches) for line in ignored), vendor
 
 
 @pytest.mark.parametrize("damage", [b"\x55", b"\x02", b"\x55" * 9])

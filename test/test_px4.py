@@ -65,10 +65,11 @@ def px4_msgs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def pose(seconds: float, x: float, variance: float = 0.04) -> PoseWithCovarianceStamped:
     covariance = [0.0] * 36
     covariance[0], covariance[7], covariance[14], covariance[35] = variance, 0.09, 0.25, 1e6
-    at = Pose(position=Point(x=x, y=2.0, z=0.5))
+    pose_enu = Pose(position=Point(x=x, y=2.0, z=0.5))
     stamp = Time(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
     return PoseWithCovarianceStamped(
-        header=Header(frame_id="map", stamp=stamp), pose=PoseWithCovariance(pose=at, covariance=covariance)
+        header=Header(frame_id="map", stamp=stamp),
+        pose=PoseWithCovariance(pose=pose_enu, covariance=covariance),
     )
 
 
@@ -120,7 +121,7 @@ def test_positions_are_sent_in_ned_without_orientation_and_velocity(
     assert third["position"] == [2.0, 5.0, -0.5]
     assert third["position_variance"] == pytest.approx([0.09, 0.04, 0.25])
     assert again["position"] == [2.0, 4.0, -0.5], "a replay starts again"
-    resets = [one["reset_counter"] - first["reset_counter"] for one in (second, third, again)]
+    resets = [message["reset_counter"] - first["reset_counter"] for message in (second, third, again)]
     assert resets == [0, 1, 2]
     assert node.signal(signal.SIGINT) == 0, node.output
 

@@ -34,7 +34,7 @@ class Host:
             self.events += self.session.receive(self.air.read(self.board), now_ns, now_ns)
             self.air.write(self.board, self.session.outgoing())
 
-    def seen(self, kind: type) -> list:
+    def received(self, kind: type) -> list:
         return [event for event in self.events if isinstance(event, kind)]
 
 
@@ -45,7 +45,7 @@ def test_ranges_reach_the_host_with_stamps_of_their_reception():
         air.set_pair(tag, anchor, Pair(6))
         host = Host(air, tag)
         host.run(2)
-        ranges = host.seen(RangeMeasurement)
+        ranges = host.received(RangeMeasurement)
         addresses = air.address(tag), air.address(anchor)
     assert len(ranges) > 100
     assert host.session.counts.lost == 0
@@ -70,7 +70,7 @@ def test_board_reports_settings_and_status_of_its_radio():
     settings = radio.settings
     assert (settings.address, settings.antenna_delay, settings.preamble_code) == (addresses[0], 2 * 16436, 9)
     assert settings.tx_power not in (0, 0xFFFFFFFF)
-    status = host.seen(RadioStatus)[-1]
+    status = host.received(RadioStatus)[-1]
     assert status.state is RadioState.RUNNING
     assert status.tried >= status.ranged > 50
     assert status.no_answer + status.timeout > 0
@@ -84,18 +84,18 @@ def test_board_reports_settings_and_status_of_its_radio():
 
 
 def test_host_configures_the_radio_while_it_ranges():
-    wanted = RadioSettings(channel=2, prf_mhz=16, window=40, pan=7)
+    requested = RadioSettings(channel=2, prf_mhz=16, window=40, pan=7)
     with ModelledAir() as air:
         tag = air.add(RadioSettings(), serial_link=SerialLink())
         anchor = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16, pan=7))
         air.set_pair(tag, anchor, Pair(6))
         host = Host(air, tag)
         host.run(0.5)
-        assert not host.seen(RangeMeasurement)
-        host.session.set_radio(wanted)
+        assert not host.received(RangeMeasurement)
+        host.session.set_radio(requested)
         host.run(1)
-        ranges = host.seen(RangeMeasurement)
-    assert not host.seen(RadioRefused)
+        ranges = host.received(RangeMeasurement)
+    assert not host.received(RadioRefused)
     assert host.session.radio is not None
     assert host.session.radio.settings.channel == 2
     assert len(ranges) > 50
@@ -111,7 +111,7 @@ def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
         assert messages.decode(messages.MessageType.SET_RADIO, payload) == SetRadio(RadioSettings(channel=6))
         host.session._radio_request.begin(SetRadio(RadioSettings(channel=6)))
         host.run(1)
-        (refusal,) = host.seen(RadioRefused)
+        (refusal,) = host.received(RadioRefused)
         assert "channel" in refusal.text
         assert host.session.radio is not None
         assert host.session.radio.settings.channel == 5

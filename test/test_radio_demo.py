@@ -21,10 +21,10 @@ COMMAND = [sys.executable, "-m", "benchmarks", "radio-demo", "--seconds"]
 
 
 def test_each_anchor_ranges_and_the_demo_succeeds():
-    done = subprocess.run([*COMMAND, "1"], capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.endswith("┘\n")
-    rows = [line.strip("│ ").split("│") for line in done.stdout.splitlines() if line.startswith("│")]
+    result = subprocess.run([*COMMAND, "1"], capture_output=True, text=True, timeout=240, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.stdout.endswith("┘\n")
+    rows = [line.strip("│ ").split("│") for line in result.stdout.splitlines() if line.startswith("│")]
     assert [int(row[0]) for row in rows] == [1, 2, 3, 4]
     for _, count, raw, corrected, true in rows:
         assert int(count) > 0

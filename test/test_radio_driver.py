@@ -136,9 +136,9 @@ class ModelledBoard:
     def _run(self) -> None:
         with ModelledAir() as air:
             tag = air.add(RadioSettings(), serial_link=SerialLink())
-            near = air.add(RadioSettings(role=Role.ANCHOR))
+            nearby = air.add(RadioSettings(role=Role.ANCHOR))
             far = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16))
-            air.set_pair(tag, near, Pair(5))
+            air.set_pair(tag, nearby, Pair(5))
             air.set_pair(tag, far, Pair(9))
             waiting = bytearray()
             while not self._stop.wait(self.STEP_S):
@@ -186,5 +186,5 @@ def test_board_without_radio_support_is_reported_and_keeps_running(ros: ros_harn
         status = ros.diagnosis("driver", lambda status: level_of(status) == 2 and "flash" in status.message)
         assert "the radio's settings are not used" in status.message
         driver.wait_for_output("the radio's settings are not used")
-        known = len(raw)
-        ros.spin_until(lambda: len(raw) > known)
+        count_before = len(raw)
+        ros.spin_until(lambda: len(raw) > count_before)

@@ -123,10 +123,10 @@ def test_every_channel_rate_and_preamble_ranges(radio: dict[str, object]):
 
 
 def test_radios_that_differ_in_the_channel_or_the_network_do_not_range():
-    for other in ({"channel": 2}, {"prf_mhz": 16}, {"pan": 1}, {"preamble_code": 10}):
+    for peer in ({"channel": 2}, {"prf_mhz": 16}, {"pan": 1}, {"preamble_code": 10}):
         with ModelledAir() as air:
             tag = air.add(RadioSettings())
-            anchor = air.add(RadioSettings(role=Role.ANCHOR, **other))
+            anchor = air.add(RadioSettings(role=Role.ANCHOR, **peer))
             air.set_pair(tag, anchor, Pair(3))
             air.run(0.3)
             assert air.counts(tag)["tried"] == 0
@@ -159,8 +159,8 @@ def test_tags_share_the_channel_without_mixing_ranges():
         for i, tag in enumerate(tags):
             for j, anchor in enumerate(anchors):
                 air.set_pair(tag, anchor, Pair(3.0 + 10 * i + 5 * j))
-            for other in tags[:i]:
-                air.set_pair(tag, other, Pair(2))
+            for peer in tags[:i]:
+                air.set_pair(tag, peer, Pair(2))
         air.set_pair(*anchors, Pair(4))
         air.run(10)
         rows, _ = air.ranges()

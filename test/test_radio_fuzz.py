@@ -43,8 +43,8 @@ def build(
 
 
 def test_arbitrary_frames_and_registers_yield_no_false_range(tmp_path: Path):
-    seen = run_tool([str(build(tmp_path, c_compiler(), "-fsanitize=address,undefined")), "300", "1"])
-    ranged, refused = (int(seen.split()[i]) for i in (0, 2))
+    output = run_tool([str(build(tmp_path, c_compiler(), "-fsanitize=address,undefined")), "300", "1"])
+    ranged, refused = (int(output.split()[i]) for i in (0, 2))
     assert ranged > 1000
     assert refused > 5000
 
@@ -69,5 +69,5 @@ def test_fuzzer_detects_an_exchange_without_one_of_its_checks(tmp_path: Path, ch
 def test_brief_fuzzing_finds_no_failure(tmp_path: Path):
     program = build(tmp_path, ("clang",), "-fsanitize=fuzzer,address,undefined", "-DUWB_LIBFUZZER")
     options = ("-runs=1000", "-seed=1", "-max_len=8000", "-len_control=0")
-    done = subprocess.run([program, *options], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    result = subprocess.run([program, *options], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-2000:]

@@ -56,10 +56,12 @@ class Run:
         self.chips = [air.chip(ppm=4.0 * number) for number in range(1 + tags)]
         for number, chip in enumerate(self.chips):
             prepare(chip)
-            for other in self.chips[:number]:
-                air.set_pair(chip, other, Pair(6.0))
-            wanted = tag if number else anchor
-            air.program(chip, ranging(wanted, self.ranges, seconds, bus=self._bus(bus), at_end=self._at_end))
+            for neighbour in self.chips[:number]:
+                air.set_pair(chip, neighbour, Pair(6.0))
+            radio_settings = tag if number else anchor
+            air.program(
+                chip, ranging(radio_settings, self.ranges, seconds, bus=self._bus(bus), at_end=self._at_end)
+            )
         air.run(2 * seconds)
 
     def _bus(self, bus: Callable[[Host], ModelBus]) -> Callable[[Host], ModelBus]:
@@ -77,8 +79,8 @@ class Run:
     def start_up(self) -> list[tuple[int, int, bytes]]:
         """Return the writes of the anchor before its configuration is complete, which sets SYS_MASK."""
         writes = [write[1:] for write in self.buses[0].writes]
-        end = next(at for at, (file, _, data) in enumerate(writes) if file == 0x0E and any(data))
-        return writes[: next(at for at in range(end + 1, len(writes)) if writes[at][0] == 0x0E)]
+        end = next(row for row, (file, _, data) in enumerate(writes) if file == 0x0E and any(data))
+        return writes[: next(row for row in range(end + 1, len(writes)) if writes[row][0] == 0x0E)]
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ LDE_REPC 2E 2804 2 3332         USR_SFD 21 0 1 08
 def expected(registers: str) -> dict[tuple[int, int], bytes]:
     """Return {(register file, sub-address): octets} of a table."""
     words = registers.split()
-    rows = [words[at : at + 5] for at in range(0, len(words), 5)]
+    rows = [words[row : row + 5] for row in range(0, len(words), 5)]
     return {
         (int(file, 16), int(sub, 16)): int(value, 16).to_bytes(int(octets), "little")
         for _, file, sub, octets, value in rows
@@ -203,7 +205,7 @@ class FastBus(ModelBus):
 def test_smart_power_sends_one_frame_per_millisecond(air: Air):
     run = Run(air, RadioSettings(preamble=64, window=0), tags=3, seconds=0.15, bus=FastBus)
     assert len(run.ranges) > 5
-    starts = [at for at, file, _, data in run.buses[0].writes if file == SYS_CTRL and data[0] & 0x42 == 2]
+    starts = [row for row, file, _, data in run.buses[0].writes if file == SYS_CTRL and data[0] & 0x42 == 2]
     assert min(later - earlier for earlier, later in itertools.pairwise(starts)) >= 1e-3
 
 

@@ -169,7 +169,7 @@ def test_unplugging_leaks_no_descriptors_or_threads(ros: Ros, link: Path):
 def test_driver_survives_resets_noise_and_damage(ros: Ros, link: Path):
     received = ros.collect(RangeCir, RAW)
     faults = Faults(2e-5, 2e-5, 2e-5, lose=0.05, duplicate=0.05)
-    known = {
+    true_range_m = {
         r.measurement.sequence: np.float32(r.measurement.range_m) for r in SimulatedSource(seed=4, count=200)
     }
     with board(link, rate_hz=200.0, faults=faults, boot_noise=500) as device:
@@ -182,7 +182,7 @@ def test_driver_survives_resets_noise_and_damage(ros: Ros, link: Path):
         received_before = len(received)
         ros.spin_until(lambda: len(received) >= received_before + 60)
         status = ros.diagnosis("driver", lambda s: int(diagnostic_value(s, "lost") or 0) > 0)
-    assert all(message.range == known[message.sequence] for message in received)
+    assert all(message.range == true_range_m[message.sequence] for message in received)
     assert status.hardware_id.startswith("board")
     assert driver.signal(signal.SIGINT) == 0, driver.output
     assert "Traceback" not in driver.output

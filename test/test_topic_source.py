@@ -95,9 +95,9 @@ def test_ranges_of_linktrack_give_poses_and_pass_the_mitigator(publisher: Ros, a
     wait_for_position(ros, poses)
     ros.spin_until(lambda: len(raw) > 40 and len(corrected) > 0)
     assert {(message.tag_id, message.anchor_id) for message in raw} == {(9, corner) for corner in CORNERS}
-    (one,) = [message for message in raw if message.anchor_id == 2][:1]
-    assert one.range == pytest.approx(math.dist(TAG, CORNERS[2]), abs=1e-4)
-    assert (one.cir.rx_power, one.cir.first_path_power) == pytest.approx((-80.5, -85.0))
+    (measured,) = [message for message in raw if message.anchor_id == 2][:1]
+    assert measured.range == pytest.approx(math.dist(TAG, CORNERS[2]), abs=1e-4)
+    assert (measured.cir.rx_power, measured.cir.first_path_power) == pytest.approx((-80.5, -85.0))
     assert corrected[0].status == RangeCorrected.NO_CIR
     assert corrected[0].range == pytest.approx(
         math.dist(TAG, CORNERS[corrected[0].anchor_id]) - 0.25, abs=1e-4
@@ -160,14 +160,16 @@ class Convert:
     """Passes messages of a shipped mapping to `TopicFeed` without DDS."""
 
     def __init__(self, mapping: str | Mapping) -> None:
-        self.found: list[RangeMeasurement] = []
+        self.published: list[RangeMeasurement] = []
         node: Any = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None))
         used = load_mapping(mapping) if isinstance(mapping, str) else mapping
-        self.ranges = TopicFeed(node, used, "", self.found.append, lambda: 5_000)
+        self.ranges = TopicFeed(node, used, "", self.published.append, lambda: 5_000)
 
     def take(self, message: Any, topic: str = "/x") -> list[tuple[int, int, float]]:
         self.ranges.take(message, topic)
-        return [(one.tag_id, one.anchor_id, round(one.range_m, 4)) for one in self.found]
+        return [
+            (measured.tag_id, measured.anchor_id, round(measured.range_m, 4)) for measured in self.published
+        ]
 
 
 @pytest.fixture
@@ -190,21 +192,21 @@ def test_linktrack_frames(types: None):
     convert = Convert("nlink_nodeframe3")
     assert convert.take(SimpleNamespace(id=5, nodes=nodes)) == [(5, 3, 4.25)]
     assert convert.take(SimpleNamespace(id=5, nodes=[])) == [(5, 3, 4.25)]
-    assert (convert.found[0].cir.first_path_power_dbm, convert.found[0].stamp_ns) == (-82.0, 5_000)
+    assert (convert.published[0].cir.first_path_power_dbm, convert.published[0].stamp_ns) == (-82.0, 5_000)
 
 
 def test_gtec_messages(types: None):
     convert = Convert("gtec_ranging")
     message = SimpleNamespace(anchorId=2, tagId=7, range=4310, seq=12, rss=-81.5, errorEstimation=0.0)
     assert convert.take(message) == [(7, 2, 4.31)]
-    assert (convert.found[0].sequence, convert.found[0].cir.rx_power_dbm) == (12, -81.5)
+    assert (convert.published[0].sequence, convert.published[0].cir.rx_power_dbm) == (12, -81.5)
     convert = Convert("gtec_uwbranging")
     registers = {"firstPathAmp1": 4889, "firstPathAmp2": 13876, "firstPathAmp3": 10464, "maxGrowthCIR": 9048}
     message = SimpleNamespace(
         anchorId=2, tagId=7, range=4310, seq=1, firstPath=749 * 64 + 32, rxPreamCount=1024, channel=5.0, prf=64, **registers
     )  # fmt: skip
     assert convert.take(message) == [(7, 2, 4.31)]
-    cir = convert.found[0].cir
+    cir = convert.published[0].cir
     assert (cir.first_path_index, cir.preamble_count, cir.channel) == (749.5, 1024, 5)
     assert cir.rx_power_dbm == pytest.approx(-91.2, abs=0.1)
     convert = Convert("gtec_pozyx_cir")
@@ -212,7 +214,7 @@ def test_gtec_messages(types: None):
         originId=0x6A40, destinationId=0x6A41, range=2500, seq=1, rxPower=-79.0, channel=5.0, cir=np.array([1, -2, 3, 4], np.int16)
     )  # fmt: skip
     assert convert.take(message) == [(0x6A40, 0x6A41, 2.5)]
-    assert convert.found[0].cir.samples.tolist() == [1, -2, 3, 4]
+    assert convert.published[0].cir.samples.tolist() == [1, -2, 3, 4]
 
 
 def test_standard_messages():
@@ -220,13 +222,13 @@ def test_standard_messages():
     message = Range(range=3.5)
     message.header.stamp.sec, message.header.stamp.nanosec = 17, 5
     assert convert.take(message, "/uwb/range_12") == [(1, 12, 3.5)]
-    assert convert.found[0].stamp_ns == 17_000_000_005
+    assert convert.published[0].stamp_ns == 17_000_000_005
     convert.take(Range(range=3.5), "/uwb/range_12")
-    assert convert.found[1].stamp_ns == 5_000
+    assert convert.published[1].stamp_ns == 5_000
     line = "AT+RANGE=tid:4,mask:05,seq:218,range:(72,0,131,0,0,0,0,0),rssi:(-77.60,0.00,-75.13,0.00,0.00,0.00,0.00,0.00)"
     convert = Convert("string_at")
     assert convert.take(String(data=line)) == [(4, 0, 0.72), (4, 2, 1.31)]
-    assert [one.cir.rx_power_dbm for one in convert.found] == [-77.6, -75.13]
+    assert [measured.cir.rx_power_dbm for measured in convert.published] == [-77.6, -75.13]
     assert Convert("string_json").take(
         String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
     ) == [(1, 2, 3.0)]

@@ -45,18 +45,18 @@ class Bench:
         self.board = board or UciBoardModel()
         self.session = UciSession(UciSettings(**{"window": 16, **settings}))
         self.now_ns = 0
-        self.found: list[RangeMeasurement] = []
+        self.measured_ranges: list[RangeMeasurement] = []
         self.sent = b""
         self.session.opened(0)
 
     def step(self, data: bytes = b"", ms: float = 5.0) -> None:
         self.now_ns += round(ms * MS)
-        self.found += self.session.receive(data, self.now_ns, self.now_ns)
+        self.measured_ranges += self.session.receive(data, self.now_ns, self.now_ns)
         sent = self.session.outgoing()
         self.sent += sent
         answer = self.board.receive(sent, self.now_ns / 1e9)
         if answer:
-            self.found += self.session.receive(answer, self.now_ns, self.now_ns)
+            self.measured_ranges += self.session.receive(answer, self.now_ns, self.now_ns)
 
     def start(self, steps: int = 2000) -> Bench:
         for _ in range(steps):
@@ -81,10 +81,10 @@ def test_a_range_notification_of_a_real_board_is_parsed():
     assert (record.peer, record.status, record.range_m, record.rssi_dbm) == (2, 0, 2.10, -78.0)
 
 
-@pytest.mark.parametrize(("at", "value"), [(27, 0x21), (29, 0xFFFF)])
-def test_a_failed_or_invalid_range_has_no_distance(at: int, value: int):
+@pytest.mark.parametrize(("position", "value"), [(27, 0x21), (29, 0xFFFF)])
+def test_a_failed_or_invalid_range_has_no_distance(position: int, value: int):
     data = bytearray(RANGE)
-    data[at : at + 2] = struct.pack("<H", value) if at == 29 else bytes([value, 0xFF])
+    data[position : position + 2] = struct.pack("<H", value) if position == 29 else bytes([value, 0xFF])
     assert np.isnan(messages.parse_ranges(bytes(data)).records[0].range_m)
 
 
@@ -104,7 +104,7 @@ def test_the_cir_has_the_taps_of_the_exchange():
     for sequence in range(1, 4):
         run.exchange(sequence)
     assert run.session.window == (157, 5)
-    measured = run.found[1]
+    measured = run.measured_ranges[1]
     cir = measured.cir
     assert (measured.tag_id, measured.anchor_id, measured.sequence, measured.range_m) == (1, 2, 2, 3.0)
     assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 157, 5))
@@ -123,7 +123,7 @@ def test_a_smaller_window_and_other_taps_are_used_as_delivered(tap_bytes: int, m
     run = Bench(UciBoardModel(max_taps=max_taps, tap_bytes=tap_bytes), window=157).start()
     run.exchange(1)
     assert run.session.window == (max_taps, 5)
-    assert np.array_equal(run.found[0].cir.samples.reshape(-1, 2), taps_of(1, max_taps, 5))
+    assert np.array_equal(run.measured_ranges[0].cir.samples.reshape(-1, 2), taps_of(1, max_taps, 5))
 
 
 def test_firmware_with_a_count_of_one_byte_gets_its_window():
@@ -165,8 +165,8 @@ def test_the_first_path_is_checked_against_the_peak(offset: int, consistent: boo
 def test_an_anchor_uses_the_final_frame_and_ranges_with_its_tag():
     run = Bench(role=Role.ANCHOR, address=2, peers=(1,)).start()
     run.exchange(1)
-    assert (run.found[0].tag_id, run.found[0].anchor_id) == (1, 2)
-    assert len(run.found[0].cir) == 16
+    assert (run.measured_ranges[0].tag_id, run.measured_ranges[0].anchor_id) == (1, 2)
+    assert len(run.measured_ranges[0].cir) == 16
 
 
 @pytest.mark.parametrize(
@@ -177,9 +177,9 @@ def test_every_range_arrives_with_its_own_cir_or_without(faults: dict):
     for sequence in range(1, 400):
         run.exchange(sequence, 1.0 + sequence / 100)
     run.step(ms=500)
-    assert len({m.sequence for m in run.found}) > 370
-    assert sum(len(m.cir) > 0 for m in run.found) > 250
-    for measured in run.found:
+    assert len({m.sequence for m in run.measured_ranges}) > 370
+    assert sum(len(m.cir) > 0 for m in run.measured_ranges) > 250
+    for measured in run.measured_ranges:
         assert measured.range_m == pytest.approx(1.0 + measured.sequence / 100)
         if len(measured.cir):
             assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 16, 5))
@@ -189,8 +189,8 @@ def test_diagnostics_after_the_next_range_are_joined_on_a_good_link():
     run = bench(late=1.0).start()
     for sequence in range(1, 50):
         run.exchange(sequence)
-    assert all(len(m.cir) == 16 for m in run.found)
-    assert len(run.found) >= 47
+    assert all(len(m.cir) == 16 for m in run.measured_ranges)
+    assert len(run.measured_ranges) >= 47
 
 
 def test_a_damaged_sequence_number_is_not_joined():
@@ -198,12 +198,12 @@ def test_a_damaged_sequence_number_is_not_joined():
     (handle,) = run.board.sessions
     for sequence in range(1, 101):
         run.exchange(sequence)
-    count = len(run.found)
+    count = len(run.measured_ranges)
     # The range of exchange 101 claims to be 102, whose own range and the diagnostics of 101 are lost.
     run.step(run.board.range_packet(handle, 102, 9.0), 18)
     run.step(run.board.diagnostics_packet(handle, 102), 18)
     run.step(ms=500)
-    assert [(m.range_m, len(m.cir)) for m in run.found[count:]] == [(9.0, 0)]
+    assert [(m.range_m, len(m.cir)) for m in run.measured_ranges[count:]] == [(9.0, 0)]
 
 
 def test_halves_of_two_notifications_are_not_assembled():
@@ -217,7 +217,7 @@ def test_halves_of_two_notifications_are_not_assembled():
     run.step(first[:259], 0.1)
     run.step(run.board.range_packet(handle, 21, 3.0) + second[259:], 20)
     run.step(ms=500)
-    assert [len(m.cir) for m in run.found[-2:]] == [0, 0]
+    assert [len(m.cir) for m in run.measured_ranges[-2:]] == [0, 0]
 
 
 def test_a_range_of_another_session_or_peer_is_ignored():
@@ -229,7 +229,7 @@ def test_a_range_of_another_session_or_peer_is_ignored():
         run.board.faults = swapped if number == handle else UciFaults()
         run.step(run.board.range_packet(number, 1, 3.0) + run.board.diagnostics_packet(number, 1), 18)
     run.step(ms=500)
-    assert not run.found
+    assert not run.measured_ranges
     assert run.session.counts["unknown_session"] >= 2
 
 
@@ -263,7 +263,7 @@ def test_firmware_that_sends_no_handle_uses_the_number_of_the_session():
 
     run = Bench(Later()).start()
     run.exchange(1)
-    assert len(run.found) == 1
+    assert len(run.measured_ranges) == 1
 
 
 def test_a_board_that_restarts_by_itself_ranges_again():
@@ -272,7 +272,7 @@ def test_a_board_that_restarts_by_itself_ranges_again():
     run.start()
     run.exchange(1)
     assert run.session.starts == 2
-    assert run.found
+    assert run.measured_ranges
 
 
 class Ending(UciBoardModel):
@@ -350,7 +350,7 @@ def test_one_session_that_ends_does_not_stop_the_others():
         run.step(run.board.exchange(second, sequence, 3.0), 18.0)
         assert second in run.board.sessions
     assert run.session.state == ""
-    assert len(run.found) >= 58
+    assert len(run.measured_ranges) >= 58
 
 
 @pytest.mark.parametrize(
@@ -414,11 +414,11 @@ def test_ranges_are_published_in_order_and_soon_after_a_lost_cir():
     run.step(run.board.range_packet(handle, 41, 3.0), 18)
     run.step(run.board.exchange(handle, 42, 3.0), 2.0)
     arrived_ns = run.now_ns
-    while run.found[-1].sequence < 42:
+    while run.measured_ranges[-1].sequence < 42:
         run.step(ms=1.0)
     assert run.now_ns - arrived_ns <= 6 * MS
-    assert [m.sequence for m in run.found] == sorted(m.sequence for m in run.found)
-    assert [len(m.cir) for m in run.found[-2:]] == [0, 16]
+    assert [m.sequence for m in run.measured_ranges] == sorted(m.sequence for m in run.measured_ranges)
+    assert [len(m.cir) for m in run.measured_ranges[-2:]] == [0, 16]
 
 
 def test_repeated_notifications_are_published_once():
@@ -430,8 +430,8 @@ def test_repeated_notifications_are_published_once():
             run.board.diagnostics_packet(handle, sequence),
         )
         run.step(2 * packets[0] + 2 * packets[1], 18)
-    assert [m.sequence for m in run.found] == list(range(1, 101))
-    assert all(len(m.cir) == 16 for m in run.found)
+    assert [m.sequence for m in run.measured_ranges] == list(range(1, 101))
+    assert all(len(m.cir) == 16 for m in run.measured_ranges)
     assert run.session.counts["duplicates"] == 200
 
 
@@ -495,9 +495,9 @@ def test_ranges_without_diagnostics_are_published_without_delay():
     (handle,) = run.board.sessions
     for sequence in range(100):
         run.step(run.board.range_packet(handle, sequence, 3.0), 18)
-    assert len(run.found) == 100
-    assert run.found[-1].stamp_ns == run.now_ns
-    assert run.found[-1].cir.source == "DW3000 without CIR"
+    assert len(run.measured_ranges) == 100
+    assert run.measured_ranges[-1].stamp_ns == run.now_ns
+    assert run.measured_ranges[-1].cir.source == "DW3000 without CIR"
 
 
 @given(st.binary(max_size=600), st.integers(1, 40))
@@ -506,8 +506,8 @@ def test_no_bytes_make_a_session_fail(data: bytes, piece: int):
     run = Bench().start()
     (handle,) = run.board.sessions
     good = run.board.range_packet(handle, 1, 3.0)
-    for at in range(0, len(data), piece):
-        run.step(data[at : at + piece])
+    for position in range(0, len(data), piece):
+        run.step(data[position : position + piece])
     # A damaged length may hide up to 255 bytes; after a timeout the decoder searches inside of them.
     for _ in range(300):
         run.step(ms=2 * MAX_GAP_NS / MS)
@@ -533,11 +533,11 @@ def test_damaged_diagnostics_are_parsed_or_refused(data: st.DataObject):
     board = UciBoardModel()
     run = Bench(board, window=16).start()
     (handle,) = board.sessions
-    whole = bytearray(board.diagnostics_packet(handle, 1)[4:])
+    damaged_payload = bytearray(board.diagnostics_packet(handle, 1)[4:])
     for _ in range(data.draw(st.integers(1, 4))):
-        whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
+        damaged_payload[data.draw(st.integers(0, len(damaged_payload) - 1))] = data.draw(st.integers(0, 255))
     try:
-        content = messages.parse_diagnostics(bytes(whole))
+        content = messages.parse_diagnostics(bytes(damaged_payload))
     except LinkError:
         return
     reading = read_cir(content, 9, np.nan)
@@ -581,9 +581,10 @@ def test_a_capture_replays_the_same_measurements(tmp_path):
     capture = UciCapture(tmp_path / "session.txt")
     for _ in range(2):
         replayed = [record.measurement for record in capture]
-        assert [m.sequence for m in replayed] == [m.sequence for m in run.found]
+        assert [m.sequence for m in replayed] == [m.sequence for m in run.measured_ranges]
         assert all(
-            np.array_equal(a.cir.samples, b.cir.samples) for a, b in zip(replayed, run.found, strict=True)
+            np.array_equal(a.cir.samples, b.cir.samples)
+            for a, b in zip(replayed, run.measured_ranges, strict=True)
         )
 
 
@@ -648,7 +649,7 @@ def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges(
             if session.active and handle in run.board.sessions:
                 run.step(run.board.range_packet(handle, number, 3.0))
     assert run.session.state == ""
-    assert {measured.anchor_id for measured in run.found} == {2, 3}
+    assert {measured.anchor_id for measured in run.measured_ranges} == {2, 3}
 
 
 def test_a_board_that_starts_slowly_after_a_reset_gets_its_window():
@@ -726,12 +727,12 @@ class Numbers(UciBoardModel):
 
     def _notify(self, name, payload):
         sent = super()._notify(name, payload)
-        at = {codes.RANGE_START: 8, codes.RANGE_DIAGNOSTICS: 4, codes.SESSION_STATUS: 4}.get(name)
-        if at is None:
+        position = {codes.RANGE_START: 8, codes.RANGE_DIAGNOSTICS: 4, codes.SESSION_STATUS: 4}.get(name)
+        if position is None:
             return sent
-        (handle,) = struct.unpack_from("<I", sent, at)
+        (handle,) = struct.unpack_from("<I", sent, position)
         number = self.sessions[handle].number if handle in self.sessions else handle
-        return sent[:at] + struct.pack("<I", number) + sent[at + 4 :]
+        return sent[:position] + struct.pack("<I", number) + sent[position + 4 :]
 
 
 class Late(UciBoardModel):
@@ -787,8 +788,8 @@ def test_boards_that_the_facts_allow_range_with_their_cir(board: type[UciBoardMo
     handle = max(model.sessions)
     for sequence in range(1, 20):
         run.step(model.exchange(handle, sequence, 3.0), 18)
-    assert [m.range_m for m in run.found] == [3.0] * 19
-    for measured in run.found:
+    assert [m.range_m for m in run.measured_ranges] == [3.0] * 19
+    for measured in run.measured_ranges:
         assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 157, 5))
     rejected = {Unnamed: {0x35}, OneByOne: {0x2C, 0x32, 0x35}}.get(board, set())
     assert run.session.rejected.keys() == rejected
@@ -807,23 +808,23 @@ def test_diagnostics_in_several_notifications_are_joined(masks: tuple[int, ...],
         parts.insert(position, run.board.range_packet(handle, sequence, 3.0))
         for part in parts:
             run.step(part, 18 / len(parts))
-    assert len(run.found) >= 58
-    for measured in run.found[6:]:
+    assert len(run.measured_ranges) >= 58
+    for measured in run.measured_ranges[6:]:
         assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 16, 5))
         assert measured.cir.start_index == FIRST_PATH - 5
     # A board that reports them in one notification again, after other firmware was loaded.
     run.board.sessions[handle].config[0xE9] = b"\x78"
-    count = len(run.found)
+    count = len(run.measured_ranges)
     for sequence in range(60, 120):
         run.exchange(sequence)
-    assert run.found[-1].sequence == 119
-    assert all(len(m.cir) == 16 for m in run.found[count + 8 :])
+    assert run.measured_ranges[-1].sequence == 119
+    assert all(len(m.cir) == 16 for m in run.measured_ranges[count + 8 :])
 
 
 def test_a_cir_of_an_unknown_layout_is_skipped_but_its_levels_are_used():
     run = Bench(UciBoardModel(tap_bytes=10)).start()
     run.exchange(1)
-    (measured,) = run.found
+    (measured,) = run.measured_ranges
     assert len(measured.cir) == 0
     assert measured.cir.rx_power_dbm == -80.5
     assert run.session.totals()["damaged"] == 0
@@ -851,8 +852,8 @@ def test_sessions_that_share_a_counter_get_their_cirs():
     for sequence in range(1, 201):
         handle = 1 + sequence % 2
         run.step(run.board.exchange(handle, sequence, 3.0), 18)
-    assert {m.anchor_id for m in run.found[-2:]} == {2, 3}
-    assert all(len(m.cir) == 16 for m in run.found[-60:])
+    assert {m.anchor_id for m in run.measured_ranges[-2:]} == {2, 3}
+    assert all(len(m.cir) == 16 for m in run.measured_ranges[-60:])
     # A lost range is still a gap in the sequence.
     gaps = run.session.totals()["gaps"]
     run.step(run.board.exchange(1 + 205 % 2, 205, 3.0), 18)

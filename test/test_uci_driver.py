@@ -132,11 +132,11 @@ def uci_settings(value):
 
 
 def test_the_first_board_is_the_tag_of_the_others():
-    tag, anchor, other = uci_settings(value_of(port="/dev/a,/dev/b,/dev/c", radio__rate=20.0))
+    tag, anchor, second_anchor = uci_settings(value_of(port="/dev/a,/dev/b,/dev/c", radio__rate=20.0))
     assert (tag.role, tag.address, tag.peers, tag.channel) == (Role.TAG, 1, (2, 3), 9)
-    assert (other.role, other.address, other.peers) == (Role.ANCHOR, 3, (1,))
+    assert (second_anchor.role, second_anchor.address, second_anchor.peers) == (Role.ANCHOR, 3, (1,))
     assert tag.effective_interval_ms == anchor.effective_interval_ms == 100
-    assert tag.session_id(3) == other.session_id(1)
+    assert tag.session_id(3) == second_anchor.session_id(1)
 
 
 @pytest.mark.parametrize("anchors", [[3, 4], ["3", "0x4"], "3,4", "[3, 4]", array("q", [3, 4])])
