@@ -42,6 +42,9 @@ def report(tmp_path: Path) -> Report:
         result = CliRunner().invoke(cli.app, [*command, *files, *(options or ("--no-unplug",))])
         checks = json.loads((tmp_path / "out.json").read_text())["checks"]
         by_name = {check["name"]: check for check in checks}
+        remedies = [check["remedy"] for check in checks if check["verdict"] != "pass"]
+        assert [remedy for remedy in remedies if remedy not in result.output] == []
+        assert "0xdeca" in result.output or source != "evb1000"
         assert result.exit_code == (1 if failed(by_name) else 0), (result.output, result.exception)
         return by_name
 

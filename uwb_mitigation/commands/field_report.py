@@ -79,8 +79,13 @@ def field_report(
         checks = run_checks(observation)
         _write(folder, source, observation, checks)
         _pack(folder, output)
-    rows = [(check.name, check.verdict.value, check.value, check.limit, check.remedy) for check in checks]
-    console.show_table("field report", ("check", "result", "value", "limit", "what to do"), rows, left=5)
+    rows = [(check.name, check.verdict.value, check.value, check.limit) for check in checks]
+    console.show_table(
+        "Field report", ("check", "result", "value", "limit"), rows, left=4, optional=["limit"]
+    )
+    for check in checks:
+        if check.verdict is not Verdict.PASS and check.remedy:
+            console.warn(f"{check.name}: {check.remedy}")
     failed = sum(check.verdict is Verdict.FAIL for check in checks)
     print_line(
         f"{output}: {len(checks)} checks, {failed} failed; read report.html in it, and attach the file to an issue"

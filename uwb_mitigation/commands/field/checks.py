@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import SATURATED, WINDOW_LEAD
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, CorrectedRange, RangeMeasurement, Status
 
@@ -176,9 +177,13 @@ def _settings(written: Mapping[str, object], read: Mapping[str, object]) -> Iter
 
 def _ids(o: Observation) -> Check:
     pairs = sorted({(measured.tag_id, measured.anchor_id) for measured in o.ranges})
-    expected = "one pair" if o.expected_ids is None else "tag {}, anchor {}".format(*o.expected_ids)
+    expected = (
+        "one pair" if o.expected_ids is None else "tag {}, anchor {}".format(*map(format_id, o.expected_ids))
+    )
     good = len(pairs) == 1 and o.expected_ids in (None, pairs[0]) and o.foreign <= len(o.ranges) / 100
-    shown = ", ".join(f"tag {tag}, anchor {anchor}" for tag, anchor in pairs[:5]) or "none"
+    shown = (
+        ", ".join(f"tag {format_id(tag)}, anchor {format_id(anchor)}" for tag, anchor in pairs[:5]) or "none"
+    )
     if o.foreign:
         shown += f"; {o.foreign} ranges of other addresses"
     remedy = "" if good else "switch other radios off, and check that the ids are not swapped"
