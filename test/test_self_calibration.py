@@ -126,12 +126,31 @@ def test_dozen_unknown_positions_determine_offset_and_line():
     assert np.median(np.linalg.norm((found.fit.position - truth)[:, :2], axis=1)) < 0.08
 
 
-def test_stationary_segments_of_a_tag_are_found():
-    _, tags, _ = places_at_rest()
-    carried = Ranges.joined(
-        [replace(tag, stamp_ns=tag.stamp_ns + 60 * n * 10**9) for n, tag in enumerate(tags)]
-    )
-    assert find_segments([carried]).is_stationary.tolist() == [True] * len(tags)
+def test_carried_tag_at_31_positions_determines_offset_and_ranges():
+    """248 links to 24 anchors, 35 % of them behind obstacles that also reduce the power; a pause between positions."""
+    rng = np.random.default_rng(1)
+    where = np.column_stack([rng.uniform(0, 40, 24), rng.uniform(0, 25, 24), rng.uniform(2, 5, 24)])
+    anchors = AnchorMap([Anchor(n, tuple(place), 0.02) for n, place in enumerate(where.tolist(), 1)])
+    placements, truth = [], []
+    for number in range(31):
+        distance = np.linalg.norm(where - [rng.uniform(3, 37), rng.uniform(3, 22), 1.0], axis=1)
+        row = np.sort(np.argsort(distance)[:8])
+        obstacle_m = np.where(rng.random(8) < 0.35, rng.exponential(0.45, 8), 0.0)
+        power = -80 - 20 * np.log10(distance[row] / 5) + rng.normal(0, 2, 8) - 10 * obstacle_m
+        range_m = distance[row] + 0.12 + obstacle_m + rng.normal(0, 0.05, 8)
+        stamp = np.arange(8) * 10**8 + number * 60 * 10**9
+        placements.append(Ranges(stamp, row, range_m, np.full(8, np.nan), power))
+        truth.append(distance[row])
+    carried = Ranges.joined(placements)
+    power = Regressors.one("level", carried.rx_power_dbm - np.median(carried.rx_power_dbm), 0.0, SLOPE_SD)
+    found = self_calibrate(anchors, [carried], power, height=LEVEL)
+    assert found.segments.is_stationary.tolist() == [True] * 31
+    observations = found.fit.observations
+    corrected = carried.range_m - (observations.rows @ found.fit.parameters)[observations.observation_index]
+    raw_mae, mae = (np.abs(value - np.concatenate(truth)).mean() for value in (carried.range_m, corrected))
+    assert mae < 0.85 * raw_mae
+    # Obstacles do not look like a wrong height, nor does a wrong height look like obstacles.
+    refused("height of 2.5 m contradicts", anchors, [carried], regressors=power, height=Height(2.5))
 
 
 @pytest.mark.parametrize("rate_hz", [40.0, 1.0])
