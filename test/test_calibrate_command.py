@@ -96,6 +96,7 @@ def site(tmp_path_factory):
 
 LEVEL = ("--anchors", "anchors.yaml", "--height", 1.0)
 WITH_TRUTH = ("--truth-topic", "/odom", "--time-offset", 0.3, "--lever-arm", "0.4,0.1,0")
+WITHOUT_TIME_OFFSET = (*WITH_TRUTH[:2], *WITH_TRUTH[4:])
 
 
 def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
@@ -305,9 +306,7 @@ def worse_live_position(fields):
     return {"live": fields["live"] | {fields["chosen"]: LiveError(9.0, 9.0)}}
 
 
-@pytest.mark.parametrize(
-    ("change", "options"), [(no_range_gain, ()), (worse_live_position, ()), (worse_live_position, WITH_TRUTH)]
-)
+@pytest.mark.parametrize(("change", "options"), [(no_range_gain, ()), (worse_live_position, WITH_TRUTH)])
 def test_calibration_without_gain_is_written_only_with_force(site, monkeypatch, change, options):
     from uwb_mitigation.training.site import calibration as site_calibration
 
@@ -329,15 +328,14 @@ def anchors_file(site, name, position):
     return ("--anchors", name, "--height", 1.0)
 
 
-@pytest.mark.parametrize("options", [WITH_TRUTH, (*WITH_TRUTH[:2], *WITH_TRUTH[4:])])
 @pytest.mark.parametrize(
-    ("move", "named"),
+    ("move", "named", "options"),
     [
-        ((0, (1.5, 0.0, 0.0)), ["anchor 1"]),
-        ((3, (0.0, 1.0, 0.0)), ["anchor 4"]),
-        ((4, (-0.8, 0.8, 0.0)), ["anchor 5"]),
-        ((0, 2), ["anchors 1 and 3"]),
-        ((1, 4), ["anchors 2 and 5"]),
+        ((0, (1.5, 0.0, 0.0)), "anchor 1", WITH_TRUTH),
+        ((3, (0.0, 1.0, 0.0)), "anchor 4", WITHOUT_TIME_OFFSET),
+        ((4, (-0.8, 0.8, 0.0)), "anchor 5", WITH_TRUTH),
+        ((0, 2), "anchors 1 and 3", WITHOUT_TIME_OFFSET),
+        ((1, 4), "anchors 2 and 5", WITH_TRUTH),
     ],
 )
 def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, options):
@@ -354,7 +352,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
     done = run(*words, "--force", folder=site)
     assert done.returncode == 1
     refused = json.loads((site / "wrong.json").read_text())["refused"]
-    assert all(name in refused for name in named), refused
+    assert named in refused
     assert not (site / "wrong.onnx").exists()
 
 
