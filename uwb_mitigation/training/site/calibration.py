@@ -201,10 +201,6 @@ class SiteCalibration:
         return bundle, offsets_path
 
 
-def _json_pair(pair: tuple[float, float]) -> list[float | None]:
-    return [None if math.isnan(value) else value for value in pair]
-
-
 def offsets_file(bundle: Path) -> Path:
     """Return the path of the offsets file that belongs to the bundle of a site."""
     return bundle.with_suffix(".offsets.yaml")
