@@ -218,6 +218,8 @@ def main() -> None:
                 json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}),
                 flush=True,
             )
+        if not rows:
+            return
         numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
         mean = {key: round(math.fsum(float(row[key]) for row in rows) / len(rows), 4) for key in numbers}  # type: ignore[arg-type]
         # A refused calibration is not written: the robot continues with raw ranges.
