@@ -142,7 +142,7 @@ def test_carried_tag_at_31_positions_determines_offset_and_ranges():
         placements.append(Ranges(stamp, row, range_m, np.full(8, np.nan), power))
         truth.append(distance[row])
     carried = Ranges.joined(placements)
-    power = Regressors.one("level", carried.rx_power_dbm - np.median(carried.rx_power_dbm), 0.0, SLOPE_SD)
+    power = Regressors.single("level", carried.rx_power_dbm - np.median(carried.rx_power_dbm), 0.0, SLOPE_SD)
     found = self_calibrate(anchors, [carried], power, height=LEVEL)
     assert found.segments.is_stationary.tolist() == [True] * 31
     observations = found.fit.observations
