@@ -9,7 +9,7 @@ import pytest
 from drives import HALL, NANOSECONDS, circuit, drive
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.survey import displacements, survey
+from uwb_mitigation.positioning.batch.survey import displacements, survey_anchors
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
@@ -27,7 +27,7 @@ def test_anchors_are_estimated_from_guesses_with_errors_of_1_5_m(minute):
     away = np.zeros((5, 3))
     away[:, :2] = rng.normal(0, 1, (5, 2))
     away *= 1.5 / np.linalg.norm(away, axis=1, keepdims=True)
-    found = survey(
+    found = survey_anchors(
         EstimatorConfig(HALL.moved(HALL.position + away, HALL.sd), height=LEVEL), minute, off_m=1.5
     )
     off = displacements(found.anchors.position, HALL.position)
@@ -39,21 +39,21 @@ def test_anchors_are_estimated_from_guesses_with_errors_of_1_5_m(minute):
 def test_anchors_that_contradict_the_ranges_are_reported(minute):
     shuffled = minute.take(slice(0, 300))
     shuffled = replace(shuffled, range_m=np.random.default_rng(1).permutation(shuffled.range_m))
-    assert not survey(EstimatorConfig(HALL, height=LEVEL), shuffled).explained
+    assert not survey_anchors(EstimatorConfig(HALL, height=LEVEL), shuffled).explained
 
 
 def test_only_the_displaced_anchor_is_named(minute):
     wrong = HALL.position.copy()
     wrong[2] += (0.4, 0.3, 0.0)
-    found = survey(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
+    found = survey_anchors(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
     assert (found.misplaced, found.swapped) == ([2], [])
-    assert survey(EstimatorConfig(HALL, height=LEVEL), minute).misplaced == []
+    assert survey_anchors(EstimatorConfig(HALL, height=LEVEL), minute).misplaced == []
 
 
 def test_swapped_pair_is_named(minute):
     wrong = HALL.position.copy()
     wrong[[1, 3]] = wrong[[3, 1]]
-    found = survey(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
+    found = survey_anchors(EstimatorConfig(HALL.moved(wrong, HALL.sd), height=LEVEL), minute)
     assert found.swapped == [(1, 3)]
     assert sorted(found.misplaced) == [1, 3]
 
@@ -65,7 +65,7 @@ def test_mirror_image_of_a_square_is_not_a_swapped_pair():
     )
     ranges, _ = drive(square, seconds=40, seed=2)
     guesses = square.position + np.random.default_rng(3).normal(0, (0.4, 0.4, 0), (4, 3))
-    found = survey(EstimatorConfig(square.moved(guesses, square.sd), height=LEVEL), ranges, off_m=0.4)
+    found = survey_anchors(EstimatorConfig(square.moved(guesses, square.sd), height=LEVEL), ranges, off_m=0.4)
     assert found.explained
     assert found.swapped == []
 
@@ -76,7 +76,7 @@ def test_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: floa
     ranges, _ = drive(narrow, seconds=20, seed=2)
     wrong = narrow.position + np.random.default_rng(4).normal(0, (guess_sd_m, guess_sd_m, 0), (4, 3))
     area = Area((-5, 1, 0), (20, 20, 3))
-    found = survey(EstimatorConfig(narrow.moved(wrong, narrow.sd), height=LEVEL, area=area), ranges)
+    found = survey_anchors(EstimatorConfig(narrow.moved(wrong, narrow.sd), height=LEVEL, area=area), ranges)
     assert found.explained
     assert found.mirrored is mirrored
 
@@ -84,10 +84,10 @@ def test_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: floa
 def test_unobservable_directions_are_reported(minute):
     guesses = HALL.moved(HALL.position, np.full(5, 0.5))
     level_drive = minute.take(minute.stamp_ns < 30 * NANOSECONDS)
-    found = survey(EstimatorConfig(guesses), level_drive, off_m=0.5)
+    found = survey_anchors(EstimatorConfig(guesses), level_drive, off_m=0.5)
     assert found.undetermined == [0, 1, 2, 3, 4]
     assert {0, 2} <= set(found.alternatives)
-    assert not survey(EstimatorConfig(HALL), level_drive, off_m=0.05).undetermined
+    assert not survey_anchors(EstimatorConfig(HALL), level_drive, off_m=0.05).undetermined
 
 
 def test_recording_that_cannot_be_surveyed_is_refused(minute):
@@ -99,4 +99,4 @@ def test_recording_that_cannot_be_surveyed_is_refused(minute):
         (HALL, still, "the tag moves by"),
     ):
         with pytest.raises(DatasetError, match=message):
-            survey(EstimatorConfig(anchors, height=LEVEL), ranges)
+            survey_anchors(EstimatorConfig(anchors, height=LEVEL), ranges)

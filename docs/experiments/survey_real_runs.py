@@ -1,4 +1,4 @@
-"""Estimate the anchors of the Hanyang drives with `survey`, from positions that are 1.5 m wrong in the plane.
+"""Estimate the anchors of the Hanyang drives with `survey_anchors`, from positions that are 1.5 m wrong in the plane.
 
 Arguments: the folder of the drives, and the number of start values per drive. Six of twelve surveys are within 0.30 m. These anchors are
 within 5 m by 2 m, and the tag passes them on one side, so start values that are this wrong hardly determine their arrangement.
@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.position_data import HEIGHTS, hanyang_run
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.survey import displacements, survey
+from uwb_mitigation.positioning.batch.survey import displacements, survey_anchors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 
 OFF_M = 1.5
@@ -27,7 +27,7 @@ for folder in sorted(Path(sys.argv[1]).glob("*_*")):
         guesses = anchors.moved(anchors.position + away, anchors.sd)
         before = np.sqrt((displacements(guesses.position, anchors.position)[:, :2] ** 2).sum(axis=1).mean())
         try:
-            found = survey(EstimatorConfig(guesses, height=HEIGHTS["hanyang"]), ranges, off_m=OFF_M)
+            found = survey_anchors(EstimatorConfig(guesses, height=HEIGHTS["hanyang"]), ranges, off_m=OFF_M)
         except DatasetError as error:
             print(f"{folder.name:8} guess {seed}: {error}", flush=True)
             continue

@@ -210,7 +210,7 @@ def survey(
     not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
-    from uwb_mitigation.positioning.batch.survey import survey as find
+    from uwb_mitigation.positioning.batch.survey import survey_anchors
     from uwb_mitigation.types.anchors import save_anchors
 
     if not 0.0 < off <= 100.0:
@@ -227,7 +227,7 @@ def survey(
     tag = max(recorded.tags, key=lambda recording: len(recording.ranges))
     with console.progress() as bar:
         bar.add_task(f"surveying from {len(tag.ranges)} ranges of tag {format_id(tag.tag_id)}", total=None)
-        result = find(config, tag.ranges, off_m=off, fixed=frozenset(rows))
+        result = survey_anchors(config, tag.ranges, off_m=off, fixed=frozenset(rows))
     save_anchors(
         output, result.anchors, f"surveyed from {bag.name}, tag {format_id(tag.tag_id)}", force=force
     )

@@ -258,7 +258,7 @@ class _Solver:
             relative_height = heights_m[site_rows] - config.height.value
             self.segments = replace(self.segments, relative_height=relative_height)
         expected = extra.rows @ extra.mean
-        check_units(config, self.segments, expected)
+        check_length_unit(config, self.segments, expected)
         offset = likely_offset(config, self.segments, expected)
         self._position, has_position = first_positions(config, self.segments, expected + offset)
         common = Regressors.single("offset", np.ones(len(expected)), offset, COMMON_SD_M)
@@ -475,7 +475,7 @@ def likely_offset(config: EstimatorConfig, segments: Segments, expected_m: NDArr
 UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2}
 
 
-def check_units(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> None:
+def check_length_unit(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> None:
     """Refuse ranges or anchor positions that fit each other only in another unit.
 
     Raises:

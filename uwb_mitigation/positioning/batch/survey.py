@@ -97,7 +97,7 @@ class SurveyResult:
         }
 
 
-def survey(
+def survey_anchors(
     config: EstimatorConfig, ranges: Ranges, *, off_m: float = 1.0, fixed: frozenset[int] = frozenset()
 ) -> SurveyResult:
     """Estimate the positions of the anchors.
