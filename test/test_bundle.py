@@ -111,12 +111,6 @@ def test_any_truncation_is_detected(saved):
             assert refused(saved.model[:length])
 
 
-def test_random_bytes_are_refused():
-    generator = random.Random(2)
-    for length in (1, 10, 1000):
-        assert refused(generator.randbytes(length))
-
-
 def test_huge_file_is_refused_without_reading_it(tmp_path):
     path = tmp_path / "huge.onnx"
     with path.open("wb") as file:

@@ -56,21 +56,6 @@ def test_unfinished_recording_is_read_by_time_and_in_order(tmp_path: Path) -> No
     assert first.log_time_ns == START_NS + 2 * STEP_NS
 
 
-def test_damaged_chunk_loses_only_itself(tmp_path: Path) -> None:
-    bag = Foreign(tmp_path / "bag.mcap").ours()
-    for number in range(300):
-        bag.range(number, samples=1016)
-        if number == 99:
-            bag.flush()
-    path = bag.finish()
-    _, (start, end), *_ = chunk_offsets(path)
-    path.write_bytes(path.read_bytes()[: (start + end) // 2])
-    read, error = prefix(path)
-    assert read == list(range(100))
-    assert isinstance(error, DamagedRecordingError)
-    assert error.where == f"{path}, byte {start}"
-
-
 @pytest.mark.parametrize("shift", [-(2**40), -7, 3, 2**40])
 def test_false_index_is_reported_and_allocates_little_memory(tmp_path: Path, shift: int) -> None:
     path = write_bag(tmp_path / "bag.mcap")

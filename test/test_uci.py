@@ -126,10 +126,6 @@ def test_a_smaller_window_and_other_taps_are_used_as_delivered(tap_bytes: int, m
     assert np.array_equal(run.measured_ranges[0].cir.samples.reshape(-1, 2), taps_of(1, max_taps, 5))
 
 
-def test_firmware_with_a_count_of_one_byte_gets_its_window():
-    assert Bench(UciBoardModel(count_bytes=1), window=157).start().session.window == (157, 5)
-
-
 def test_firmware_that_refuses_the_number_of_taps_gets_the_lead():
     class Refusing(UciBoardModel):
         def _set_calibration(self, payload):
@@ -152,11 +148,16 @@ def test_taps_of_18_bits_are_scaled_to_16_bits():
     assert (cir.first_path_index, cir.rx_power_dbm) == (1.0, -70.0)
 
 
-@pytest.mark.parametrize(("offset", "consistent"), [(-5, True), (5, True), (-9, False), (120, False)])
-def test_the_first_path_is_checked_against_the_peak(offset: int, consistent: bool):
+@pytest.mark.parametrize("has_position", [True, False])
+@pytest.mark.parametrize(
+    ("offset", "consistent"), [(-5, True), (-3, False), (-8, False), (-9, False), (-40, False), (120, False)]
+)
+def test_the_first_path_is_checked_against_the_leading_edge(
+    offset: int, consistent: bool, has_position: bool
+):
     block = messages.CirBlock(0, 1, True, offset, taps_of(1, 64, 5))
-    metrics = messages.SegmentMetrics(0, 1, True, -80.0, -84.0, 362, 362.5, 363)
-    frame = messages.FrameReport(2, True, None, 0.0, (metrics,), (block,), False)
+    metrics = (messages.SegmentMetrics(0, 1, True, -80.0, -84.0, 362, 362.5, 363),) * has_position
+    frame = messages.FrameReport(2, True, None, 0.0, metrics, (block,), False)
     reading = read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan)
     assert reading.consistent is consistent
     assert np.isfinite(reading.cir.first_path_index) == consistent
@@ -236,34 +237,6 @@ def test_a_range_of_another_session_or_peer_is_ignored():
 def test_error_answers_are_repeated_until_the_board_ranges():
     run = bench(errors=0.15).start(20_000)
     assert run.session.counts["error_answers"] > 0
-
-
-def test_rejected_optional_settings_are_left_out():
-    class Old(UciBoardModel):
-        def _command(self, name, payload, now_s):
-            if name == codes.SET_APP_CONFIG and bytes([0x35, 1, 1]) in payload:
-                return self._respond(name, bytes([0x04, 1, 0x35, 0x04]))
-            return super()._command(name, payload, now_s)
-
-    run = Bench(Old()).start()
-    (session,) = run.board.sessions.values()
-    assert 0x35 not in session.config
-    assert 0xE9 in session.config
-
-
-def test_firmware_that_sends_no_handle_uses_the_number_of_the_session():
-    class Later(UciBoardModel):
-        def _command(self, name, payload, now_s):
-            answer = super()._command(name, payload, now_s)
-            if name == codes.SESSION_INIT:
-                (number,) = struct.unpack_from("<I", payload)
-                self.sessions[number] = self.sessions.pop(self._handles)
-                answer = self._respond(name, b"\0")
-            return answer
-
-    run = Bench(Later()).start()
-    run.exchange(1)
-    assert len(run.measured_ranges) == 1
 
 
 def test_a_board_that_restarts_by_itself_ranges_again():
@@ -471,14 +444,6 @@ def test_first_path_positions_are_in_taps_or_nanoseconds(index: int, scale: floa
     assert np.abs(errors[8:]).max() < (0.02 if unit != "contradictory" else 1.0)
 
 
-def test_a_first_path_before_which_the_signal_rises_is_a_contradiction():
-    taps = taps_of(1, 64, 5)
-    for offset, consistent in ((-5, True), (-8, False), (-3, False), (-40, False)):
-        block = messages.CirBlock(0, 1, True, offset, taps)
-        frame = messages.FrameReport(2, True, None, 0.0, (), (block,), False)
-        assert read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan).consistent is consistent, offset
-
-
 def test_a_silent_board_is_started_again_but_a_waiting_anchor_is_not():
     run = Bench(role=Role.ANCHOR, address=2, peers=(1,)).start()
     for _ in range(2000):
@@ -652,26 +617,6 @@ def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges(
     assert {measured.anchor_id for measured in run.measured_ranges} == {2, 3}
 
 
-def test_a_board_that_starts_slowly_after_a_reset_gets_its_window():
-    class Slow(UciBoardModel):
-        ready_s = 0.0
-
-        def receive(self, data, now_s):
-            if now_s < self.ready_s:
-                return b""
-            ready = self._notify(codes.DEVICE_STATUS, b"\1") if self.ready_s else b""
-            self.ready_s = 0.0
-            if data.startswith(encode_packets(*codes.RESET, b"\0")):
-                self.ready_s = now_s + 0.4
-                self.sessions.clear()
-                return self._respond(codes.RESET, b"\0")
-            return ready + super().receive(data, now_s)
-
-    run = Bench(Slow(), window=157).start()
-    assert run.session.window == (157, 5)
-    assert run.session.starts == 1
-
-
 class OneKey(UciBoardModel):
     """Sets one calibration key per command."""
 
@@ -776,8 +721,38 @@ class Extended(UciBoardModel):
         return super()._notify(name, payload)
 
 
+class NoHandle(UciBoardModel):
+    """Sends no handle: the number of the session is used."""
+
+    def _command(self, name, payload, now_s):
+        answer = super()._command(name, payload, now_s)
+        if name == codes.SESSION_INIT:
+            (number,) = struct.unpack_from("<I", payload)
+            self.sessions[number] = self.sessions.pop(self._handles)
+            answer = self._respond(name, b"\0")
+        return answer
+
+
+class Slow(UciBoardModel):
+    """Is ready 0.4 s after a reset."""
+
+    ready_s = 0.0
+
+    def receive(self, data, now_s):
+        if now_s < self.ready_s:
+            return b""
+        ready = self._notify(codes.DEVICE_STATUS, b"\1") if self.ready_s else b""
+        self.ready_s = 0.0
+        if data.startswith(encode_packets(*codes.RESET, b"\0")):
+            self.ready_s = now_s + 0.4
+            self.sessions.clear()
+            return self._respond(codes.RESET, b"\0")
+        return ready + super().receive(data, now_s)
+
+
 @pytest.mark.parametrize(
-    "board", [OneKey, Unnamed, OneByOne, NoReset, OnlyReady, Numbers, Late, Chatty, Active, Extended]
+    "board",
+    [NoHandle, Slow, OneKey, Unnamed, OneByOne, NoReset, OnlyReady, Numbers, Late, Chatty, Active, Extended],
 )
 def test_boards_that_the_facts_allow_range_with_their_cir(board: type[UciBoardModel]):
     model = board(count_bytes=1) if board is OneKey else board()

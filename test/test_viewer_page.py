@@ -35,7 +35,6 @@ from uwb_mitigation.viewer.page import Page, View
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
     AnchorPosition,
-    History,
     NodeStatus,
     Pose,
     Sample,
@@ -617,13 +616,6 @@ def test_raw_positions_are_those_of_the_locator_on_raw_ranges() -> None:
         assert position == pytest.approx(expected[stamp_s], abs=1e-6)
     assert position[:2] == pytest.approx((5.0, 2.0), abs=0.3)
     assert scene.pairs[2, 7].samples[-1].innovation_m == pytest.approx(0.5)
-
-
-def test_missing_sequence_numbers_are_lost_ranges() -> None:
-    history = History()
-    for sequence in (0, 4, 8, 12, 24, 28, 32):
-        history.count_lost(sequence & 0xFFFFFFFF)
-    assert history.lost == 2
 
 
 def contrast(first: str, second: str) -> float:
