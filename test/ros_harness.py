@@ -52,7 +52,7 @@ class Process:
         self.pid = self._popen.pid
 
     def exit_code(self) -> int | None:
-        """Exit code; Exit code; Exit code; None while it runs; negative: the signal that ended it."""
+        """Exit code; None while it runs; negative: the signal that ended it."""
         return self._popen.poll()
 
     @property

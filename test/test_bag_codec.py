@@ -30,6 +30,15 @@ from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED_TYPE
 
 TYPES = (RANGE_CIR_TYPE, RANGE_TRUTH_TYPE, RANGE_CORRECTED_TYPE)
 
+COLUMNS = (
+    "start_index",
+    "first_path_index",
+    "scale",
+    "preamble_count",
+    "rx_power_dbm",
+    "first_path_power_dbm",
+)
+
 float32 = st.floats(width=32)
 uint64 = st.integers(0, 2**64 - 1)
 uint16 = st.integers(0, 2**16 - 1)
@@ -131,22 +140,9 @@ def test_batch_equals_single_messages_or_is_refused(
         decoded, ranges = codec.decode_range(message), batch.columns
         assert (decoded.cir.encoding, decoded.cir.radio) == (ranges.encoding, ranges.radio)
         assert np.array_equal(decoded.cir.samples, ranges.samples[row])
-        names = ("start_index", "first_path_index", "scale", "preamble_count")
-        expected = [
-            *(getattr(decoded.cir, name) for name in (*names, "rx_power_dbm", "first_path_power_dbm"))
-        ]
-        assert repr(expected) == repr(
-            [
-                column[row].item()
-                for column in (
-                    *(getattr(ranges, name) for name in names),
-                    ranges.rx_power_dbm,
-                    ranges.first_path_power_dbm,
-                )
-            ]
-        )
-        values = (float(column[row]) for column in columns.values())
-        range_m, correction_m, variance_m2 = values
+        expected = [getattr(decoded.cir, name) for name in COLUMNS]
+        assert repr(expected) == repr([getattr(ranges, name)[row].item() for name in COLUMNS])
+        range_m, correction_m, variance_m2 = (float(column[row]) for column in columns.values())
         single = CorrectedRange(
             range_m, decoded.range_m, correction_m, variance_m2, Status(status[row]), CorrectedBy.DEVICE, 77
         )

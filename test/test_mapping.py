@@ -126,17 +126,10 @@ def _matlab(path: Path) -> None:
     savemat(path, {"log": TABLE})
 
 
-@pytest.mark.parametrize(
-    ("name", "make", "group"),
-    [
-        ("x.mat", _matlab, "log"),
-        ("seven.mat", _matlab_7_3, "log"),
-        ("x.h5", _hdf5, "log"),
-    ],
-)
-def test_array_formats_give_the_same_ranges_and_cirs(name: str, make: Any, group: str, tmp_path: Path):
+@pytest.mark.parametrize(("name", "make"), [("x.mat", _matlab), ("seven.mat", _matlab_7_3), ("x.h5", _hdf5)])
+def test_array_formats_give_the_same_ranges_and_cirs(name: str, make: Any, tmp_path: Path):
     make(tmp_path / name)
-    source = read(PLAIN | {"group": group, "cir": {"column": "cir"}}, tmp_path / name)
+    source = read(PLAIN | {"group": "log", "cir": {"column": "cir"}}, tmp_path / name)
     records = list(source)
     assert [record.measurement.range_m for record in records] == [1.5, 2.5, 3.5, 4.5, 5.5]
     assert [record.measurement.anchor_id for record in records] == [3, 4, 3, 4, 3]
@@ -154,9 +147,16 @@ def test_a_matrix_needs_names_for_its_columns(tmp_path: Path):
         read(document, tmp_path / "x.mat")
 
 
-@pytest.mark.parametrize("form", ["magnitude", "complex", "interleaved"])
-def test_cirs_in_text_keep_their_values(form: str, tmp_path: Path):
-    text = {"magnitude": "[3, 4]", "complex": "[(3-1j); 4+2i]", "interleaved": "3 -1 4 2"}[form]
+@pytest.mark.parametrize(
+    ("form", "text"),
+    [
+        ("magnitude", "[3, 4]"),
+        ("complex", "[(3-1j); 4+2i]"),
+        ("complex", "[[3, -1], [4, 2]]"),
+        ("interleaved", "3 -1 4 2"),
+    ],
+)
+def test_cirs_in_text_keep_their_values(form: str, text: str, tmp_path: Path):
     write(tmp_path / "x.csv", f't,a,r,c\n0,1,2,"{text}"\n')
     (record,) = read(PLAIN | {"cir": {"column": "c", "samples": form}}, tmp_path / "x.csv")
     expected = [3, 4] if form == "magnitude" else [3, -1, 4, 2]
@@ -164,12 +164,6 @@ def test_cirs_in_text_keep_their_values(form: str, tmp_path: Path):
     assert record.measurement.cir.encoding == (
         Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
     )
-
-
-def test_complex_cirs_are_read_from_pairs(tmp_path: Path):
-    write(tmp_path / "x.csv", 't,a,r,c\n0,1,2,"[[1, 2], [3, -4]]"\n')
-    (record,) = read(PLAIN | {"cir": {"column": "c", "samples": "complex"}}, tmp_path / "x.csv")
-    assert record.measurement.cir.samples.tolist() == [1, 2, 3, -4]
 
 
 def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):
@@ -665,24 +659,7 @@ def test_unsorted_and_repeated_stamps_and_nan_are_reported(tmp_path: Path):
         "ranges repeat the stamp of another range of the same pair",
         "ranges are negative",
     ]
-    assert any("sorted" in kind for kind in _after_reading(source))
-
-
-def _after_reading(source: MappedRecording) -> list[str]:
-    list(source)
-    return list(source.skipped)
-
-
-HUGE = {
-    "r": "1e297",
-    "true": "1e297",
-    "level": "1e297",
-    "index": "1e297",
-    "t": "1e297",
-    "s": "1e297",
-    "n": "1e297",
-    "x": "1e297",
-}
+    assert any("sorted" in kind for kind in source.skipped)
 
 
 def test_single_impossible_values_are_dropped_and_counted(tmp_path: Path):
@@ -703,7 +680,7 @@ def test_single_impossible_values_are_dropped_and_counted(tmp_path: Path):
         "n": "100",
         "x": "0",
     }
-    rows = [usual, *(usual | {name: value} for name, value in HUGE.items()), usual | {"level": "-inf"}]
+    rows = [usual, *(usual | {name: "1e297"} for name in usual if name != "a"), usual | {"level": "-inf"}]
     write(tmp_path / "x.csv", "\n".join([",".join(usual), *(",".join(row.values()) for row in rows)]))
     expected = {
         "stamp is not a number": 1, "range is above 10000": 1, "true range is above 10000": 1, "rx_power is above 10000": 1,
@@ -780,7 +757,6 @@ def test_a_truncated_compressed_file_gives_what_is_before_the_damage(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name: x\nfields: {anchor: a, rang: r}\n", "fields: unknown field .rang.; did you mean .range"),
         (
             "name: x\nfields: {anchor: a, range: r, rng: r}\n",
             r"fields: unknown field .rng.; did you mean 'range'",
@@ -835,18 +811,18 @@ def test_a_hostile_yaml_file_is_a_typed_error(text: str, tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["x.mat", "x.h5", "x.npy", "x.bag", "x.csv.xz", "x.csv.gz", "x.yaml"])
 def test_garbage_in_any_format_is_a_typed_error(name: str, tmp_path: Path):
-    for module in {"x.h5": ["h5py"]}.get(name, []):
-        pytest.importorskip(module)
+    if name == "x.h5":
+        pytest.importorskip("h5py")
     (tmp_path / name).write_bytes(b"\x93NUMPY garbage \x00\xff" * 40)
     with pytest.raises(RecordingError):
         read(PLAIN | {"topics": ["/x"]}, tmp_path / name)
 
 
 def test_a_damaged_file_of_a_library_is_a_typed_error(tmp_path: Path):
-    name, old, new = "x.h5", b"HEAP", b"HEAD"
-    _hdf5(tmp_path / name)
-    data = (tmp_path / name).read_bytes()
-    assert old in data
-    (tmp_path / name).write_bytes(data.replace(old, new, 1))
+    path = tmp_path / "x.h5"
+    _hdf5(path)
+    data = path.read_bytes()
+    assert b"HEAP" in data
+    path.write_bytes(data.replace(b"HEAP", b"HEAD", 1))
     with pytest.raises(RecordingError, match="cannot be read"):
-        read(PLAIN | {"group": "log" if name == "x.h5" else "", "cir": {"column": "cir"}}, tmp_path / name)
+        read(PLAIN | {"group": "log", "cir": {"column": "cir"}}, path)

@@ -122,12 +122,10 @@ def test_feet_and_inches_are_found_by_the_truth(unit: str, metres: float, tmp_pa
         f"{n / 10},1,{r:.3f},{t:.3f}\n" for n, (r, t) in enumerate(zip(measured, true, strict=True))
     )
     write(tmp_path / "x.csv", "t,a,r,true\n" + rows)
-    document = PLAIN | {"truth": {"range": "true"}}
+    truth = {"truth": {"range": "true"}}
     with pytest.raises(RecordingError, match=f"times the true ranges.*unit: {unit} of range"):
-        read(document, tmp_path / "x.csv")
-    source = read(with_fields(range={"column": "r", "unit": unit}) | document | {
-        "fields": {**PLAIN["fields"], "range": {"column": "r", "unit": unit}}
-    }, tmp_path / "x.csv")  # fmt: skip
+        read(PLAIN | truth, tmp_path / "x.csv")
+    source = read(with_fields(range={"column": "r", "unit": unit}) | truth, tmp_path / "x.csv")
     assert 0.3 < np.median(source.errors_m) < 0.6
 
 

@@ -14,12 +14,12 @@ from benchmarks.equipment.board import Board
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.events import OffsetsRefused
+from uwb_mitigation.radios.wire.framing import WireFrame
 from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import Correction, Hello
 from uwb_mitigation.radios.wire.session import MAX_TRIES, REQUEST_INTERVAL_NS, BoardSession
-from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, dump_offsets, parse_offsets, read_offsets
 
 TEXT = """\
@@ -143,28 +143,30 @@ class Echo:
     def correct(self, measurements: list[RangeMeasurement]) -> list[CorrectedRange]:
         (asked,) = measurements
         offset_m = float(self.offsets.lookup([asked.tag_id], [asked.anchor_id])[0])
-        plain = messages.decode(*messages.encode(CORRECTION))
-        assert isinstance(plain, Correction)
-        return [replace(plain.corrected, range_m=asked.range_m - offset_m, correction_m=offset_m)]
+        range_m = asked.range_m
+        return [CorrectedRange(range_m - offset_m, range_m, offset_m, 1.0, Status.OK, CorrectedBy.DEVICE, 5)]
 
 
-CORRECTION = Correction(0, 1, 2, 3, 4, CorrectedRange(1.0, 1.0, 0.0, 1.0, Status.OK, 1, 5))  # type: ignore[arg-type]
+class OlderBoard(Board):
+    """A board whose firmware ignores offsets."""
+
+    def _answer(self, frame: WireFrame, now_us: int) -> bytes:
+        return b"" if frame.type == MessageType.SET_OFFSETS else super()._answer(frame, now_us)
 
 
 class Pair:
-    """A session connected to a board; a board with older firmware ignores offsets."""
+    """A session connected to a board."""
 
-    def __init__(self, wanted: Offsets | None, *, older: bool = False) -> None:
+    def __init__(self, offsets: Offsets, board: type[Board] = Board) -> None:
         self.session = BoardSession()
-        self.older = older
+        self.board_class = board
         self.now = 0
         self.events: list[object] = []
         self.start()
-        if wanted is not None:
-            self.session.set_offsets(wanted)
+        self.session.set_offsets(offsets)
 
     def start(self, boot: int = 1) -> None:
-        self.board = Board(Hello(model_id=5), Echo(), mode=Mode.DEVICE, boot_id=boot)
+        self.board = self.board_class(Hello(model_id=5), Echo(), mode=Mode.DEVICE, boot_id=boot)
         self.deliver(self.board.hello(self.now))
 
     def deliver(self, data: bytes) -> None:
@@ -173,22 +175,12 @@ class Pair:
     def turn(self) -> None:
         self.now += REQUEST_INTERVAL_NS
         self.deliver(b"")
-        asked = self.session.outgoing()
-        if self.older:
-            decoder = messages_in(asked)
-            asked = b"".join(wire for kind, wire in decoder if kind != MessageType.SET_OFFSETS)
-        self.deliver(self.board.receive(asked, self.now // 1000))
+        self.deliver(self.board.receive(self.session.outgoing(), self.now // 1000))
 
     def range(self) -> list[float]:
         before = len(self.events)
         self.deliver(self.board.measure(measurement(3.0), self.now // 1000))
         return [event.corrected.range_m for event in self.events[before:] if isinstance(event, Correction)]
-
-
-def messages_in(data: bytes) -> list[tuple[int, bytes]]:
-    from uwb_mitigation.radios.wire.framing import FrameDecoder, encode_frame
-
-    return [(frame.type, encode_frame(frame)) for frame in FrameDecoder().feed(data)]
 
 
 def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
@@ -208,7 +200,7 @@ def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
 
 
 def test_older_board_is_reported_and_its_corrections_are_ignored():
-    pair = Pair(Offsets(0.25), older=True)
+    pair = Pair(Offsets(0.25), OlderBoard)
     for _ in range(MAX_TRIES + 3):
         pair.turn()
     (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]
@@ -217,7 +209,7 @@ def test_older_board_is_reported_and_its_corrections_are_ignored():
 
 
 def test_older_board_is_accepted_without_offsets():
-    pair = Pair(NO_OFFSETS, older=True)
+    pair = Pair(NO_OFFSETS, OlderBoard)
     assert pair.range() == [3.0]
     for _ in range(MAX_TRIES + 3):
         pair.turn()

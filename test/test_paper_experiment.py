@@ -179,15 +179,12 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-def paper(*words: object, folder: Path) -> dict:
-    done = run("paper", *words, "--json", "out.json", folder=folder)
-    assert done.returncode == 0, done.stderr
-    return json.loads((folder / "out.json").read_text())
-
-
 def test_command_writes_its_results(folder):
     quick = ("--networks", "remnet", "--windows", 8, "--seeds", 1, "--epochs", 1, "--workers", 1)
-    result = paper("protocol", "--data", "rooms.mcap", "-o", "models", *quick, folder=folder)
+    words = ("protocol", "--data", "rooms.mcap", "-o", "models", "--json", "out.json", *quick)
+    done = run("paper", *words, folder=folder)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((folder / "out.json").read_text())
     assert json.loads((folder / "models" / RESULTS).read_text()) == result
     assert (result["data"], result["split"]) == ("rooms.mcap (simulated)", "paper")
     assert (result["train"], result["test"]) == (131, 48)  # the share of the published rows

@@ -210,25 +210,26 @@ def test_smart_power_sends_one_frame_per_millisecond(air: Air):
 
 
 @pytest.mark.parametrize(
-    ("settings", "tag", "anchor"),
+    ("settings", "tag", "anchor", "revision"),
     [
-        (RadioSettings(channel=2), 2 * 0x4011, 2 * 0x4111),
-        (RadioSettings(channel=2, rate_kbps=110, preamble=1024), 2 * 0x4022, 2 * 0x4122),
-        (RadioSettings(channel=5), 2 * 0x4033, 2 * 0x4133),
-        (RadioSettings(channel=5, rate_kbps=110, preamble=1024), 2 * 0x4044, 2 * 0x4144),
-        (RadioSettings(channel=5, rate_kbps=850), 0x8050, 0x8050),
-        (RadioSettings(channel=3), 0x8050, 0x8050),
-        (RadioSettings(channel=3, prf_mhz=16), 0x8060, 0x8060),
-        (RadioSettings(channel=2, antenna_delay=32_700), 32_700, 32_700),
+        (RadioSettings(channel=2), 2 * 0x4011, 2 * 0x4111, 2),
+        (RadioSettings(channel=2, rate_kbps=110, preamble=1024), 2 * 0x4022, 2 * 0x4122, 2),
+        (RadioSettings(channel=5), 2 * 0x4033, 2 * 0x4133, 2),
+        (RadioSettings(channel=5, rate_kbps=110, preamble=1024), 2 * 0x4044, 2 * 0x4144, 2),
+        (RadioSettings(channel=5, rate_kbps=850), 0x8050, 0x8050, 2),
+        (RadioSettings(channel=3), 0x8050, 0x8050, 2),
+        (RadioSettings(channel=3, prf_mhz=16), 0x8060, 0x8060, 2),
+        (RadioSettings(channel=2, antenna_delay=32_700), 32_700, 32_700, 2),
+        # Only revisions 2 and 3 are those of a TREK1000.
+        (RadioSettings(), 0x8050, 0x8050, 1),
+        (RadioSettings(), 2 * 0x4033, 2 * 0x4133, 3),
+        (RadioSettings(), 0x8050, 0x8050, 4),
     ],
 )
-def test_antenna_delay_of_a_trek1000_is_from_otp(air: Air, settings: RadioSettings, tag: int, anchor: int):
-    assert antenna_delays(air, settings, revision=2) == (anchor, tag)
-
-
-@pytest.mark.parametrize(("revision", "delays"), [(1, 0x8050), (3, 2 * 0x4033), (4, 0x8050)])
-def test_only_otp_revisions_2_and_3_are_those_of_a_trek1000(air: Air, revision: int, delays: int):
-    assert antenna_delays(air, RadioSettings(), revision)[1] == delays
+def test_antenna_delay_of_a_trek1000_is_from_otp(
+    air: Air, settings: RadioSettings, tag: int, anchor: int, revision: int
+):
+    assert antenna_delays(air, settings, revision) == (anchor, tag)
 
 
 def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[int, int]:
