@@ -10,7 +10,7 @@ from pathlib import Path
 
 import model_material
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.equipment import random_networks
 from benchmarks.firmware import Network, network_of
@@ -28,6 +28,11 @@ from uwb_mitigation.training.paper import published
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD
+
+
+def bits(values: ArrayLike) -> NDArray[np.uint32]:
+    """Return the bit patterns of values in binary32."""
+    return np.asarray(values, np.float32).view(np.uint32)
 
 
 def write_model(folder: Path, weights: Int8Weights, **changes: object) -> Path:

@@ -17,7 +17,7 @@ import firmware_models
 import model_material
 import numpy as np
 import pytest
-from firmware_models import Exported
+from firmware_models import Exported, bits
 
 from benchmarks.equipment import emulator, random_networks
 from benchmarks.equipment.emulated_firmware import EmulatedFirmware, cut_to_window
@@ -41,10 +41,6 @@ pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not
 
 # Instructions of one inference, k0 = 3. The paper's rate at K = 157 means about 3.7 million cycles.
 BUDGET = {157: 360_000, 128: 320_000, 64: 162_000, 32: 82_000, 16: 48_000, 8: 40_000}
-
-
-def bits(values: np.ndarray) -> np.ndarray:
-    return np.asarray(values, np.float32).view(np.uint32)
 
 
 @pytest.fixture(scope="module", params=firmware_models.SHAPES, ids=firmware_models.shape_name)

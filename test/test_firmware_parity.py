@@ -13,7 +13,7 @@ import model_material
 import numpy as np
 import pytest
 from compilers import NEEDS_CC, NEEDS_CXX
-from firmware_models import Exported
+from firmware_models import Exported, bits
 
 from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import UwbMitigationError
@@ -34,10 +34,6 @@ pytestmark = NEEDS_CC
 
 # Undefined behaviour ends the process, so that it is always detected.
 SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
-
-
-def bits(values: np.ndarray) -> np.ndarray:
-    return np.asarray(values, np.float32).view(np.uint32)
 
 
 @pytest.fixture(scope="module", params=firmware_models.SHAPES, ids=firmware_models.shape_name)
