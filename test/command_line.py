@@ -15,6 +15,7 @@ from typing import NamedTuple
 from unittest import mock
 
 from uwb_mitigation.commands import cli
+from uwb_mitigation.commands.support import console
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent), "COLUMNS": "160"}
 """Environment of a command in its own process: the package of this repository, and the terminal width."""
@@ -35,6 +36,9 @@ def run(*arguments: object, folder: Path, columns: int = 160) -> Finished:
     with (
         mock.patch.object(sys, "argv", ["uwb-mitigation", *map(str, arguments)]),
         mock.patch.dict(os.environ, COLUMNS=str(columns)),
+        # A console that another test created has the width of that time.
+        mock.patch.object(console.out, "_width", columns),
+        mock.patch.object(console.err, "_width", columns),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

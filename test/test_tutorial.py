@@ -65,11 +65,11 @@ def outputs(folder: Path) -> dict[str, str]:
 
 def printed(name: str, folder: Path, request: pytest.FixtureRequest) -> str:
     if name in ("info", "offset"):
-        logs = request.getfixturevalue("apartment")
+        logs = shlex.quote(str(request.getfixturevalue("apartment")))
         return output_of(folder, f"data info {logs}" if name == "info" else f"offset {logs} --truth --common")
     if name == "demo":
         pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
-        words = [sys.executable, "-m", "uwb_mitigation.commands.entry", "demo", "--rate", "10"]
+        words = [sys.executable, "-m", "uwb_mitigation.commands.entry", "demo", "--rate", "2"]
         environment = os.environ | {"COLUMNS": "80"}
         return subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout
     outputs: dict[str, str] = request.getfixturevalue("outputs")
