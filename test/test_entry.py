@@ -13,6 +13,9 @@ from conftest import REPOSITORY
 
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
 
+# Short sleeps: a signal that arrives just before a sleep is handled after it.
+LOADING = "import time\nprint('loading', flush=True)\nwhile True:\n    time.sleep(0.1)\n"
+
 
 def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Popen[str]:
     """Start an executable or a demo; modules in `path` replace installed ones."""
@@ -57,9 +60,7 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
 )
 def test_signal_during_the_import_ends_the_process(executable: str, number: signal.Signals, tmp_path: Path):
     for package in ("rclpy", "typer"):
-        (tmp_path / f"{package}.py").write_text(
-            "import time\nprint('loading', flush=True)\ntime.sleep(600)\n"
-        )
+        (tmp_path / f"{package}.py").write_text(LOADING)
     process = run(executable, path=tmp_path)
     assert process.stdout.readline() == "loading\n"
     process.send_signal(number)
@@ -69,7 +70,7 @@ def test_signal_during_the_import_ends_the_process(executable: str, number: sign
 
 def test_signal_during_the_start_of_a_node_ends_it_immediately(tmp_path: Path):
     pytest.importorskip("rclpy")
-    (tmp_path / "serial.py").write_text("import time\nprint('loading', flush=True)\ntime.sleep(600)\n")
+    (tmp_path / "serial.py").write_text(LOADING)
     process = run("driver", path=tmp_path)
     assert process.stdout.readline() == "loading\n"
     process.send_signal(signal.SIGINT)

@@ -21,7 +21,6 @@ from benchmarks.positions import evaluate
 from uwb_mitigation.commands import positioning
 from uwb_mitigation.commands.offline import track as tracking
 from uwb_mitigation.commands.offline.track import held_out, track_tag
-from uwb_mitigation.commands.support import console
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
@@ -79,12 +78,10 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(tmp_path_factory.mktemp("hall") / "hall.mcap", *drive(seconds=40), too_long_m=0.6)
 
 
-def test_track_is_written_evaluated_and_read_by_evo(
-    hall: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(console.out, "_width", 80)
+def test_track_is_written_evaluated_and_read_by_evo(hall: Path, tmp_path: Path):
     out, tum, result = tmp_path / "track.mcap", tmp_path / "track.tum", tmp_path / "track.json"
-    done = run("track", hall, "-o", out, "--tum", tum, "--height", "1.0", "--json", result, folder=tmp_path)
+    options = ["-o", out, "--tum", tum, "--height", "1.0", "--json", result]
+    done = run("track", hall, *options, folder=tmp_path, columns=80)
     assert done.returncode == 0, done.stderr
     excerpt = json.loads(result.read_text())
     assert excerpt["unknown_anchors"] == {"99": 1}
