@@ -28,13 +28,27 @@ def corrected(
 def test_counts_rate_latency_and_sigma():
     statistics = RangeStatistics()
     for index in range(100):
-        statistics.raw += 1
+        statistics.add_raw(index * 100_000_000)
         corrected(statistics, index, 2.2, 1.9, latency_s=(1 + index % 3) / 1000)
-    statistics.raw += 1
+    statistics.add_raw(100 * 100_000_000)
     assert (statistics.corrected, statistics.missing, statistics.errors) == (100, 1, {})
     assert statistics.latency_ms(50) == pytest.approx(2.0)
     assert statistics.pairs[7, 1].rate_hz() == pytest.approx(10.0, rel=1e-2)
     assert statistics.pairs[7, 1].corrected.variance_m2 == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("late", ["raw", "corrected"])
+def test_ranges_before_the_other_topic_are_not_lost(late: str):
+    statistics = RangeStatistics()
+    for index in range(178):
+        if late != "raw" or index >= 37:
+            statistics.add_raw(index * 100_000_000)
+        if (late != "corrected" or index >= 37) and index != 100:
+            corrected(statistics, index, 2.2, 1.9)
+    assert statistics.missing == 1
+    console = Console(width=100, record=True)
+    console.print(summary(statistics))
+    assert "37 of the " in console.export_text()
 
 
 def test_errors_are_absolute_and_grouped_by_label():

@@ -22,6 +22,7 @@ from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
+from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import AnchorMap, dump_anchors
 from uwb_mitigation.types.ros import topics
@@ -38,10 +39,11 @@ SETTLE_S = 3.0
 
 @dataclass(frozen=True, slots=True)
 class DemoPlan:
-    """A demo: title, the driver's parameters, and if known the anchors and the offset of the boards."""
+    """A demo: title, parameters of the driver, speed, and if known the anchors and the offset of the boards."""
 
     title: str
     parameters: tuple[str, ...]
+    rate: float
     anchors: AnchorMap | None = None
     offset_m: float | None = None
 
@@ -49,17 +51,12 @@ class DemoPlan:
 def simulated(rate: float) -> DemoPlan:
     """Return the demo of the simulator's default scene, in which weak signals give no range."""
     source = SimulatedSource(count=SIMULATED_EXCHANGES, rate_hz=SIMULATED_RATE_HZ)
-    offset_m = offset_of(source)
     return DemoPlan(
         f"simulated recording, {len(list(source))} ranges",
-        (
-            "source:=simulated",
-            f"count:={SIMULATED_EXCHANGES}",
-            f"simulated_rate:={SIMULATED_RATE_HZ}",
-            f"rate:={rate or 1.0}",
-        ),
+        ("source:=simulated", f"count:={SIMULATED_EXCHANGES}", f"simulated_rate:={SIMULATED_RATE_HZ}"),
+        rate or 1.0,
         source.anchors,
-        offset_m,
+        offset_of(source),
     )
 
 
@@ -96,7 +93,8 @@ def recorded(path: Path, rate: float) -> DemoPlan:
     rate = rate or max(1.0, length_s / TARGET_S)
     return DemoPlan(
         f"{name}, {count} ranges, {rate:.1f} x recorded speed",
-        (f"source:={kind}", f"path:={path.resolve()}", f"rate:={rate}", f"longest_pause:={LONGEST_PAUSE_S}"),
+        (f"source:={kind}", f"path:={path.resolve()}", f"longest_pause:={LONGEST_PAUSE_S}"),
+        rate,
         offset_m=offset_m,
     )
 
@@ -143,7 +141,15 @@ def watch(plan: DemoPlan, console: Console) -> list[str]:
             if plan.anchors is not None:
                 file = Path(folder) / "anchors.yaml"
                 file.write_text(dump_anchors(plan.anchors), encoding="utf-8")
-                nodes.start("locator", f"anchors:={file}", "level:=true", "rate:=0.0")
+                # A replay at another speed changes the speed of the robot, and the noise of its motion.
+                acceleration = min(NoiseModel().acceleration * plan.rate**1.5, 1000.0)
+                nodes.start(
+                    "locator",
+                    f"anchors:={file}",
+                    "level:=true",
+                    "rate:=0.0",
+                    f"acceleration:={acceleration:.6f}",
+                )
                 nodes.wait(
                     lambda: monitor.count_publishers(anchors) > 0, "the locator did not start: see above"
                 )
@@ -152,22 +158,23 @@ def watch(plan: DemoPlan, console: Console) -> list[str]:
                 "the mitigator did not start: see above",
             )
             # The mitigator and this process must receive the first range.
-            nodes.start("driver", *plan.parameters, "wait_for_subscribers:=2")
+            nodes.start("driver", *plan.parameters, f"rate:={plan.rate}", "wait_for_subscribers:=2")
             with Live(console=console, refresh_per_second=REFRESH_HZ) as live:
                 while nodes.running:
                     live.update(live_table(statistics, title, console.width))
                     time.sleep(1 / REFRESH_HZ)
                 # The last corrected ranges may arrive after the end of the driver.
                 deadline = time.monotonic() + SETTLE_S
-                while statistics.missing and time.monotonic() < deadline:
+                while statistics.corrected < statistics.raw and time.monotonic() < deadline:
                     time.sleep(0.05)
                 live.update(live_table(statistics, title, console.width))
         console.print(summary(statistics))
         if len(poses) > 1 and len(truth) > 1:
+            speed = "" if plan.rate == 1.0 else f" (at {plan.rate:g} x speed, for which it is not tuned)"
             console.print(
-                f"horizontal position error of the locator: {position_rmse(poses, truth):.3f} m RMSE"
+                f"horizontal position error of the locator: {position_rmse(poses, truth):.3f} m RMSE{speed}"
             )
-    if statistics.missing or not statistics.corrected:
+    if statistics.corrected < statistics.raw or not statistics.corrected:
         nodes.failures.append(f"{statistics.corrected} of {statistics.raw} ranges were corrected")
     return nodes.failures
 

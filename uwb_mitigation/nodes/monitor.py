@@ -23,7 +23,7 @@ from uwb_mitigation.nodes.support.processes import spinning_node
 from uwb_mitigation.nodes.support.spinning import stop_event
 from uwb_mitigation.types.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.types.ros import topics
-from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_truth
+from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
 from uwb_mitigation.types.stamps import NS_PER_S
 
 REFRESH_HZ = 5
@@ -34,6 +34,9 @@ MAX_LATENCIES = 100_000
 
 MAX_TRUTHS = 10_000
 """Number of latest truths that wait for their corrected ranges."""
+
+_RECENT = 1000
+"""Number of latest stamps of a topic that are stored while the other topic is not received yet."""
 
 
 class PairStatistics:
@@ -61,13 +64,17 @@ class RangeStatistics:
     """Counts, latencies and errors of the received ranges, by pair.
 
     Attributes:
+        raw, corrected: numbers of received ranges.
+        early: the numbers of them from before the first range of the other topic.
         errors: {label: (number, sum of raw, sum of corrected absolute errors in m)} of ranges with known truth.
     """
 
     def __init__(self) -> None:
         self.pairs: dict[tuple[int, int], PairStatistics] = {}
-        self.raw = 0
-        self.corrected = 0
+        self.raw = self.corrected = 0
+        self.early = {"raw": 0, "corrected": 0}
+        self._recent_ns: dict[str, deque[int]] = {topic: deque(maxlen=_RECENT) for topic in self.early}
+        self._both_since_ns: int | None = None
         self.statuses: Counter[Status] = Counter()
         self.errors: defaultdict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(3))
         self._latencies_s: deque[float] = deque(maxlen=MAX_LATENCIES)
@@ -75,8 +82,8 @@ class RangeStatistics:
 
     @property
     def missing(self) -> int:
-        """Number of raw ranges without a corrected range; 0 if the board corrects and sends no raw ranges."""
-        return max(self.raw - self.corrected, 0)
+        """Number of raw ranges without a corrected range, since both topics are received."""
+        return max(self.raw - self.early["raw"] - self.corrected + self.early["corrected"], 0)
 
     def latency_ms(self, percentile: float) -> float:
         """Return a percentile of the time from stamp to reception; NaN without data."""
@@ -87,10 +94,27 @@ class RangeStatistics:
         if len(self._truths) > MAX_TRUTHS:
             self._truths.pop(next(iter(self._truths)))
 
+    def add_raw(self, stamp_ns: int) -> None:
+        self.raw += 1
+        self._add_stamp("raw", stamp_ns)
+
+    def _add_stamp(self, topic: str, stamp_ns: int) -> None:
+        if self._both_since_ns is not None:
+            self.early[topic] += stamp_ns < self._both_since_ns
+            return
+        self._recent_ns[topic].append(stamp_ns)
+        if all(self._recent_ns.values()):
+            # Discovery of two publishers takes different times: compare from the later first range.
+            self._both_since_ns = since_ns = max(stamps[0] for stamps in self._recent_ns.values())
+            totals = {"raw": self.raw, "corrected": self.corrected}
+            for name, stamps in self._recent_ns.items():
+                self.early[name] = totals[name] - sum(stamp >= since_ns for stamp in stamps)
+
     def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange, arrival_s: float) -> None:
         """Add a corrected range; `arrival_s` is on the clock of its stamp."""
         truth = self._truths.pop(key, None)
         self.corrected += 1
+        self._add_stamp("corrected", key.stamp_ns)
         self.statuses[corrected.status] += 1
         self._latencies_s.append(arrival_s - key.stamp_ns / NS_PER_S)
         pair = self.pairs.setdefault((key.anchor_id, key.tag_id), PairStatistics())
@@ -117,7 +141,8 @@ class Monitor(Node):
             self.create_subscription(kind, topics.relative(topic), callback, endpoints.RANGES, raw=True)
 
     def _on_raw(self, data: bytes) -> None:
-        self.statistics.raw += 1
+        with contextlib.suppress(RecordingError):
+            self.statistics.add_raw(decode_range(data).stamp_ns)
 
     def _on_truth(self, data: bytes) -> None:
         with contextlib.suppress(RecordingError):
@@ -125,7 +150,6 @@ class Monitor(Node):
 
     def _on_corrected(self, data: bytes) -> None:
         now_s = self.get_clock().now().nanoseconds / NS_PER_S
-        # A malformed message counts as missing.
         with contextlib.suppress(RecordingError):
             self.statistics.add_corrected(*decode_corrected(data), now_s)
 
@@ -190,6 +214,9 @@ def summary(statistics: RangeStatistics) -> Group:
         Text(),
         Text(f"{statistics.raw} ranges received, {corrected}, {statistics.missing} lost"),
     ]
+    for topic, reference in (("corrected", "raw"), ("raw", "corrected")):
+        if early := statistics.early[topic]:
+            lines.append(Text(f"{early} of the {topic} ranges came before the first {reference} range"))
     if statistics.corrected:
         p50, p99 = statistics.latency_ms(50), statistics.latency_ms(99)
         lines.append(Text(f"latency from stamp to corrected range: p50 {p50:.2f} ms, p99 {p99:.2f} ms"))
