@@ -1,6 +1,8 @@
 VENV := .venv
 SETUP = PYTHON='$(PYTHON)' ./setup.sh
 IN_ROS = . $(VENV)/environment.sh;
+# With compiled files, processes start in half the time.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-training demo firmware-demo radio-demo paper test test-fast colcon path-for-colcon docs docs-links lint lock clean

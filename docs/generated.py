@@ -14,8 +14,9 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import typer
 from typer.cli import get_docs_for_click
@@ -148,14 +149,19 @@ def thresholds() -> str:
     return "\n".join(f"| WARN | {fact} above {limit:g} | {text} |" for fact, limit, text in rows)
 
 
+@cache
+def _commands() -> dict[str, Any]:
+    """Return all commands and groups of commands, {name: command}."""
+    return dict(typer.main.get_command(cli.app).commands)  # type: ignore[attr-defined]
+
+
 def command_list() -> str:
     """Return tables of all commands by topic with links to their pages, and their table of contents."""
-    known = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
     lines: list[str] = []
     for topic, names in cli.PANELS.items():
         lines += ["", f"## {topic}", "", "| command | purpose |", "|---|---|"]
         for name in names:
-            about = (known[name].help or "").partition("\n")[0]
+            about = (_commands()[name].help or "").partition("\n")[0]
             lines.append(f"| [`{name}`](commands/{name}.md) | {about} |")
     lines += ["", "```{toctree}", ":hidden:", "", *(f"commands/{name}" for name in _command_names()), "```"]
     return "\n".join(lines)
@@ -167,7 +173,7 @@ def _command_names() -> list[str]:
 
 def command_page(name: str) -> str:
     """Return the page of a command or of a group of commands, with all options as in `--help`."""
-    command = typer.main.get_command(cli.app).commands[name]  # type: ignore[attr-defined]
+    command = _commands()[name]
     text = get_docs_for_click(
         obj=command, ctx=typer.Context(command, info_name=name), name=name, call_prefix="uwb-mitigation"
     )

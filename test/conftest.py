@@ -42,8 +42,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    is_slow_file = collection_path.match("test_*.py") and not is_fast(collection_path)
-    return True if config.getoption("--fast") and is_slow_file else None
+    if config.getoption("--fast") and collection_path.match("test_*.py") and not is_fast(collection_path):
+        return True
+    return None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

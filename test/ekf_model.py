@@ -7,6 +7,7 @@ State, Jacobian, default covariances and the order of prediction and correction 
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -54,21 +55,28 @@ class Ekf:
         """
         if sensor not in self._parameters:
             return
-        config = self._parameters[f"{sensor}_config"]
-        assert len(config) == 15
-        rows = [row for row, selected in zip(range(8), np.take(config, PLANAR), strict=True) if selected]
-        assert sum(config) == len(rows), "values that are not in the plane"
-        columns = [column for column, row in enumerate(values) if row in rows]
-        assert len(columns) == len(rows), f"{sensor} does not measure all selected values"
+        rows, columns = self._selection(sensor, tuple(values))
         if self.time_s is not None and time_s > self.time_s:
             self._predict(time_s - self.time_s)
         self.time_s = time_s if self.time_s is None else max(time_s, self.time_s)
         z, R = np.array(list(values.values()))[columns], R[np.ix_(columns, columns)]
-        H = np.eye(8)[list(np.array(list(values))[columns])]
-        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
-        self.x = self.x + K @ (z - H @ self.x)
-        residual = np.eye(8) - K @ H
+        # H selects rows of the state.
+        K = np.linalg.solve(self.P[np.ix_(rows, rows)] + R, self.P[rows]).T
+        self.x = self.x + K @ (z - self.x[rows])
+        residual = np.eye(8)
+        residual[:, rows] -= K
         self.P = residual @ self.P @ residual.T + K @ R @ K.T
+
+    @cache  # noqa: B019
+    def _selection(self, sensor: str, measured: tuple[int, ...]) -> tuple[list[int], list[int]]:
+        """Return the rows of the state that the configuration selects, and their places in the measured values."""
+        config = self._parameters[f"{sensor}_config"]
+        assert len(config) == 15
+        rows = [row for row, selected in enumerate(np.take(config, PLANAR)) if selected]
+        assert sum(config) == len(rows), "values that are not in the plane"
+        assert set(rows) <= set(measured), f"{sensor} does not measure all selected values"
+        columns = [column for column, row in enumerate(measured) if row in rows]
+        return [measured[column] for column in columns], columns
 
     def _predict(self, dt: float) -> None:
         cosine, sine, half = math.cos(self.x[YAW]), math.sin(self.x[YAW]), 0.5 * dt * dt

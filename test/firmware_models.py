@@ -146,10 +146,10 @@ class Exported:
         samples = self.weights.architecture.samples
         return random_networks.rounding_windows(samples, self.weights.activation_scale["input"], count)
 
-    def real_windows(self, apartment: Path, every: int = 1) -> NDArray[np.float32]:
-        """Return the network inputs of the real measurements, or of every n-th."""
+    def real_windows(self, apartment: Path) -> NDArray[np.float32]:
+        """Return the network inputs of the real measurements."""
         samples = self.weights.architecture.samples
-        measured = real_measurements(apartment)[::every]
+        measured = real_measurements(apartment)
         faults, windows = Preprocessing(samples, Scaling.PREAMBLE).windows_of(measured)
         return windows[np.equal(faults, 0)]
 

@@ -110,9 +110,12 @@ def lines_of(*start: str) -> list:
     ]
 
 
+COMMANDS = typer.main.get_command(cli.app)
+
+
 @pytest.mark.parametrize("words", lines_of("uwb-mitigation"))
 def test_commands_on_pages_exist_with_their_options(words: list[str]):
-    check_options(typer.main.get_command(cli.app), words)
+    check_options(COMMANDS, words)
 
 
 @pytest.mark.parametrize("words", lines_of("python", "-m", "benchmarks"))

@@ -52,7 +52,10 @@ def stamp_ns(header: Header) -> int:
 
 
 class LiveRobot:
-    """Publishes ranges and odometry of a robot in chunks, and waits until the locator has processed each."""
+    """Publishes ranges and odometry of a robot in chunks, and waits until the locator has processed each.
+
+    The odometry is a chunk ahead, because messages of two topics arrive in any order.
+    """
 
     def __init__(
         self, ros: Ros, *, seconds: float = 40.0, imu: bool = False, slip=(0.0, 0.0), namespace: str = ""
@@ -62,6 +65,7 @@ class LiveRobot:
         # Old enough that the locator does not predict poses at the current time.
         self.start_ns = ros.node.get_clock().now().nanoseconds - round((seconds + 40.0) * NANOSECONDS)
         self._ros, self._at_s, self._uses_imu = ros, 0.0, imu
+        self._odometry_end_ns = 0
         qos = QoSProfile(depth=1000)
         self._ranges_out = ros.node.create_publisher(RangeCorrected, f"{namespace}/uwb/range_corrected", qos)
         self._odometry_out = ros.node.create_publisher(Odometry, f"{namespace}/odom", qos)
@@ -85,7 +89,9 @@ class LiveRobot:
             begin, end = (round(s * NANOSECONDS) for s in (self._at_s, self._at_s + CHUNK_S))
             self._at_s += CHUNK_S
             if odometry:
-                self._send_odometry(begin, end)
+                sent, ahead = self._odometry_end_ns, min(self._at_s + CHUNK_S, until_s)
+                self._odometry_end_ns = round(ahead * NANOSECONDS)
+                self._send_odometry(max(begin, sent), self._odometry_end_ns)
             stamps = self.ranges.stamp_ns
             rows = np.flatnonzero((stamps >= begin) & (stamps < end)).tolist()
             for i, tag in itertools.product(rows, tags):

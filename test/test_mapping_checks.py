@@ -310,7 +310,7 @@ def test_missing_output_folder_is_an_error_before_reading(tmp_path: Path):
 
 
 def test_sigterm_removes_the_partial_file(tmp_path: Path):
-    arguments = command("data", "simulate", "-o", "x.mcap", "--ranges", "2000000")
+    arguments = command("data", "simulate", "-o", "x.mcap", "--ranges", "200000")
     process = subprocess.Popen(arguments, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.DEVNULL)
     try:
         for _ in range(600):
