@@ -26,7 +26,7 @@ def test_least_squares_solves_as_a_dense_matrix_does():
         first = (n % (knots - 1)) * b
         columns[n] = [*range(first, first + 2 * b), *range(knots * b, knots * b + q)]
         dense[n, columns[n]] = values[n]
-    rows = problem.add(columns, values, target, 4.0)
+    problem.add(columns, values, target, 4.0)
     solution = problem.solve()
     inverse = np.linalg.inv(4.0 * dense.T @ dense)
     wanted = inverse @ (4.0 * dense.T @ target)
@@ -36,12 +36,12 @@ def test_least_squares_solves_as_a_dense_matrix_does():
     for k, found in enumerate(solution.covariances(2)):
         np.testing.assert_allclose(found, inverse[k * b : k * b + 2, k * b : k * b + 2], atol=1e-9)
     adapted = dense[:, -q:] - dense[:, :-q] @ np.linalg.lstsq(dense[:, :-q], dense[:, -q:])[0]
-    np.testing.assert_allclose(solution.reduced(rows), adapted, atol=1e-9)
+    np.testing.assert_allclose(solution.reduced(columns, values), adapted, atol=1e-9)
 
 
 def test_smoother_agrees_with_nonlinear_least_squares():
     """SciPy with numerical derivatives as an oracle: independent errors, no robust loss, no offsets."""
-    model = NoiseModel(long=100.0, short=100.0, white=1.0, offset_sd=1e-6, pair_sd=1e-6)
+    model = NoiseModel(long=100.0, short=100.0, smoother_white=1.0, offset_sd=1e-6, pair_sd=1e-6)
     ranges, truth = drive(seconds=4, model=NoiseModel(white=1.0), offset_m=0.0)
     knots_ns, of = knots_of(ranges.stamp_ns)
     ranges = ranges.take(np.flatnonzero(ranges.stamp_ns == knots_ns[of]))
@@ -76,15 +76,15 @@ def known_track(truth: TruePath) -> Track:
 
 def test_smoothed_tracks_are_consistent_and_better_than_live_ones():
     live, smooth = [], []
+    # The errors of the drives are those of the model.
+    config = EstimatorConfig(HALL, NoiseModel(smoother_white=NoiseModel().white))
     for seed in range(6):
         rng = np.random.default_rng(seed)
         ranges, truth = drive(seconds=25, seed=seed, offset_m=rng.normal(0, NoiseModel().offset_sd))
         ranges.range_m[:] += rng.normal(0, NoiseModel().pair_sd, len(HALL))[ranges.anchor]
         first = TagEstimator(EstimatorConfig(HALL)).run(ranges)
         live.append(track_errors(first, truth).rmse)
-        smooth.append(
-            track_errors(Smoother(EstimatorConfig(HALL, NoiseModel()), ranges).fit(first).track, truth)
-        )
+        smooth.append(track_errors(Smoother(config, ranges).fit(first).track, truth))
     assert np.mean([e.rmse for e in smooth]) < 0.95 * np.mean(live)
     assert 0.5 < np.mean([e.nees_per_dof for e in smooth]) < 1.6
 

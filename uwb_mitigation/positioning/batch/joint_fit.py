@@ -41,6 +41,8 @@ FAR_S = 0.5
 _ITERATIONS = 25
 _HUBER_ITERATIONS = 4
 _CONVERGED_M = 1e-3
+PARAMETER_PRECISION = 0.2
+"""The parameters are the result: they must change by less than this share of the limit for positions."""
 _NO_PRIOR = 1e-8
 _STATIONARY = 1e-6
 
@@ -299,9 +301,11 @@ class _JointProblem:
         self._x[:, :d] = start.position[:, :d]
         self._parameters = prior.mean.copy() if start.parameters is None else start.parameters
         self._solution: Solution | None = None
+        self._without_ranges = self._motion_and_priors()
+        self._pattern = self._without_ranges.pattern(self._columns())
 
     def improve(self, iteration: int) -> float:
-        """Linearise and solve; return the largest change of a position, m."""
+        """Linearise and solve; return the change, m: root mean square of positions, or the largest one of parameters."""
         noise_group, start = self._observations.noise_group, self._start
         unit, error_m = self._residuals()
         if not self._has_scale and (iteration or start.parameters is not None):
@@ -312,9 +316,11 @@ class _JointProblem:
         if iteration < _HUBER_ITERATIONS and not start.is_close:
             robust = np.minimum(1.0, 1.0 / np.maximum(np.abs(z), 1e-9))
         self._solution = self._linearised(unit, error_m, self._weight(robust)).solve()
-        d, before = self._config.dims, self._x
+        positions = np.s_[:, : self._config.dims]
+        change = float(np.sqrt(np.mean((self._solution.x[positions] - self._x[positions]) ** 2)))
+        changes = np.abs(self._solution.shared - self._parameters) / PARAMETER_PRECISION
         self._x, self._parameters = self._solution.x, self._solution.shared
-        return float(np.abs(self._x[:, :d] - before[:, :d]).max())
+        return float(np.max(changes, initial=change))
 
     def result(self) -> JointFit:
         """Return the solution."""
@@ -355,8 +361,7 @@ class _JointProblem:
     ) -> NDArray[np.float64]:
         """Return the covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
         observations = self._observations
-        problem = LeastSquares(len(observations.time_s), 2 * self._config.dims, observations.rows.shape[1])
-        rows = solution.reduced(problem.add(*self._rows(problem, unit), 0.0, 1.0))
+        rows = solution.reduced(self._pattern.columns, self._derivatives(unit))
         # The errors of stationary positions are independent, so that the residuals show most of them.
         is_stationary = observations.is_stationary[observations.segment]
         slow_sd_m = np.where(is_stationary, CORRECTED_SLOW_SD_M, self._prior.slow_sd_m)
@@ -380,40 +385,41 @@ class _JointProblem:
         unit, distance = unit_vectors(tag, self._config.anchors.position[observations.anchor])
         return unit, observations.range_m - distance - observations.rows @ self._parameters
 
-    def _rows(
-        self, problem: LeastSquares, unit: NDArray[np.float64]
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """Return the columns and derivatives of each observation: of position and velocity, and of the parameters."""
-        d, observations = self._config.dims, self._observations
+    def _derivatives(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives (n, 2 d + q) of each observation: by position and velocity, and by the parameters."""
+        level, observations = unit[:, : self._config.dims], self._observations
+        return np.concatenate([level, observations.ahead_s[:, None] * level, observations.rows], axis=1)
+
+    def _columns(self) -> NDArray[np.intp]:
+        """Return the columns (n, 2 d + q) of the derivatives."""
+        observations, problem = self._observations, self._without_ranges
         n, q = observations.rows.shape
         shared = np.broadcast_to(problem.of_shared(range(q)), (n, q))
-        columns = np.concatenate([problem.of_knot(observations.knot[:, None], range(2 * d)), shared], axis=1)
-        level = unit[:, :d]
-        return columns, np.concatenate(
-            [level, observations.ahead_s[:, None] * level, observations.rows], axis=1
+        return np.concatenate(
+            [problem.of_knot(observations.knot[:, None], range(problem.unknowns)), shared], axis=1
         )
 
     def _linearised(
         self, unit: NDArray[np.float64], error_m: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> LeastSquares:
-        d, observations, model = self._config.dims, self._observations, self._config.model
-        x, parameters = self._x, self._parameters
-        problem = LeastSquares(len(x), 2 * d, len(parameters))
-        columns, rows = self._rows(problem, unit)
+        problem, rows = self._without_ranges.copy(), self._derivatives(unit)
         # The unknowns are solved for, not their changes: motion and priors are linear in them.
-        target = error_m + np.einsum("nc,nc->n", rows, np.append(x.reshape(-1), parameters)[columns])
-        problem.add(columns, rows, target, weight)
+        x = np.append(self._x.reshape(-1), self._parameters)[self._pattern.columns]
+        problem.add(self._pattern, rows, error_m + np.einsum("nc,nc->n", rows, x), weight)
+        return problem
+
+    def _motion_and_priors(self) -> LeastSquares:
+        """Return the part of the problem that is linear and has constant weights."""
+        d, observations, model = self._config.dims, self._observations, self._config.model
+        problem = LeastSquares(len(observations.time_s), 2 * d, len(self._prior.mean))
         connected = np.flatnonzero(np.diff(observations.knot_segment) == 0)
         problem.add_motion(connected, np.diff(observations.time_s)[connected], d, model.acceleration**2)
-        if len(parameters):
-            problem.add_prior(
-                problem.of_shared(range(len(parameters))), self._prior.mean, self._prior.information
-            )
+        problem.add_prior(problem.of_shared(range(problem.shared)), self._prior.mean, self._prior.information)
         first = np.flatnonzero(np.diff(observations.knot_segment, prepend=-1))
         is_stationary = observations.is_stationary[observations.knot_segment[first]]
         speed = np.where(is_stationary, _STATIONARY, model.speed)
-        knots, centre = np.arange(len(x)), self._config.anchors.position.mean(axis=0)
-        prior_position = self._start.position if self._start.is_prior else np.tile(centre, (len(x), 1))
+        knots, centre = np.arange(problem.knots), self._config.anchors.position.mean(axis=0)
+        prior_position = self._start.position if self._start.is_prior else np.tile(centre, (len(knots), 1))
         information = 1.0 / AROUND_M**2 if self._start.is_prior else _NO_PRIOR
         for axis in range(d):
             problem.add_prior(problem.of_knot(knots, axis), prior_position[:, axis], information)

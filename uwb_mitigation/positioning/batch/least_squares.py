@@ -13,18 +13,20 @@ LAPACK's banded Cholesky factorisation solves A in K b^3 operations, and the Sch
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse import csr_matrix, vstack
 
 from uwb_mitigation.errors import DatasetError
 
 _DIVERGED = 1e6
+_ROWS = 8192
 
 
 @contextmanager
@@ -61,8 +63,21 @@ def gauss_newton(
             return
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RowPattern:
+    """The columns of rows that are added several times, see `LeastSquares.pattern`.
+
+    Attributes:
+        columns: int (n, c).
+        index: int (n, c (c + 1) / 2), element of the normal equations for each pair of columns, in the order of `_pairs`.
+    """
+
+    columns: NDArray[np.intp]
+    index: NDArray[np.intp]
+
+
 class LeastSquares:
-    """Collects the rows of a problem.
+    """Normal equations, to which rows are added.
 
     Args:
         knots, unknowns, shared: K knots in the order of time, b unknowns of each, and q shared unknowns.
@@ -70,9 +85,16 @@ class LeastSquares:
 
     def __init__(self, knots: int, unknowns: int, shared: int) -> None:
         self.knots, self.unknowns, self.shared = knots, unknowns, shared
-        self._jacobians: list[csr_matrix] = []
-        self._targets: list[NDArray[np.float64]] = []
-        self._weights: list[NDArray[np.float64]] = []
+        n = knots * unknowns
+        # The lower triangle of A by diagonals (2 b, K b), then C and the upper triangle of G (K b + q, q).
+        self._normal = np.zeros(2 * unknowns * n + (n + shared) * shared)
+        self._right = np.zeros(n + shared)
+
+    def copy(self) -> LeastSquares:
+        """Return an independent copy."""
+        twin = copy.copy(self)
+        twin._normal, twin._right = self._normal.copy(), self._right.copy()
+        return twin
 
     def of_knot(
         self, knot: NDArray[np.intp] | int, unknown: NDArray[np.intp] | int | range
@@ -85,28 +107,36 @@ class LeastSquares:
         """Columns of shared unknowns."""
         return self.knots * self.unknowns + np.asarray(unknown, np.intp)
 
+    def pattern(self, columns: NDArray[np.intp]) -> RowPattern:
+        """Return the pattern of rows that depend on the unknowns at columns (n, c), which differ within a row."""
+        n, columns = self.knots * self.unknowns, np.atleast_2d(columns)
+        first, second = _pairs(columns.shape[1])
+        high = np.maximum(columns[:, first], columns[:, second])
+        low = np.minimum(columns[:, first], columns[:, second])
+        beside = 2 * self.unknowns * n + low * self.shared + high - n
+        return RowPattern(columns, np.where(high < n, (high - low) * n + low, beside))
+
     def add(
         self,
-        columns: NDArray[np.intp],
+        columns: NDArray[np.intp] | RowPattern,
         values: NDArray[np.float64],
         target: NDArray[np.float64] | float,
         weight: NDArray[np.float64] | float,
-    ) -> csr_matrix:
-        """Add n rows: values (n, c) at columns (n, c), targets (n,) and inverse variances (n,); all are broadcast.
-
-        Returns:
-            The rows as a sparse matrix, for `Solution.reduced`.
-        """
-        columns, values = np.broadcast_arrays(np.atleast_2d(columns), np.atleast_2d(values))
+    ) -> None:
+        """Add n rows: values (n, c) at columns (n, c), targets (n,) and inverse variances (n,); all are broadcast."""
+        pattern = columns if isinstance(columns, RowPattern) else self.pattern(columns)
+        values = np.broadcast_to(np.atleast_2d(values), pattern.columns.shape)
         n, width = values.shape
-        jacobian = csr_matrix(
-            (values.reshape(-1), columns.reshape(-1), np.arange(0, n * width + 1, width)),
-            shape=(n, self.knots * self.unknowns + self.shared),
-        )
-        self._jacobians.append(jacobian)
-        self._targets.append(np.broadcast_to(np.asarray(target, np.float64), n))
-        self._weights.append(np.broadcast_to(np.asarray(weight, np.float64), n))
-        return jacobian
+        weighted = values * np.broadcast_to(weight, n)[:, None]
+        right = weighted * np.broadcast_to(target, n)[:, None]
+        self._right += np.bincount(pattern.columns.reshape(-1), right.reshape(-1), len(self._right))
+        first, second = _pairs(width)
+        # The products of all rows of a long recording need too much memory.
+        for start in range(0, n, _ROWS):
+            rows = slice(start, start + _ROWS)
+            product = weighted[rows][:, first] * values[rows][:, second]
+            index = pattern.index[rows].reshape(-1)
+            self._normal += np.bincount(index, product.reshape(-1), len(self._normal))
 
     def add_prior(
         self,
@@ -143,22 +173,23 @@ class LeastSquares:
             numpy.linalg.LinAlgError: the rows do not determine it.
         """
         n, b, q = self.knots * self.unknowns, self.unknowns, self.shared
-        jacobian = vstack(self._jacobians, format="csr")
-        weighted = jacobian.T.multiply(np.concatenate(self._weights)).tocsr()
-        normal, right = weighted @ jacobian, weighted @ np.concatenate(self._targets)
-        band = np.zeros((2 * b, n))
-        a = normal[:n, :n]
-        for below in range(min(2 * b, n)):
-            band[below, : n - below] = a.diagonal(-below)
+        band = self._normal[: 2 * b * n].reshape(2 * b, n)
+        border, corner = np.split(self._normal[2 * b * n :].reshape(n + q, q), [n])
         factor = cholesky_banded(band, lower=True, check_finite=False)
-        border = normal[:n, n:].toarray()
-        columns = np.column_stack([right[:n], border])
+        columns = np.column_stack([self._right[:n], border])
         solved = cho_solve_banded((factor, True), columns, overwrite_b=True, check_finite=False)
         x, y = solved[:, 0], solved[:, 1:]
-        schur = normal[n:, n:].toarray() - border.T @ y
+        schur = corner + np.triu(corner, 1).T - border.T @ y
         covariance = np.linalg.inv((schur + schur.T) / 2.0) if q else np.zeros((0, 0))
-        t = covariance @ (right[n:] - border.T @ x)
-        return Solution((x - y @ t).reshape(self.knots, b), t, covariance, y, band)
+        t = covariance @ (self._right[n:] - border.T @ x)
+        return Solution((x - y @ t).reshape(self.knots, b), t, covariance, y, factor)
+
+
+@cache
+def _pairs(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the two columns of each pair of columns of rows with that number of columns, a column with itself included."""
+    first, second = np.triu_indices(width)
+    return first, second
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,40 +204,34 @@ class Solution:
     shared: NDArray[np.float64]
     shared_covariance: NDArray[np.float64]
     _y: NDArray[np.float64]
-    _band: NDArray[np.float64]
+    _factor: NDArray[np.float64]
 
-    def reduced(self, jacobian: csr_matrix) -> NDArray[np.float64]:
-        """Return the derivatives (n, q) of rows with respect to the shared unknowns, with the knots adapted to these."""
-        n = len(self._y)
-        rows: NDArray[np.float64] = jacobian[:, n:].toarray() - jacobian[:, :n] @ self._y
+    def reduced(self, columns: NDArray[np.intp], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives (n, q) of rows with respect to the shared unknowns, with the knots adapted to these.
+
+        Args:
+            columns: int (n, c), as in `LeastSquares.add`.
+            values: float64 (n, c).
+        """
+        adapted = np.concatenate([-self._y, np.eye(len(self.shared))])
+        rows: NDArray[np.float64] = np.einsum("nc,ncq->nq", values, adapted[columns])
         return rows
 
-    @_singular_is_undetermined()
     def covariances(self, first: int) -> NDArray[np.float64]:
         """Return the marginal covariance of each knot's `first` unknowns, float64 (K, first, first).
 
-        The blocks of the inverse of a block-tridiagonal matrix come from a sweep in each direction. The border adds the
-        effect of the shared unknowns' covariance.
-
-        Raises:
-            DatasetError: the ranges do not determine the knots.
+        A backward sweep through the Cholesky factor L of the block-tridiagonal matrix, as in a Rauch-Tung-Striebel smoother:
+        P_k = (L_kk L_kk')^-1 + G_k P_(k+1) G_k' with G_k = (L_(k+1)k L_kk^-1)'. The border adds the effect of the shared
+        unknowns' covariance.
         """
         knots, b = self.x.shape
         i, j = np.indices((b, b))
-        row = np.arange(knots)[:, None, None] * b
-        diagonal = self._band[np.abs(i - j), row + np.minimum(i, j)]
-        beside = self._band[b + j - i, row[:-1] + i]
-        forward = np.zeros((knots, b, b))
-        for k in range(1, knots):
-            coupling = beside[k - 1]
-            forward[k] = coupling.T @ np.linalg.solve(diagonal[k - 1] - forward[k - 1], coupling)
-        covariance = np.empty((knots, first, first))
-        backward = np.zeros((b, b))
-        for k in range(knots - 1, -1, -1):
-            covariance[k] = np.linalg.inv(diagonal[k] - forward[k] - backward)[:first, :first]
-            if k:
-                coupling = beside[k - 1]
-                backward = coupling @ np.linalg.solve(diagonal[k] - backward, coupling.T)
+        column = np.arange(knots)[:, None, None] * b + j
+        inverse = np.linalg.inv(np.tril(self._factor[np.abs(i - j), column]))
+        gain = (self._factor[b + i - j, column[:-1]] @ inverse[:-1]).swapaxes(1, 2)
+        covariance = inverse.swapaxes(1, 2) @ inverse
+        for k in range(knots - 2, -1, -1):
+            covariance[k] += gain[k] @ covariance[k + 1] @ gain[k].T
         y = self._y.reshape(knots, b, -1)[:, :first]
-        covariance += np.einsum("kiq,qr,kjr->kij", y, self.shared_covariance, y)
-        return covariance
+        shared = np.einsum("kiq,qr,kjr->kij", y, self.shared_covariance, y)
+        return np.asarray(covariance[:, :first, :first] + shared, np.float64)

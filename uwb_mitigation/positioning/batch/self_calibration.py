@@ -258,7 +258,6 @@ class _Solver:
             relative_height = heights_m[site_rows] - config.height.value
             self.segments = replace(self.segments, relative_height=relative_height)
         expected = extra.rows @ extra.mean
-        check_length_unit(config, self.segments, expected)
         offset = likely_offset(config, self.segments, expected)
         self._position, has_position = first_positions(config, self.segments, expected + offset)
         common = Regressors.single("offset", np.ones(len(expected)), offset, COMMON_SD_M)
@@ -457,6 +456,9 @@ def with_own_offsets(
     return with_groups(names, sd), [name for name in members if name not in names], sd
 
 
+UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2}
+
+
 def likely_offset(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> float:
     """Return the one of `OFFSETS_M` with which the ranges of a few moments agree best; 0 if no moment has enough ranges.
 
@@ -464,37 +466,25 @@ def likely_offset(config: EstimatorConfig, segments: Segments, expected_m: NDArr
         config: anchors, noise model, height and area.
         segments: ranges, r in total.
         expected_m: float64 (r,), also subtracted from the ranges.
+
+    Raises:
+        DatasetError: ranges and anchor positions fit each other only in another unit; names the unit.
     """
     moments = _moments(config, segments, expected_m)
     if not moments:
         return 0.0
     loss = _moment_losses(config, moments)
+    per_moment = float(loss.min()) / len(moments)
+    if per_moment >= MIN_UNIT_LOSS:
+        for unit, metres in UNITS.items():
+            for factor, name in ((metres, "ranges"), (1.0 / metres, "anchor positions")):
+                scaled = [(row, value * factor) for row, value in moments]
+                if float(_moment_losses(config, scaled).min()) / len(moments) < 0.3 * per_moment:
+                    raise DatasetError(
+                        f"the ranges do not fit the anchor positions, but would if the {name} were in {unit}",
+                        valid="metres",
+                    )
     return float(OFFSETS_M[int(np.argmin(loss))])
-
-
-UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2}
-
-
-def check_length_unit(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> None:
-    """Refuse ranges or anchor positions that fit each other only in another unit.
-
-    Raises:
-        DatasetError: names the unit.
-    """
-    moments = _moments(config, segments, expected_m)
-    if not moments:
-        return
-    per_moment = float(_moment_losses(config, moments).min()) / len(moments)
-    if per_moment < MIN_UNIT_LOSS:
-        return
-    for unit, metres in UNITS.items():
-        for factor, name in ((metres, "ranges"), (1.0 / metres, "anchor positions")):
-            scaled = [(row, value * factor) for row, value in moments]
-            if float(_moment_losses(config, scaled).min()) / len(moments) < 0.3 * per_moment:
-                raise DatasetError(
-                    f"the ranges do not fit the anchor positions, but would if the {name} were in {unit}",
-                    valid="metres",
-                )
 
 
 _Moments = list[tuple[NDArray[np.intp], NDArray[np.float64]]]

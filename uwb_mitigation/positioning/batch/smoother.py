@@ -101,13 +101,18 @@ class Smoother:
         self._ahead_s = (ranges.stamp_ns - self._origin_ns - self._knots_ns[self._knot]) / NS_PER_S
         self._variance = model.variances(ranges.variance_m2)
         median = np.array([np.median(self._variance[self._slot == s]) for s in range(len(self._used))])
-        self._persisting = (1.0 - model.white) * median
+        self._persisting = (1.0 - model.smoother_white) * median
         if not find_anchors:
             self._persisting = self._persisting + anchors.sd[self._used] ** 2
-        self._white = np.maximum(model.white * self._variance, self._variance - self._persisting[self._slot])
+        self._white = np.maximum(
+            model.smoother_white * self._variance, self._variance - self._persisting[self._slot]
+        )
         # A common offset, and one of each anchor.
         self._offset_sd = np.array([model.offset_sd, *[model.pair_sd] * len(self._used)])
         self._heights = config.heights if config.height is None else None
+        extra = (self._height is not None) + (3 * len(self._used) if find_anchors else 0)
+        self._without_ranges = self._motion_and_priors(len(self._offset_sd) + extra)
+        self._pattern = self._without_ranges.pattern(self._columns())
         self._x, self._shared = np.zeros((0, 0)), np.zeros(0)
         self._solution: Solution | None = None
 
@@ -121,8 +126,7 @@ class Smoother:
         self._x = np.zeros((len(self._time_s), 2 * self._d + len(self._used)))
         for axis in range(self._d):
             self._x[:, axis] = np.interp(self._time_s, stamp_s, initial.position[:, axis])
-        extra = (self._height is not None) + (3 * len(self._used) if self._find else 0)
-        self._shared = np.zeros(len(self._offset_sd) + extra)
+        self._shared = np.zeros(self._without_ranges.shared)
         gauss_newton(self._improve, iterations=iterations, converged=_CONVERGED_M)
         return self._result()
 
@@ -174,26 +178,41 @@ class Smoother:
         return unit, self._ranges.range_m - distance - shared[0] - shared[1 + self._slot]
 
     def _linearised(self) -> LeastSquares:
-        d, model, knot, slot = self._d, self._model, self._knot[:, None], self._slot[:, None]
-        x, shared = self._x, self._shared
-        knots, p = len(x), len(self._offset_sd)
-        problem = LeastSquares(knots, x.shape[1], len(shared))
         unit, residual = self._residuals()
-        error = problem.of_knot(knot, 2 * d + slot)
-        columns = [problem.of_knot(knot, range(2 * d)), error, problem.of_shared(slot * (0, 1) + (0, 1))]
-        values = [unit[:, :d], self._ahead_s[:, None] * unit[:, :d], np.ones((len(knot), 3))]
-        if self._height is not None:
-            columns.append(np.full((len(knot), 1), problem.of_shared(p)))
-            values.append(unit[:, 2:])
+        values = [
+            unit[:, : self._d],
+            self._ahead_s[:, None] * unit[:, : self._d],
+            np.ones((len(unit), 3)),
+            unit[:, 2:][:, : int(self._height is not None)],
+        ]
         if self._find:
-            columns.append(problem.of_shared(len(shared) - 3 * len(self._used) + 3 * slot + np.arange(3)))
             values.append(-unit)
+        row, problem = np.concatenate(values, axis=1), self._without_ranges.copy()
         # The unknowns are solved for, not their changes: motion and priors are linear in them.
-        column, row = np.concatenate(columns, axis=1), np.concatenate(values, axis=1)
-        target = residual - x[self._knot, 2 * d + self._slot]
-        target += np.einsum("nc,nc->n", row, np.append(x.reshape(-1), shared)[column])
-        problem.add(column, row, target, model.weight(residual / np.sqrt(self._variance)) / self._white)
+        target = residual - self._x[self._knot, 2 * self._d + self._slot]
+        target += np.einsum("nc,nc->n", row, np.append(self._x, self._shared)[self._pattern.columns])
+        weight = self._model.weight(residual / np.sqrt(self._variance)) / self._white
+        problem.add(self._pattern, row, target, weight)
+        return problem
 
+    def _columns(self) -> NDArray[np.intp]:
+        """Return the columns (n, c) of the unknowns on which each range depends."""
+        problem, knot, slot = self._without_ranges, self._knot[:, None], self._slot[:, None]
+        columns = [
+            problem.of_knot(knot, range(2 * self._d)),
+            problem.of_knot(knot, 2 * self._d + slot),
+            problem.of_shared(slot * (0, 1) + (0, 1)),
+        ]
+        if self._height is not None:
+            columns.append(np.full(knot.shape, problem.of_shared(len(self._offset_sd))))
+        if self._find:
+            columns.append(problem.of_shared(problem.shared - 3 * len(self._used) + 3 * slot + np.arange(3)))
+        return np.concatenate(columns, axis=1)
+
+    def _motion_and_priors(self, shared: int) -> LeastSquares:
+        """Return the part of the problem that is linear and has constant weights."""
+        d, model, knots = self._d, self._model, len(self._time_s)
+        problem = LeastSquares(knots, 2 * d + len(self._used), shared)
         dt, every = np.diff(self._time_s), np.arange(knots - 1)
         problem.add_motion(every, dt, d, model.acceleration**2)
         decay = np.exp(-dt / model.persistence_s)

@@ -19,7 +19,7 @@ SPEED_SD, YAW_RATE_SD = 0.05, 0.05
 """White noise of velocities (m/s) and yaw rates (rad/s) of messages without a covariance."""
 
 MOTION_SHARE, CORRELATION_S = 0.05, 1.0
-"""Wheels slip and floors are uneven: velocities and yaw rates have random errors of this share, for about this time."""
+"""Wheels slip and floors are uneven: velocities have random errors of this share, for about this time."""
 
 WHEEL_DRIFT, GYRO_DRIFT = 0.02, 0.01
 """Standard deviation of the constant yaw drift of wheels (rad/m) and of an IMU (rad/s, 0.6 degrees per second)."""
@@ -28,6 +28,8 @@ WHEEL_TURN, GYRO_TURN = 0.05, 0.01
 """Standard deviation of the constant relative error of rotations."""
 
 TURN_SHARE = 0.02
+"""The same for the yaw rates of wheels, in addition to the constant error of rotations."""
+
 MAX_SPEED, MAX_YAW_RATE = 50.0, 50.0
 """m/s, rad/s: faster odometry is invalid."""
 
@@ -42,7 +44,7 @@ class PathPoint(NamedTuple):
     """A point of the integrated path, with sums since its beginning.
 
     Attributes:
-        part: points of different parts have no known relative motion.
+        segment: points of different segments have no known relative motion.
         x, y, yaw: pose in the frame of the path, m and rad.
         distance_m: distance driven.
         drift: standard deviation of the yaw error by a constant drift, rad.

@@ -105,11 +105,11 @@ class RangeFilter:
         self.state.H[:3] = vector / max(distance, SHORTEST_M)
         return self.state.update_range(anchor, range_m - distance, variance_m2)
 
-    def update_height(self, height_m: float, variance_m2: float) -> float:
-        """Update with the height of the tag; return the normalised innovation."""
+    def update_height(self, height_m: float, variance_m2: float) -> tuple[float, float]:
+        """Update with the height of the tag; return as `RobustUpdate.update_range`."""
         H = np.zeros(len(self.x))
         H[2] = 1.0
-        return self.state.update(H, height_m - float(self.x[2]), variance_m2, robust=False)[0]
+        return self.state.update(H, height_m - float(self.x[2]), variance_m2, robust=False)
 
     def confine(self, low: Sequence[float], high: Sequence[float]) -> None:
         """Project the position onto a box."""

@@ -16,7 +16,7 @@ from uwb_mitigation.types.tracks import Ranges, Track
 IMPLAUSIBLE = 9.0
 """Positions that are less likely than the best one by a factor of e^9 (eight thousand) are not plausible."""
 
-_STEPS = 40
+_STEPS, _CONVERGED_M = 40, 1e-6
 _STUCK = 0.01
 _WALL_SD_M = 0.02
 """Standard deviation of the pseudo-measurement that keeps a position at the boundary of the area."""
@@ -156,7 +156,10 @@ class _Trilateration:
         for _ in range(_STEPS):
             diagonal = np.einsum("nii->ni", hessian)
             damped = hessian + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(3)
-            trial = x - np.linalg.solve(damped, gradient[..., None])[..., 0]
+            step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+            if float(np.abs(step).max(initial=0.0)) < _CONVERGED_M:
+                break
+            trial = x - step
             trial_values = self.linearised(trial)
             better = trial_values[0] <= cost
             x = np.where(better[:, None], trial, x)

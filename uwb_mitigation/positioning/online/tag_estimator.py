@@ -60,6 +60,9 @@ _RETAINED_RANGES = 400
 _MAX_CANDIDATES = 12
 _RETRY_S = 0.25
 
+_Mirror = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""A point and the normal of a line or plane."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotData:
@@ -134,7 +137,7 @@ class TagEstimator:
     filter: RangeFilter | None
     _hypotheses: list[_PositionHypothesis]
     _origin_ns: int | None
-    _mirror: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    _mirror: _Mirror | None
     _time_s: float
     _search_began_s: float
     _next_check_s: float
@@ -152,6 +155,8 @@ class TagEstimator:
         self._states = [_AnchorState() for _ in range(len(self.anchors))]
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_RETAINED_RANGES)
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_RETAINED_RANGES)
+        self._mirror_key: tuple[int, ...] | None = None
+        self._last_mirror: _Mirror | None = None
         self.restart()
 
     @property
@@ -255,11 +260,11 @@ class TagEstimator:
         is_first = self._recent_height() is None
         self._heights.append((self._time_s, *measurement))
         for hypothesis in self._hypotheses:
-            z = hypothesis.filter.update_height(*measurement)
-            hypothesis.loss += self._model.student_loss(z)
+            z, sd = hypothesis.filter.update_height(*measurement)
+            hypothesis.loss += self._model.student_loss(z) + math.log(sd)
             self._confine(hypothesis.filter)
         if self.filter is not None:
-            z = self.filter.update_height(*measurement)
+            z, _ = self.filter.update_height(*measurement)
             self._confine(self.filter)
             if is_first and abs(z) > SURPRISE:
                 # The linear update moves the position too far: search again with the known height.
@@ -302,9 +307,14 @@ class TagEstimator:
             self._ambiguous_s = self._time_s
         self.is_ambiguous = is_near or (self.is_ambiguous and not self._excludes_mirror(filter_))
 
-    def _mirror_of(self, rows: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return a point and the normal of the line or plane in which anchors mirror positions; None: they exclude the image."""
-        dims = self._dims
+    def _mirror_of(self, rows: list[int]) -> _Mirror | None:
+        """Return the line or plane in which anchors mirror positions; None: they exclude the image."""
+        key = self._dims, *rows
+        if key != self._mirror_key:
+            self._mirror_key, self._last_mirror = key, self._find_mirror(rows, self._dims)
+        return self._last_mirror
+
+    def _find_mirror(self, rows: list[int], dims: int) -> _Mirror | None:
         if len(rows) == 0:
             return None
         position = self.anchors.position[rows]
