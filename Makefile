@@ -34,9 +34,9 @@ test: setup-training  ## run all tests (COVERAGE=yes: with the coverage of the c
 # The commands of a user with ROS 2; without ROS, .venv is used in place of /opt/ros/jazzy.
 COLCON = $(IN_ROS) PATH="$(CURDIR)/$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$${AMENT_PREFIX_PATH:-$(CURDIR)/$(VENV)}" \
   CMAKE_TOOLCHAIN_FILE="$(CURDIR)/cmake/ros_wheels.cmake" colcon
-COLCON_TESTS = $(addprefix test/test_,installed.py preprocessing.py mitigation.py bag_codec.py link_messages.py launch.py)
+COLCON_TESTS = test/test_installed.py test/test_launch.py
 
-colcon: path-for-colcon setup-training  ## colcon build and colcon test (installed files and quick tests)
+colcon: path-for-colcon setup-training  ## colcon build and colcon test (of the installed files)
 	@$(COLCON) build --base-paths . msg_defs
 	@$(COLCON) test --base-paths . msg_defs --event-handlers console_cohesion+ --return-code-on-test-failure \
 	  --packages-select uwb_mitigation --pytest-args $(COLCON_TESTS)

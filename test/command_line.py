@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -29,12 +30,12 @@ class Finished(NamedTuple):
     stderr: str
 
 
-def run(*arguments: object, folder: Path, columns: int = 160) -> Finished:
-    """Run the command in `folder`, on a terminal of the given width."""
+def run(words: str, *arguments: object, folder: Path, columns: int = 160) -> Finished:
+    """Run the command in `folder`, on a terminal of the given width: `words` as in a shell, then arguments."""
     out, err = io.StringIO(), io.StringIO()
     before = Path.cwd()
     with (
-        mock.patch.object(sys, "argv", ["uwb-mitigation", *map(str, arguments)]),
+        mock.patch.object(sys, "argv", ["uwb-mitigation", *shlex.split(words), *map(str, arguments)]),
         mock.patch.dict(os.environ, COLUMNS=str(columns)),
         # A console that another test created has the width of that time.
         mock.patch.object(console.out, "_width", columns),
@@ -53,10 +54,17 @@ def run(*arguments: object, folder: Path, columns: int = 160) -> Finished:
     return Finished(code, out.getvalue(), err.getvalue())
 
 
-def start(*arguments: object, folder: Path) -> Finished:
-    """Run the command in `folder` in a separate process."""
+def succeed(words: str, *arguments: object, folder: Path, columns: int = 160) -> Finished:
+    """Run the command, which must exit with 0; see `run`."""
+    done = run(words, *arguments, folder=folder, columns=columns)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def start(words: str, *arguments: object, folder: Path) -> Finished:
+    """Run the command in `folder` in a separate process; see `run`."""
     done = subprocess.run(
-        command(*arguments),
+        command(words, *arguments),
         cwd=folder,
         env=ENVIRONMENT,
         capture_output=True,
@@ -67,6 +75,6 @@ def start(*arguments: object, folder: Path) -> Finished:
     return Finished(done.returncode, done.stdout, done.stderr)
 
 
-def command(*arguments: object) -> list[str]:
-    """Return the command line."""
-    return [sys.executable, "-m", "uwb_mitigation.commands.cli", *map(str, arguments)]
+def command(words: str, *arguments: object) -> list[str]:
+    """Return the command line; see `run`."""
+    return [sys.executable, "-m", "uwb_mitigation.commands.cli", *shlex.split(words), *map(str, arguments)]

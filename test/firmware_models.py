@@ -146,13 +146,6 @@ class Exported:
         samples = self.weights.architecture.samples
         return random_networks.rounding_windows(samples, self.weights.activation_scale["input"], count)
 
-    def real_windows(self, apartment: Path) -> NDArray[np.float32]:
-        """Return the network inputs of the real measurements."""
-        samples = self.weights.architecture.samples
-        measured = real_measurements(apartment)
-        faults, windows = Preprocessing(samples, Scaling.PREAMBLE).windows_of(measured)
-        return windows[np.equal(faults, 0)]
-
 
 SHAPES = [*itertools.product((3, 5), published.WINDOWS), (0, 157)]
 """First kernel and length of each tested network; 0: MLP."""

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import run
-from drives import drive
+from command_line import run, succeed
+from drives import HALL, drive
 from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.errors import RecordingError
@@ -42,8 +42,6 @@ def arm_to(frame):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """Return a folder with drives past five anchors without CIRs and with a localisation delayed by 0.3 s."""
-    from drives import HALL
-
     folder = tmp_path_factory.mktemp("a site")
     save_anchors(folder / "anchors.yaml", HALL)
     ranges, path = drive(seconds=200, rate_hz=8.0, offset_m=0.0)
@@ -94,25 +92,13 @@ def site(tmp_path_factory):
     return folder
 
 
-LEVEL = ("--anchors", "anchors.yaml", "--height", 1.0)
-WITH_TRUTH = ("--truth-topic", "/odom", "--time-offset", 0.3, "--lever-arm", "0.4,0.1,0")
-WITHOUT_TIME_OFFSET = (*WITH_TRUTH[:2], *WITH_TRUTH[4:])
+LEVEL = "--anchors anchors.yaml --height 1.0"
+WITHOUT_TIME_OFFSET = "--truth-topic /odom --lever-arm 0.4,0.1,0"
+WITH_TRUTH = f"{WITHOUT_TIME_OFFSET} --time-offset 0.3"
 
 
 def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
-    done = run(
-        "calibrate",
-        "drive.mcap",
-        *LEVEL,
-        "-o",
-        "site.onnx",
-        "--json",
-        "r.json",
-        "--report",
-        "r.html",
-        folder=site,
-    )
-    assert done.returncode == 0, done.stderr
+    succeed(f"calibrate drive.mcap {LEVEL} -o site.onnx --json r.json --report r.html", folder=site)
     result = json.loads((site / "r.json").read_text())
     assert result["truth"] == "none"
     assert result["refused"] is None
@@ -128,7 +114,7 @@ def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
     corrected = Mitigation(bundle, offsets).correct([RangeMeasurement(0, 7, 5, 0, 0, 5.3, cir)])[0]
     assert corrected.status == 0
     assert corrected.range_m == pytest.approx(5.0, abs=0.12)
-    none = run("quantise", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=site)
+    none = run("quantise site.onnx --data drive.mcap -o int8.onnx", folder=site)
     assert (none.returncode, "no network to quantise" in none.stderr) == (1, True)
     page = (site / "r.html").read_text()
     assert "polyline" in page
@@ -141,36 +127,26 @@ def test_drive_yields_a_bundle_and_offsets_that_improve_other_ranges(site):
         "Live position error on held-out segments",
     ):
         assert text in page
-    again = run("calibrate", "drive.mcap", *LEVEL, "-o", "site.onnx", folder=site)
+    again = run(f"calibrate drive.mcap {LEVEL} -o site.onnx", folder=site)
     assert (again.returncode, "--force" in again.stderr) == (2, True)
 
 
 def test_delayed_localisation_provides_the_truth(site):
-    done = run(
-        "calibrate",
-        "drive.mcap",
-        *LEVEL,
-        "-o",
-        "odom.onnx",
-        "--json",
-        "o.json",
-        "--truth-topic",
-        "/odom",
-        "--estimate-lever-arm",
+    succeed(
+        f"calibrate drive.mcap {LEVEL} -o odom.onnx --json o.json --truth-topic /odom --estimate-lever-arm",
         folder=site,
     )
-    assert done.returncode == 0, done.stderr
     result = json.loads((site / "o.json").read_text())
     assert result["truth"] == "/odom"
     assert result["live_position_change"] < -0.2
     assert result["localisation"]["time_offset_s"] == pytest.approx(0.3, abs=0.02)
     assert np.abs(np.array(result["localisation"]["lever_arm_m"]) - LEVER)[:2].max() < 0.05
     assert "with truth from /odom" in load_bundle(site / "odom.onnx").card.origin
-    wrong = run("calibrate", "drive.mcap", *LEVEL, "-o", "x.onnx", "--truth-topic", "/amcl_pose", folder=site)
+    wrong = run(f"calibrate drive.mcap {LEVEL} -o x.onnx --truth-topic /amcl_pose", folder=site)
     assert (wrong.returncode, "/odom (nav_msgs/msg/Odometry)" in wrong.stderr) == (1, True)
 
 
-@pytest.mark.parametrize("truth", [None, "/odom"])
+@pytest.mark.parametrize("truth", ["", "--truth-topic /odom --estimate-lever-arm"])
 def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, monkeypatch):
     from uwb_mitigation.training.site import calibration
 
@@ -185,9 +161,7 @@ def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, m
 
     choose = calibration.held_out_site_errors
     monkeypatch.setattr(calibration, "held_out_site_errors", look)
-    options = ("--truth-topic", truth, "--estimate-lever-arm") if truth else ()
-    done = run("calibrate", "drive.mcap", *LEVEL, "-o", "w.onnx", "--force", *options, folder=site)
-    assert done.returncode == 0, done.stderr
+    succeed(f"calibrate drive.mcap {LEVEL} -o w.onnx --force {truth}", folder=site)
     ((nothing, without, own),) = seen
     assert np.abs(nothing).max() < 2e-3
     assert np.abs(without[own]).max() > 3.0 * np.abs(nothing).max()
@@ -205,8 +179,10 @@ def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
 
 
 def test_localisation_needs_few_ranges(site):
-    done = run("calibrate", "few.mcap", *LEVEL, "-o", "few.onnx", "--json", "f.json", "--truth-topic", "/odom", "--estimate-lever-arm", "--force", folder=site)  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    done = succeed(
+        f"calibrate few.mcap {LEVEL} -o few.onnx --json f.json --truth-topic /odom --estimate-lever-arm --force",
+        folder=site,
+    )
     assert "no transform" not in done.stderr  # uwb_tag is at the antenna
     # Without the held-out quarter, there are too few to estimate a time offset and a lever arm.
     assert 40 <= json.loads((site / "f.json").read_text())["labelled"] < 53
@@ -215,18 +191,17 @@ def test_localisation_needs_few_ranges(site):
 @pytest.fixture(scope="module")
 def clean(site):
     """The result of a drive without outliers, calibrated with a constant height."""
-    return figures(site, "drive.mcap", "--height", 1.0)[0]
+    return figures(site, "drive.mcap", "--height 1.0")[0]
 
 
-def figures(site, bag, *options):
-    done = run("calibrate", bag, "--anchors", "anchors.yaml", *options, "-o", "f.onnx", "--json", "f.json", "--force",
-               folder=site)  # fmt: skip
-    assert done.returncode == 0, done.stderr
+def figures(site, bag, options):
+    words = f"calibrate {bag} --anchors anchors.yaml {options} -o f.onnx --json f.json --force"
+    done = succeed(words, folder=site)
     return json.loads((site / "f.json").read_text()), done
 
 
 def test_nine_gross_outliers_change_no_result(site, clean):
-    with_outliers, done = figures(site, "gross.mcap", "--height", 1.0)
+    with_outliers, done = figures(site, "gross.mcap", "--height 1.0")
     assert (clean["outliers"], with_outliers["outliers"]) == (0, 9)
     assert "9 outliers" in done.stderr
     for key in ("raw_mae_m", "calibrated_mae_m"):
@@ -234,20 +209,18 @@ def test_nine_gross_outliers_change_no_result(site, clean):
 
 
 def test_heights_come_from_a_topic_and_stamps_are_shifted(site, clean):
-    shifted, _ = figures(site, "drive.mcap", "--height-topic", "/odom", "--stamp-offset", 0.3)
+    shifted, _ = figures(site, "drive.mcap", "--height-topic /odom --stamp-offset 0.3")
     # The localisation is delayed by 0.3 s: without the option, it would not cover the first three ranges.
     assert shifted["skipped"] == {"no height at that time": 1}
     for pair, value in clean["offsets_m"].items():
         assert shifted["offsets_m"][pair] == pytest.approx(value, abs=0.02)
-    both = run("calibrate", "drive.mcap", *LEVEL, "--height-topic", "/odom", "-o", "x.onnx", folder=site)
+    both = run(f"calibrate drive.mcap {LEVEL} --height-topic /odom -o x.onnx", folder=site)
     assert (both.returncode, "either of them" in both.stderr) == (2, True)
 
 
 def test_lever_arm_that_contradicts_the_ranges_is_refused(site):
     """Without a transform it is 0."""
-    done = run(
-        "calibrate", "drive.mcap", *LEVEL, "--truth-topic", "/odom", "-o", "f.onnx", "--force", folder=site
-    )
+    done = run(f"calibrate drive.mcap {LEVEL} --truth-topic /odom -o f.onnx --force", folder=site)
     assert done.returncode == 1
     assert "no transform from base_link" in done.stderr
     assert "the lever arm (0.00, 0.00) m contradicts the ranges: they fit (0.4" in done.stderr
@@ -257,39 +230,37 @@ def test_recording_of_unknown_anchors_is_refused(site):
     from uwb_mitigation.types.anchors import AnchorMap
 
     save_anchors(site / "few.yaml", AnchorMap(load_anchors(site / "anchors.yaml").anchors[:2]), force=True)
-    done = run("calibrate", "drive.mcap", "--anchors", "few.yaml", "-o", "f.onnx", "--force", folder=site)
+    done = run("calibrate drive.mcap --anchors few.yaml -o f.onnx --force", folder=site)
     assert (done.returncode, "not in the anchors file: 3, 4, 5" in done.stderr) == (1, True)
 
 
 def test_pair_with_few_ranges_gets_the_common_offset(site):
     """Its only range is later than the last pose of the localisation."""
-    result, _ = figures(site, "rare.mcap", "--height", 1.0, *WITH_TRUTH)
+    result, _ = figures(site, "rare.mcap", f"--height 1.0 {WITH_TRUTH}")
     others = [result["offsets_m"][f"7-{anchor}"] for anchor in range(1, 5)]
     assert min(others) < result["offsets_m"]["7-5"] < max(others)
     assert 0.1 < result["offset_sd_m"]["7-5"] < 0.5
 
 
 def test_offsets_above_a_metre_are_refused(site):
-    done = run("calibrate", "far.mcap", *LEVEL, "-o", "far.onnx", "--json", "far.json", folder=site)
+    done = run(f"calibrate far.mcap {LEVEL} -o far.onnx --json far.json", folder=site)
     assert done.returncode == 1
     assert "antenna delays" in json.loads((site / "far.json").read_text())["refused"]
     assert not (site / "far.onnx").exists()
-    done = run(
-        "calibrate", "odd.mcap", *LEVEL, *WITH_TRUTH, "-o", "far.onnx", "--json", "far.json", folder=site
-    )
+    done = run(f"calibrate odd.mcap {LEVEL} {WITH_TRUTH} -o far.onnx --json far.json", folder=site)
     assert done.returncode == 1
     assert "and anchor 2;" in json.loads((site / "far.json").read_text())["refused"]
 
 
 def test_lever_arm_is_the_transform_to_the_frame_of_the_ranges(site):
-    result, done = figures(site, "rare.mcap", "--height", 1.0, "--truth-topic", "/odom")
+    result, done = figures(site, "rare.mcap", "--height 1.0 --truth-topic /odom")
     assert result["localisation"]["lever_arm_m"] == LEVER.tolist()
     assert result["localisation"]["lever_arm_sd_m"] == [0.0] * 3
     assert "no transform" not in done.stderr
 
 
 def test_refusal_is_reported_in_the_json_and_writes_no_model(site):
-    done = run("calibrate", "short.mcap", *LEVEL, "-o", "short.onnx", "--json", "s.json", folder=site)
+    done = run(f"calibrate short.mcap {LEVEL} -o short.onnx --json s.json", folder=site)
     assert done.returncode == 1
     result = json.loads((site / "s.json").read_text())
     assert "too few" in result["refused"]
@@ -313,26 +284,18 @@ def test_calibration_without_gain_is_written_only_with_force(site, monkeypatch, 
 
     make = site_calibration.SiteCalibration
     monkeypatch.setattr(site_calibration, "SiteCalibration", lambda **fields: make(**fields | change(fields)))
-    words = ("drive.mcap", *LEVEL, *WITH_TRUTH, "-o", "harm.onnx", "--json", "h.json")
-    assert run("calibrate", *words, folder=site).returncode == 1
+    words = f"calibrate drive.mcap {LEVEL} {WITH_TRUTH} -o harm.onnx --json h.json"
+    assert run(words, folder=site).returncode == 1
     assert "not written" in json.loads((site / "h.json").read_text())["refused"]
     assert not (site / "harm.onnx").exists()
-    assert run("calibrate", *words, "--force", folder=site).returncode == 0
+    succeed(f"{words} --force", folder=site)
     (site / "harm.onnx").unlink()
     (site / "harm.offsets.yaml").unlink()
-
-
-def anchors_file(site, name, position):
-    from drives import HALL
-
-    save_anchors(site / name, HALL.moved(position, HALL.sd), force=True)
-    return ("--anchors", name, "--height", 1.0)
 
 
 @pytest.mark.parametrize(
     ("move", "named", "options"),
     [
-        ((0, (1.5, 0.0, 0.0)), "anchor 1", WITH_TRUTH),
         ((3, (0.0, 1.0, 0.0)), "anchor 4", WITHOUT_TIME_OFFSET),
         ((4, (-0.8, 0.8, 0.0)), "anchor 5", WITH_TRUTH),
         ((0, 2), "anchors 1 and 3", WITHOUT_TIME_OFFSET),
@@ -340,26 +303,23 @@ def anchors_file(site, name, position):
     ],
 )
 def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, options):
-    from drives import HALL
-
     position = HALL.position.copy()
     if isinstance(move[1], int):
         position[list(move)] = position[list(move)[::-1]]
     else:
         position[move[0]] += move[1]
-    where = anchors_file(site, "wrong.yaml", position)
-    words = ("calibrate", "drive.mcap", *where, *options, "-o", "wrong.onnx", "--json", "wrong.json")
+    save_anchors(site / "wrong.yaml", HALL.moved(position, HALL.sd), force=True)
+    words = (
+        f"calibrate drive.mcap --anchors wrong.yaml --height 1.0 {options} -o wrong.onnx --json wrong.json"
+    )
     # --force applies only to a calibration without gain.
-    done = run(*words, "--force", folder=site)
-    assert done.returncode == 1
+    assert run(f"{words} --force", folder=site).returncode == 1
     refused = json.loads((site / "wrong.json").read_text())["refused"]
     assert named in refused
     assert not (site / "wrong.onnx").exists()
 
 
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
-    from drives import HALL
-
     from uwb_mitigation.positioning.batch.anchor_errors import validate_anchor_map
 
     ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
@@ -414,8 +374,9 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
             if number % 7 == 0:
                 measured = replace(measured, cir=replace(measured.cir, samples=np.zeros(0, np.int16)))
             bag.write(replace(record, measurement=measured, truth=None))
-    done = run("calibrate", "drive.mcap", "--anchors", "anchors.yaml", "--height", 0.0, "-o", "site.onnx", "--json", "r.json", folder=tmp_path)  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    done = succeed(
+        "calibrate drive.mcap --anchors anchors.yaml --height 0.0 -o site.onnx --json r.json", folder=tmp_path
+    )
     assert "torch is not installed" in done.stderr
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["chosen"].startswith("offsets + universal network")
@@ -430,16 +391,13 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path, monkeypatch):
     assert result["calibrated_mae_m"] < 0.7 * result["raw_mae_m"]
     assert load_bundle(tmp_path / "site.onnx").card.needs_cir
     # The drive without true ranges is sufficient for int8.
-    done = run("quantise", "site.onnx", "--data", "drive.mcap", "-o", "int8.onnx", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("quantise site.onnx --data drive.mcap -o int8.onnx", folder=tmp_path)
     assert load_bundle(tmp_path / "int8.onnx").quantised
 
 
-@pytest.mark.parametrize(("taps", "slope", "chosen"), [(16, 0.06, "offsets + line"), (157, 0.0, "offsets")])  # fmt: skip
+@pytest.mark.parametrize(("taps", "slope", "chosen"), [(16, 0.06, "offsets + line"), (157, 0.0, "offsets")])
 def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps, slope, chosen):
     """NLOS makes simulated STS ranges longer by `slope` m per dB between receive and first-path level, or not at all."""
-    from drives import HALL
-
     from benchmarks.equipment.uci_board import taps_of
 
     def measure(seed):
@@ -473,8 +431,7 @@ def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps
     with BagWriter(tmp_path / "drive.mcap", {"simulated": "true"}) as bag:
         for measured in measure(1)[0]:
             bag.write(Record(measured))
-    done = run("calibrate", "drive.mcap", *LEVEL, "-o", "site.onnx", "--json", "r.json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed(f"calibrate drive.mcap {LEVEL} -o site.onnx --json r.json", folder=tmp_path)
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["chosen"] == chosen
     bundle, offsets = load_bundle(tmp_path / "site.onnx"), read_offsets(str(tmp_path / "site.offsets.yaml"))

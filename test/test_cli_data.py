@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_material import chunk_offsets
-from command_line import run, start
+from command_line import run, start, succeed
 from real_logs import Reading
 
 from uwb_mitigation.recordings.bag.reader import BagReader
@@ -96,8 +96,7 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
     from uwb_mitigation.types.ros import schemas
 
     options = "-o apartment.mcap --longest-pause inf --json import.json"
-    done = run("data", "import", apartment, *options.split(), folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("data", "import", apartment, *options.split(), folder=tmp_path)
     result = json.loads((tmp_path / "import.json").read_text())
     assert result["pairs"] == 28
     assert result["skipped"]
@@ -124,8 +123,7 @@ def test_import_shortens_pauses_by_default_and_reports_it(tmp_path: Path) -> Non
             bag.write(Record(RangeMeasurement(stamp_ns, 5, 2, 0, 0, 4.5, Cir(np.zeros(2, np.int16)))))
 
     def span_s(*options: str) -> float:
-        done = run("data", "import", "in.mcap", "-o", "out.mcap", "--force", *options, folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        done = succeed("data", "import", "in.mcap", "-o", "out.mcap", "--force", *options, folder=tmp_path)
         assert ("Shortened 1 pauses to 5 s, 995 s in total" in done.stdout) is not bool(options)
         first, last = BagReader(tmp_path / "out.mcap").messages()
         assert BagReader(tmp_path / "out.mcap").metadata["uwb_mitigation"]["simulated"] == "unknown"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
-from command_line import run
+from command_line import run, succeed
 from rich.console import Console
 
 from uwb_mitigation.commands import cli
@@ -81,8 +81,7 @@ def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ..
 
 @pytest.mark.parametrize("words", list(commands(typer.main.get_command(cli.app))), ids=" ".join)
 def test_help_fits_80_columns_and_needs_no_checkout(words: tuple[str, ...], tmp_path: Path):
-    done = run(*words, "--help", folder=tmp_path, columns=80)
-    assert done.returncode == 0
+    done = succeed(*words, "--help", folder=tmp_path, columns=80)
     assert not re.search(r"<str>|<bool>|docs/|\.md\b|…", done.stdout)
     wrapped_examples = [line for line in done.stdout.splitlines() if re.match(r" (-|/)", line)]
     assert wrapped_examples == []

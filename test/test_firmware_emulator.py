@@ -176,9 +176,7 @@ def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):
 
 
 def test_image_of_the_dwm1001_dev_fits_and_is_written_as_hex(tmp_path: Path):
-    done = command_line.run(
-        "board", "build-image", "-o", "radio.hex", "--json", "image.json", folder=tmp_path
-    )
+    done = command_line.run("board build-image -o radio.hex --json image.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "image.json").read_text())
     assert result["flash_bytes"] < 48 << 10

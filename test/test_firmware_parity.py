@@ -46,22 +46,11 @@ def compiled(exported: Exported) -> CompiledFirmware:
     return CompiledFirmware(exported.folder, exported.folder)
 
 
-def check_windows(exported: Exported, compiled: CompiledFirmware, windows: np.ndarray) -> None:
+def test_c_and_reference_equal_onnx_runtime(exported: Exported, compiled: CompiledFirmware):
+    windows = exported.windows()
     expected = bits(exported.subject.expect(windows))
     assert np.array_equal(bits(IntegerNetwork(exported.weights).predict_m(windows)), expected)
     assert np.array_equal(bits(compiled.predict_m(windows)), expected)
-
-
-def test_c_and_reference_equal_onnx_runtime_on_windows(exported: Exported, compiled: CompiledFirmware):
-    check_windows(exported, compiled, exported.windows())
-
-
-def test_c_and_reference_equal_onnx_runtime_on_logs(
-    exported: Exported, compiled: CompiledFirmware, apartment: Path
-):
-    windows = exported.real_windows(apartment)
-    assert len(windows) > 1000
-    check_windows(exported, compiled, windows)
 
 
 @pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])

@@ -36,7 +36,7 @@ from uwb_mitigation.types.ros.poses import yaw_of
 pytestmark = pytest.mark.ros
 
 ROUTE = ((2.0, 2.0), (10.0, 2.0), (10.0, 7.0), (6.0, 5.0), (2.0, 7.0))
-HEIGHT_M, SECONDS = 1.0, 40.0
+HEIGHT_M, SECONDS = 1.0, 30.0
 
 
 class Buffer:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import run
+from command_line import succeed
 
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 from uwb_mitigation.recordings.bag.odometry import read_odometry
@@ -55,19 +55,7 @@ def test_ten_lines_import_a_csv_file(tmp_path: Path):
     write(tmp_path / "map.yaml", TEN_LINES)
     rows = "".join(f"{1000 + 10 * n};{n % 3};{1.7e9 + n / 10:.1f}\n" for n in range(30))
     write(tmp_path / "log.csv", "range_mm;anchor;time\n" + rows)
-    done = run(
-        "data",
-        "import",
-        "log.csv",
-        "--map",
-        "map.yaml",
-        "-o",
-        "out.mcap",
-        "--json",
-        "out.json",
-        folder=tmp_path,
-    )
-    assert done.returncode == 0, done.stderr
+    succeed("data import log.csv --map map.yaml -o out.mcap --json out.json", folder=tmp_path)
     result = json.loads((tmp_path / "out.json").read_text())
     assert {name: result[name] for name in ("ranges", "with_cir", "with_truth", "anchors", "tags", "dropped")} == {
         "ranges": 30, "with_cir": 0, "with_truth": 0, "anchors": 3, "tags": 1, "dropped": {},
@@ -84,8 +72,7 @@ def test_a_dry_run_shows_units_errors_and_what_is_missing(tmp_path: Path):
         tmp_path / "map.yaml", yaml.safe_dump(PLAIN | {"truth": {"range": {"column": "true", "unit": "cm"}}})
     )
     write(tmp_path / "log.csv", "t,a,r,true\n" + "".join(f"{n},1,{2 + n / 100},190\n" for n in range(40)))
-    done = run("data", "import", "log.csv", "--map", "map.yaml", "--dry-run", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("data", "import", "log.csv", "--map", "map.yaml", "--dry-run", folder=tmp_path)
     assert "true range, m" in done.stdout
     assert "1.900" in done.stdout
     assert "Errors (measured - true) of 40 ranges" in done.stdout
@@ -517,8 +504,7 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
     folder = DATA / "chemnitz_labyrinth"
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent: set UWB_MITIGATION_DATA to run this test")
-    done = run("data", "import", folder, "--map", "labyrinth", "-o", "out.mcap", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed("data", "import", folder, "--map", "labyrinth", "-o", "out.mcap", folder=tmp_path)
     records = list(McapRecording(tmp_path / "out.mcap"))
     assert len(records) == 233
     assert all(record.truth and record.tag_position for record in records)
@@ -687,10 +673,7 @@ def test_single_impossible_values_are_dropped_and_counted(tmp_path: Path):
         "first_path_index is above 10000": 1,
     }  # fmt: skip
     for where in (["--dry-run"], ["-o", "x.mcap"]):
-        done = run(
-            "data", "import", "x.csv", "--map", "map.yaml", *where, "--json", "x.json", folder=tmp_path
-        )
-        assert done.returncode == 0, done.stderr
+        done = succeed("data import x.csv --map map.yaml", *where, "--json", "x.json", folder=tmp_path)
         assert json.loads((tmp_path / "x.json").read_text())["dropped"] == expected
         assert "Dropped 1 rows: range is above 10000" in done.stdout
     assert len(list(McapRecording(tmp_path / "x.mcap"))) == len(rows) - 5

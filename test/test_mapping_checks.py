@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from command_line import ENVIRONMENT, command, run
+from command_line import ENVIRONMENT, command, run, succeed
 from mcap.writer import Writer as McapWriter
 from test_mapping import PLAIN, _message_store, _write_bag, read, with_fields, write
 
@@ -86,8 +86,7 @@ def test_delay_of_cirs_and_the_offset_that_attaches_them_are_reported(tmp_path: 
 def test_stamps_are_kept_unless_ros_cannot_represent_them(tmp_path: Path):
     write(tmp_path / "map.yaml", yaml.safe_dump(PLAIN))
     write(tmp_path / "x.csv", "t,a,r\n" + "".join(f"{n / 10},1,2\n" for n in range(20)))
-    done = run("data", "import", "x.csv", "--map", "map.yaml", "-o", "x.mcap", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed("data", "import", "x.csv", "--map", "map.yaml", "-o", "x.mcap", folder=tmp_path)
     stamps = [record.measurement.stamp_ns for record in McapRecording(tmp_path / "x.mcap")]
     assert stamps == [n * 10**8 for n in range(20)]
     write(tmp_path / "y.csv", "t,a,r\n" + "".join(f"{n / 10 - 7.5},1,2\n" for n in range(20)))
@@ -280,10 +279,7 @@ def test_dry_run_shows_extent_outliers_names_and_missing_levels(tmp_path: Path):
     write(tmp_path / "map.yaml", yaml.safe_dump(PLAIN | {"fields": fields}))
     rows = "".join(f"{n / 10},{'hall' if n % 2 else 'lab'},{500 if n == 7 else 2},-80\n" for n in range(41))
     write(tmp_path / "x.csv", f"t,a,r,l\n{rows}")
-    done = run(
-        "data", "import", "x.csv", "--map", "map.yaml", "--dry-run", "--json", "x.json", folder=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
+    done = succeed("data import x.csv --map map.yaml --dry-run --json x.json", folder=tmp_path)
     assert "4.0 s, 2 pairs with 20 to 21 ranges (5 to 5.2 Hz); 1 ranges above 100 m" in done.stdout
     assert "anchor name" in done.stdout
     assert [line.split()[1:4:2] for line in done.stdout.splitlines() if "hall" in line] == [["hall", "2"]]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
+from command_line import succeed
 from rosbags.highlevel import AnyReader
 
 from uwb_mitigation.errors import RecordingError
@@ -33,8 +33,7 @@ SECONDS = 300.0
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bag = tmp_path_factory.mktemp("drive") / "drive.mcap"
-    done = run("data", "simulate", "-o", bag, "--ranges", "400", folder=bag.parent)
-    assert done.returncode == 0, done.stderr
+    succeed("data", "simulate", "-o", bag, "--ranges", "400", folder=bag.parent)
     return bag
 
 

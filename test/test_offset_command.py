@@ -169,9 +169,7 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
         "with": ("--offsets", "o.yaml"),
         "number": ("--offsets", "0.5"),
     }.items():
-        done = command_line.run(
-            "evaluate", "--data", "los.mcap", *options, "--json", "e.json", folder=tmp_path
-        )
+        done = command_line.run("evaluate --data los.mcap", *options, "--json", "e.json", folder=tmp_path)
         assert done.returncode == 0, done.stderr
         errors[name] = json.loads((tmp_path / "e.json").read_text())["corrected"]["mae"]
     assert errors["with"] < 0.5 * errors["without"]

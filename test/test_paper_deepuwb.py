@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import run, start
+from command_line import run, start, succeed
 from model_material import window_of
 
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
@@ -115,7 +115,7 @@ def test_frames_of_older_pandas_are_read(version: str) -> None:
 @pytest.mark.parametrize("error", [-9.9, -1.234567, 1e-4, 5.999999, 21.9])
 def test_errors_survive_import_into_a_bag_to_a_micrometre(tmp_path: Path, error: float) -> None:
     written(tmp_path, frame(1).assign(Error=[error]))
-    assert run("data", "import", "dataset.pkl", "-o", "bag.mcap", folder=tmp_path).returncode == 0
+    succeed("data", "import", "dataset.pkl", "-o", "bag.mcap", folder=tmp_path)
     (record,) = McapRecording(tmp_path / "bag.mcap")
     assert record.truth is not None
     assert abs(record.measurement.range_m - record.truth.range_m - error) < 1e-6
@@ -273,7 +273,7 @@ def test_simulated_cirs_are_cut_and_normalised_and_powers_known(simulated: list[
 
 def test_command_simulates_a_bag_that_can_be_played(tmp_path: Path) -> None:
     words = ("paper", "simulate", "--ranges", "100", "-o", "sim.mcap", "--json", "sim.json")
-    assert run(*words, folder=tmp_path).returncode == 0
+    succeed(*words, folder=tmp_path)
     assert json.loads((tmp_path / "sim.json").read_text())["ranges"] == 100
     recording = McapRecording(tmp_path / "sim.mcap")
     stamps = [record.measurement.stamp_ns for record in recording]

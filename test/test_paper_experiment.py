@@ -9,7 +9,7 @@ from shutil import copytree
 
 import numpy as np
 import pytest
-from command_line import run
+from command_line import run, succeed
 from model_material import dataset, integer_network
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
@@ -175,15 +175,14 @@ def folder(tmp_path_factory) -> Path:
     """Simulated rooms in `rooms.mcap`."""
     folder = tmp_path_factory.mktemp("commands")
     words = ("--ranges", 200, "--exchanges", 4, "-o", "rooms.mcap")
-    assert run("paper", "simulate", *words, folder=folder).returncode == 0
+    succeed("paper", "simulate", *words, folder=folder)
     return folder
 
 
 def test_command_writes_its_results(folder):
     quick = ("--networks", "remnet", "--windows", 8, "--seeds", 1, "--epochs", 1, "--workers", 1)
     words = ("protocol", "--data", "rooms.mcap", "-o", "models", "--json", "out.json", *quick)
-    done = run("paper", *words, folder=folder)
-    assert done.returncode == 0, done.stderr
+    succeed("paper", *words, folder=folder)
     result = json.loads((folder / "out.json").read_text())
     assert json.loads((folder / "models" / RESULTS).read_text()) == result
     assert (result["data"], result["split"]) == ("rooms.mcap (simulated)", "paper")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
+from command_line import run, succeed
 from model_material import dataset
 
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
@@ -214,8 +214,7 @@ def test_hostile_names_are_only_text():
 def test_command_writes_the_page_and_rejects_wrong_files(apartment, tmp_path):
     log = sorted((apartment / "logs").glob("*.log*"))[0]
     words = ("paper", "report", "--data", log, "-o", "out", "--json", "out.json")
-    done = run(*words, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed(*words, folder=tmp_path)
     assert Page((tmp_path / "out" / "report.html").read_text()).all("img")
     values = json.loads((tmp_path / "out.json").read_text())
     assert [one["id"] for one in values["figures"]] == ["fig3", "fig4a", "fig4b"]

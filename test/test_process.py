@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_material import Foreign, chunk_offsets
-from command_line import ENVIRONMENT, command, run, start
+from command_line import ENVIRONMENT, command, run, start, succeed
 from firmware_models import random_measurement
 from model_material import cir
 
@@ -154,9 +154,8 @@ def test_damaged_bag_is_processed_up_to_the_damage(tmp_path: Path) -> None:
 def test_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(40))
     done = start(
-        "process", "in.mcap", "-o", "out.mcap", "--model", "evk1000_apartment", "--json", "out.json",
-        folder=tmp_path,
-    )  # fmt: skip
+        "process in.mcap -o out.mcap --model evk1000_apartment --json out.json",
+        folder=tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "40 ranges" in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
@@ -171,8 +170,7 @@ def test_ranges_of_a_radio_without_model_are_counted_with_their_reason(tmp_path:
     measured = [replace(each, cir=replace(each.cir, **other)) for each in exchanges(12)]
     write_bag(tmp_path / "in.mcap", [*exchanges(3), *measured])
     words = "process in.mcap -o out.mcap --model evk1000_apartment --json out.json"
-    done = run(*words.split(), folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed(*words.split(), folder=tmp_path)
     text = " ".join(done.stderr.split())
     assert "12 ranges are not corrected: they are of DW3000 STS" in text
     assert "trained for DW1000 IPATOV" in text
@@ -186,8 +184,7 @@ def test_offsets_of_a_file_are_subtracted_for_each_pair(tmp_path: Path) -> None:
     offsets = "default: 0.2\nanchors: {2: 0.35}\npairs: [{anchor: 3, tag: 7, offset: -0.1}]\n"
     (tmp_path / "offsets.yaml").write_text(offsets)
     words = "process in.mcap -o out.mcap --offsets offsets.yaml --model evk1000_apartment"
-    done = run(*words.split(), folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed(*words.split(), folder=tmp_path)
     expected = one_by_one(exchanges(30), Offsets(0.2, {2: 0.35}, pairs={(7, 3): -0.1}))
     assert corrected_of(tmp_path / "out.mcap") == expected
     without = [codec.decode_corrected(data)[1].correction_m for data in one_by_one(exchanges(30))]
@@ -203,7 +200,7 @@ def test_existing_output_is_kept_without_force(tmp_path: Path) -> None:
     assert "--force" in refused.stderr
     assert len(refused.stderr.splitlines()) == 1
     assert corrected_of(output) == []
-    assert run("process", source, "-o", output, "--force", folder=tmp_path).returncode == 0
+    succeed("process", source, "-o", output, "--force", folder=tmp_path)
     assert len(corrected_of(output)) == 4
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_material import write_corrected
-from command_line import run
+from command_line import run, succeed
 from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, Robot, circuit, drive, wrapped
 
@@ -81,8 +81,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_track_is_written_evaluated_and_read_by_evo(hall: Path, tmp_path: Path):
     out, tum, result = tmp_path / "track.mcap", tmp_path / "track.tum", tmp_path / "track.json"
     options = ["-o", out, "--tum", tum, "--height", "1.0", "--json", result]
-    done = run("track", hall, *options, folder=tmp_path, columns=80)
-    assert done.returncode == 0, done.stderr
+    done = succeed("track", hall, *options, folder=tmp_path, columns=80)
     excerpt = json.loads(result.read_text())
     assert excerpt["unknown_anchors"] == {"99": 1}
     assert excerpt["corrected"] is True
@@ -150,8 +149,7 @@ def test_recording_that_cannot_be_tracked_is_refused(hall: Path, tmp_path: Path)
 def test_tag_without_a_position_does_not_stop_the_others(tmp_path: Path):
     bag = write_drive(tmp_path / "two.mcap", *drive(seconds=10), other_tag=8)
     arguments = ("track", bag, "-o", tmp_path / "track.mcap", "--tum", tmp_path / "track.tum")
-    done = run(*arguments, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed(*arguments, folder=tmp_path)
     assert "tag 8: no position can be determined from 1 ranges" in done.stderr
     assert [path.name for path in tmp_path.glob("*.tum")] == ["track.tag_7.tum"]
     (tmp_path / "track.mcap").unlink()
@@ -165,8 +163,7 @@ def test_survey_improves_the_anchor_positions(hall: Path, tmp_path: Path):
     off[1] += (0.5, -0.4, 0.0)
     guesses.write_text(dump_anchors(HALL.moved(off, HALL.sd)))
     arguments = ("survey", hall, "-o", found, "--anchors", guesses, "--height", "1.0", "--json", result)
-    done = run(*arguments, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed(*arguments, folder=tmp_path)
     assert json.loads(result.read_text())["misplaced"] == [2]
     excerpt = parse_anchors(found.read_text(), "found")
     assert np.linalg.norm(excerpt.position[1] - HALL.position[1]) < 0.5
@@ -181,8 +178,7 @@ def test_height_topic_is_used_and_excludes_a_constant_height(tmp_path: Path):
 
     bag = write_drive(tmp_path / "flight.mcap", *drive(seconds=20, path=up_and_down))
     arguments = ("track", bag, "-o", tmp_path / "track.mcap", "--height-topic")
-    done = run(*arguments, "/height", "--json", result, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed(*arguments, "/height", "--json", result, folder=tmp_path)
     excerpt = json.loads(result.read_text())
     for kind in ("live", "smoothed"):
         assert excerpt[kind]["horizontal_rmse_m"] < 0.2
@@ -196,12 +192,7 @@ def test_height_topic_is_used_and_excludes_a_constant_height(tmp_path: Path):
 def robot_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a simulated drive with odometry and IMU, and its anchors file."""
     bag = tmp_path_factory.mktemp("robot") / "drive.mcap"
-    assert (
-        run(
-            "data", "simulate", "--like", "drive", "--ranges", "1200", "-o", bag, folder=bag.parent
-        ).returncode
-        == 0
-    )
+    succeed("data simulate --like drive --ranges 1200 -o", bag, folder=bag.parent)
     return bag
 
 
@@ -209,11 +200,10 @@ def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path):
     results = []
     for number, options in enumerate(([], ["--odometry", "/odom"], ["--odometry", "/odom", "--imu", "/imu"])):
         out, report, tum = (tmp_path / f"{number}.{kind}" for kind in ("mcap", "json", "tum"))
-        ran = run(
+        ran = succeed(
             "track", str(robot_bag), "-o", str(out), "--height", "0", *options,
             "--json", str(report), "--tum", str(tum), folder=tmp_path,
         )  # fmt: skip
-        assert ran.returncode == 0, ran.stderr
         assert "lever arm" not in ran.stderr
         results.append(json.loads(report.read_text()))
     without, with_odometry, with_imu = results
@@ -238,8 +228,7 @@ def test_unknown_lever_arm_is_reported(robot_bag: Path, tmp_path: Path, monkeypa
         "uwb_mitigation.recordings.bag.pose_paths.read_range_frame", lambda bag: "uwb_antenna"
     )
     options = ("--height", "0", "--odometry", "/odom")
-    ran = run("track", str(robot_bag), "-o", str(tmp_path / "x.mcap"), *options, folder=tmp_path)
-    assert ran.returncode == 0
+    ran = succeed("track", str(robot_bag), "-o", str(tmp_path / "x.mcap"), *options, folder=tmp_path)
     assert "no transform from base_link to uwb_antenna" in ran.stderr
 
 
@@ -358,8 +347,7 @@ def test_real_run_is_read_with_its_anchors_and_positions(hanyang: Path):
 
 
 def test_bag_of_a_real_run_keeps_its_stamps_and_anchors(hanyang: Path, tmp_path: Path):
-    done = run("data", "import", hanyang / "LOS_A2", "-o", tmp_path / "a2.mcap", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed("data", "import", hanyang / "LOS_A2", "-o", tmp_path / "a2.mcap", folder=tmp_path)
     wanted = [record.measurement.stamp_ns for record in open_recording(hanyang / "LOS_A2")]
     assert [record.measurement.stamp_ns for record in open_recording(tmp_path / "a2.mcap")] == wanted
     anchors = parse_anchors((tmp_path / "a2.anchors.yaml").read_text(), "a2")

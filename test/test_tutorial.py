@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import run, succeed
 from conftest import REPOSITORY
 
 
@@ -46,8 +46,7 @@ def lines(text: str) -> list[str]:
 
 
 def output_of(folder: Path, line: str) -> str:
-    done = run(*shlex.split(line), folder=folder, columns=80)
-    assert done.returncode == 0, done.stderr
+    done = succeed(*shlex.split(line), folder=folder, columns=80)
     assert max((len(line) for line in done.stdout.splitlines() if line[:1] in ("┃", "│")), default=0) <= 80
     return done.stdout + done.stderr
 

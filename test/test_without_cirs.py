@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
+from command_line import run, succeed
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -100,23 +100,21 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
     with BagWriter(tmp_path / "bare.mcap", {"source": "test", "simulated": "true"}) as bag:
         for record in ranges():
             bag.write(record)
-    done = run("train", "--data", "bare.mcap", "-o", "line.onnx", "--json", "train.json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed("train", "--data", "bare.mcap", "-o", "line.onnx", "--json", "train.json", folder=tmp_path)
     trained = json.loads((tmp_path / "train.json").read_text())
     assert trained["choice"]["chosen"] == "line"
     assert {row["name"] for row in trained["rows"]} == {"raw", "overall_median", "l1_line", "float"}
     assert trained["improved"]
     assert not load_bundle(tmp_path / "line.onnx").card.needs_cir
 
-    done = run("evaluate", "--data", "bare.mcap", "--model", "line.onnx", "--json", "e.json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed("evaluate --data bare.mcap --model line.onnx --json e.json", folder=tmp_path)
     result = json.loads((tmp_path / "e.json").read_text())
     assert result["statuses"] == {"OK": result["n"]}
     assert result["corrected"]["mae"] < 0.7 * result["raw"]["mae"]
     los = result["by_label"]["LOS"]
     assert los["corrected_mae"] < los["raw_mae"] + 0.03
 
-    done = run(
+    succeed(
         *(
             "evaluate",
             "--data",
@@ -130,7 +128,6 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
         ),
         folder=tmp_path,
     )
-    assert done.returncode == 0, done.stderr
     rows = {row["name"]: row["mae_mean"] for row in json.loads((tmp_path / "c.json").read_text())["rows"]}
     assert list(rows) == ["raw", "los_median", "overall_median", "l1_line", "shipped_float"]
     assert rows["l1_line"] < 0.7 * rows["raw"]
@@ -147,8 +144,7 @@ def test_ranges_without_first_path_level_are_passed_through(tmp_path: Path):
             if number % 5 == 0:
                 cir = replace(cir, first_path_power_dbm=np.nan)
             bag.write(replace(record, measurement=replace(record.measurement, cir=cir)))
-    done = run("train", "--data", "some.mcap", "-o", "line.onnx", "--json", "t.json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("train", "--data", "some.mcap", "-o", "line.onnx", "--json", "t.json", folder=tmp_path)
     mae_m = {row["name"]: row["mae"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
     assert 0.2 * mae_m["raw"] < mae_m["l1_line"] < 0.8 * mae_m["raw"]
     command = ("evaluate", "--data", "some.mcap", "--cross-validate", "configuration", "--seeds", 1)
@@ -182,8 +178,7 @@ def test_offset_from_true_ranges_needs_no_levels(tmp_path: Path):
     with BagWriter(tmp_path / "bare.mcap", {"source": "test", "simulated": "true"}) as bag:
         for record in records:
             bag.write(record)
-    done = run("offset", "bare.mcap", "--truth", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("offset", "bare.mcap", "--truth", folder=tmp_path)
     assert "nan" not in done.stdout
     blocked = [record for record in records if record.truth is not None and record.truth.label == "NLOS"]
     with pytest.raises(DatasetError, match="labelled as NLOS"):
