@@ -16,6 +16,7 @@ from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, 
 from uwb_mitigation.simulation.channel import (
     INDUSTRIAL_LOS,
     INDUSTRIAL_NLOS,
+    MAX_DECAY_NS,
     OFFICE_LOS,
     OFFICE_NLOS,
     OUTDOOR_LOS,
@@ -303,11 +304,11 @@ def block_of(
 
 
 def _with_decay(environment: Environment, factor: float) -> Environment:
-    """Return an environment with decay times of clusters and rays that are multiplied by `factor`."""
+    """Return an environment with decay times of clusters and rays that are multiplied by `factor`, within the valid limits."""
     return replace(
         environment,
-        cluster_decay_ns=factor * environment.cluster_decay_ns,
-        ray_decay_ns=factor * environment.ray_decay_ns,
+        cluster_decay_ns=min(factor * environment.cluster_decay_ns, MAX_DECAY_NS),
+        ray_decay_ns=min(factor * environment.ray_decay_ns, MAX_DECAY_NS),
     )
 
 

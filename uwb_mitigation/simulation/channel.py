@@ -30,6 +30,9 @@ PATTERN_LOSS_DB = (4.0, 1.0)
 path. The direct path has one direction, the diffuse field has all, so only their ratio matters. The mean of
 4 dB is the mean difference of receive and first-path level in the LOS EVK1000 logs."""
 
+MAX_DECAY_NS = 200.0
+"""Upper limit of decay times: 200 of the 1016 taps of a CIR."""
+
 MAX_CLUSTERS = 10
 RAYS_PER_CLUSTER = 28
 """The omitted rays contain less than 0.1 % of the mean power of a residential cluster."""
@@ -93,8 +96,8 @@ class Environment:
             ("ray_rates_per_ns[0]", self.ray_rates_per_ns[0], 1e-2, 10),
             ("ray_rates_per_ns[1]", self.ray_rates_per_ns[1], 1e-2, 10),
             ("ray_mix", self.ray_mix, 0, 1),
-            ("cluster_decay_ns", self.cluster_decay_ns, 0.1, 200),
-            ("ray_decay_ns", self.ray_decay_ns, 0.1, 200),
+            ("cluster_decay_ns", self.cluster_decay_ns, 0.1, MAX_DECAY_NS),
+            ("ray_decay_ns", self.ray_decay_ns, 0.1, MAX_DECAY_NS),
             ("cluster_shadowing_db", self.cluster_shadowing_db, 0, 20),
             ("nakagami_log_mean", self.nakagami_log_mean, -0.6, 4),
             ("nakagami_log_std", self.nakagami_log_std, 0, 2),
