@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +25,13 @@ from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, session_op
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.training.paper import published
 
 CLOCK_HZ = 64e6
 """Clock of the board in the paper, an Arduino Nano 33 BLE Sense."""
 
-DEFAULT_INPUTS = 5000
+DEFAULT_INPUTS, CORRECTIONS = 5000, 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +71,8 @@ class NetworkCost:
         k, k0: window length and first kernel; k0 is 0 for an MLP.
         kernels: `cortex_m4` (assembly) or `portable` (C, -O3).
         instructions: maximum per inference from a window of floats, over all inputs.
+        instructions_correct: maximum per correction of a simulated CIR: preprocessing, OOD score, search for a missed direct
+            path, and inference. `instructions_early_path`: how much less without the search. None: random weights.
         cycles_estimated: at zero wait states, see `cycles`.
         ram_bytes: size of the arena, without `stack_bytes`.
         flash_bytes: size of an image that only corrects ranges.
@@ -91,6 +94,8 @@ class NetworkCost:
     hz: float
     energy_mj: float | None
     paper_hz: float | None
+    instructions_correct: int | None = None
+    instructions_early_path: int | None = None
 
 
 def random_shapes(
@@ -151,11 +156,10 @@ def measure(
         windows = rounding_windows(packed.samples, packed.input_scale, inputs)
     expected = network.expect(windows)
     examples = golden_windows(packed)
+    golden = Golden(examples, network.expect(examples))
     with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
         folder = Path(name)
-        write_header(
-            folder, packed, network.card, network.model_id, Golden(examples, network.expect(examples))
-        )
+        write_header(folder, packed, network.card, network.model_id, golden)
         optimisation = "-O3" if kernels is Kernels.PORTABLE else "-Os"
         image = compile_image(folder, folder, Target.QEMU_MPS2, kernels, optimisation)
         result = emulator.run_windows(image, windows)
@@ -166,6 +170,7 @@ def measure(
     wrong = (result.records["output_m"].view(np.uint32) != expected.view(np.uint32)) | (
         result.records["status"] != 0
     )
+    whole, search = _correction_instructions(network, golden, kernels) if network.model_id else (None, None)
     return NetworkCost(
         model=network.network,
         k=packed.samples,
@@ -181,4 +186,22 @@ def measure(
         hz=hz,
         energy_mj=None if published_model is None else published_model.board[3] / hz,
         paper_hz=None if published_model is None else published_model.board[0],
+        instructions_correct=whole,
+        instructions_early_path=search,
     )
+
+
+def _correction_instructions(network: Network, golden: Golden, kernels: Kernels) -> tuple[int, int]:
+    """Return the maximum per correction of a simulated CIR, and the share of the search for a missed direct path."""
+    measurements = [record.measurement for record in SimulatedSource(seed=3, count=CORRECTIONS)]
+    counts = []
+    for card in (network.card, replace(network.card, early_path=False)):
+        with tempfile.TemporaryDirectory(prefix="uwb_firmware_") as name:
+            folder = Path(name)
+            write_header(folder, network.packed, card, network.model_id, golden)
+            image = compile_image(
+                folder, folder, Target.QEMU_MPS2, kernels, "-O3" if kernels is Kernels.PORTABLE else "-Os"
+            )
+            result = emulator.run_measurements(image, measurements, network.packed.samples)
+        counts.append(result.instructions_correct)
+    return counts[0], counts[0] - counts[1]

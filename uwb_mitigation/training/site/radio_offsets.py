@@ -49,7 +49,7 @@ _MEDIAN_SD_FACTOR = math.sqrt(math.pi / 2.0)
 
 MIN_LINE_PLACEMENTS, MIN_LINE_SPAN_DB = 6, 3.0
 """A line in the first-path level needs as many LOS placements, whose levels differ by as much: the bias of a DW1000 changes
-by about 0.1 m in 10 dB (Decawave APS011), less than `PLACEMENT_SD_M`."""
+by up to 0.1 m in 10 dB (Decawave APS011), less than `PLACEMENT_SD_M`."""
 
 _Sample = tuple[float, float, float, float, float, str]
 """Offset, m; predicted error, m, or NaN; power gap, dB, or NaN; first-path level, dBm, or NaN; 1: LOS, 0: NLOS, NaN: unknown;
