@@ -166,7 +166,7 @@ def test_universal_model_reaches_the_error_of_its_card_on_the_real_logs(apartmen
         build_dataset(apartment_reading.records, bundle.preprocessing), bundle
     )
     left = [np.abs(found.errors[f"universal{offset}"]).mean() for offset in ("_los_offset", "_offset")]
-    assert left == pytest.approx([0.205, 0.196], abs=0.001)
+    assert left == pytest.approx([0.220, 0.209], abs=0.001)
 
 
 def test_universal_model_helps_in_simulated_rooms_by_amplitude():

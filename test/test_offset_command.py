@@ -142,7 +142,8 @@ def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment: Path, tm
     )  # fmt: skip
     assert outcome.returncode == 0, outcome.stderr
     result = json.loads((tmp_path / "o.json").read_text())
-    assert result["offset_m"] == pytest.approx(0.22, abs=2.0 * result["sd_m"])
+    # The median of the placements that are labelled LOS.
+    assert result["offset_m"] == pytest.approx(0.237, abs=2.0 * result["sd_m"])
     assert 0.02 < result["sd_m"] < 0.1
     refused = {pair["placement"].rpartition("/")[2] for pair in result["pairs"] if pair["refused"]}
     # Behind a wall and a cabinet; in the open.

@@ -2,7 +2,7 @@
 
 Arguments: the folder of the EVK1000 logs, and the number of draws (60).
 
-Up to 12 placements the universal model with its own offset is best, from 15 on their mean, by less than 0.01 m. The limit of `train` is 20,
+Up to 12 placements the universal model with its own offset or the mean of both is best, from 15 on the line, by 0.01 to 0.03 m. The limit of `train` is 20,
 because a linear model describes the walls of one apartment, and few placements do not show whether it generalises.
 """
 

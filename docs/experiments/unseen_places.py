@@ -3,11 +3,6 @@
 Arguments: the recording, and bundles. "LOS offset" subtracts the median of all LOS placements, "left-one-out offset" the
 median of all other placements. "One placement" is what a user does with one known distance: the offset is the mean error of a single
 LOS placement, which is left out of the evaluation; mean and range over all choices of this placement.
-
-Tried and dropped for `universal`: an ensemble of three networks (0.224 against 0.225), larger batches with a cosine schedule, a
-detector threshold that grows with the level, and the noise of the logs. Kept: a first cluster that is later the longer the path is (0.20
-against 0.22). Windows of 64 and 32 samples give 0.205 and 0.204; 157 ships, because boards and models were measured with it. The left-one-out
-error of 0.19 m that was aimed for is missed (0.201).
 """
 
 import sys

@@ -3,7 +3,7 @@
 Arguments: the folder of the EVK1000 logs, the step between the ranges that are used, and bundles or names of shipped ones. For a model
 without the offset of boards, the offset of the LOS placements is subtracted first.
 
-`universal` is at worst 1.1 % worse than the raw ranges minus offset (at -17 dB). `evk1000_apartment` is 10 to 11 % worse at -13 dB: a
+`universal` has at most 0.86 times the error of raw ranges minus offset (at -17 dB). `evk1000_apartment` is 10 to 11 % worse at -13 dB: a
 single range cannot show whether the radio is weaker or a wall is in between.
 """
 

@@ -39,8 +39,9 @@ PLACEMENT_SD_M = 0.15
 """Standard deviation of the offset of one placement without noise: 0.12 m between the seven LOS placements of the EVK1000
 logs (1.48 x median absolute deviation after `universal`), a rough estimate from seven placements."""
 
-MAX_EXCESS_M, MAX_ERROR_M = 0.25, 0.5
-"""If the predicted error is larger, the path is NLOS. The second limit is for models with a linear bias that contains the offset."""
+MAX_EXCESS_M, MAX_ERROR_M = 0.15, 0.5
+"""If the predicted error is larger, the path is NLOS. In held-out simulated buildings with boards like the EVB1000, `universal`
+predicts less for 89 % of the LOS ranges whose power gap is small. The second limit is for models with a linear bias that contains the offset."""
 
 MIN_RANGES = 10
 _BATCH = 256
