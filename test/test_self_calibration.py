@@ -230,6 +230,16 @@ def test_two_swapped_opposite_anchors_are_named(recorded):
     refused("anchors 1 and 3 contradict", swapped, [some], height=LEVEL)
 
 
+def test_positions_of_a_carried_tag_without_pauses_are_refused():
+    rng = np.random.default_rng(1)
+    row = np.tile(np.arange(5), 3 * 12)
+    position = np.repeat(rng.uniform((1, 1, 1), (11, 8, 1), (12, 3)), 15, axis=0)
+    distance = np.linalg.norm(HALL.position[row] - position, axis=1) + rng.normal(0, 0.03, len(row))
+    unknown = np.full(len(row), np.nan)
+    carried = Ranges(np.arange(len(row)) * 10**8, row, distance, unknown, unknown)
+    refused("contradict the estimated track", HALL, [carried], height=LEVEL)
+
+
 def test_heavy_tail_accuses_no_anchor(recorded):
     """A person between the tag and one anchor lengthens 80 % of its ranges."""
     ranges, _ = recorded

@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.anchor_errors import (
+    MAX_SUSPECTS,
     check_anchor_positions,
     check_height,
     check_motion,
@@ -265,7 +266,8 @@ class _Solver:
         used = float(has_position[self.segments.segment].mean())
         if used < MIN_POSITION_SHARE:
             scale_m = np.full(int(extra.noise_group.max(initial=0)) + 1, START_SD_M)
-            check_swapped(self.segments, config, self.common, first_positions, scale_m)
+            suspects = _suspects(config, self.segments, expected + offset)
+            check_swapped(self.segments, config, self.common, first_positions, scale_m, suspects)
         if not has_position.any():
             raise DatasetError(
                 "no position of a tag can be determined",
@@ -508,6 +510,22 @@ def _moments(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np
         if len(moments) == MAX_WINDOWS:
             break
     return moments
+
+
+def _suspects(
+    config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]
+) -> NDArray[np.intp]:
+    """Return the rows of the anchors with the largest residuals at a few moments."""
+    loss = np.zeros(len(config.anchors))
+    for row, value in _moments(config, segments, expected_m):
+        possible = _candidate_positions(config, row, value)
+        if possible:
+            distance = np.linalg.norm(config.anchors.position[row] - possible[0].position, axis=1)
+            loss[row] += config.model.loss((value - distance) / START_SD_M)
+        else:
+            loss[row] += NO_POSITION_LOSS / len(row)
+    received = np.unique(segments.ranges.anchor)
+    return received[np.argsort(-loss[received], kind="stable")][:MAX_SUSPECTS]
 
 
 def _moment_losses(config: EstimatorConfig, moments: _Moments) -> NDArray[np.float64]:
