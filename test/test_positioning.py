@@ -220,6 +220,13 @@ def test_fixed_lag_poses_among_obstacles_are_not_worse_than_live(seed: int):
     assert smoothed.coverage95 > 0.85
 
 
+def test_fixed_lag_covariances_contain_constant_errors_as_live_ones_do():
+    ranges, truth = drive(seconds=30, seed=1)
+    block(ranges, 1).range_m[:] += np.array([0.4, 0.0, 0.1, -0.1, 0.5])[ranges.anchor]
+    live, smoothed = (track_errors(one, truth) for one in lagged(HALL, ranges, truth))
+    assert smoothed.coverage95 > live.coverage95 - 0.05
+
+
 @pytest.mark.parametrize("seed", [0, 3])
 @pytest.mark.parametrize("height", [None, Height(1.0)])
 def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Height | None):

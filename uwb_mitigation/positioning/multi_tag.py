@@ -108,13 +108,14 @@ class FixedLagSmoother:
         batch.position[:] += (query_ns - int(track.stamp_ns[nearest])) / NS_PER_S * batch.velocity
         live_ns, live, estimate = [state for state in self._states if state[0] <= query_ns][-1]
         after_s = (query_ns - live_ns) / NS_PER_S
+        moved, velocity = estimate.position + after_s * estimate.velocity, estimate.velocity
+        covariance = estimate.covariance
         if estimate.heading is None:
             live = live.copy()
             live.predict(live.time_s + after_s)
-            mean, covariance = live.x[:6], live.P[:6, :6]
-        else:
-            moved = estimate.position + after_s * estimate.velocity
-            mean, covariance = np.concatenate([moved, estimate.velocity]), estimate.covariance
+            predicted = live.estimate(query_ns)
+            moved, velocity, covariance = predicted.position, predicted.velocity, predicted.covariance
+        mean = np.concatenate([moved, velocity])
         state, covariance, spread = fused_with_batch(mean[None], covariance[None], batch)
         position = state[0, :3] if config.area is None else config.area.clip(state[0, :3])
         return Estimate(query_ns, position, state[0, 3:], (covariance + spread)[0], estimate.heading)
