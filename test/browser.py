@@ -153,12 +153,12 @@ class Browser:
         self.wait(f"{role} {name}", lambda: self.find(role, name)).click()
 
     def table(self, name: str) -> list[dict[str, str]]:
-        """Return the rows of a table, {title of the column: text}."""
+        """Return the rows of a table, {title of the column: text}; the titles are the last row of its head."""
         table = self.find("table", name)
         if table is None:
             return []
         rows = self.run(
-            "return [...arguments[0].rows].map((row) => [...row.cells].map((cell) => cell.innerText.trim()))",
+            "return [...arguments[0].rows].slice(arguments[0].tHead.rows.length - 1).map((row) => [...row.cells].map((cell) => cell.innerText.trim()))",
             table,
         )
         return [dict(zip(rows[0], row, strict=True)) for row in rows[1:]]

@@ -29,8 +29,9 @@ from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, Tag
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.types.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
+from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
-from uwb_mitigation.viewer.health import predicted_accuracy
+from uwb_mitigation.viewer.headline import live_cards
 from uwb_mitigation.viewer.page import Page, View
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
@@ -102,6 +103,13 @@ def cards(browser: Browser) -> dict[str, tuple[str, str]]:
     return {title: (value, explanation) for title, value, explanation in texts}
 
 
+def empty_figures(browser: Browser) -> dict[str, str]:
+    """Return the messages in figures without data, {figure: message}."""
+    return browser.run(
+        "return Object.fromEntries([...document.querySelectorAll('[data-empty]')].map((e) => [e.id, e.dataset.empty]))"
+    )
+
+
 def open_page(browser: Browser, server: ViewerServer, width: int = 1280, height: int = 1150) -> None:
     browser.open(server.url, width, height)
     browser.wait("the page", browser.ready)
@@ -143,12 +151,16 @@ def test_pairs_tags_and_nodes_without_data_are_grey(
     browser.wait("no data", lambda: browser.column("pairs", "status") == ["no data for 12 s"] * 2)
     assert browser.column("pairs", "rate") == [0.0, 0.0]
     browser.wait("the row", lambda: "no data" in browser.table("Pairs")[0]["status"])
-    assert browser.column("map", "name")[-1] == "tag: no data for 12 s"
+    assert browser.column("map", "name")[-1] == "tag 7: no data for 12 s"
     assert browser.column("map", "corrected") == []
     assert "STALE" in browser.text()
     assert "no diagnostics for 12 s; last: 10.0 Hz" in browser.text()
     assert "damaged" in browser.text(), "it is not of a node"
     assert "No ranges for 12 s." in browser.text()
+    assert cards(browser)["Position error, now"] == ("-", "no position of tag 7 in the last 3 s")
+    browser.wait(
+        "the state of the page", lambda: "NO RANGES" in browser.text() and "LIVE" not in browser.text()
+    )
     browser.screenshot("viewer_no_data")
     with view.lock:
         view.scene.add_sample((1, 7), Sample(1017.0, 5.3, 5.1, 0.1, Status.OK))
@@ -459,21 +471,20 @@ def test_pairs_can_be_sorted_and_selected(browser: Browser, view: View, server: 
     first = browser.table("Pairs")[0]
     values = [
         first[name]
-        for name in ("corrected, m", "raw, m", "mean correction, m", "not OK, %", "rate, Hz", "lost")
+        for name in ("corrected, m", "raw, m", "correction, m", "not OK, %", "rate, Hz", "lost, %")
     ]
     assert values == ["5.100", "5.300", "0.200", "0", "10.0", "0"]
-    browser.click("button", "mean correction, m")
+    browser.click("button", "correction, m")
     browser.wait("the smallest correction first", lambda: anchors() == ["2, 7", "1, 7"])
-    assert browser.find("columnheader", "mean correction, m").get_attribute("aria-sort") == "ascending"
+    assert browser.find("columnheader", "correction, m").get_attribute("aria-sort") == "ascending"
     browser.find("searchbox", "search").send_keys("1,")
     browser.wait("one row", lambda: anchors() == ["1, 7"])
     browser.find("searchbox", "search").clear()
     browser.find("combobox", "show").send_keys("not OK")
     browser.wait("the bad pair", lambda: anchors() == ["2, 7"])
     browser.find("button", "Select anchor 2, tag 7").send_keys("\ue007")
-    browser.wait(
-        "its CIR", lambda: browser.find("heading", "Channel impulse response (CIR): anchor 2, tag 7")
-    )
+    title = "Last channel impulse response (CIR): anchor {}, tag 7"
+    browser.wait("its CIR", lambda: browser.find("heading", title.format(2)))
     pressed = browser.find("button", "Select anchor 2, tag 7").get_attribute("aria-pressed")
     assert pressed == "true"
     browser.wait("it in the URL", lambda: "#anchor=2&tag=7" in browser.driver.current_url)
@@ -481,8 +492,8 @@ def test_pairs_can_be_sorted_and_selected(browser: Browser, view: View, server: 
         view.scene.add_sample((3, 7), Sample(1005.0, 5.3, 5.3, 0.1, Status.NO_CIR))
     browser.wait("the other pair", lambda: anchors() == ["2, 7", "3, 7"])
     browser.click("button", "Select anchor 3, tag 7")
-    title = "Channel impulse response (CIR): anchor 3, tag 7: no CIR"
-    browser.wait("the reason", lambda: browser.find("heading", title))
+    browser.wait("the title", lambda: browser.find("heading", title.format(3)))
+    browser.wait("the reason", lambda: empty_figures(browser)["cir"] == "No CIR of this pair yet.")
 
 
 def test_map_shows_and_exports_tracks_and_rays(browser: Browser, view: View, server: ViewerServer) -> None:
@@ -562,14 +573,14 @@ def test_click_shows_values_and_selects_an_anchor(browser: Browser, view: View, 
         actions.perform()
 
     for name, x, y, text in (
-        ("strip", -40.0, 5.2, "-4.90 (seconds); raw 5.300; corrected 5.100; true 5.100"),
+        ("strip", -40.0, 5.2, "-4.90 (time before now, s); raw 5.300; corrected 5.100; true 5.100"),
         ("cir", 0.0, 500.0, "0.00 (samples (1 ns) from the first path); CIR 1000.000"),
         ("errors", 0.52, 10.0, "0.50 to 0.55 (measured - true, m); raw 50; corrected 50"),
     ):
         click(name, x, y)
         browser.wait(name, lambda text=text: text in browser.text())
     click("map", 8.0, 0.0)
-    browser.wait("the other anchor", lambda: browser.find("heading", "Range: anchor 2, tag 7"))
+    browser.wait("the other anchor", lambda: browser.find("heading", "Range, last 60 s: anchor 2, tag 7"))
     assert browser.console_messages() == []
 
 
@@ -586,9 +597,7 @@ def test_dark_page_and_labels_are_readable(browser: Browser, view: View, server:
 
     with browser.dark_mode():
         open_page(browser, server, 400)
-        browser.wait(
-            "labels above the tracks", lambda: colours() == ["annotation", PAPER, NIGHT] * 2 + [PAPER]
-        )
+        browser.wait("labels above the tracks", lambda: colours() == ["annotation", PAPER, NIGHT, PAPER])
         browser.wait("a hint", lambda: "scroll the table sideways" in browser.text())
 
 
@@ -612,7 +621,29 @@ def test_raw_positions_are_those_of_the_locator_on_raw_ranges() -> None:
     for stamp_s, *position, _ in scene.tracks["tag", TrackKind.RAW].points:
         assert position == pytest.approx(expected[stamp_s], abs=1e-6)
     assert position[:2] == pytest.approx((5.0, 2.0), abs=0.3)
-    assert scene.pairs[2, 7].samples[-1].innovation_m == pytest.approx(0.5)
+    assert scene.pairs[2, 7].samples[-1].residual_m == pytest.approx(0.5)
+
+
+def test_hostile_positions_do_not_stop_the_stream() -> None:
+    """Positions of a topic may have any value; raw positions are estimated from them."""
+    rng = np.random.default_rng(1)
+    values = (0.0, 1.0, -3.0, 8.0, 1e-300, 1e5, -2e7, 1e17, 1e300, math.inf, math.nan)
+    for case in range(40):
+        # More anchors than an estimator accepts.
+        places = {1 + n: AnchorPosition(*rng.choice(values, 3)) for n in range(300 if case == 0 else 5)}
+        places |= {
+            10_000 + n: AnchorPosition(8.0 * (n % 2), 6.0 * (n // 2), rng.choice(values)) for n in range(4)
+        }
+        scene = Scene(Clock())
+        scene.set_anchors(places)
+        for step in range(60):
+            stamp_s = 1000.0 + step / 40.0
+            scene.add_pose("tag", Pose(4.0, 3.0, float(rng.choice(values)), stamp_s=stamp_s))
+            anchor = list(places)[step % len(places)]
+            range_m = float(rng.choice((*values, 4.0, 5.0, 5.0, 5.0)))
+            scene.add_sample((anchor, 7), Sample(stamp_s, range_m, 5.0, 0.1, Status.OK))
+        for track in scene.tracks.values():
+            assert np.isfinite(track.columns()[:, 1:3]).all()
 
 
 def contrast(first: str, second: str) -> float:
@@ -688,6 +719,10 @@ def test_empty_page_has_axes_and_no_dark_blocks(browser: Browser, view: View, se
     )
     assert all(end is not None and math.isfinite(end) for end in ends)
     assert cards(browser) == {}
+    none = "No CIRs: the source sends none, or no raw ranges are received."
+    assert empty_figures(browser) == {
+        "strip": "No range of this pair yet.", "cir": none, "waterfall": none, "errors": "No true ranges."
+    }  # fmt: skip
     browser.screenshot("viewer_empty")
 
 
@@ -706,22 +741,88 @@ def test_anchors_have_a_traffic_light_and_advice(
     browser.wait(
         "advice", lambda: "Anchor 2 reads 0.42 m long: calibrate, or check its position." in browser.text()
     )
-    states = browser.run(
-        "return [...document.querySelectorAll('#health tr')].map((row) => row.cells[0].textContent)"
-    )
-    assert states[1].endswith("bad")
+    assert [row["state"] for row in browser.table("Anchors")] == [health.GOOD, health.BAD]
+    assert [row["state"] for row in browser.table("Pairs")] == [health.GOOD, health.BAD]
     browser.click("checkbox", "predicted accuracy")
     browser.wait("the map", lambda: len(browser.column("map", "dw")) == 1)
     clock.now_s = 20.0
-    browser.wait("a stopped anchor", lambda: "Anchor 1 has not answered for 20 s" in browser.text())
+    browser.wait("advice for all", lambda: "No anchor answers: check the tag" in browser.text())
+
+
+@pytest.mark.parametrize(
+    ("residuals_m", "nlos", "expected"),
+    [
+        ([0.0, 0.8, 0.0], [0.0, 94.0, 0.0], "Anchor 2 reads 0.80 m long, with 94 % NLOS: its line of sight"),
+        ([0.0, -0.4, 0.0], [0.0, 0.0, 0.0], "Anchor 2 reads 0.40 m short: calibrate"),
+        (
+            [0.2, 0.8, 0.3],
+            [0.0, 94.0, 0.0],
+            "All anchors read too long, 0.30 m in the median: a common cause",
+        ),
+        ([0.2, -0.8, 0.3], [0.0, 0.0, 0.0], "The ranges of all anchors contradict the position: check ids"),
+        (
+            [0.2, 0.8, 0.3],
+            [90.0, 94.0, 60.0],
+            "The ranges of all anchors contradict the position, and most are NLOS",
+        ),
+        ([math.nan] * 3, [math.nan] * 3, ""),
+    ],
+)
+def test_advice_names_the_probable_cause(residuals_m: list[float], nlos: list[float], expected: str) -> None:
+    anchors = {
+        number: {
+            "rate": 10.0,
+            "nlos": share,
+            "lost": 0.0,
+            "not_ok": 0.0,
+            "residual": residual_m,
+            "stopped": 0.0,
+        }
+        for number, (residual_m, share) in enumerate(zip(residuals_m, nlos, strict=True), 1)
+    }
+    common, advice = health.advice(anchors)
+    texts = [text for text in (common, *advice.values()) if text]
+    assert len(texts) == (expected != "")
+    assert "".join(texts).startswith(expected)
+
+
+def test_figures_are_those_of_the_selected_tag() -> None:
+    scene = Scene(Clock())
+    for tag, name, error_m in ((7, "tag", 0.1), (9, "tag_9", 0.5)):
+        scene.add_sample((1, tag), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
+        for step in range(20):
+            time_s = 1000.0 + step / 10
+            scene.add_position(f"tag_{tag}", TrackKind.TRUE, (time_s, step / 10, 0.0, 0.0, math.nan))
+            scene.add_pose(name, Pose(step / 10, error_m, 0.0, stamp_s=time_s, sd_m=0.2))
+    for tag, expected in ((7, "0.100 m"), (9, "0.500 m")):
+        assert live_cards(scene, tag)[0] == ["Position error, now", expected, f"tag {tag}, horizontal"]
+    scene.add_sample((1, 5), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
+    for tag in (5, 7):
+        assert live_cards(scene, tag)[0] == ["Position", "-", f"no positions of tag {tag}"], (
+            "the tag is ambiguous"
+        )
+
+
+def test_names_on_the_map_do_not_cover_each_other(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    with view.lock:
+        anchors = {number: AnchorPosition(0.2 * number, 0.0, 2.0, f"column {number}") for number in range(30)}
+        view.scene.set_anchors(anchors)
+    browser.open(server.url + "#anchor=17&tag=7")
+    browser.wait("names", lambda: browser.column("map", "text")[:2] == ["tag 7", "column 17"])
+    shown = browser.column("map", "text")
+    assert 3 < len(shown) < 15
+    for _ in range(8):
+        browser.driver.find_element("id", "map").send_keys("+")
+    browser.wait("others after zooming in", lambda: set(browser.column("map", "text")) - set(shown))
 
 
 def test_predicted_accuracy_is_hdop_times_standard_deviation() -> None:
     anchors = np.array([[0.0, 0.0, 1.0], [8.0, 0.0, 1.0], [8.0, 8.0, 1.0], [0.0, 8.0, 1.0]])
-    image, low, size = predicted_accuracy(anchors, 1.0, 0.1)
+    image, low, size = health.predicted_accuracy(anchors, 1.0, 0.1)
     centre = np.array([*(low + size * (20 + 0.5) / 40), 1.0])
     assert image[20, 20] == pytest.approx(0.1 * dop(anchors, centre, level=True).hdop, rel=1e-5)
-    assert np.isnan(predicted_accuracy(anchors[:1], 1.0, 0.1)[0]).all()
+    assert np.isnan(health.predicted_accuracy(anchors[:1], 1.0, 0.1)[0]).all()
 
 
 def test_many_diagnostics_scroll_and_a_printed_page_is_complete(
@@ -749,7 +850,8 @@ def test_many_diagnostics_scroll_and_a_printed_page_is_complete(
 def test_selected_pair_survives_a_restart(browser: Browser, view: View, server: ViewerServer) -> None:
     fill_scene(view)
     browser.open(server.url + "#anchor=3&tag=7")
-    browser.wait("the requested pair", lambda: browser.find("heading", "Range: anchor 3, tag 7"))
+    browser.wait("the requested pair", lambda: browser.find("heading", "Range, last 60 s: anchor 3, tag 7"))
+    assert empty_figures(browser)["strip"] == "No range of this pair yet."
     with view.lock:
         view.scene.add_sample((3, 7), Sample(1005.0, 5.3, 5.2, 0.1, Status.OK))
     browser.wait("its range", lambda: len(browser.column("strip", "raw")) == 1)

@@ -44,7 +44,7 @@ from uwb_mitigation.types.ros.topics import (
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import playback
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.headline import WHOLE, recorded_cards
+from uwb_mitigation.viewer.headline import WHOLE, current_card, interval_cards
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import AnchorPosition, Scene
 
@@ -295,7 +295,8 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
     timeline = player.timeline
     assert timeline is not None
     assert len(timeline.time_s) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
-    cards = {title: (value, text) for title, value, text in recorded_cards(timeline, None, 101, WHOLE, 10.0)}
+    figures = current_card(timeline, 101, 10.0) + interval_cards(timeline, None, 101, WHOLE, 10.0)
+    cards = {title: (value, text) for title, value, text in figures}
     corrected, references = cards["Position RMSE, whole recording"]
     assert float(corrected.split()[0]) < 0.8 * float(re.search(r"raw \+ same filter: (\S+) m", references)[1])
     assert cards["Position error, now"][0] != "-"
@@ -311,8 +312,8 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
     track = timeline.tracks["tag_101", TrackKind.CORRECTED]
     assert scene.tracks["tag_101", TrackKind.CORRECTED].columns()[-1] == pytest.approx(track[-1])
     assert scene.tags["tag_101"].pose is not None
-    innovations = [abs(sample.innovation_m) for sample in scene.pairs[1, 101].samples]
-    assert np.nanmedian(innovations[5:]) < 1.0, "also of the ranges that a seek reads"
+    residuals = [abs(sample.residual_m) for sample in scene.pairs[1, 101].samples]
+    assert np.nanmedian(residuals[5:]) < 1.0, "also of the ranges that a seek reads"
 
 
 def test_next_bad_range_is_found_and_a_step_advances_by_one_range(tmp_path: Path):
@@ -415,7 +416,7 @@ def test_recording_plays_on_the_page(browser: Browser, bag: Path):
     with serve_recording(bag) as (running, url):
         browser.open(url + "#anchor=2&tag=7&t=1.0")
         browser.wait("the position of the URL", lambda: ranges() == [4.25 + 99, 4.25 + 100])
-        assert browser.find("heading", "Range: anchor 2, tag 7")
+        assert browser.find("heading", "Range, last 60 s: anchor 2, tag 7")
         browser.click("button", "Next range")
         browser.wait("one more range", lambda: ranges() == [4.25 + 100, 4.25 + 101])
         assert "t=1.01" in browser.driver.current_url

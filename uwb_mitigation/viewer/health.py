@@ -1,119 +1,106 @@
-"""State of the anchors, with advice, and the accuracy that their positions permit."""
+"""State of pairs and anchors, with advice, and the accuracy that the positions of the anchors permit."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from enum import IntEnum
+from collections import defaultdict
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.viewer.scene import Pair, Scene
+from uwb_mitigation.viewer.scene import Pair
 
 LONG_M, VERY_LONG_M = 0.15, 0.3
-"""Mean residuals of an anchor that need attention, and that spoil positions."""
+"""Mean residuals that need attention, and that spoil positions."""
 LOST, NLOS, NOT_OK = 20.0, 50.0, 20.0
 """Shares of ranges that need attention, %."""
+GOOD, CHECK, BAD = "\u25cf good", "\u25b2 check", "\u2716 bad"
+STATES = (
+    f"{BAD}: no ranges, or a mean residual over {VERY_LONG_M:.2f} m. {CHECK}: a mean residual over {LONG_M:.2f} m, "
+    f"{LOST:.0f} % lost, {NOT_OK:.0f} % not OK, or {NLOS:.0f} % NLOS. The status of a pair shows only "
+    "whether the network could correct the range, not whether the range agrees with the position."
+)
+"""Definition of the states, for the page."""
 CELLS = 40
 """Width and height of the map of the predicted accuracy, cells."""
 MAX_PREDICTED_M = 10.0
 """Larger predicted standard deviations are not shown."""
 
-
-class Level(IntEnum):
-    """Traffic light of an anchor."""
-
-    OK = 0
-    CHECK = 1
-    BAD = 2
+Means = Mapping[str, float]
+"""Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
+the estimated position (m); `stopped`, age of the last range if it is not recent, else 0 (s). NaN: unknown."""
 
 
-@dataclass(frozen=True, slots=True)
-class AnchorHealth:
-    """Means over the pairs of one anchor; NaN: unknown.
+def state(means: Means) -> str:
+    """Return the state of a pair or an anchor."""
+    residual_m = abs(means["residual"])
+    if means["stopped"] > 0.0 or residual_m > VERY_LONG_M:
+        return BAD
+    is_suspicious = means["lost"] > LOST or means["not_ok"] > NOT_OK or means["nlos"] > NLOS
+    return CHECK if is_suspicious or residual_m > LONG_M else GOOD
 
-    Attributes:
-        rate_hz: sum of the rates of its pairs.
-        nlos, lost, not_ok: shares, %.
-        residual_m: mean of corrected range minus distance to the estimated position.
-        age_s: time since the last range if the anchor has stopped, else NaN.
+
+def anchor_means(pairs: Mapping[Pair, Means]) -> dict[int, Means]:
+    """Return the means over the pairs of each anchor, and the sum of their rates."""
+    by_anchor = defaultdict[int, list[Means]](list)
+    for (anchor_id, _), means in pairs.items():
+        by_anchor[anchor_id].append(means)
+    result: dict[int, Means] = {}
+    for anchor_id, rows in by_anchor.items():
+        values = {name: [row[name] for row in rows if not math.isnan(row[name])] for name in rows[0]}
+        means = {name: sum(column) / len(column) if column else math.nan for name, column in values.items()}
+        # An anchor has stopped if all of its pairs have.
+        result[anchor_id] = means | {"rate": sum(values["rate"]), "stopped": min(values["stopped"])}
+    return result
+
+
+def advice(anchors: Mapping[int, Means]) -> tuple[str, dict[int, str]]:
+    """Return a sentence on what all anchors have in common, and one for each anchor; empty: no advice.
+
+    If all anchors are wrong in the same way, the cause is probably not in each of them.
     """
-
-    anchor_id: int
-    rate_hz: float
-    nlos: float
-    lost: float
-    not_ok: float
-    residual_m: float
-    age_s: float = math.nan
-
-    def verdict(self) -> tuple[Level, str]:
-        """Return the level and a sentence with advice."""
-        name = f"Anchor {format_id(self.anchor_id)}"
-        if self.age_s > 0.0:
-            return Level.BAD, f"{name} has not answered for {self.age_s:.0f} s: check its power and PAN id."
-        if abs(self.residual_m) > LONG_M:
-            level = Level.BAD if abs(self.residual_m) > VERY_LONG_M else Level.CHECK
-            direction = "long" if self.residual_m > 0.0 else "short"
-            advice = (
-                f"{name} reads {abs(self.residual_m):.2f} m {direction}: calibrate, or check its position."
-            )
-            return level, advice
-        if self.lost > LOST:
-            return Level.CHECK, f"{name} loses {self.lost:.0f} % of its ranges: check distance and antenna."
-        if self.not_ok > NOT_OK:
-            return (
-                Level.CHECK,
-                f"{self.not_ok:.0f} % of the ranges of {name.lower()} are not OK: see their status.",
-            )
-        if self.nlos > NLOS:
-            return (
-                Level.CHECK,
-                f"{name} has no line of sight in {self.nlos:.0f} % of the CIRs: move it if possible.",
-            )
-        return Level.OK, ""
+    common = _common_advice(list(anchors.values())) if len(anchors) > 1 else ""
+    return common, {
+        anchor_id: "" if common else _anchor_advice(f"Anchor {format_id(anchor_id)}", means)
+        for anchor_id, means in anchors.items()
+    }
 
 
-def anchor_health(
-    scene: Scene, statistics: dict[Pair, dict[str, float]], losses: dict[Pair, tuple[int, int]]
-) -> list[AnchorHealth]:
-    """Return the state of each anchor with ranges.
+def _common_advice(anchors: list[Means]) -> str:
+    residuals_m = np.array([means["residual"] for means in anchors])
+    if all(means["stopped"] > 0.0 for means in anchors):
+        return "No anchor answers: check the tag, and the diagnostics of the driver."
+    if not (np.abs(residuals_m) > LONG_M).all():
+        return ""
+    if all(means["nlos"] > NLOS for means in anchors):
+        return "The ranges of all anchors contradict the position, and most are NLOS: something close to the tag covers it."
+    if np.ptp(np.sign(residuals_m)) > 0.0:
+        return "The ranges of all anchors contradict the position: check ids and coordinates in the anchors file, and the height."
+    size_m, direction = abs(float(np.median(residuals_m))), "long" if residuals_m[0] > 0.0 else "short"
+    return (
+        f"All anchors read too {direction}, {size_m:.2f} m in the median: a common cause is likely. Calibrate the offset "
+        "(antenna delay), or check the anchors file and the height."
+    )
 
-    Args:
-        scene: provides the latest ranges.
-        statistics: of the latest ranges of each pair.
-        losses: lost and received ranges of each pair of a recording; of other pairs, those of the scene are used.
-    """
-    rows: dict[int, list[list[float]]] = {}
-    for pair, history, _ in scene.latest():
-        age_s = scene.age_s(history)
-        has_data, means = history.has_data(age_s), statistics[pair]
-        lost, received = losses.get(pair, (history.lost, history.received))
-        rows.setdefault(pair[0], []).append(
-            [
-                history.rate_hz(age_s) if has_data else 0.0,
-                means["nlos"],
-                100.0 * lost / max(lost + received, 1),
-                means["not_ok"],
-                means["innovation"],
-                math.nan if has_data else age_s,
-            ]
-        )
-    health = []
-    for anchor_id, values in rows.items():
-        table = np.array(values)
-        rates, ages = table[:, 0], table[:, 5]
-        averages = [
-            float(column[~np.isnan(column)].mean()) if not np.isnan(column).all() else math.nan
-            for column in table.T[1:5]
-        ]
-        stopped_s = float(ages.min()) if np.isfinite(ages).all() else math.nan
-        nlos, lost_share, not_ok, residual_m = averages
-        rate_hz = float(np.nansum(rates))
-        health.append(AnchorHealth(anchor_id, rate_hz, nlos, lost_share, not_ok, residual_m, stopped_s))
-    return health
+
+def _anchor_advice(name: str, means: Means) -> str:
+    residual_m = means["residual"]
+    reads = f"{name} reads {abs(residual_m):.2f} m {'long' if residual_m > 0.0 else 'short'}"
+    if means["stopped"] > 0.0:
+        return f"{name} has not answered for {means['stopped']:.0f} s: check its power and PAN id."
+    if abs(residual_m) > LONG_M and means["nlos"] > NLOS:
+        return f"{reads}, with {means['nlos']:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."
+    if abs(residual_m) > LONG_M:
+        return f"{reads}: calibrate, or check its position."
+    if means["lost"] > LOST:
+        return f"{name} loses {means['lost']:.0f} % of its ranges: check distance and antenna."
+    if means["not_ok"] > NOT_OK:
+        return f"{means['not_ok']:.0f} % of the ranges of {name.lower()} are not OK: see their status."
+    if means["nlos"] > NLOS:
+        return f"{name} has no line of sight in {means['nlos']:.0f} % of the CIRs: move it if possible."
+    return ""
 
 
 def predicted_accuracy(

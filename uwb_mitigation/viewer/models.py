@@ -37,34 +37,44 @@ from uwb_mitigation.types.palette import (
     TrackKind,
 )
 from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.scene import CELL_M, HISTORY_S, WATERFALL
+from uwb_mitigation.viewer.headline import WHOLE
+from uwb_mitigation.viewer.health import STATES
+from uwb_mitigation.viewer.scene import CELL_M, HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180
 """Number of samples shown before and after the first path."""
 
+_RANGES, _CIRS = f"last {STATISTICS} ranges", f"last {WATERFALL} CIRs"
+
 COLUMNS = {
-    "status": ("status", "status of the last range"),
-    "raw": ("raw, m", "last measured range"),
-    "corrected": ("corrected, m", "last corrected range"),
-    "second": ("second, m", "last corrected range of the second recording"),
-    "sigma": ("\u03c3, m", "standard deviation of the corrected range"),
-    "correction": ("mean correction, m", "mean of raw minus corrected of the last 100 ranges"),
-    "spread": ("spread, m", "standard deviation of raw minus corrected of the last 100 ranges"),
-    "innovation": ("innovation, m", "mean of corrected range minus distance to the estimated position"),
-    "not_ok": ("not OK, %", "share of ranges whose status is not OK"),
-    "nlos": ("NLOS, %", "no line of sight: share of CIRs with the first path 6 dB or more below the total"),
-    "rate": ("rate, Hz", "ranges per second"),
-    "lost": ("lost", "missing sequence numbers: of the whole recording, or since the viewer started"),
-    "rx": ("RX, dBm", "mean receive level"),
-    "fp": ("FP, dBm", "mean level of the first path"),
+    "state": ("state", "", STATES),
+    "status": ("status", "last range", "whether the network could correct the range"),
+    "raw": ("raw, m", "last range", "measured range"),
+    "corrected": ("corrected, m", "last range", "corrected range"),
+    "second": ("second, m", "last range", "corrected range of the second recording"),
+    "sigma": ("\u03c3, m", "last range", "standard deviation of the corrected range"),
+    "correction": ("correction, m", _RANGES, "mean of raw minus corrected range"),
+    "spread": ("spread, m", _RANGES, "standard deviation of raw minus corrected range"),
+    "residual": ("residual, m", _RANGES, "mean of corrected range minus distance to the estimated position"),
+    "not_ok": ("not OK, %", _RANGES, "share of ranges whose status is not OK"),
+    "nlos": (
+        "NLOS, %",
+        _CIRS,
+        "no line of sight: share of CIRs with the first path 6 dB or more below the total",
+    ),
+    "rx": ("RX, dBm", _CIRS, "mean receive level"),
+    "fp": ("FP, dBm", _CIRS, "mean level of the first path"),
+    "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
+    "lost": ("lost, %", WHOLE, "share of missing sequence numbers"),
 }
-"""Columns of the table of pairs after anchor and tag: {field: (title, description)}."""
+"""Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}; live, the interval `WHOLE` is
+`LIVE`."""
 
 FIGURES = {
     "map": "Map",
-    "strip": "Range",
+    "strip": f"Range, last {HISTORY_S:.0f} s",
     "timeline": "Error over time",
-    "cir": "Channel impulse response (CIR)",
+    "cir": "Last channel impulse response (CIR)",
     "waterfall": f"Last {WATERFALL} CIRs",
     "errors": "Error histogram",
 }
@@ -93,9 +103,11 @@ class Controls(DataModel):  # type: ignore[misc]
 
     Attributes:
         command: set by the script: name, arguments, and a number that makes it unique.
-        update: set by the server after each update: its number, and how long the previous one took, s.
+        update: set by the server after each update: its number, how long the previous one took, and the age of the
+            latest range, s; the age is negative if there are no recent ranges.
         acknowledged: set by the script to the number of the last update that it has drawn.
         summary, notice, nodes, health, cards, player, selected, marks: set by the server.
+        empty: set by the server: messages of figures without data, {name: message}.
     """
 
     command = AnyValue(default=None)
@@ -103,6 +115,7 @@ class Controls(DataModel):  # type: ignore[misc]
     acknowledged = AnyValue(default=0)
     health = AnyValue(default=[])
     cards = AnyValue(default=[])
+    empty = AnyValue(default={})
     summary = AnyValue(default="")
     notice = AnyValue(default=[])
     nodes = AnyValue(default=[])
@@ -137,6 +150,8 @@ class Models:
         self.anchors = _source("anchors", "x", "y", "name", "id")
         self.selected = _source("", "x", "y")
         self.tags = _source("tags", "x", "y", "name", "status", "label_y")
+        # The script of the page fills it with the names that do not cover each other.
+        self.labels = _source("", "x", "y", "text", "offset")
         self.headings = _source("headings", "x", "y", "heading")
         self.ellipses = _source("ellipses", "x", "y", "width", "height", "angle", "status")
         self.protection = _source("protection levels", "x", "y", "protection")
@@ -172,11 +187,13 @@ class Models:
     def roots(self) -> list[Any]:
         return [*self.figures.values(), self.pairs, self.controls]
 
-    def show_empty(self, name: str, empty: bool) -> None:
-        """Set the invisible corners of a figure of `corners` if it is empty, otherwise remove them."""
-        corners = [0.0, 10.0] if empty else []
+    def show_empty(self, name: str, message: str) -> None:
+        """Set the message and the invisible corners of a figure of `corners` without data; empty: it has data."""
+        corners = [0.0, 10.0] if message else []
         if self.corners[name].data["corner_x"] != corners:
             self.corners[name].data = {"corner_x": corners, "corner_y": corners}
+        if self.controls.empty.get(name) != message:
+            self.controls.empty = self.controls.empty | {name: message}
 
     def update_legend(self) -> None:
         """Show the entries of the map's legend that the map contains."""
@@ -219,8 +236,8 @@ class Models:
         tag = CategoricalColorMapper(factors=["OK"], palette=[BLUE], nan_color=GREY)
         on_request: dict[str, Any] = {"fill_color": None, "visible": False}
         label = {
-            "text": "name", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
-            "background_fill_color": PAPER, "background_fill_alpha": 0.8,
+            "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset",
         }  # fmt: skip
         layers: list[tuple[str, str, ColumnDataSource, dict[str, Any]]] = [
             ("wall", "scatter", walls, {"marker": "square", "size": 12, "color": GREY}),
@@ -252,8 +269,7 @@ class Models:
             ("selected anchor", "scatter", self.selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
             }),
-            ("", "text", self.anchors, label | {"y_offset": -13}),
-            ("", "text", self.tags, label | {"y": "label_y", "y_offset": -4}),
+            ("", "text", self.labels, label),
         ]  # fmt: skip
         items = defaultdict[str, list[Any]](list)
         for name, glyph, source, style in layers:
@@ -266,7 +282,7 @@ class Models:
         return _with_legend(plot, self._legend, "below")
 
     def _strip(self) -> figure:
-        plot = _figure(230, "seconds", "m", x_range=Range1d(-HISTORY_S, 0))
+        plot = _figure(230, "time before now, s", "m", x_range=Range1d(-HISTORY_S, 0))
         self._lines(plot, self.strip, "age", *self._kinds, TrackKind.TRUE)
         plot.scatter("age", "corrected", source=self.bad, size=8, legend_field="status", **self._symbols)
         return _with_legend(plot)

@@ -6,6 +6,7 @@ import math
 import time
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from itertools import groupby, pairwise
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -21,9 +22,9 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.palette import STATUS_LOOKS, TrackKind
+from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.headline import RECENT, WHOLE, Card, live_cards, recorded_cards
-from uwb_mitigation.viewer.health import anchor_health, predicted_accuracy
+from uwb_mitigation.viewer.headline import LIVE, RECENT, WHOLE, Card, current_card, interval_cards, live_cards
 from uwb_mitigation.viewer.models import COLUMNS, FADING, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models
 from uwb_mitigation.viewer.scene import (
     CELL_M,
@@ -43,6 +44,8 @@ from uwb_mitigation.viewer.scene import (
     Trace,
     count_errors,
     finite_or_zero,
+    plain_tag_id,
+    tag_label,
     with_gaps,
 )
 
@@ -57,7 +60,7 @@ LEVELS = ("\u25cf OK", "\u25b2 WARN", "\u2716 ERROR", "\u25a0 STALE")
 """Texts of the diagnostic levels."""
 
 TABLE_S = 0.5
-"""Minimum interval of updates of the table of pairs."""
+"""Minimum interval of updates of the texts."""
 
 MARGIN_M = 5.0
 """Margin around a tag on a map without anchors."""
@@ -73,9 +76,6 @@ MAX_POINTS = 400
 
 RANGE_SD_M = 0.1
 """Standard deviation for the map of the predicted accuracy if the ranges have none."""
-
-LIGHTS = ("\u25cf good", "\u25b2 check", "\u2716 bad")
-"""Texts of the traffic lights of anchors."""
 
 _TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
 
@@ -121,7 +121,8 @@ class Page:
         self._sent, self._sent_s, self._took_s, self._redraw = 0, 0.0, 0.0, False
         self._due_s = self._table_due_s = 0.0
         self._drawn: dict[str, object] = {}
-        self._paused = False
+        self._paused = self._has_data = False
+        self._interval_cards: list[Card] = []
         player, compares = view.player, view.second is not None
         self._models = models = Models(None if player is None else player.seconds, view.plan, compares)
         # Register before the model is added to the document: later registrations have no effect.
@@ -131,12 +132,22 @@ class Page:
             for model in models.roots:
                 document.add_root(model)
         document.title = view.title
+        columns = {
+            name: (title, LIVE if interval == WHOLE and player is None else interval, description)
+            for name, (title, interval, description) in COLUMNS.items()
+            if name != "second" or compares
+        }
         document.template = _TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
             page_title=view.title,
             recording=player is not None,
             nonce=nonce,
-            columns={name: texts for name, texts in COLUMNS.items() if name != "second" or compares},
+            columns=columns,
+            intervals=[
+                (interval, len(list(names)))
+                for interval, names in groupby(columns, key=lambda name: columns[name][1])
+            ],
+            states=health.STATES,
             figures={name: FIGURES[name] for name in FIGURES if name in models.figures},
             looks=STATUS_LOOKS,
             speeds=SPEEDS,
@@ -185,17 +196,22 @@ class Page:
         now_s = time.monotonic()
         if is_changed or now_s > self._sent_s + HEARTBEAT_S:
             self._sent, self._sent_s, self._redraw = self._sent + 1, now_s, False
-            self._models.controls.update = [self._sent, round(self._took_s, 3)]
+            age_s = scene.clock() - scene.received_s if self._has_data else -1.0
+            self._models.controls.update = [self._sent, round(self._took_s, 3), round(age_s, 3)]
 
     def _draw_scene(self, scene: Scene) -> None:
-        self._draw_pairs(scene)
-        self._draw_summary(scene)
+        if self._selected is None:
+            self._selected = next((pair for pair, _, _ in scene.latest()), None)
+        self._set(selected=self._selected and [format_id(identity) for identity in self._selected])
+        if (now_s := time.monotonic()) >= self._table_due_s:
+            self._table_due_s = now_s + TABLE_S
+            self._draw_tables(scene)
+        else:
+            self._drawn.pop("scene", None)
         self._draw_map(scene)
         history = None if self._selected is None else scene.pairs.get(self._selected)
         self._draw_strip(scene, history)
-        self._draw_trace(() if history is None else tuple(history.traces))
-        reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
-        self._set(nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports])
+        self._draw_trace(scene, () if history is None else tuple(history.traces))
         self._draw_errors(scene)
 
     def select(self, pair: Pair | None) -> None:
@@ -236,46 +252,42 @@ class Page:
             columns = second.timeline.mean_errors(second.seconds)
             models.second_timeline.data = {"time": columns["time"], "second": columns["corrected"]}
 
-    def _draw_pairs(self, scene: Scene) -> None:
-        if self._selected is None:
-            self._selected = next((pair for pair, _, _ in scene.latest()), None)
-        self._set(selected=self._selected and [format_id(identity) for identity in self._selected])
-        if time.monotonic() < self._table_due_s:
-            self._drawn.pop("scene", None)
-            return
-        self._table_due_s = time.monotonic() + TABLE_S
+    def _draw_tables(self, scene: Scene) -> None:
+        """Draw everything that consists of text; all of it is from the same time."""
         timeline = None if self._player is None else self._player.timeline
-        losses = {} if timeline is None else timeline.losses
-        rows, statistics = [], {}
+        second, rows, pairs = self._view.second, [], {}
         for pair, history, sample in scene.latest():
-            no_data = _no_data(scene, history)
-            second = None if self._view.second is None else self._view.second.pairs.get(pair)
-            statistics[pair] = history.statistics()
+            no_data, age_s = _no_data(scene, history), scene.age_s(history)
+            means = history.statistics()
+            means |= {
+                "rate": 0.0 if no_data else history.rate_hz(age_s),
+                "stopped": age_s if no_data else 0.0,
+            }
+            if timeline is not None and pair in timeline.losses:
+                lost, received = timeline.losses[pair]
+                means["lost"] = 100.0 * lost / max(lost + received, 1)
+            compared = None if second is None or pair not in second.pairs else second.pairs[pair].latest
+            pairs[pair] = means
             rows.append(
-                statistics[pair]
+                means
                 | {
                     "anchor": format_id(pair[0]),
                     "tag": format_id(pair[1]),
-                    "rate": 0.0 if no_data else history.rate_hz(scene.age_s(history)),
+                    "state": health.state(means),
                     "raw": sample.raw_m,
                     "corrected": sample.range_m,
-                    "second": second.latest.range_m if second and second.latest else math.nan,
-                    "lost": float(losses.get(pair, (history.lost, 0))[0]),
+                    "second": compared.range_m if compared else math.nan,
                     "sigma": sample.sigma_m,
                     "status": no_data or sample.status.name,
                     "no_data": bool(no_data),
                 }
             )
+        self._has_data = any(not row["no_data"] for row in rows)
         _set_rows(self._models.pairs, rows)
-        health = []
-        for anchor in anchor_health(scene, statistics, losses):
-            level, advice = anchor.verdict()
-            values = (anchor.rate_hz, anchor.nlos, anchor.residual_m, anchor.lost)
-            texts = [f"{value:.{digits}f}" for value, digits in zip(values, (1, 0, 2, 0), strict=True)]
-            health.append([LIGHTS[level], format_id(anchor.anchor_id), *texts, advice])
-        self._set(
-            health=[[text.replace("nan", "-") for text in row] for row in health], cards=self._cards(scene)
-        )
+        self._set(health=_anchor_rows(health.anchor_means(pairs)), cards=self._cards(scene))
+        reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
+        self._set(nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports])
+        self._draw_summary(scene)
 
     def _cards(self, scene: Scene) -> list[Card]:
         """Return the large figures."""
@@ -284,15 +296,19 @@ class Page:
             return live_cards(scene, tag_id)
         if player.timeline is None:
             return [["Reading the recording ...", "", ""]]
-        second = None if player.companion is None else player.companion.timeline
-        return recorded_cards(player.timeline, second, tag_id, self._window, player.position_s)
+        timeline, second = player.timeline, None if player.companion is None else player.companion.timeline
+        position_s = player.position_s if self._window == RECENT else 0.0
+        is_complete = timeline.is_complete, second is not None and second.is_complete
+        if self._changed("cards", (self._window, tag_id, position_s, second is None, *is_complete)):
+            self._interval_cards = interval_cards(timeline, second, tag_id, self._window, position_s)
+        return current_card(timeline, tag_id, player.position_s) + self._interval_cards
 
     def _draw_summary(self, scene: Scene) -> None:
-        """Show counts, the reason for an empty page, and the pairs and tags that have stopped."""
+        """Show counts, and the reason for an empty page."""
         histories = [history for _, history, _ in scene.latest()]
         texts = [f"{len(histories)} pair{'' if len(histories) == 1 else 's'}"]
         timeline = None if self._player is None else self._player.timeline
-        texts.append(f"{scene.ranges if timeline is None else len(timeline.bad)} ranges")
+        texts.append(f"{scene.ranges if timeline is None else len(timeline.bad)} corrected ranges")
         missing, ranges = self._view.missing, ""
         if scene.dropped:
             texts.append(f"{scene.dropped} dropped by the viewer")
@@ -300,13 +316,13 @@ class Page:
             texts.insert(0, _utc(now_s))
         if not histories:
             ranges = missing.ranges
-        elif all(_no_data(scene, history) for history in histories):
+        elif not self._has_data:
             ranges = f"No ranges for {min(map(scene.age_s, histories)):.0f} s."
         lines = (
             ranges,
             "" if scene.anchors else missing.anchors,
             "" if scene.tags or scene.tracks else missing.positions,
-            *(() if self._player is None or self._player.timeline is None else self._player.timeline.notices),
+            *(() if timeline is None else timeline.notices),
         )
         self._set(summary=" \u00b7 ".join(texts), notice=[line for line in lines if line])
 
@@ -322,15 +338,16 @@ class Page:
         if self._changed("selected", place):
             _set_rows(models.selected, [{"x": place.x, "y": place.y}] if place else [])
         tags: list[dict[str, Any]] = []
+        plain_id = plain_tag_id(scene.tags, scene.pairs)
         for name, tag in scene.tags.items():
             if (pose := tag.pose) is not None:
-                age_s = scene.age_s(tag)
+                age_s, label = scene.age_s(tag), tag_label(name, plain_id)
                 major, minor, angle = map(_drawable, pose.ellipse)
                 tags.append(
                     {
                         "x": pose.x,
                         "y": pose.y,
-                        "name": f"{name}: no data for {age_s:.0f} s" if age_s > NO_DATA_S else name,
+                        "name": f"{label}: no data for {age_s:.0f} s" if age_s > NO_DATA_S else label,
                         "status": "no data" if age_s > NO_DATA_S else "OK",
                         "width": 2 * major,
                         "height": 2 * minor,
@@ -381,17 +398,15 @@ class Page:
 
     def _fading(self, track: NDArray[np.float64], age_s: float) -> list[NDArray[np.float64]]:
         """Return x and y of the newest, middle and oldest third of the displayed time of a track, float64 (k, 2)."""
-        now_s = track[-1, 0] + age_s
-        duration_s = min(self._trail_s, now_s - track[0, 0])
-        ages = (now_s - track[:, 0]) / max(duration_s, 1e-9) * len(FADING)
-        thirds = []
-        for third in range(len(FADING)):
-            # The first point of the next third belongs to both, so that the line is continuous.
-            rows = np.flatnonzero((ages >= third) & (ages <= third + 1))
-            if len(rows) and rows[-1] + 1 < len(track):
-                rows = np.append(rows, rows[-1] + 1)
-            thirds.append(with_gaps(_thin(track[rows, :3]), NO_DATA_S)[:, 1:])
-        return thirds
+        time_s, now_s = track[:, 0], track[-1, 0] + age_s
+        edges_s = now_s - min(self._trail_s, now_s - time_s[0]) / len(FADING) * np.arange(len(FADING) + 1)
+        ends = np.searchsorted(time_s, edges_s, side="right")
+        ends[-1] = np.searchsorted(time_s, edges_s[-1])
+        # The first point of the next third belongs to both, so that the line is continuous.
+        return [
+            with_gaps(_thin(track[begin : end + 1, :3]), NO_DATA_S)[:, 1:]
+            for end, begin in pairwise(ends.tolist())
+        ]
 
     def _draw_accuracy(self, scene: Scene, shown: list[Sample]) -> None:
         """Draw the map of the predicted accuracy if it is visible."""
@@ -403,7 +418,7 @@ class Page:
         sds_m = [sample.sigma_m for sample in shown if sample.sigma_m > 0.0]
         sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
         if self._changed("accuracy", (anchors.tobytes(), round(height_m, 1), sd_m)):
-            image, low, size = predicted_accuracy(anchors, height_m, sd_m)
+            image, low, size = health.predicted_accuracy(anchors, height_m, sd_m)
             models.accuracy.data = {
                 "image": [image], "x": [low[0]], "y": [low[1]], "dw": [size[0]], "dh": [size[1]]
             }  # fmt: skip
@@ -467,7 +482,13 @@ class Page:
             "true": [_drawable(sample.true_m) for sample in samples],
             "second": self._second_ranges(samples),
         }
-        self._models.show_empty("strip", not np.isfinite(values["raw"]).any())
+        has_ranges = history is not None and history.latest is not None
+        none = (
+            f"No range of this pair in the last {HISTORY_S:.0f} s."
+            if has_ranges
+            else "No range of this pair yet."
+        )
+        self._models.show_empty("strip", "" if np.isfinite(values["raw"]).any() else none)
         rate_hz = 0.0 if history is None else finite_or_zero(history.rate_hz())
         table = _thin(np.array(list(values.values()), np.float64).reshape(len(values), -1).T, 3 * MAX_POINTS)
         table = with_gaps(table, max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0.0 else 0.0))
@@ -490,12 +511,19 @@ class Page:
         ranges = {round(sample.time_s, 6): sample.range_m for sample in history.samples} if history else {}
         return [_drawable(ranges.get(round(sample.time_s, 6), math.nan)) for sample in samples]
 
-    def _draw_trace(self, traces: tuple[Trace, ...]) -> None:
+    def _draw_trace(self, scene: Scene, traces: tuple[Trace, ...]) -> None:
         models = self._models
+        if not traces:
+            has_cirs = any(history.traces for history in scene.pairs.values())
+            none = (
+                "No CIR of this pair yet."
+                if has_cirs
+                else "No CIRs: the source sends none, or no raw ranges are received."
+            )
+        models.show_empty("cir", "" if traces else none)
         # Compare the newest trace instead of its stamp, because stamps may be equal.
         if not self._changed("traces", (self._selected, traces[-1] if traces else None)):
             return
-        models.show_empty("cir", not traces)
         models.waterfall.data = {"image": [_waterfall_image(traces)] if traces else []}
         if not traces:
             _set_rows(models.trace, [])
@@ -519,7 +547,8 @@ class Page:
         timeline = None if player is None else player.timeline
         second = None if player is None or player.companion is None else player.companion.timeline
         end_s = math.inf if player is None or self._window == WHOLE else player.position_s
-        if not self._changed("errors", (scene.errors, end_s, timeline is None, second is None)):
+        live_errors = scene.errors if timeline is None else -1
+        if not self._changed("errors", (live_errors, end_s, second is None)):
             return
         begin_s = end_s - HISTORY_S if end_s < math.inf else -math.inf
         counts = (
@@ -527,7 +556,7 @@ class Page:
         )
         compared = counts if second is None else count_errors(second.range_errors(begin_s, end_s))
         columns = zip(("raw", "corrected", "second"), (*counts.astype(float), compared[1]), strict=True)
-        self._models.show_empty("errors", not counts.any())
+        self._models.show_empty("errors", "" if counts.any() else "No true ranges.")
         self._models.errors.data = dict(columns) | {"left": ERROR_EDGES_M[:-1], "right": ERROR_EDGES_M[1:]}
 
     def _changed(self, name: str, value: object) -> bool:
@@ -595,6 +624,17 @@ def _no_data(scene: Scene, history: History) -> str:
     """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
     age_s = scene.age_s(history)
     return "" if history.has_data(age_s) else f"no data for {age_s:.0f} s"
+
+
+def _anchor_rows(anchors: dict[int, health.Means]) -> list[list[str]]:
+    """Return the texts of the table of anchors; advice for all of them is in the first row."""
+    common, advice = health.advice(anchors)
+    rows = [[health.BAD, "all", "", "", "", "", common]] if common else []
+    for anchor_id, means in anchors.items():
+        digits = {"rate": 1, "nlos": 0, "residual": 2, "lost": 0}
+        texts = [f"{means[name]:.{count}f}".replace("nan", "-") for name, count in digits.items()]
+        rows.append([health.state(means), format_id(anchor_id), *texts, advice[anchor_id]])
+    return rows
 
 
 def _set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -18,16 +18,17 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.types.anchors import Anchor, AnchorMap
+from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, CorrectedRange, Encoding, Status, Truth
 from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
-MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_ANCHORS = 256, 64, 64, 256
+MAX_PAIRS, MAX_TAGS, MAX_NODES = 256, 64, 64
 MAX_TRUTHS, MAX_WITHOUT_TRUTH = (
     10_000,
     1000,
@@ -58,8 +59,8 @@ STEP_M, STEP_S, CELL_M = 0.02, 0.09, 0.5
 """Distance and time between points of a live track: closer points are skipped, unless a point is 0.5 s old; cell of the heat map."""
 HEIGHT_VARIANCE_M2 = 0.01
 """Of the published height, for the positions from raw ranges."""
-STATISTICS = 100
-"""Number of latest ranges in the statistics of a pair."""
+STATISTICS, RATE_RANGES = 100, 20
+"""Numbers of latest ranges in the statistics of a pair and in its rate."""
 
 Pair = tuple[int, int]
 """Anchor and tag."""
@@ -94,7 +95,7 @@ class Sample:
         time_s: stamp.
         raw_m, range_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
         true_m, label: true range and label; NaN and empty if unknown.
-        innovation_m: corrected range minus the distance of the anchor from the estimated position; NaN: unknown.
+        residual_m: corrected range minus the distance of the anchor from the estimated position; NaN: unknown.
     """
 
     time_s: float
@@ -104,7 +105,7 @@ class Sample:
     status: Status
     true_m: float = math.nan
     label: str = ""
-    innovation_m: float = math.nan
+    residual_m: float = math.nan
 
     @classmethod
     def from_corrected(cls, time_s: float, corrected: CorrectedRange, truth: Truth | None) -> Sample:
@@ -194,12 +195,12 @@ class History:
         gap_db = _plausible_values([cir.power_gap_db for cir in cirs])
         correction_m = _plausible_values([sample.raw_m - sample.range_m for sample in samples])
         return {
-            "lost": float(self.lost),
+            "lost": 100.0 * self.lost / max(self.lost + self.received, 1),
             "not_ok": _mean(np.array([100.0 * (sample.status is not Status.OK) for sample in samples])),
             "nlos": _mean(100.0 * (gap_db >= LINE_OF_SIGHT_DB)),
             "correction": _mean(correction_m),
             "spread": float(correction_m.std()) if len(correction_m) else math.nan,
-            "innovation": _mean(_plausible_values([sample.innovation_m for sample in samples])),
+            "residual": _mean(_plausible_values([sample.residual_m for sample in samples])),
             "rx": _mean(_plausible_values([cir.rx_power_dbm for cir in cirs])),
             "fp": _mean(_plausible_values([cir.first_path_power_dbm for cir in cirs])),
         }
@@ -209,13 +210,13 @@ class History:
         return self.samples[-1] if self.samples else None
 
     def rate_hz(self, age_s: float = 0.0) -> float:
-        """Return the rate of the last twenty ranges; NaN before the second one.
+        """Return the rate of the last `RATE_RANGES` ranges; NaN before the second one.
 
         Args:
             age_s: time since the last range; the rate decreases if this is several mean intervals.
         """
         # Copy in one step: the monitor draws its table in another thread than the one that adds ranges.
-        recent = [sample.time_s for sample in list(islice(reversed(self.samples), 20))]
+        recent = [sample.time_s for sample in list(islice(reversed(self.samples), RATE_RANGES))]
         span = recent[0] - recent[-1] if recent else 0.0
         if not span > 0:
             return math.nan
@@ -319,6 +320,7 @@ class Scene:
         clock: returns the time for ages, s: a steady clock live, the recording's time in a replay. Stamps are not
             compared with it, because they may come from another computer.
         ranges, not_ok: number of ranges, and of those whose status is not OK.
+        received_s: time of the last range on the scene's clock.
         dropped: number of ranges that the viewer could not read in time.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
@@ -333,6 +335,7 @@ class Scene:
         # {tag: (latest stamp, its time of reception)}: stamps of different tags may come from different clocks.
         self._latest: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.not_ok = self.dropped = 0
+        self.received_s = math.nan
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
         self.tags: BoundedDict[str, TagView] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
@@ -378,7 +381,7 @@ class Scene:
         self.ranges += 1
         self.not_ok += sample.status is not Status.OK
         history.add(sample, tag_latest_s)
-        history.received_s = self.clock()
+        history.received_s = self.received_s = self.clock()
         self._compare_with_position(pair, sample)
 
     def count_error(self, sample: Sample) -> None:
@@ -401,7 +404,7 @@ class Scene:
 
     def add_pose(self, tag: str, pose: Pose, received_s: float | None = None) -> None:
         """Set the pose of a tag; `received_s` is on the scene's clock, None: now."""
-        if _is_plausible(pose.x, pose.y):
+        if _is_plausible(pose.x, pose.y, pose.z):
             entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or TagView())
             entry.pose, entry.received_s = pose, self.clock() if received_s is None else received_s
             point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
@@ -410,8 +413,8 @@ class Scene:
     def add_position(self, tag: str, kind: TrackKind, point: TrackPoint) -> None:
         """Append a position to a track; `tag` is its name."""
         self.revision += 1
-        stamp_s, x, y, *_ = point
-        if self.is_indexed or not (_is_plausible(x, y) and math.isfinite(stamp_s)):
+        stamp_s, x, y, z, _ = point
+        if self.is_indexed or not (_is_plausible(x, y, z) and math.isfinite(stamp_s)):
             return
         key = tag[:MAX_TEXT], kind
         track = self.tracks.add(key, self.tracks.get(key) or TrackView())
@@ -431,7 +434,7 @@ class Scene:
         self.revision += 1
 
     def _compare_with_position(self, pair: Pair, sample: Sample) -> None:
-        """Compute what a range and the position of its tag yield together: innovation, heat map, raw position."""
+        """Compute what a range and the position of its tag yield together: residual, heat map, raw position."""
         anchor, tag = self.anchors.get(pair[0]), self.tag_of(pair[1])
         pose = None if tag is None else tag.pose
         if tag is None or pose is None or self.age_s(tag) > NO_DATA_S:
@@ -441,7 +444,7 @@ class Scene:
         if anchor is None:
             return
         height_m = finite_or_zero(pose.z - anchor.z)
-        sample.innovation_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
+        sample.residual_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
         if not self.is_indexed:
             self._locate_raw(pair, pose, sample)
 
@@ -463,7 +466,9 @@ class Scene:
             self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
 
     def set_anchors(self, anchors: dict[int, AnchorPosition]) -> None:
-        plausible = ((id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y))
+        plausible = (
+            (id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y, place.z)
+        )
         anchors_before, self.anchors = self.anchors, dict(islice(plausible, MAX_ANCHORS))
         self.revision += 1
         if self.anchors and self.anchors != anchors_before:
@@ -512,18 +517,35 @@ class Scene:
                 yield pair, history, history.latest
 
     def tag_of(self, tag_id: int) -> TagView | None:
-        """Return the tag of a range: the tag of that name, else the plain tag if it is the only one without a name."""
-        tag = self.tags.get(tag_frame(tag_id))
-        if tag is not None or DEFAULT_TAG not in self.tags:
-            return tag
-        nameless = {pair_tag for _, pair_tag in self.pairs if tag_frame(pair_tag) not in self.tags}
-        return self.tags[DEFAULT_TAG] if nameless == {tag_id} else None
+        """Return the tag of a range; None: it has no position."""
+        return self.tags.get(tag_name(tag_id, self.tags, self.pairs))
+
+
+def plain_tag_id(names: Container[str], pairs: Iterable[Pair]) -> int | None:
+    """Return the id of the tag whose positions have the plain name: the only one of `pairs` without positions of its name."""
+    nameless = {tag_id for _, tag_id in pairs if tag_frame(tag_id) not in names}
+    return nameless.pop() if DEFAULT_TAG in names and len(nameless) == 1 else None
+
+
+def tag_name(tag_id: int, names: Container[str], pairs: Iterable[Pair]) -> str:
+    """Return the name of the positions of a tag; empty: it has none."""
+    if (name := tag_frame(tag_id)) in names:
+        return name
+    return DEFAULT_TAG if plain_tag_id(names, pairs) == tag_id else ""
+
+
+def tag_label(name: str, plain_id: int | None) -> str:
+    """Return the name of positions as the page shows it, such as "tag 7"; see `plain_tag_id`."""
+    if name == DEFAULT_TAG and plain_id is not None:
+        return f"tag {format_id(plain_id)}"
+    return name.replace("_", " ")
 
 
 def count_errors(errors_m: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the numbers of raw and corrected errors float64 (2, n) in each bin, int64 (2, bins)."""
-    clipped = np.clip(errors_m, ERROR_EDGES_M[0], ERROR_EDGES_M[-1])
-    return np.stack([np.histogram(row, ERROR_EDGES_M)[0] for row in clipped])
+    bins = len(ERROR_EDGES_M) - 1
+    rows = np.clip(np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1, 0, bins - 1)
+    return np.stack([np.bincount(row, minlength=bins) for row in rows])
 
 
 def add_heat(
@@ -556,5 +578,6 @@ def finite_or_zero(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-def _is_plausible(x: float, y: float) -> bool:
-    return abs(x) <= MAX_COORDINATE_M and abs(y) <= MAX_COORDINATE_M
+def _is_plausible(x: float, y: float, z: float) -> bool:
+    """Return whether coordinates are on Earth; z may be NaN."""
+    return abs(x) <= MAX_COORDINATE_M and abs(y) <= MAX_COORDINATE_M and not abs(z) > MAX_COORDINATE_M

@@ -42,6 +42,7 @@ from uwb_mitigation.viewer.scene import (
     BoundedDict,
     Pair,
     add_heat,
+    tag_name,
     with_gaps,
 )
 
@@ -325,11 +326,13 @@ def _estimate_tracks(
     config = EstimatorConfig(anchors, height=height)
     row_of_anchor = np.array([anchors.index.get(int(anchor), -1) for anchor in np.unique(ranges["anchor"])])
     anchor_row = row_of_anchor[np.unique(ranges["anchor"], return_inverse=True)[1]]
+    names = {name for name, kind in timeline.tracks if kind is TrackKind.CORRECTED}
     for tag_id in np.unique(ranges["tag"])[:MAX_TAGS]:
         rows = np.flatnonzero((ranges["tag"] == tag_id) & (anchor_row >= 0))
         rows = rows[np.argsort(ranges["stamp_ns"][rows], kind="stable")]
         stamp_ns, time_s = ranges["stamp_ns"][rows], timeline.time_s[rows]
-        name, selected = tag_frame(int(tag_id)), (ranges[rows], anchor_row[rows])
+        name = tag_name(int(tag_id), names, timeline.losses) or tag_frame(int(tag_id))
+        selected = ranges[rows], anchor_row[rows]
         tracks: dict[TrackKind, Track] = {}
         # There may be too few ranges for a track of this tag.
         with contextlib.suppress(DatasetError, IndexError, ValueError):
@@ -359,9 +362,8 @@ def _ranges(rows: NDArray[Any], anchor_row: NDArray[np.intp], column: str) -> Ra
 def _add_heat(timeline: Timeline) -> None:
     """Add the mean correction along the tracks."""
     tracks = {name: track for (name, kind), track in timeline.tracks.items() if kind is TrackKind.CORRECTED}
-    single = next(iter(tracks.values())) if len(tracks) == 1 else None
     for tag_id in np.unique(timeline.tag):
-        track = tracks.get(tag_frame(int(tag_id)), single)
+        track = tracks.get(tag_name(int(tag_id), tracks, timeline.losses))
         if track is None or not len(track):
             continue
         rows = np.flatnonzero(timeline.tag == tag_id)

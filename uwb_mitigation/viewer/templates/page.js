@@ -31,10 +31,11 @@ function start(doc) {
   // The next update comes after this one has been drawn: a slow page skips updates instead of showing old ones.
   let received = performance.now();
   const showAge = () => {
-    const player = controls.player, age = (performance.now() - received) / 1000 + (controls.update?.[1] ?? 0);
-    const late = player?.behind ? "Reading ..." : age > 2 && (player?.playing ?? true) ? `${age.toFixed(0)} s behind` : "";
+    const player = controls.player, [, took, rangeAge] = controls.update ?? [0, 0, -1], age = (performance.now() - received) / 1000 + took;
+    const late = player?.behind ? "Reading ..." : age > 2 && (player?.playing ?? true) ? `${age.toFixed(0)} s behind`
+      : player?.playing && !position && rangeAge < 0 ? "NO RANGES" : "";
     $("age").className = late ? "late" : "";
-    setText($("age"), late || (player?.playing ? `${position ? "PLAYING" : "LIVE"} ${age.toFixed(1)} s` : "PAUSED"));
+    setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s`));
   };
   on("update", () => {
     received = performance.now();
@@ -69,7 +70,7 @@ function start(doc) {
   let sort = "pair", descending = false;
   const makeRow = (data, i) => {
     const row = document.createElement("tr"), pick = document.createElement("button");
-    for (const field of fields) row.insertCell().className = {pair: "pair", status: "text"}[field] ?? "";
+    for (const field of fields) row.insertCell().className = {pair: "pair", state: "text state", status: "text"}[field] ?? "";
     pick.type = "button";
     pick.textContent = `${data.anchor[i]}, ${data.tag[i]}`;
     pick.setAttribute("aria-label", `Select anchor ${data.anchor[i]}, tag ${data.tag[i]}`);
@@ -82,7 +83,7 @@ function start(doc) {
     const data = source.data, count = data.anchor.length, keys = Array.from({length: count}, (_, i) => i);
     const words = $("search").value.trim().toLowerCase(), filter = $("filter").value;
     const shown = keys.filter((i) => `${data.anchor[i]}, ${data.tag[i]}`.toLowerCase().includes(words)
-      && (filter === "all" || (filter === "no_data" ? data.no_data[i] : data.status[i] !== "OK")));
+      && {all: true, no_data: data.no_data[i], bad: data.status[i] !== "OK", not_good: !data.state[i].endsWith("good")}[filter]);
     const value = (i) => sort === "pair" ? i : data[sort][i];
     const compare = (a, b) => typeof a === "string" ? a.localeCompare(b) : Number.isNaN(a) - Number.isNaN(b) || a - b;
     shown.sort((a, b) => (descending ? -1 : 1) * compare(value(a), value(b)) || a - b);
@@ -96,7 +97,7 @@ function start(doc) {
       fields.forEach((field, cell) => {
         if (field === "pair") return;
         const value = data[field][i];
-        setText(row.cells[cell], field === "status" ? value : number(value, DIGITS[field]));
+        setText(row.cells[cell], typeof value === "string" ? value : number(value, DIGITS[field]));
         if (field === "status") row.cells[cell].className = `text ${data.no_data[i] ? "" : value}`;
       });
       return row;
@@ -114,14 +115,16 @@ function start(doc) {
   body.addEventListener("pointerdown", () => { pressed = true; });
   for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { pressed = false; setTimeout(drawPairs); });
   source.properties.data.change.connect(updatePairs);
-  const trace = model("cir").renderers.map((r) => r.data_source).find((s) => "magnitude" in s.data);
-  const titlePair = () => {
-    const [anchor, tag] = controls.selected ?? [], pair = anchor == null ? "" : `: anchor ${anchor}, tag ${tag}`;
-    setText($("strip-title"), "Range" + pair);
-    setText($("cir-title"), `Channel impulse response (CIR)${pair}${trace.data.sample.length ? "" : ": no CIR"}`);
-  };
-  trace.properties.data.change.connect(titlePair);
-  on("selected", () => { drawPairs(); titlePair(); });
+  const titles = ["strip", "cir", "waterfall"].map((name) => [$(`${name}-title`), $(`${name}-title`).textContent]);
+  on("selected", () => {
+    drawPairs();
+    const [anchor, tag] = controls.selected ?? [];
+    for (const [element, title] of titles) setText(element, anchor == null ? title : `${title}: anchor ${anchor}, tag ${tag}`);
+  });
+  on("empty", () => {
+    const {cir} = controls.empty;
+    for (const [name, message] of Object.entries({...controls.empty, waterfall: cir ?? ""})) $(name).dataset.empty = message;
+  });
   for (const name of ["search", "filter"]) $(name).addEventListener("input", drawPairs);
   for (const button of document.querySelectorAll("[data-sort]")) button.addEventListener("click", () => {
     descending = sort === button.dataset.sort && !descending;
@@ -146,11 +149,31 @@ function start(doc) {
   const tags = map.renderers.map((r) => r.data_source).find((s) => s.name === "tags");
   tags.properties.data.change.connect(() => {
     if ($("follow").getAttribute("aria-pressed") !== "true") return;
-    const i = Math.max(tags.data.name.findIndex((name) => name === `tag_${controls.selected?.[1]}`), 0);
+    const i = Math.max(tags.data.name.findIndex((name) => name.split(":")[0] === `tag ${controls.selected?.[1]}`), 0);
     const [dx, dy] = ranges().map((range, axis) =>
       ((axis ? tags.data.y : tags.data.x)[i] - (range.start + range.end) / 2) / (range.end - range.start));
     if (Math.hypot(dx, dy) > 0.02) pan(dx, dy);
   });
+  // A name that would cover another one is hidden: tags come first, then the selected anchor.
+  const [anchors, labels] = ["id", "offset"].map((column) => map.renderers.map((r) => r.data_source).find((s) => column in s.data));
+  const placeLabels = () => {
+    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame, boxes = [], shown = {x: [], y: [], text: [], offset: []};
+    const place = (x, y, text, offset) => {
+      const half = 3.5 * text.length + 2, px = x_scale.compute(x), bottom = y_scale.compute(y) + offset;
+      const box = [px - half, bottom - 15, px + half, bottom];
+      if (boxes.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) return;
+      boxes.push(box);
+      for (const [name, value] of Object.entries({x, y, text, offset})) shown[name].push(value);
+    };
+    tags.data.name.forEach((name, i) => place(tags.data.x[i], tags.data.label_y[i], name, -4));
+    const isSelected = (i) => controls.selected && BigInt(controls.selected[0]) == anchors.data.id[i];
+    const order = [...anchors.data.name.keys()].sort((a, b) => isSelected(b) - isSelected(a));
+    for (const i of order) place(anchors.data.x[i], anchors.data.y[i], anchors.data.name[i], -13);
+    if (JSON.stringify(shown) !== JSON.stringify(labels.data)) labels.setv({data: shown}, {sync: false});
+  };
+  tags.properties.data.change.connect(placeLabels);
+  // The view and the size of the map change without a common event.
+  setInterval(placeLabels, 200);
   $("fit").addEventListener("click", fit);
   $("follow").addEventListener("click", (event) =>
     event.target.setAttribute("aria-pressed", event.target.getAttribute("aria-pressed") !== "true"));
@@ -196,9 +219,7 @@ function start(doc) {
     show(parts.join("; ") || "No data.");
   });
 
-  const counts = model("errors").renderers[0].data_source;
-  const titleErrors = () => setText($("errors-title"), `Range errors, ${$("window")?.value ?? "since the start"}${counts.data.raw.some(Boolean) ? "" : ": no true ranges"}`);
-  counts.properties.data.change.connect(titleErrors);
+  const titleErrors = () => setText($("errors-title"), `Range errors, ${$("window")?.value ?? "since the start"}`);
   titleErrors();
 
   // Recording.
@@ -233,8 +254,8 @@ function start(doc) {
       send("seek", Number(position.value));
     });
     for (const name of ["step", "previous_bad", "next_bad", "largest"]) $(name).addEventListener("click", () => send(name));
-    $("window").addEventListener("change", (event) => { send("window", event.target.value); saveUrl(false); });
-    if (wanted.has("window")) { $("window").value = wanted.get("window"); send("window", wanted.get("window")); }
+    $("window").addEventListener("change", (event) => { send("window", event.target.value); titleErrors(); saveUrl(false); });
+    if (wanted.has("window")) { $("window").value = wanted.get("window"); titleErrors(); send("window", wanted.get("window")); }
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
