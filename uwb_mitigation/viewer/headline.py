@@ -98,16 +98,16 @@ def _range_cards(
     """Return the figures of ranges, from their errors {name: errors, or the mean absolute error}; "": the corrected ranges."""
     if not count:
         return []
-    share = [
+    not_ok_card = [
         f"Ranges not OK, {window}",
         f"{100.0 * not_ok / count:.1f} %",
         f"{not_ok} of {count} corrected ranges",
     ]
     means_m = {name: _metres(np.abs(errors)) for name, errors in errors_m.items()}
     if (mean_m := means_m.pop("")) == "-":
-        return [share]
+        return [not_ok_card]
     references = "; ".join(f"{name}: {text}" for name, text in means_m.items())
-    return [share, [f"Mean absolute range error, {window}", mean_m, references]]
+    return [not_ok_card, [f"Mean absolute range error, {window}", mean_m, references]]
 
 
 class _Positions:
@@ -203,6 +203,6 @@ def _p95(values: NDArray[np.float64]) -> float:
 
 
 def _metres(values_m: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:
-    """Return a statistic of the finite values as text; "-" if there are none."""
+    """Return a statistic of the finite values as text; "-" without any."""
     finite = values_m[np.isfinite(values_m)]
     return f"{statistic(finite):.3f} m" if len(finite) else "-"
