@@ -48,16 +48,16 @@ path-for-colcon:
 	  { echo "colcon: CMake's macros of ROS do not accept the path $(CURDIR): move the checkout to one of ASCII letters, digits and spaces" >&2; exit 1; }
 
 # Networks that an interrupted run has trained are used again. Other data and quick runs have separate folders.
-PAPER_QUICK = --windows 157,16 --seeds 1
+PAPER_QUICK = --windows 157,16 --seeds 1 --epochs 20
 PAPER = build/paper/$(if $(DATA),$(shell echo '$(DATA)' | tr '/ ' '__'),simulated)$(if $(QUICK),-quick)
 PAPER_DATA = $(or $(DATA),build/paper/deepuwb.mcap)
 
 paper: setup-training  ## the paper's experiment, the firmware's cost and their report: 50 minutes (QUICK=1: 5; DATA=deepuwb.pkl)
 	@test -z '$(DATA)' || test -e '$(DATA)' || { echo "DATA=$(DATA) does not exist" >&2; exit 1; }
-	@mkdir -p $(PAPER); test -e '$(PAPER_DATA)' || $(VENV)/bin/uwb-mitigation paper simulate -o $(PAPER_DATA)
+	@mkdir -p $(PAPER); test -e '$(PAPER_DATA)' || $(VENV)/bin/python -m benchmarks paper simulate -o $(PAPER_DATA)
 	@$(VENV)/bin/python -m benchmarks firmware $(if $(QUICK),--inputs 200 --no-portable) --json $(PAPER)/firmware.json
-	@$(VENV)/bin/uwb-mitigation paper protocol --data '$(PAPER_DATA)' -o $(PAPER)/models $(if $(QUICK),$(PAPER_QUICK))
-	@$(VENV)/bin/uwb-mitigation paper report --data '$(PAPER_DATA)' -o $(PAPER) --models $(PAPER)/models --firmware $(PAPER)/firmware.json
+	@$(VENV)/bin/python -m benchmarks paper protocol --data '$(PAPER_DATA)' -o $(PAPER)/models $(if $(QUICK),$(PAPER_QUICK))
+	@$(VENV)/bin/python -m benchmarks paper report --data '$(PAPER_DATA)' -o $(PAPER) --models $(PAPER)/models --firmware $(PAPER)/firmware.json
 	@echo "$(CURDIR)/$(PAPER)/report.html"
 
 SPHINX = $(VENV)/bin/sphinx-build --fail-on-warning --keep-going --nitpicky --fresh-env --quiet --jobs auto -c docs -d build/doctrees .

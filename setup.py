@@ -70,7 +70,6 @@ setup(
             "types/ros/interfaces/*.msg",
             "recordings/mappings/*.yaml",
             "training/templates/*.j2",
-            "training/paper/templates/*.j2",
             "commands/field/templates/*.j2",
             "viewer/templates/*",
         ]

@@ -1,13 +1,12 @@
 """Measure nodes, positions, radios, firmware and links: `python -m benchmarks NAME [--json FILE]`, in a checkout.
 
-More commands: emulated boards (`emulate-board`, `emulate-evb1000`, `emulate-uci`) and two demonstrations (`radio-demo`,
-`firmware-demo`).
+More commands: emulated boards (`emulate-board`, `emulate-evb1000`, `emulate-uci`), two demonstrations (`radio-demo`,
+`firmware-demo`), and the experiment of the paper (`paper`).
 """
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -18,9 +17,11 @@ import typer
 from benchmarks.equipment.emulate_board import emulate_board
 from benchmarks.equipment.emulate_evb1000 import emulate_evb1000
 from benchmarks.equipment.emulate_uci import emulate_uci
+from benchmarks.paper import cli as paper
+from uwb_mitigation.commands import cli
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import ConsoleTable, JsonOption
-from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
+from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
     from benchmarks.nodes import SubjectResult
@@ -35,6 +36,7 @@ app = typer.Typer(
 app.command("emulate-board")(emulate_board)
 app.command("emulate-evb1000")(emulate_evb1000)
 app.command("emulate-uci")(emulate_uci)
+app.add_typer(paper.app, name="paper")
 
 
 @app.command()
@@ -413,14 +415,5 @@ def _text(value: Any) -> str:
 
 
 def main() -> None:
-    """Run the command line; an error of the package or a missing library gives a one-line error and exit code 1."""
-    try:
-        app()
-    except (UwbMitigationError, ImportError) as error:
-        failure = missing_dependency(error) if isinstance(error, ImportError) else error
-        if failure is None:
-            raise
-        console.err.print(f"benchmarks: {failure}", style="red", markup=False, soft_wrap=True)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    """Run the command line."""
+    cli.run(app, "benchmarks")

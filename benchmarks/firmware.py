@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks.equipment import emulator
 from benchmarks.equipment.random_networks import mlp, remnet, rounding_windows
+from benchmarks.paper import published
 from uwb_mitigation.mitigation.embedded.export import Golden, golden_windows, write_header
 from uwb_mitigation.mitigation.embedded.packing import PackedNetwork, pack
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target, compile_image
@@ -26,7 +27,6 @@ from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.training.paper import published
 
 CLOCK_HZ = 64e6
 """Clock of the board in the paper, an Arduino Nano 33 BLE Sense."""

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.equipment import random_networks
 from benchmarks.firmware import Network, network_of
+from benchmarks.paper import published
 from uwb_mitigation.mitigation.embedded.export import Golden, golden_windows, write_header
 from uwb_mitigation.mitigation.embedded.packing import pack
 from uwb_mitigation.mitigation.model import graph
@@ -24,7 +25,6 @@ from uwb_mitigation.mitigation.model.ood import Band, OodBands
 from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.recordings.decaranging import open_decaranging
-from uwb_mitigation.training.paper import published
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD

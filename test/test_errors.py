@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.paper.data import split_by_name
+from benchmarks.paper.experiment import Task
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.model.shipped import model_path
 from uwb_mitigation.nodes.support import launching
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.recordings.bag.pose_paths import check_topic
-from uwb_mitigation.training.paper.data import split_by_name
-from uwb_mitigation.training.paper.experiment import Task
 from uwb_mitigation.types.anchors import parse_anchors
 from uwb_mitigation.types.offsets import parse_offsets
 

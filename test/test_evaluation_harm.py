@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from model_material import amplitudes_only
 
+from benchmarks.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
@@ -17,7 +18,6 @@ from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.training.data.dataset import build_dataset
 from uwb_mitigation.training.evaluation import zero_shot
 from uwb_mitigation.training.evaluation.accuracy import Accuracy, evaluate_accuracy
-from uwb_mitigation.training.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.types.measurement import Cir, Record
 
 EVERY = 15

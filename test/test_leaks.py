@@ -18,7 +18,7 @@ from model_material import dataset
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from uwb_mitigation.commands.cli import app
+from benchmarks.cli import app
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
@@ -28,13 +28,13 @@ from uwb_mitigation.training.fit import linear_fit
 
 pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
+from benchmarks.paper import data as recordings
+from benchmarks.paper import experiment
+from benchmarks.paper.data import Parts
 from uwb_mitigation.training import comparison, train
 from uwb_mitigation.training.fit import candidates, fitting, model_card, selection
 from uwb_mitigation.training.fit.candidates import Recipe
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.paper import data as recordings
-from uwb_mitigation.training.paper import experiment
-from uwb_mitigation.training.paper.data import Parts
 
 SAMPLES = 8
 QUICK = FitOptions(epochs=1)

@@ -19,16 +19,16 @@ import pytest
 from command_line import run, start, succeed
 from model_material import window_of
 
+from benchmarks.paper import data as experiment_data
+from benchmarks.paper import rooms
+from benchmarks.paper.download import fetch_deepuwb
+from benchmarks.paper.environments import OBSTACLES as SIMULATED_OBSTACLES
+from benchmarks.paper.environments import ROOMS as SIMULATED_ROOMS
+from benchmarks.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
 from uwb_mitigation.recordings.mcap import McapRecording
-from uwb_mitigation.simulation.rooms import OBSTACLES as SIMULATED_OBSTACLES
-from uwb_mitigation.simulation.rooms import ROOMS as SIMULATED_ROOMS
-from uwb_mitigation.training.paper import data as experiment_data
-from uwb_mitigation.training.paper import rooms
-from uwb_mitigation.training.paper.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, DeepUwbRecording
-from uwb_mitigation.training.paper.download import fetch_deepuwb
-from uwb_mitigation.training.paper.simulated import SimulatedDeepUwb
+from uwb_mitigation.training.data.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, DeepUwbRecording
 from uwb_mitigation.types.measurement import Encoding, Record
 
 OBSTACLES = ("0000000000", "1000000000", "0000001001", "0000000001")

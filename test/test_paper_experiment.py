@@ -15,14 +15,14 @@ from model_material import dataset, integer_network
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
 
+from benchmarks.paper import experiment
+from benchmarks.paper.data import Parts, shorten_windows
+from benchmarks.paper.results import RESULTS, ExperimentResults, read
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.fit.options import FitOptions
-from uwb_mitigation.training.paper import experiment
-from uwb_mitigation.training.paper.data import Parts, shorten_windows
-from uwb_mitigation.training.paper.results import RESULTS, ExperimentResults, read
 
 QUICK = FitOptions(epochs=2, learning_rate=1e-3, weight_decay=0.0)
 
@@ -187,7 +187,7 @@ def test_command_writes_its_results(folder):
     assert json.loads((folder / "models" / RESULTS).read_text()) == result
     assert (result["data"], result["split"]) == ("rooms.mcap (simulated)", "paper")
     assert (result["train"], result["test"]) == (131, 48)  # the share of the published rows
-    assert result["command"].startswith("uwb-mitigation paper protocol --data rooms.mcap")
+    assert result["command"].startswith("python -m benchmarks paper protocol --data rooms.mcap")
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,10 @@ import pytest
 from command_line import run, succeed
 from model_material import dataset
 
+from benchmarks.paper import report, tables
+from benchmarks.paper.report import Report, Study, build_report
+from benchmarks.paper.results import ExperimentResults, FirmwareRow
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.paper import report, tables
-from uwb_mitigation.training.paper.report import Report, Study, build_report
-from uwb_mitigation.training.paper.results import ExperimentResults, FirmwareRow
 
 PARTS = ["data", "table1", "table2", "table3", "fig3", "fig4a", "fig4b", "fig5"]
 HOSTILE = "<script>alert(1)</script>_$\\frac{$"
@@ -63,7 +63,7 @@ def study(name: str = "logs", label: str = "LOS", configuration: str = "", simul
     scaled = (data.inputs / data.inputs.max(axis=1, keepdims=True)).astype(np.float32)
     data = replace(data, labels=labels, configurations=names, inputs=scaled)
     data = replace(data, preprocessing=Preprocessing(data.inputs.shape[1], Scaling.MAX))
-    return Study(Path(name), name, simulated, data, "uwb-mitigation paper report")
+    return Study(Path(name), name, simulated, data, "python -m benchmarks paper report")
 
 
 def trained(network: str = "remnet", samples: int = 157, seed: int = 0, **changes: object) -> dict:

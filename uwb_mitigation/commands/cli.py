@@ -20,7 +20,6 @@ from uwb_mitigation.commands import (
     field_report,
     model,
     offset,
-    paper,
     positioning,
     process,
     universal,
@@ -50,9 +49,6 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
     "Boards": {
         "board": board.app,
         "field-report": field_report.field_report,
-    },
-    "The paper": {
-        "paper": paper.app,
     },
     "Installation": {
         "doctor": doctor.doctor,
@@ -120,16 +116,21 @@ _UsageError: Any = typer.BadParameter.__base__
 """click's error for wrong usage, of which newer versions of typer contain a copy."""
 
 
-def _exit_with_error(error: object, code: int = 1) -> NoReturn:
-    console.err.print(f"uwb-mitigation: {error}", style="red", markup=False, soft_wrap=True)
-    sys.exit(code)
-
-
 def main() -> None:
-    """Run the command line; exit with 2 and one line for wrong usage, 1 and one line for other errors, 130 on Ctrl-C.
+    """Run `uwb-mitigation`."""
+    run(app, "uwb-mitigation")
+
+
+def run(app: typer.Typer, program: str) -> NoReturn:
+    """Run a command line; exit with 2 and one line for wrong usage, 1 and one line for other errors, 130 on Ctrl-C.
 
     If the reader of standard output (head, less) exits, typer and rich exit with 1 and without a message.
     """
+
+    def exit_with_error(error: object, code: int = 1) -> NoReturn:
+        console.err.print(f"{program}: {error}", style="red", markup=False, soft_wrap=True)
+        sys.exit(code)
+
     command: Any = typer.main.get_command(app)
     _reflow_help(command)
     try:
@@ -138,16 +139,16 @@ def main() -> None:
         if type(error).__name__ == "NoArgsIsHelpError":
             error.show()
             sys.exit(2)
-        name = error.ctx.command_path if error.ctx is not None else "uwb-mitigation"
-        _exit_with_error(f"{error.format_message()} (see {name} --help)", 2)
+        name = error.ctx.command_path if error.ctx is not None else program
+        exit_with_error(f"{error.format_message()} (see {name} --help)", 2)
     except ParameterError as error:
-        _exit_with_error(error, 2)
+        exit_with_error(error, 2)
     except UwbMitigationError as error:
-        _exit_with_error(error)
+        exit_with_error(error)
     except ImportError as error:
         if (problem := missing_dependency(error)) is None:
             raise
-        _exit_with_error(problem)
+        exit_with_error(problem)
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
 

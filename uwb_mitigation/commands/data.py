@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import enum
 import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -29,50 +28,21 @@ _STRIDE = 100
 """Number of ranges between two updates of a progress bar."""
 
 
-class CirChoice(str, enum.Enum):
-    """Frame of a DecaRanging exchange whose CIR is used."""
-
-    FINAL = "final"
-    POLL = "poll"
-
-
-class Like(str, enum.Enum):
-    """Kind of simulated recording."""
-
-    DRIVE = "drive"
-    SURVEY = "survey"
-    BUILDINGS = "buildings"
-
-
-LongestPauseOption = Annotated[
-    float,
-    typer.Option(metavar="SECONDS", help="Longer pauses are shortened to this; inf: never."),
-]
 _LONGEST_PAUSE_S = 5.0
 
 CirOption = Annotated[
-    CirChoice, typer.Option(help="Frame of a DecaRanging exchange whose CIR is used: final or poll.")
+    Literal["final", "poll"], typer.Option(help="Frame of a DecaRanging exchange whose CIR is used.")
 ]
-
-
-OutputOption = Annotated[
-    Path,
-    typer.Option(
-        "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
-    ),
-]
+OUTPUT = typer.Option(
+    "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
+)
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")]
 
 
 @app.command("import")
 def import_recordings(
     sources: Annotated[list[Path], typer.Argument(metavar="SRC...", help="Recordings: logs, folders, bags.")],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
-        ),
-    ] = None,
+    output: Annotated[Path | None, OUTPUT] = None,
     mapping: Annotated[
         str,
         typer.Option(
@@ -85,8 +55,10 @@ def import_recordings(
             "--dry-run", help="Show how the recording is understood, and write nothing (with --map)."
         ),
     ] = False,
-    cir: CirOption = CirChoice.FINAL,
-    longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
+    cir: CirOption = "final",
+    longest_pause: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Longer pauses are shortened to this; inf: never.")
+    ] = _LONGEST_PAUSE_S,
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
@@ -119,14 +91,14 @@ def import_recordings(
 
 @app.command()
 def simulate(
-    output: OutputOption,
+    output: Annotated[Path, OUTPUT],
     like: Annotated[
-        Like,
+        Literal["drive", "survey", "buildings"],
         typer.Option(
             help="drive: a robot that drives through a flat; survey: static placements in that flat; buildings: placements "
-            "in random buildings, with different boards. `paper simulate`: DeepUWB's rooms."
+            "in random buildings, with different boards."
         ),
-    ] = Like.DRIVE,
+    ] = "drive",
     seed: Annotated[int, typer.Option(help="Seed. Stamps start today at 0:00 UTC.")] = 1,
     ranges: Annotated[
         int, typer.Option(help="Number of ranges, including those that are too weak to be received.")
@@ -135,7 +107,6 @@ def simulate(
         int, typer.Option(help="Exchanges of each static placement (survey, buildings).")
     ] = 20,
     anchors: Annotated[int, typer.Option(help="Number of anchors of a drive, 4 to 8.")] = 4,
-    longest_pause: LongestPauseOption = _LONGEST_PAUSE_S,
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
@@ -145,15 +116,17 @@ def simulate(
     with a scale error of 2 %, drift and slip. The antenna of the tag is at the origin of base_link.
     """
     source = simulated_source(like, seed, ranges, exchanges, anchors)
-    # The robot moves on during a pause.
-    longest_pause = math.inf if like is Like.DRIVE else longest_pause
-    write_simulated(source, ranges, seed, output, longest_pause, force, json)
+    write_simulated(source, ranges, seed, output, force, json)
 
 
 def write_simulated(
-    source: Source, total: int, seed: int, output: Path, longest_pause: float, force: bool, json: Path | None
+    source: Source, total: int, seed: int, output: Path, force: bool, json: Path | None
 ) -> None:
     """Write a simulated source to a bag; `total` is the number of ranges for the progress bar."""
+    from uwb_mitigation.simulation.simulated import SimulatedSource
+
+    # A robot moves on during a pause.
+    longest_pause = math.inf if isinstance(source, SimulatedSource) else _LONGEST_PAUSE_S
     _write([source], output, longest_pause, force, json, total, {"seed": seed, "simulated": True})
 
 
@@ -191,7 +164,7 @@ def _write(
         _show_source(source)
     if total is None:
         _show_summary(result)
-    if pauses.cut:
+    if pauses.cut and total is None:
         print_line(
             f"Shortened {pauses.cut} pauses to {pauses.longest_s:g} s, {pauses.cut_s:.0f} s in total; "
             "--longest-pause inf keeps them."
@@ -255,7 +228,7 @@ def _motion_of(source: Source, start_ns: int) -> tuple[Odometry, Imu | None] | N
     return replace(motion.odometry, stamp_ns=stamps), replace(motion.imu, stamp_ns=stamps)
 
 
-def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors: int = 4) -> Source:
+def simulated_source(like: str, seed: int, ranges: int, exchanges: int, anchors: int = 4) -> Source:
     """Return the simulator's source.
 
     Raises:
@@ -264,13 +237,13 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
     from uwb_mitigation.simulation import simulated
     from uwb_mitigation.simulation.simulated import SimulatedBuildings
 
-    if like in (Like.SURVEY, Like.BUILDINGS):
+    if like in ("survey", "buildings"):
         if exchanges < 1 or ranges % exchanges:
             raise ParameterError(
                 f"{ranges} ranges of {exchanges} exchanges a placement", valid="a multiple of the exchanges"
             )
         placements = ranges // exchanges
-        if like is Like.BUILDINGS:
+        if like == "buildings":
             return SimulatedBuildings(seed=seed, placements=placements, exchanges=exchanges)
         return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges)
     if ranges < 1:
@@ -278,21 +251,21 @@ def simulated_source(like: Like, seed: int, ranges: int, exchanges: int, anchors
     return simulated.SimulatedSource.with_anchors(anchors, seed=seed, count=ranges)
 
 
-def _open(path: Path, cir: CirChoice) -> Source:
+def _open(path: Path, cir: Literal["final", "poll"]) -> Source:
     """Open any recording, including DeepUWB's pickle; raises the errors of `open_recording`."""
     from uwb_mitigation.recordings.formats import open_recording
 
     if path.suffix == ".pkl":
-        from uwb_mitigation.training.paper.deepuwb import DeepUwbRecording
+        from uwb_mitigation.training.data.deepuwb import DeepUwbRecording
 
         return DeepUwbRecording(path)
-    return open_recording(path, cir=cir.value)
+    return open_recording(path, cir=cir)
 
 
 @app.command()
 def info(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="A recording: log, folder or bag.")],
-    cir: CirOption = CirChoice.FINAL,
+    cir: CirOption = "final",
     json: JsonOption = None,
 ) -> None:
     """Show the contents of a recording: pairs, counts, warnings."""

@@ -22,7 +22,7 @@ LIBRARIES = {
     "": ("numpy", "onnxruntime", "pyyaml"),
     "boards on a serial link": ("cobs", "pyserial"),
     "bags": ("mcap", "rosbags", "zstandard", "lz4"),
-    "models, positions, reports and data sets": ("onnx", "scipy", "pydantic", "pandas", "pooch"),
+    "models, positions and recordings": ("onnx", "scipy", "pydantic", "pandas"),
     "the command line, the viewer and benchmarks": ("typer", "rich", "bokeh", "psutil"),
 }
 """{purpose: required libraries}; the first entry is required by everything."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from benchmarks.paper import published
+from benchmarks.paper.results import FORMS, ExperimentResults, FirmwareRow, Spread, TrainedModel
 from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
-from uwb_mitigation.training.paper import published
-from uwb_mitigation.training.paper.results import FORMS, ExperimentResults, FirmwareRow, Spread, TrainedModel
 
 NAMES = {
     "remnet": "REMNet",

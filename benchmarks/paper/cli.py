@@ -1,4 +1,4 @@
-"""`uwb-mitigation paper`: the paper's experiment, tables and figures, and DeepUWB."""
+"""`python -m benchmarks paper`: the paper's experiment, tables and figures, and DeepUWB."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
 if TYPE_CHECKING:
-    from uwb_mitigation.training.paper.data import Parts
-    from uwb_mitigation.training.paper.results import ExperimentResults
+    from benchmarks.paper.data import Parts
+    from benchmarks.paper.results import ExperimentResults
 
 app = typer.Typer(
     help="The paper's experiment, tables and figures; DeepUWB, downloaded or simulated.", no_args_is_help=True
@@ -59,7 +59,7 @@ def fetch(
 
     `data import` and all commands of `paper` read the file.
     """
-    from uwb_mitigation.training.paper.download import fetch_deepuwb
+    from benchmarks.paper.download import fetch_deepuwb
 
     with console.progress() as bar:
         bar.add_task("downloading", total=None)
@@ -85,13 +85,13 @@ def simulate_deepuwb(
 ) -> None:
     """Simulate data with the rooms, obstacles and format of DeepUWB, and write it to a bag.
 
-    The bag is marked as simulated. In a checkout, `make paper` runs the complete experiment on it.
+    The bag is marked as simulated. `make paper` runs the complete experiment on it.
     """
+    from benchmarks.paper.simulated import SimulatedDeepUwb
     from uwb_mitigation.commands.data import write_simulated
-    from uwb_mitigation.training.paper.simulated import SimulatedDeepUwb
 
     source = SimulatedDeepUwb(seed=seed, ranges=ranges, exchanges=exchanges)
-    write_simulated(source, ranges, seed, output, 5.0, force, json)
+    write_simulated(source, ranges, seed, output, force, json)
 
 
 @app.command()
@@ -120,7 +120,7 @@ def protocol(
     """
     lengths = _lengths(windows)
     with needs_torch():
-        from uwb_mitigation.training.paper import experiment
+        from benchmarks.paper import experiment
 
     tasks = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)
     options = replace(experiment.PAPER, epochs=epochs, learning_rate=learning_rate)
@@ -155,11 +155,11 @@ def report(
 ) -> None:
     """Write an HTML page with the tables and figures of the paper and of your data."""
     # Read everything before the work begins, so that a missing library or a wrong file is an early error.
+    from benchmarks.paper import published, results
+    from benchmarks.paper import report as reports
+    from benchmarks.paper.data import load_paper_data
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-    from uwb_mitigation.training.paper import published, results
-    from uwb_mitigation.training.paper import report as reports
-    from uwb_mitigation.training.paper.data import load_paper_data
 
     trainings = None if models is None else results.read(results.ExperimentResults, models / results.RESULTS)
     bench = () if firmware is None else results.read(results.FirmwareResults, firmware).rows
@@ -182,12 +182,12 @@ def report(
 
 def _command() -> str:
     """Return the command line of this process, for the provenance of results."""
-    return shlex.join(["uwb-mitigation", *sys.argv[1:]])
+    return shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]])
 
 
 def _split_data(path: Path, samples: int, scaling: ScalingName, split: str) -> Parts:
+    from benchmarks.paper import data as paper_data
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-    from uwb_mitigation.training.paper import data as paper_data
 
     preprocessing = Preprocessing(samples, Scaling(scaling))
     with console.reading() as on_record:
@@ -224,8 +224,8 @@ def _make_folder(path: Path) -> None:
 
 
 def _show_experiment(result: ExperimentResults) -> None:
+    from benchmarks.paper import tables
     from uwb_mitigation.commands.support.console import print_line, show_table
-    from uwb_mitigation.training.paper import tables
 
     provenance = tables.Provenance(result.data, result.split, "", "")
     table = tables.accuracy(result, provenance, "", "Measured")

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.paper.rooms import has_rooms, parse_configuration
 from uwb_mitigation.errors import DatasetError, ParameterError, check_name
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
+from uwb_mitigation.training.data.deepuwb import DeepUwbRecording
 from uwb_mitigation.training.data.splits import Split
-from uwb_mitigation.training.paper.deepuwb import DeepUwbRecording
-from uwb_mitigation.training.paper.rooms import has_rooms, parse_configuration
 from uwb_mitigation.types.source import Source
 
 AUTO, PAPER, CONFIGURATIONS = "auto", "paper", "configurations"

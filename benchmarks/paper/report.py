@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.paper import figures, published, tables
+from benchmarks.paper.data import TEST_ROOM
+from benchmarks.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
+from benchmarks.paper.rooms import ROOM_ROWS, has_rooms, parse_configuration
+from benchmarks.paper.tables import Cell, Provenance, ReportTable
 from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.data.deepuwb import ROOMS
 from uwb_mitigation.training.evaluation.baselines import scikit_learn
 from uwb_mitigation.training.html import render_page
-from uwb_mitigation.training.paper import figures, published, tables
-from uwb_mitigation.training.paper.data import TEST_ROOM
-from uwb_mitigation.training.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
-from uwb_mitigation.training.paper.rooms import ROOM_ROWS, ROOMS, has_rooms, parse_configuration
-from uwb_mitigation.training.paper.tables import Cell, Provenance, ReportTable
 
 LOS = "LOS"
 MAX_SAMPLES = 3
@@ -131,7 +132,7 @@ def build_report(
     study: Study, trainings: ExperimentResults | None = None, firmware: Sequence[FirmwareRow] = ()
 ) -> Report:
     """Return every table and figure that the data, the trainings and the firmware results allow."""
-    train = f"uwb-mitigation paper protocol --data {shlex.quote(str(study.path))} -o models"
+    train = f"python -m benchmarks paper protocol --data {shlex.quote(str(study.path))} -o models"
     bench = "python -m benchmarks firmware --json firmware.json"
     lacking: dict[str, str] = {}
     shown, pictures = (

@@ -21,11 +21,28 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.training.paper.rooms import MATERIALS, ROOMS, configuration_of
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement, Record, Truth
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import NS_PER_S
 
+ROOMS = ("cross-room", "big room", "medium room", "small room", "outdoor")
+"""Index: the value of the column `Room`."""
+
+MATERIALS = (
+    "wall",
+    "polystyrene plate",
+    "plastic",
+    "plywood plate",
+    "cardboard box",
+    "LCD TV",
+    "metal plate",
+    "wood door",
+    "glass plate",
+    "metal window",
+)
+"""Index: the position of the character in the column `Obstacles`. All characters 0: LOS."""
+
+NO_MATERIAL = "clear"
 MAX_BYTES, MAX_ERROR_M = 1 << 29, 1000.0
 CIR_SAMPLES = 157
 NOMINAL_RANGE_M = 10.0
@@ -47,6 +64,12 @@ _ALLOWED = {
     "_codecs": {"encode"},
 }
 """Classes that a pickled frame of arrays, lists and scalars needs. None of them runs code from the file."""
+
+
+def configuration_of(room: int, obstacles: str) -> str:
+    """Return the configuration name of a row: `deepuwb/room2/wall+metal plate`, `deepuwb/room1/clear`."""
+    present = [material for material, digit in zip(MATERIALS, obstacles, strict=True) if digit == "1"]
+    return f"deepuwb/room{room}/{'+'.join(present) or NO_MATERIAL}"
 
 
 class DeepUwbRecording(Source):

@@ -13,6 +13,17 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from benchmarks.paper import published
+from benchmarks.paper.data import Parts, fingerprint
+from benchmarks.paper.jobs import run_jobs
+from benchmarks.paper.results import (
+    FORMS,
+    RESULTS,
+    Baseline,
+    ErrorsByCondition,
+    ExperimentResults,
+    TrainedModel,
+)
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, UwbMitigationError, check_name
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.model import floating, graph
@@ -29,17 +40,6 @@ from uwb_mitigation.training.fit.candidates import fit_line, linear_bias_m
 from uwb_mitigation.training.fit.model_card import card_of
 from uwb_mitigation.training.fit.options import FitOptions
 from uwb_mitigation.training.fit.quantisation import MSE, quantise_network
-from uwb_mitigation.training.paper import published
-from uwb_mitigation.training.paper.data import Parts, fingerprint
-from uwb_mitigation.training.paper.jobs import run_jobs
-from uwb_mitigation.training.paper.results import (
-    FORMS,
-    RESULTS,
-    Baseline,
-    ErrorsByCondition,
-    ExperimentResults,
-    TrainedModel,
-)
 
 PAPER = FitOptions(published.EPOCHS, published.LEARNING_RATE, published.BATCH, dropout=0.5, weight_decay=0.0)
 """The paper does not report its dropout rate."""

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.paper.results import Box, Spread
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.training.paper.results import Box, Spread
 from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S
 
 try:

@@ -11,11 +11,12 @@ from itertools import count as counting
 
 import numpy as np
 
+from benchmarks.paper.environments import OBSTACLES, ROOMS, draw_obstacles, obstruct
+from benchmarks.paper.rooms import ROOM_ROWS
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, place
 from uwb_mitigation.simulation.channel import check_range
 from uwb_mitigation.simulation.radio import Receiver
-from uwb_mitigation.simulation.rooms import OBSTACLES, ROOMS, draw_obstacles, obstruct
 from uwb_mitigation.simulation.scene import DirectPath
 from uwb_mitigation.simulation.simulated import (
     BATCH,
@@ -25,8 +26,13 @@ from uwb_mitigation.simulation.simulated import (
     TwrBatch,
     check_seed,
 )
-from uwb_mitigation.training.paper.deepuwb import CIR_SAMPLES, FIRST_ANCHOR_ID, FIRST_PATH_INDEX, FULL_SCALE
-from uwb_mitigation.training.paper.rooms import ROOM_ROWS, configuration_of
+from uwb_mitigation.training.data.deepuwb import (
+    CIR_SAMPLES,
+    FIRST_ANCHOR_ID,
+    FIRST_PATH_INDEX,
+    FULL_SCALE,
+    configuration_of,
+)
 from uwb_mitigation.types.measurement import Cir, Encoding, Record
 
 LATE_FIRST_PATH = "first path too late for a whole window"

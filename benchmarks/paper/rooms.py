@@ -1,4 +1,4 @@
-"""DeepUWB's rooms and materials, and the configuration names that contain them."""
+"""DeepUWB's rooms and materials in the names of configurations."""
 
 from __future__ import annotations
 
@@ -10,35 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-
-ROOMS = ("cross-room", "big room", "medium room", "small room", "outdoor")
-"""Index: the value of the column `Room`."""
+from uwb_mitigation.training.data.deepuwb import MATERIALS, NO_MATERIAL
 
 ROOM_ROWS = (954, 18_422, 13_210, 17_601, 4_971)
 """Published number of rows of each room."""
 
-MATERIALS = (
-    "wall",
-    "polystyrene plate",
-    "plastic",
-    "plywood plate",
-    "cardboard box",
-    "LCD TV",
-    "metal plate",
-    "wood door",
-    "glass plate",
-    "metal window",
-)
-"""Index: the position of the character in the column `Obstacles`. All characters 0: LOS."""
-
 _NAME = re.compile(r"(?:simulated seed [0-9]+/)?deepuwb/room([0-4])/([^/]+)(?:/placement [0-9]+)?")
-_NO_MATERIAL = "clear"
-
-
-def configuration_of(room: int, obstacles: str) -> str:
-    """Return the configuration name of a row: `deepuwb/room2/wall+metal plate`, `deepuwb/room1/clear`."""
-    present = [material for material, digit in zip(MATERIALS, obstacles, strict=True) if digit == "1"]
-    return f"deepuwb/room{room}/{'+'.join(present) or _NO_MATERIAL}"
 
 
 def has_rooms(configurations: Sequence[str] | NDArray[np.str_]) -> bool:
@@ -54,7 +31,7 @@ def parse_configuration(name: str) -> tuple[int, tuple[str, ...]]:
         DatasetError: the name is not one of DeepUWB's.
     """
     match = _NAME.fullmatch(name)
-    materials = tuple(match[2].split("+")) if match and match[2] != _NO_MATERIAL else ()
+    materials = tuple(match[2].split("+")) if match and match[2] != NO_MATERIAL else ()
     if match is None or not set(materials) <= set(MATERIALS):
         raise DatasetError(
             f"configuration {name[:80]!r} is not from DeepUWB", valid="such as 'deepuwb/room2/wall+plastic'"

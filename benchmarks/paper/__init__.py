@@ -1,0 +1,1 @@
+"""The paper's experiment, tables and figures, with DeepUWB and its simulated stand-in. `python -m benchmarks paper`."""
