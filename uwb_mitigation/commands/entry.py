@@ -10,45 +10,18 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _NODES = ("driver", "mitigator", "locator", "pipeline", "monitor", "px4", "viewer")
 
 
-def driver() -> None:
-    """Run the node `driver`."""
-    _node("driver")
-
-
-def mitigator() -> None:
-    """Run the node `mitigator`."""
-    _node("mitigator")
-
-
-def locator() -> None:
-    """Run the node `locator`."""
-    _node("locator")
-
-
-def pipeline() -> None:
-    """Run `driver` and `mitigator` in one process."""
-    _node("pipeline")
-
-
-def monitor() -> None:
-    """Run the node `monitor`."""
-    _node("monitor")
-
-
-def px4() -> None:
-    """Run the node `px4`."""
-    _node("px4")
-
-
-def viewer() -> None:
-    """Run the node `viewer`."""
-    _node("viewer")
+def __getattr__(name: str) -> Callable[[], None]:
+    """Return the entry point of a node."""
+    if name in _NODES:
+        return partial(_node, name)
+    raise AttributeError(name)
 
 
 def command_line() -> None:

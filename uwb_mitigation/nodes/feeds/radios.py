@@ -38,13 +38,11 @@ class RadioSource(Protocol):
 
     def read_settings(self, value: ValueReader) -> Sequence[Any]:
         """Return the settings of each radio; raise ParameterError for an invalid parameter."""
-        ...
 
     def open(
         self, settings: Sequence[Any], on_event: OnEvent, stamp_clock: Callable[[], int]
     ) -> Sequence[RadioPort]:
         """Open the radios."""
-        ...
 
 
 def radio_source(name: str) -> RadioSource:

@@ -11,39 +11,30 @@ class Bus(Protocol):
     @property
     def name(self) -> str:
         """Name for users."""
-        ...
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         """Transfer in one chip-select period: write `header`, then write `out` or read and return `count` octets."""
-        ...
 
     def speed(self, fast: bool) -> None:
         """Set the SPI clock: at most 3 MHz, or at most 20 MHz if `fast`."""
-        ...
 
     @property
     def reply_us(self) -> int:
         """Time that a tag on this bus needs from ANSWER to FINAL."""
-        ...
 
     @property
     def timeout_us(self) -> int:
         """Timeout of a tag for the frames of an anchor on such a bus."""
-        ...
 
     @property
     def has_reset(self) -> bool:
         """Whether RSTn is wired."""
-        ...
 
     def reset(self) -> None:
         """Pull RSTn low for a short time, then let it float."""
-        ...
 
     def pause(self) -> None:
         """Wait between two polls of the chip's status."""
-        ...
 
     def close(self) -> None:
         """Close the bus; may be called twice."""
-        ...

@@ -39,25 +39,13 @@ _MAX_HISTORY = 1024
 
 
 class DeviceClock:
-    """Strictly increasing map from a board's counter to the host's clock.
+    """Strictly increasing map from a board's uptime in microseconds to the host's clock."""
 
-    Args:
-        tick_hz: rate of the counter.
-        wrap: the counter's modulus, such as `DEVICE_TIME_WRAP`; None if it never wraps. A gap may contain
-            any number of wraps: the host's clock determines the number.
-    """
-
-    def __init__(self, tick_hz: float = 1e6, wrap: int | None = None) -> None:
-        self._ns_per_tick = 1e9 / tick_hz
-        self._wrap = wrap
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
         """Reset the estimate, for example after the board was restarted."""
-        self._last: tuple[int, int] | None = None
-        self._restart()
-
-    def _restart(self) -> None:
         # Host time = board time + origin + offset, at board time `_updated_ns`.
         self._origin: int | None = None
         self._updated_ns = 0
@@ -90,17 +78,16 @@ class DeviceClock:
         """Standard deviation of the estimate at the last update."""
         return float(max(self._p_offset, 0.0) ** 0.5)
 
-    def arrival(self, ticks: int, arrived_ns: int) -> None:
-        """Add a frame that reports an event at counter value `ticks` and arrived at `arrived_ns`."""
-        self._arrival(self._board_ns(ticks, arrived_ns), arrived_ns)
+    def arrival(self, uptime_us: int, arrived_ns: int) -> None:
+        """Add a frame that reports an event at `uptime_us` and arrived at `arrived_ns`."""
+        self._arrival(1000 * uptime_us, arrived_ns)
 
-    def exchange(self, sent_ns: int, received: int, replied: int, arrived_ns: int) -> None:
+    def exchange(self, sent_ns: int, received_us: int, replied_us: int, arrived_ns: int) -> None:
         """Add a round trip: the host sends, the board receives and replies, the host receives the reply.
 
         Inconsistent round trips (shorter than the time between the board's reception and reply) are ignored.
         """
-        received_ns = self._board_ns(received, arrived_ns)
-        replied_ns = self._board_ns(replied, arrived_ns)
+        received_ns, replied_ns = 1000 * received_us, 1000 * replied_us
         earliest = sent_ns - received_ns
         latest = arrived_ns - replied_ns
         if latest < earliest or replied_ns < received_ns:
@@ -116,13 +103,13 @@ class DeviceClock:
         self._is_bounded = True
         self._clip(board_ns, low, high)
 
-    def stamp(self, ticks: int, arrived_ns: int) -> int:
-        """Return the host's time, ns, at `ticks`, the event time of a frame that arrived at `arrived_ns`.
+    def stamp(self, uptime_us: int, arrived_ns: int) -> int:
+        """Return the host's time, ns, at `uptime_us`, the event time of a frame that arrived at `arrived_ns`.
 
-        The same ticks always map to the same stamp, later ticks to a later stamp, and no stamp is after the
+        The same uptime always maps to the same stamp, a later one to a later stamp, and no stamp is after the
         arrival. Stamps move back only after a clock was set or a board was reset.
         """
-        board_ns = self._board_ns(ticks, arrived_ns)
+        board_ns = 1000 * uptime_us
         self._arrival(board_ns, arrived_ns)
         index = bisect.bisect_left(self._times, board_ns)
         if index < len(self._times) and self._times[index] == board_ns:
@@ -137,16 +124,6 @@ class DeviceClock:
         del self._times[:-_MAX_HISTORY], self._stamps[:-_MAX_HISTORY]
         return stamp_ns
 
-    def _board_ns(self, ticks: int, host_ns: int) -> int:
-        if self._wrap is not None:
-            if self._last is not None:
-                last_ticks, last_host_ns = self._last
-                expected = last_ticks + round((host_ns - last_host_ns) / self._ns_per_tick)
-                half = self._wrap // 2
-                ticks = expected + (ticks - expected + half) % self._wrap - half
-            self._last = (ticks, host_ns)
-        return round(ticks * self._ns_per_tick)
-
     def _predict_ns(self, board_ns: int) -> int:
         origin = self._origin or 0
         return board_ns + origin + round(self._offset + self._drift * (board_ns - self._updated_ns))
@@ -154,7 +131,7 @@ class DeviceClock:
     def _arrival(self, board_ns: int, arrived_ns: int) -> None:
         late_ns = 0 if self._origin is None else arrived_ns - self._predict_ns(board_ns)
         if late_ns > _MAX_AGE_NS:
-            self._restart()
+            self.reset()
         if self._origin is None:
             self._origin = arrived_ns - board_ns
             self._updated_ns = board_ns
@@ -201,7 +178,7 @@ class DeviceClock:
         if abs(nearest - predicted) > _STEP_NS:
             origin = (self._origin or 0) + round(nearest)
             enclosed = self._is_bounded
-            self._restart()
+            self.reset()
             self._origin, self._updated_ns, self._is_bounded = origin, board_ns, enclosed
             self._p_offset = _LATE_ARRIVAL_NS**2
             return
