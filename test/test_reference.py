@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import signal
 import sys
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ros_harness import Ros, domain
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation import open_recording
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.types.ros import topics
 
@@ -126,17 +124,3 @@ def test_mitigator_receives_the_ranges_of_the_node_on_the_page_about_sources(tmp
     message = received[0]
     assert (message.tag_id, message.anchor_id, message.status) == (7, 1, RangeCorrected.NO_CIR)
     assert message.header.frame_id == "my_antenna"
-
-
-def test_recorder_of_the_installation_guide_writes_a_bag(tmp_path: Path):
-    code = re.search(r"^```python\n(.*?)^```", (GUIDES / "installation.md").read_text(), re.M | re.S)[1]
-    bag = tmp_path / "drive.mcap"
-    with domain(tmp_path) as ros:
-        recorder = ros.run([sys.executable, "-c", code, str(bag)])
-        ros.start("driver", "source:=simulated", "simulated_rate:=400.0")
-        # The first chunk of the file is written: until then, the recorder may not have found the driver.
-        ros.spin_until(lambda: sum(path.stat().st_size for path in tmp_path.glob("drive.mcap*")) > 100_000)
-        assert recorder.signal(signal.SIGINT) == 0
-    recorded = [record.measurement.sequence for record in open_recording(bag)]
-    assert len(recorded) > 10
-    assert recorded == sorted(set(recorded))

@@ -33,6 +33,7 @@ from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
 from uwb_mitigation.nodes.feeds.replay import ReplayClock, ReplayFeed
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros.topics import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
@@ -336,6 +337,22 @@ def test_parameters_pause_seek_and_speed_up_a_running_replay(ros: Ros, bag: Path
     assert driver.wait() == 0, driver.output
     ros.spin_until(lambda: len(received) == COUNT // 4)
     assert [m.sequence for m in received] == list(range(300, COUNT))
+
+
+@pytest.mark.ros
+def test_driver_records_its_ranges_and_never_replaces_a_file(ros: Ros, tmp_path: Path):
+    path = tmp_path / "live.mcap"
+    options = ("wait_for_subscribers:=0", "start_delay:=0.0", f"record:={path}")
+    assert ros.start("driver", *options, "count:=40", "simulated_rate:=1000.0").wait() == 0
+    with McapRecording(path) as recording:
+        recorded = list(recording)
+    source = SimulatedSource(count=40, rate_hz=1000.0)
+    assert [r.measurement.range_m for r in recorded] == pytest.approx([r.measurement.range_m for r in source])
+    assert recording.simulated
+    assert all(record.truth for record in recorded)
+    second = ros.start("driver", *options, "count:=1")
+    assert second.wait() == 1
+    assert "the file exists" in second.output
 
 
 def test_time_to_open_a_source_does_not_make_its_first_records_late():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +15,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
+from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.radios.wire.messages import Correction
@@ -23,6 +26,7 @@ from uwb_mitigation.types.ros.poses import encode_true_position, prepare_encoder
 
 if TYPE_CHECKING:
     from uwb_mitigation.nodes.mitigator import Mitigator
+    from uwb_mitigation.recordings.bag.writer import BagWriter
 
 _NO_CIR = Cir(np.zeros(0, np.int16))
 ACKNOWLEDGEMENT_S = 5.0
@@ -42,10 +46,12 @@ class RangePublisher:
     def __init__(
         self, node: ManagedNode, consumer: Mitigator | None, *, corrections: bool, recording: bool
     ) -> None:
+        self._node = node
         self._consumer = consumer
         self._frame_id: str = node.value("frame_id")
         self._ranges = node.publisher(RangeCir, topics.RANGE_RAW)
         self._sensor_ranges: endpoints.SensorRanges | None = None
+        self._bag = self._open_bag() if node.value("record") else None
         if corrections:
             self._corrected = node.publisher(RangeCorrected, topics.RANGE_CORRECTED)
             if node.value("sensor_ranges"):
@@ -73,7 +79,10 @@ class RangePublisher:
         if cir.radio is RadioType.UNKNOWN:
             # The protocols of boards and local radios are those of the DW1000.
             cir = replace(cir, radio=RadioType.DW1000, segment=Segment.IPATOV)
-        self._publish([replace(measurement, cir=cir, frame_id=self._frame_id)])
+        measurement = replace(measurement, cir=cir, frame_id=self._frame_id)
+        if self._bag is not None:
+            self._record(Record(measurement))
+        self._publish([measurement])
 
     def publish_correction(self, correction: Correction) -> None:
         """Publish a range that a board has corrected."""
@@ -92,6 +101,8 @@ class RangePublisher:
             frame_id = record.measurement.frame_id or self._frame_id
             measurement = replace(record.measurement, stamp_ns=stamp_ns, frame_id=frame_id)
             measurements.append(measurement)
+            if self._bag is not None:
+                self._record(replace(record, measurement=measurement))
             if record.truth is not None:
                 self._truths.publish(encode_truth(measurement, record.truth))
             if record.tag_position is not None:
@@ -111,6 +122,37 @@ class RangePublisher:
         self._ranges.wait_for_all_acked(timeout)
         if self._consumer is not None:
             self._consumer.wait_for_all_acked(timeout)
+
+    def _open_bag(self) -> BagWriter:
+        # Import here: other drivers need no writer of bags.
+        from uwb_mitigation.recordings.bag.writer import BagWriter
+
+        path, source = Path(self._node.value("record")).expanduser(), self._node.value("source")
+        if os.path.lexists(path):
+            raise ParameterError(f"parameter record = {path}: the file exists", valid="another path")
+        origin = {"source": f"driver, source {source}"}
+        if source == "simulated":
+            origin["simulated"] = "true"
+        self._node.destroy_at_close(self, RangePublisher._complete_bag)
+        return BagWriter(path, origin)
+
+    def _complete_bag(self) -> None:
+        bag, self._bag = self._bag, None
+        if bag is None:
+            return
+        try:
+            bag.__exit__(None, None, None)
+        except RecordingError as error:
+            self._node.get_logger().error(f"the recording is lost: {error}")
+
+    def _record(self, record: Record) -> None:
+        """Write a range to the bag; an error, such as a full disk, is logged and ends the recording."""
+        assert self._bag is not None
+        try:
+            self._bag.write(record)
+        except RecordingError as error:
+            self._bag = None
+            self._node.get_logger().error(f"the recording has ended: {error}")
 
     def _publish(self, measurements: Sequence[RangeMeasurement]) -> None:
         if self._consumer is not None:

@@ -182,6 +182,8 @@ DRIVER = (
     Parameter("radio.tags", "", "Addresses of the tags of an anchor, separated by commas; empty: 1 (uci).",
               live=True, or_number=True, or_array=True),
     Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced. Empty: none (uci)."),
+    Parameter("record", "", "MCAP bag to which the raw ranges are written, completed when the node ends or is cleaned up; an "
+              "existing file is refused. Empty: none."),
     Parameter("radio.reset", "", "Reset line of the chip, such as gpiochip0:25; empty: not connected (spi)."),
     Parameter("frame_id", "uwb_antenna", "Frame id of the receiving antenna, if the source contains none."),
     _SENSOR_RANGES,
