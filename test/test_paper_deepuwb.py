@@ -28,6 +28,7 @@ from benchmarks.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
 from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.training.data import deepuwb
 from uwb_mitigation.training.data.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, DeepUwbRecording
 from uwb_mitigation.types.measurement import Encoding, Record
 
@@ -90,7 +91,7 @@ def test_every_kind_of_frame_is_read(tmp_path: Path, writing: Callable[[pd.DataF
     assert np.allclose(amplitudes_of(records), np.stack(list(data["CIR"])), atol=2e-5)
     errors = [record.measurement.range_m - NOMINAL_RANGE_M for record in records]
     assert np.allclose(errors, data["Error"], rtol=1e-6)
-    names = [rooms.configuration_of(*row) for row in zip(data["Room"], data["Obstacles"], strict=True)]
+    names = [deepuwb.configuration_of(*row) for row in zip(data["Room"], data["Obstacles"], strict=True)]
     assert [record.truth.configuration for record in records if record.truth] == names
 
 
@@ -201,7 +202,7 @@ def test_other_files_are_rejected_by_name(tmp_path: Path, content: bytes) -> Non
 
 
 def test_splits_have_the_published_sizes() -> None:
-    names = np.repeat([rooms.configuration_of(room, OBSTACLES[0]) for room in range(5)], rooms.ROOM_ROWS)
+    names = np.repeat([deepuwb.configuration_of(room, OBSTACLES[0]) for room in range(5)], rooms.ROOM_ROWS)
     for split, sizes in (("paper", (36_023, 13_210)), ("all_but_room_2", (41_948, 13_210))):
         name, rows = experiment_data.split_by_name(names, split)
         assert (name, len(rows.train), len(rows.test)) == (split, *sizes)
@@ -237,8 +238,8 @@ def room(record: Record) -> int:
 
 
 def test_simulated_rooms_and_obstacles_are_those_of_deepuwb(simulated: list[Record]) -> None:
-    assert tuple(one.name for one in SIMULATED_ROOMS) == rooms.ROOMS
-    assert tuple(one.name for one in SIMULATED_OBSTACLES) == rooms.MATERIALS
+    assert tuple(one.name for one in SIMULATED_ROOMS) == deepuwb.ROOMS
+    assert tuple(one.name for one in SIMULATED_OBSTACLES) == deepuwb.MATERIALS
     assert SimulatedDeepUwb().rows == rooms.ROOM_ROWS
     counted = np.bincount([room(record) for record in simulated])
     assert counted.tolist() == list(SimulatedDeepUwb(ranges=900).rows)
