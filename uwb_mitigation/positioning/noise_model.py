@@ -33,7 +33,7 @@ class NoiseModel:
         offset_sd: of the common offset of a tag's ranges, m. 0.15: without calibration of its antenna delay, a radio changes
             ranges by 0.30 m at three sigma (Decawave APS014), and a pair has two radios.
         pair_sd: of the additional offset of each anchor, m; the live filter does not use it.
-        smoother_white: as `white`, for the batch smoother. On simulated drives its errors are 3 to 28 % smaller than with
+        smoother_white: as `white`, for the batch smoother. On simulated drives its errors are 3 to 14 % smaller than with
             `white`, which suits the filter.
         long, short: thresholds of the normalised residual of a range that is too long or too short, from which its weight
             decreases. Obstacles lengthen ranges only, so `long` is the smaller one.
