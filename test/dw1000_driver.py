@@ -1,7 +1,4 @@
-"""A simple DW1000 driver in Python, written from the user manual, for tests of the chip model.
-
-It can omit the steps that drivers often forget.
-"""
+"""A simple DW1000 driver in Python, written from the user manual, for tests of the chip model."""
 
 from __future__ import annotations
 
@@ -15,10 +12,8 @@ WRAP = 1 << 40
 TICK_S = 1 / (128 * 499.2e6)
 TICK_M = 299_792_458 * TICK_S
 
-TXSTRT, TXDLYS, TRXOFF, WAIT4RESP, RXENAB = 2, 4, 0x40, 0x80, 0x100
-CPLOCK, TXFRB, TXPRS, TXPHS, TXFRS = (1 << bit for bit in (1, 4, 5, 6, 7))
-RXPRD, RXSFDD, LDEDONE, RXPHD, RXPHE, RXDFR, RXFCG, RXFCE = (1 << bit for bit in range(8, 16))
-RXRFSL, RXRFTO, LDEERR, RXSFDTO, HPDWARN, TXPUTE = (1 << bit for bit in (16, 17, 18, 26, 27, 34))
+TXSTRT, TXDLYS, WAIT4RESP, RXENAB = 2, 4, 0x80, 0x100
+CPLOCK, RXPHE, RXFCG, RXRFTO = (1 << bit for bit in (1, 12, 14, 17))
 
 _CODE = 9
 
@@ -62,16 +57,15 @@ class Driver:
     def command(self, bits: int) -> None:
         self.set(0x0D, 0, bits, 4)
 
-    def start(self, *, load_lde: bool = True) -> None:
-        """Reset and configure; `load_lde` is what a driver may forget."""
+    def start(self) -> None:
+        """Reset and configure."""
         self.hz = SLOW_HZ
         self.host.reset_pin()
         self.host.delay(5e-3)
         assert self.get(0x00) == 0xDECA0130
         self.set(0x36, 0, 0x0301, 2)
-        if load_lde:
-            self.set(0x2D, 6, 0x8000, 2)
-            self.host.delay(150e-6)
+        self.set(0x2D, 6, 0x8000, 2)
+        self.host.delay(150e-6)
         self.set(0x36, 0, 0x0200, 2)
         self.host.delay(1e-3)
         self.hz = FAST_HZ
@@ -88,34 +82,18 @@ class Driver:
         self.set(0x04, 0, 0x1200 | (3 if mode.long_frames else 0) << 16)
         self.fctrl = 2 << 13 | 0x8000 | 2 << 16 | 0x5 << 18
 
-    def load(self, data: bytes) -> None:
-        """Put a frame into the transmit buffer."""
+    def send(self, data: bytes) -> None:
+        """Send immediately, without waiting for the end."""
         self.write(0x09, 0, data)
         self.set(0x08, 0, self.fctrl | (len(data) + 2), 4)
-
-    def send(self, data: bytes, bits: int = 0) -> None:
-        """Send immediately, without waiting for the end."""
-        self.load(data)
-        self.command(TXSTRT | bits)
-
-    def send_at(self, data: bytes, when: int) -> None:
-        self.load(data)
-        self.set(0x0A, 0, when % WRAP, 5)
-        self.command(TXSTRT | TXDLYS)
+        self.command(TXSTRT)
 
     def listen(self) -> None:
         self.command(RXENAB)
 
-    def off(self) -> None:
-        self.command(TRXOFF)
-
     def reset_receiver(self) -> None:
         self.set(0x36, 3, 0xE0, 1)
         self.set(0x36, 3, 0xF0, 1)
-
-    @property
-    def time(self) -> int:
-        return self.get(0x06, 0, 5)
 
     @property
     def tx_stamp(self) -> int:
@@ -124,17 +102,6 @@ class Driver:
     @property
     def rx_stamp(self) -> int:
         return self.get(0x15, 0, 5)
-
-    def accumulator(self, first: int, samples: int, *, clocks: bool = True) -> bytes:
-        """Return octets of the accumulator without its dummy octet."""
-        low = self.get(0x36, 0, 2)
-        if clocks:
-            self.set(0x36, 0, 0x48 | (low & 0xB3), 1)
-            self.set(0x36, 1, 0x80 | low >> 8, 1)
-        data = self.read(0x25, 4 * first, 1 + 4 * samples)[1:]
-        self.set(0x36, 0, low & 0xB3, 1)
-        self.set(0x36, 1, low >> 8 & 0x7F, 1)
-        return data
 
 
 def pair(air: Air, channel: Pair | None = None) -> tuple[Driver, Driver, Chip, Chip]:
