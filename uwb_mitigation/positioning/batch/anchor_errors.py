@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.batch.first_positions import first_positions
 from uwb_mitigation.positioning.batch.joint_fit import (
     FAR_S,
     JointFit,
@@ -89,10 +89,6 @@ _NO_POSITION_LOSS = 6.0
 _DISPLACEMENT_SD_M = 2.0
 _STEPS = 6
 _MAX_RANGES = 1000
-
-FirstPositions = Callable[
-    [EstimatorConfig, Segments, NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.bool_]]
-]
 
 
 def detect_anchor_errors(
@@ -197,13 +193,12 @@ def check_height(fit: JointFit) -> None:
         )
 
 
-def check_anchor_positions(segments: Segments, fit: JointFit, first_positions: FirstPositions) -> None:
+def check_anchor_positions(segments: Segments, fit: JointFit) -> None:
     """Refuse ranges that other anchor positions explain much better.
 
     Args:
         segments: ranges of the solution.
         fit: solution with the positions of the file.
-        first_positions: as in `self_calibration`.
 
     Raises:
         DatasetError: names the anchors; or most ranges contradict the track.
@@ -216,8 +211,7 @@ def check_anchor_positions(segments: Segments, fit: JointFit, first_positions: F
     if misfit > MISFIT_SHARE:
         loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
         by_anchor = np.bincount(observations.anchor, loss * observations.independent)
-        suspects = np.argsort(by_anchor)[::-1][:MAX_SUSPECTS]
-        check_swapped(segments, fit.config, fit.prior, first_positions, fit.scale_m, suspects)
+        check_swapped(segments, fit.config, fit.prior, fit.scale_m, np.argsort(by_anchor)[::-1])
     if misfit > MAX_MISFIT_SHARE:
         raise DatasetError(
             f"{misfit:.0%} of the ranges contradict the estimated track by more than {MISFIT_M:g} m",
@@ -245,20 +239,65 @@ def check_swapped(
     segments: Segments,
     config: EstimatorConfig,
     prior: Regressors,
-    first_positions: FirstPositions,
     scale_m: NDArray[np.float64],
     suspects: NDArray[np.intp],
 ) -> None:
-    """Refuse two anchors of the rows `suspects` whose exchange explains the ranges much better.
+    """Refuse two anchors whose exchange explains the ranges much better.
+
+    Args:
+        segments: ranges.
+        config: anchors, noise model, height and area.
+        prior: parameters of the ranges.
+        scale_m: float64 (g,), of the residuals.
+        suspects: rows of anchors; the first `MAX_SUSPECTS` are examined, if they were received.
 
     Raises:
         DatasetError: names them.
     """
-    if (pair := _swapped(segments, config, prior, first_positions, scale_m, suspects)) is not None:
-        a, b = (config.anchors.anchors[row] for row in pair)
+    order = np.arange(len(config.anchors))
+    trial = _SwapTrial(segments, config, prior, scale_m)
+    limit = (1.0 - LARGER) * trial.loss(order) - MIN_MEAN_GAIN
+    best: tuple[int, int] | None = None
+    examined = np.intersect1d(suspects[:MAX_SUSPECTS], segments.ranges.anchor)
+    for a, b in itertools.combinations(examined.tolist(), 2):
+        swapped = order.copy()
+        swapped[[a, b]] = b, a
+        if (value := trial.loss(swapped)) < limit:
+            best, limit = (a, b), value
+    if best is not None:
+        first, second = (config.anchors.anchors[row] for row in best)
         raise DatasetError(
-            f"anchors {a} and {b} contradict the others: swapped, they explain the ranges", valid=_FIX
+            f"anchors {first} and {second} contradict the others: swapped, they explain the ranges",
+            valid=_FIX,
         )
+
+
+class _SwapTrial:
+    """The first ranges, to which the anchors are fitted in another order."""
+
+    def __init__(
+        self, segments: Segments, config: EstimatorConfig, prior: Regressors, scale_m: NDArray[np.float64]
+    ) -> None:
+        is_trial = np.arange(len(segments.ranges)) < _MAX_RANGES
+        self._segments, self._prior = segments.select_ranges(is_trial), prior.select_rows(is_trial)
+        self._config, self._scale_m = config, np.maximum(scale_m, 0.1)
+
+    def loss(self, order: NDArray[np.intp]) -> float:
+        """Return the mean loss of a range; a range without a position counts as an outlier."""
+        anchors, segments, prior = self._config.anchors, self._segments, self._prior
+        config = replace(self._config, anchors=anchors.moved(anchors.position[order], anchors.sd))
+        position, has_position = first_positions(config, segments, prior.rows @ prior.mean)
+        if not has_position.any():
+            return _NO_POSITION_LOSS
+        ranges_with_position = has_position[segments.segment]
+        prior = prior.select_rows(ranges_with_position)
+        observations = observations_of(segments.select(has_position), prior, config.model)
+        try:
+            refit = fit_joint(config, observations, prior, Start(position), self._scale_m)
+        except DatasetError:
+            return _NO_POSITION_LOSS
+        used = float(ranges_with_position.mean())
+        return used * refit.loss / float(observations.independent.sum()) + (1.0 - used) * _NO_POSITION_LOSS
 
 
 def _displaced(row: int, segments: Segments, fit: JointFit) -> tuple[float, float]:
@@ -297,51 +336,6 @@ def _displaced(row: int, segments: Segments, fit: JointFit) -> tuple[float, floa
     except DatasetError:
         return 0.0, 0.0
     return float(np.linalg.norm(displaced.position[row] - anchors.position[row])), gain
-
-
-def _swapped(
-    segments: Segments,
-    config: EstimatorConfig,
-    prior: Regressors,
-    first_positions: FirstPositions,
-    scale_m: NDArray[np.float64],
-    suspects: NDArray[np.intp],
-) -> tuple[int, int] | None:
-    """Return the pair of anchors that explains the ranges best if swapped; None: no pair is much better."""
-    is_trial = np.arange(len(segments.ranges)) < _MAX_RANGES
-    trial, columns = segments.select_ranges(is_trial), prior.select_rows(is_trial)
-    scale = np.maximum(scale_m, 0.1)
-
-    def loss(order: NDArray[np.intp]) -> float:
-        """Return the mean loss of a range; a range without a position counts as an outlier."""
-        anchors = config.anchors
-        swapped = replace(config, anchors=anchors.moved(anchors.position[order], anchors.sd))
-        position, has_position = first_positions(swapped, trial, columns.rows @ columns.mean)
-        if not has_position.any():
-            return _NO_POSITION_LOSS
-        ranges_with_position = has_position[trial.segment]
-        observations = observations_of(
-            trial.select(has_position), columns.select_rows(ranges_with_position), config.model
-        )
-        try:
-            refit = fit_joint(
-                swapped, observations, columns.select_rows(ranges_with_position), Start(position), scale
-            )
-        except DatasetError:
-            return _NO_POSITION_LOSS
-        used = float(ranges_with_position.mean())
-        return used * refit.loss / float(observations.independent.sum()) + (1.0 - used) * _NO_POSITION_LOSS
-
-    order = np.arange(len(config.anchors))
-    limit = (1.0 - LARGER) * loss(order) - MIN_MEAN_GAIN
-    best: tuple[int, int] | None = None
-    rows = np.intersect1d(trial.ranges.anchor, suspects)
-    for a, b in itertools.combinations(rows.tolist(), 2):
-        swapped = order.copy()
-        swapped[[a, b]] = b, a
-        if (value := loss(swapped)) < limit:
-            best, limit = (a, b), value
-    return best
 
 
 def position_scatter(fit: JointFit, correction_m: NDArray[np.float64]) -> float:

@@ -16,7 +16,6 @@ from scipy.stats import chi2
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.anchor_errors import (
-    MAX_SUSPECTS,
     check_anchor_positions,
     check_height,
     check_motion,
@@ -26,16 +25,19 @@ from uwb_mitigation.positioning.batch.anchor_errors import (
     mirrored,
     position_scatter,
 )
-from uwb_mitigation.positioning.batch.joint_fit import KNOT_S, SLOW_S, JointFit, Start, fit_segments
+from uwb_mitigation.positioning.batch.first_positions import (
+    START_SD_M,
+    first_positions,
+    likely_offset,
+    suspects,
+)
+from uwb_mitigation.positioning.batch.joint_fit import SLOW_S, JointFit, Start, fit_segments
 from uwb_mitigation.positioning.batch.motion_segments import Segments, find_segments
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
-from uwb_mitigation.positioning.online.initialization import CandidatePosition, candidate_positions
-from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.types.tracks import Ranges, Track
+from uwb_mitigation.types.tracks import Ranges
 
 MAX_COMMON_SD_M = 0.2
 """A common offset with a larger standard deviation is unknown: uncalibrated antenna delays differ by as much."""
@@ -66,17 +68,8 @@ MIN_SHARE = 0.5
 
 MIN_OWN_SD_M = 0.02
 
-OFFSETS_M = np.arange(-1.0, 2.01, 0.5)
-START_SD_M = 0.2
-WINDOW_S = 0.5
-MAX_WINDOWS = 12
-
 MIN_POSITION_SHARE = 0.5
 """If fewer ranges have a position, swapped anchors are examined."""
-
-NO_POSITION_LOSS = 50.0
-MIN_UNIT_LOSS = 5.0
-"""Loss of a moment from which other units are examined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -89,8 +82,8 @@ class SelfCalibration:
         level: `pair`, `anchor` or `one`: what has a separate offset.
         notes: messages about parameters that are not observable, and about ranges that were left out.
         tag_ids: of the tags.
-        unobserved_m: the estimate of a common offset that is not significant and therefore not subtracted; 0: it is.
-        own_sd_m: standard deviation of own offsets about the common one, for pairs that get the common one.
+        common_offset_m: size of a common offset that is not significant and therefore not subtracted; 0: it is.
+        individual_sd_m: standard deviation of own offsets about the common one, for pairs that get the common one.
         pseudo_m, pseudo_sd_m: float64 (r,), in the order of `segments.ranges`: the distance of each range's anchor from the
             track of the *other* anchors, and its standard deviation; NaN: unknown.
         position_scatter_m: `position_scatter` of raw ranges, and of calibrated ones on held-out parts; NaN: unknown.
@@ -266,8 +259,8 @@ class _Solver:
         used = float(has_position[self.segments.segment].mean())
         if used < MIN_POSITION_SHARE:
             scale_m = np.full(int(extra.noise_group.max(initial=0)) + 1, START_SD_M)
-            suspects = _suspects(config, self.segments, expected + offset)
-            check_swapped(self.segments, config, self.common, first_positions, scale_m, suspects)
+            rows = suspects(config, self.segments, expected + offset)
+            check_swapped(self.segments, config, self.common, scale_m, rows)
         if not has_position.any():
             raise DatasetError(
                 "no position of a tag can be determined",
@@ -354,7 +347,7 @@ class _Solver:
             columns = own_offset_columns(missing, OWN_SD_M, fit.prior.noise_group)
             start = Start(fit.position, np.append(fit.parameters, np.zeros(len(missing))), is_close=True)
             fit = fit_segments(self.config, self.segments, fit.prior.concat(columns), start)
-        check_anchor_positions(self.segments, fit, first_positions)
+        check_anchor_positions(self.segments, fit)
         if has_constant_height:
             check_height(fit)
 
@@ -456,134 +449,6 @@ def with_own_offsets(
         return None, [], sd
     names = [name for name, is_observable in zip(members, observable, strict=True) if is_observable]
     return with_groups(names, sd), [name for name in members if name not in names], sd
-
-
-UNITS = {"feet": 0.3048, "millimetres": 1e-3, "centimetres": 1e-2}
-
-
-def likely_offset(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> float:
-    """Return the one of `OFFSETS_M` with which the ranges of a few moments agree best; 0 if no moment has enough ranges.
-
-    Args:
-        config: anchors, noise model, height and area.
-        segments: ranges, r in total.
-        expected_m: float64 (r,), also subtracted from the ranges.
-
-    Raises:
-        DatasetError: ranges and anchor positions fit each other only in another unit; names the unit.
-    """
-    moments = _moments(config, segments, expected_m)
-    if not moments:
-        return 0.0
-    loss = _moment_losses(config, moments)
-    per_moment = float(loss.min()) / len(moments)
-    if per_moment >= MIN_UNIT_LOSS:
-        for unit, metres in UNITS.items():
-            for factor, name in ((metres, "ranges"), (1.0 / metres, "anchor positions")):
-                scaled = [(row, value * factor) for row, value in moments]
-                if float(_moment_losses(config, scaled).min()) / len(moments) < 0.3 * per_moment:
-                    raise DatasetError(
-                        f"the ranges do not fit the anchor positions, but would if the {name} were in {unit}",
-                        valid="metres",
-                    )
-    return float(OFFSETS_M[int(np.argmin(loss))])
-
-
-_Moments = list[tuple[NDArray[np.intp], NDArray[np.float64]]]
-
-
-def _moments(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]) -> _Moments:
-    """Return anchors and median ranges of at most `MAX_WINDOWS` moments with redundant ranges."""
-    rng = np.random.default_rng(1)
-    moments = []
-    ranges = segments.ranges
-    window = (ranges.stamp_ns - ranges.stamp_ns[0]) // round(WINDOW_S * NS_PER_S)
-    key = np.where(
-        segments.is_stationary[segments.segment],
-        -1 - segments.segment,
-        window * len(segments) + segments.segment,
-    )
-    for group in rng.permutation(np.unique(key)).tolist():
-        row, value = _medians(ranges, np.flatnonzero(key == group), expected_m)
-        if len(row) > config.dims + 1:
-            moments.append((row, value))
-        if len(moments) == MAX_WINDOWS:
-            break
-    return moments
-
-
-def _suspects(
-    config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]
-) -> NDArray[np.intp]:
-    """Return the rows of the anchors with the largest residuals at a few moments."""
-    loss = np.zeros(len(config.anchors))
-    for row, value in _moments(config, segments, expected_m):
-        possible = _candidate_positions(config, row, value)
-        if possible:
-            distance = np.linalg.norm(config.anchors.position[row] - possible[0].position, axis=1)
-            loss[row] += config.model.loss((value - distance) / START_SD_M)
-        else:
-            loss[row] += NO_POSITION_LOSS / len(row)
-    received = np.unique(segments.ranges.anchor)
-    return received[np.argsort(-loss[received], kind="stable")][:MAX_SUSPECTS]
-
-
-def _moment_losses(config: EstimatorConfig, moments: _Moments) -> NDArray[np.float64]:
-    """Return the loss of all moments with each of `OFFSETS_M`."""
-    loss = np.zeros(len(OFFSETS_M))
-    for row, value in moments:
-        for k, offset in enumerate(OFFSETS_M.tolist()):
-            possible = _candidate_positions(config, row, value - offset)
-            loss[k] += possible[0].loss if possible else NO_POSITION_LOSS
-    return loss
-
-
-def first_positions(
-    config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return initial positions float64 (K, 3) at the knots of the segments that have any; which these are, bool (s,)."""
-    position: list[NDArray[np.float64]] = []
-    has_position = np.zeros(len(segments), np.bool_)
-    edges = np.searchsorted(segments.segment, np.arange(len(segments) + 1))
-    for number in range(len(segments)):
-        rows = np.arange(edges[number], edges[number + 1])
-        if segments.is_stationary[number]:
-            row, value = _medians(segments.ranges, rows, expected_m)
-            possible = _candidate_positions(config, row, value) if len(row) > config.dims else []
-            if possible:
-                position.append(possible[0].position[None])
-                has_position[number] = True
-            continue
-        ranges = segments.ranges.take(rows)
-        corrected = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[rows], 0.0))
-        track = live_track(config, corrected)
-        if len(track) >= 2:
-            position.append(_at_knots(track, ranges))
-            has_position[number] = True
-    return np.concatenate(position) if position else np.zeros((0, 3)), has_position
-
-
-def _candidate_positions(
-    config: EstimatorConfig, row: NDArray[np.intp], range_m: NDArray[np.float64]
-) -> list[CandidatePosition]:
-    where, sd = config.anchors.position[row], np.full(len(row), START_SD_M)
-    return candidate_positions(where, range_m, sd, config.model, height=config.height, area=config.area)
-
-
-def _at_knots(track: Track, ranges: Ranges) -> NDArray[np.float64]:
-    since = (ranges.stamp_ns - ranges.stamp_ns[0]) / NS_PER_S
-    knots = np.unique(np.rint(since / KNOT_S).astype(np.int64)) * KNOT_S
-    track_s = (track.stamp_ns - ranges.stamp_ns[0]) / NS_PER_S
-    return np.stack([np.interp(knots, track_s, axis) for axis in track.position.T], axis=1)
-
-
-def _medians(
-    ranges: Ranges, rows: NDArray[np.intp], expected_m: NDArray[np.float64]
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the anchors received in `rows`, and the median corrected range of each."""
-    value = ranges.range_m[rows] - expected_m[rows]
-    received = np.unique(ranges.anchor[rows])
-    return received, np.array([np.median(value[ranges.anchor[rows] == row]) for row in received])
 
 
 def _with_ids(name: str, anchors: AnchorMap, tags: Sequence[Ranges]) -> str:
