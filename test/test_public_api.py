@@ -35,7 +35,7 @@ EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with `drive.mcap`, `site.mcap` and `anchors.yaml`."""
     path = tmp_path_factory.mktemp("drive")
-    for name, count in (("drive", 400), ("site", 3000)):
+    for name, count in (("drive", 400), ("site", 2000)):
         with BagWriter(path / f"{name}.mcap", {"simulated": "true"}) as bag:
             for record in SimulatedSource(seed=1, count=count):
                 bag.write(record)
