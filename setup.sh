@@ -29,8 +29,13 @@ for tool in cmake make gcc g++; do command -v $tool >/dev/null || missing+=($too
 [ ${#missing[@]} = 0 ] || fail "missing tools. Install them with: sudo apt-get install ${missing[*]}"
 
 # An environment does not work after its checkout was moved, and not with another Python.
+first=
 origin="$PWD $("$python" -c 'import os, sys; print(os.path.realpath(sys._base_executable), sys.version)') $site"
 if [ "$(cat .venv/origin 2>/dev/null)" != "$origin" ]; then
+  first=yes
+  size=0.8
+  if [ "$goal" = develop ]; then size=2.1; fi
+  echo "setup: this takes a few minutes and $size GB in .venv"
   step environment
   rm -rf .venv
   "$python" -m venv $site .venv
@@ -86,4 +91,9 @@ if [ "$(cat .venv/compiled 2>/dev/null)" != "$installed" ]; then
   .venv/bin/python -m compileall -q -j 0 -x '/(torch|sympy|networkx|sklearn|matplotlib|pyarrow|dask|distributed|selenium)/' .venv/lib uwb_mitigation \
     >/dev/null || true  # templates do not compile
   echo "$installed" > .venv/compiled
+fi
+
+if [ -n "$first" ] && [ "$goal" != docs ]; then
+  echo "setup: done. Commands and nodes are in .venv/bin: try .venv/bin/uwb-mitigation --help, or make demo"
+  if [ -z "$site" ]; then echo "setup: ROS wheels have no ros2 command, launch or ros2 bag: see docs/guides/installation.md"; fi
 fi

@@ -194,6 +194,14 @@ def test_invalid_options_are_refused(options: tuple[str, str]):
     assert result.exception is not None
 
 
+def test_earlier_report_is_not_replaced(tmp_path: Path):
+    path = tmp_path / "report.zip"
+    path.touch()
+    command = ["field-report", "--source", "uci", "--port", "/dev/a", "--distance", "3", "-o", str(path)]
+    assert "the file exists" in str(CliRunner().invoke(cli.app, command).exception)
+    assert "is not there" in str(CliRunner().invoke(cli.app, [*command, "--force"]).exception)
+
+
 RANGE = RangeMeasurement(0, 1, 2, 0, 0, 3.0, Cir(np.tile(np.int16([3, -3]), 20), first_path_index=5.0))
 
 

@@ -44,6 +44,7 @@ def field_report(
     unplug: Annotated[
         bool, typer.Option("--unplug/--no-unplug", help="Test unplugging and reconnecting the first port.")
     ] = True,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE.zip if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Test a pair of radios at a known distance and write a report.
@@ -62,6 +63,8 @@ def field_report(
         raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")
     if output.suffix != ".zip" or output.is_dir() or not output.absolute().parent.is_dir():
         raise ParameterError(f"-o {output}", valid="a file .zip in a folder that exists")
+    if output.exists() and not force:
+        raise ParameterError("the file exists", where=str(output), valid="another path, or --force")
     ports = [name.strip() for name in port.split(",") if name.strip()]
     observation = Observation(distance, seconds)
     with tempfile.TemporaryDirectory() as name:

@@ -156,6 +156,7 @@ def quantise(
     percentile: Annotated[
         float, typer.Option(help="Percentile of each activation that is quantised to 255; 100: the maximum.")
     ] = 100.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Quantise a float bundle to int8.
@@ -168,7 +169,7 @@ def quantise(
 
     source = load_bundle(model)
     quantisation.check(source, percentile)
-    check_output(output)
+    check_output(output, force)
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
     console.show_skipped(dataset.skipped)
