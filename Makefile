@@ -82,3 +82,4 @@ lock: setup  ## resolve requirements/*.in again: for ROS wheels, and for a syste
 
 clean:  ## remove .venv and all generated files
 	rm -rf $(VENV) build install log .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage* docs/reference
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

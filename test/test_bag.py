@@ -24,7 +24,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
@@ -146,7 +146,7 @@ def test_files_equal_those_of_the_mcap_library() -> None:
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])
 def test_existing_bag_is_kept_without_force(tmp_path: Path, name: str) -> None:
     path = write_bag(tmp_path / name, 5)
-    with pytest.raises(RecordingError, match="--force"):
+    with pytest.raises(ParameterError, match="--force"):
         write_bag(path, 2)
     assert BagReader(path).message_count == 15
     write_bag(path, 2, force=True)

@@ -281,7 +281,7 @@ def test_command_simulates_a_bag_that_can_be_played(tmp_path: Path) -> None:
     assert recording.simulated
     assert stamps[0] > 1_700_000_000 * 10**9
     assert max(np.diff(stamps)) <= 5 * 10**9
-    assert run(*words, folder=tmp_path).returncode == 1  # without --force
+    assert run(*words, folder=tmp_path).returncode == 2  # without --force
     assert run("paper", "simulate", "--ranges", "7", "-o", "x.mcap", folder=tmp_path).returncode == 2
     assert not (tmp_path / "x.mcap").exists()
 

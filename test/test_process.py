@@ -196,7 +196,7 @@ def test_existing_output_is_kept_without_force(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(4))
     output = write_bag(tmp_path / "out.mcap", exchanges(1))
     refused = run("process", source, "-o", output, folder=tmp_path)
-    assert refused.returncode == 1
+    assert refused.returncode == 2
     assert "--force" in refused.stderr
     assert len(refused.stderr.splitlines()) == 1
     assert corrected_of(output) == []

@@ -108,8 +108,9 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
     """Process one bag. If the input is damaged, the output ends there and the outcome contains the error.
 
     Raises:
-        RecordingError: the input is not a bag of this package or has no raw ranges, or the output exists
-            or cannot be written. A partial output is removed.
+        RecordingError: the input is not a bag of this package or has no raw ranges, or the output cannot be written. A
+            partial output is removed.
+        ParameterError: the output exists, or its folder does not.
         ModelError: the model cannot be used.
     """
     mitigation = Mitigation(load_bundle(job.model), job.offsets)

@@ -19,7 +19,7 @@ from typing import BinaryIO
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 import uwb_mitigation
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.files import partial_path, write_atomically
 from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import Channel, Schema
@@ -67,17 +67,17 @@ def check_bag_output(path: Path, *, force: bool = False) -> None:
     """Check that a bag can be created at `path`.
 
     Raises:
-        RecordingError: the bag exists and `force` is not given, or its folder does not exist.
+        ParameterError: the bag exists and `force` is not given, or its folder does not exist.
     """
     is_file, folder = path.suffix == ".mcap", path.absolute().parent
     if is_file and not folder.is_dir():
-        raise RecordingError("the folder of the output does not exist", where=str(path), valid=str(folder))
+        raise ParameterError("the folder of the output does not exist", where=str(path), valid=str(folder))
     if not is_file and path.exists() and not path.is_dir():
-        raise RecordingError("a file instead of a bag folder", where=str(path))
+        raise ParameterError("a file instead of a bag folder", where=str(path))
     # Without `force`, a broken link is not replaced either.
     occupied = os.path.lexists(_bag_file(path)) or (not is_file and path.is_dir() and any(path.iterdir()))
     if occupied and not force:
-        raise RecordingError("exists already", where=str(path), valid="--force replaces it")
+        raise ParameterError("exists already", where=str(path), valid="--force replaces it")
 
 
 class BagWriter:
@@ -93,7 +93,8 @@ class BagWriter:
         file: the MCAP file.
 
     Raises:
-        RecordingError: the bag exists and `force` is not given, or the path cannot be written.
+        ParameterError: as `check_bag_output`.
+        RecordingError: the path cannot be written.
     """
 
     def __init__(self, path: Path, metadata: Mapping[str, str], *, force: bool = False) -> None:
