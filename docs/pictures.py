@@ -155,6 +155,8 @@ def main() -> None:
             browser.wait("the page", browser.ready)
             # CIRs come only while a page is open.
             time.sleep(FILLED_S)
+            browser.click("button", "Fit")
+            time.sleep(1.0)
             save(browser, "viewer")
             browser.resize(400, 1250)
             time.sleep(2.0)

@@ -19,7 +19,9 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
 from benchmarks.equipment.page_clients import PageClients
+from uwb_mitigation.nodes import markers
 from uwb_mitigation.nodes.support import endpoints
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 
 pytestmark = pytest.mark.ros
 
@@ -32,47 +34,14 @@ def address(viewer: ros_harness.Process) -> str:
     return found[1]
 
 
-def test_page_shows_published_messages(ros: ros_harness.Ros, browser: Browser, tmp_path: Path):
+def test_page_shows_published_messages_and_names_missing_nodes(ros: ros_harness.Ros, browser: Browser):
     published = ros.collect(RangeCorrected, "/uwb/range_corrected")
-    ros.start("mitigator")
-    ros.start("driver", "source:=simulated", "simulated_rate:=40.0")
-    ros.spin_until(lambda: len({message.anchor_id for message in published}) >= 2)
-    ids = sorted({message.anchor_id for message in published})
-    anchors = tmp_path / "anchors.yaml"
-    anchors.write_text(
-        "anchors:\n" + "".join(f"  - {{id: {i}, x: {n}.0, y: 0.5, z: 2.0}}\n" for n, i in enumerate(ids))
-    )
-    ros.start("locator", f"anchors:={anchors}")
+    anchors_out = ros.node.create_publisher(MarkerArray, "/uwb/anchors", endpoints.LATCHED)
     viewer = ros.start("viewer", "port:=0")
     url = address(viewer)
-    assert ros.node.count_subscribers("/uwb/range_raw") == 1, (
-        "CIRs are for the mitigator, while no page is open"
+    assert ros.node.count_subscribers("/uwb/range_raw") == 0, (
+        "CIRs are not for the viewer while no page is open"
     )
-    browser.open(url)
-
-    def seen() -> bool:
-        ros.spin_for(0.05)
-        shown = browser.column("pairs", "corrected")
-        values = {round(message.range, 6) for message in published}
-        return bool(shown) and all(round(value, 6) in values for value in shown)
-
-    browser.wait("ranges as published", seen)
-    browser.wait(
-        "the locator's anchors by their ids", lambda: sorted(map(int, browser.column("map", "id"))) == ids
-    )
-    browser.wait("a CIR", lambda: len(browser.column("cir", "magnitude")) > 100)
-    browser.wait("diagnostics", lambda: "mitigator: ranges" in browser.text())
-    assert browser.run("return document.title").startswith("UWB ranges")
-    browser.run("window.before = true")
-    viewer.signal(signal.SIGKILL)
-    ros.start("viewer", f"port:={url.rsplit(':')[-1].strip('/')}")
-    browser.wait("the page to come back by itself", lambda: not browser.run("return window.before ?? false"))
-    browser.wait("ranges of the new one", lambda: len(browser.column("pairs", "corrected")) >= 2)
-
-
-def test_killed_nodes_become_stale_and_missing_nodes_are_named(ros: ros_harness.Ros, browser: Browser):
-    viewer = ros.start("viewer", "port:=0")
-    url = address(viewer)
     browser.open(url)
     browser.wait("the page", browser.ready)
 
@@ -84,8 +53,21 @@ def test_killed_nodes_become_stale_and_missing_nodes_are_named(ros: ros_harness.
     driver = ros.start("driver", "source:=simulated", "simulated_rate:=40.0")
     browser.wait("what else to start", lambda: shown("Start the mitigator"))
     mitigator = ros.start("mitigator")
-    browser.wait("ranges", lambda: len(browser.column("pairs", "status")) >= 2)
+
+    def shows_published_ranges() -> bool:
+        ros.spin_for(0.05)
+        values = {round(message.range, 6) for message in published}
+        column = browser.column("pairs", "corrected")
+        return len(column) >= 2 and all(round(value, 6) in values for value in column)
+
+    browser.wait("ranges as published", shows_published_ranges)
+    ids = sorted({message.anchor_id for message in published})
+    anchors = AnchorMap([Anchor(identity, (float(x), 0.5, 2.0)) for x, identity in enumerate(ids)])
+    anchors_out.publish(MarkerArray(markers=markers.anchor_markers(anchors, "map", 0)))
+    browser.wait("the anchors", lambda: sorted(map(int, browser.column("map", "id"))) == ids)
+    browser.wait("a CIR", lambda: len(browser.column("cir", "magnitude")) > 100)
     browser.wait("diagnostics", lambda: shown("mitigator: ranges"))
+    assert browser.run("return document.title").startswith("UWB ranges")
     for node in (driver, mitigator):
         node.signal(signal.SIGKILL)
     browser.wait(

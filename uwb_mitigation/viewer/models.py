@@ -74,7 +74,7 @@ FIGURES = {
     "map": "Map",
     "strip": f"Range, last {HISTORY_S:.0f} s",
     "timeline": "Error over time",
-    "cir": "Last channel impulse response (CIR)",
+    "cir": "Last CIR",
     "waterfall": f"Last {WATERFALL} CIRs",
     "errors": "Error histogram",
 }
