@@ -17,6 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bag_material import START_NS, STEP_NS, corrected, record, write_bag, write_corrected
+from bokeh.document import Document
 from browser import Browser
 from command_line import run
 from drives import HALL, drive
@@ -42,7 +43,7 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_RAW,
 )
 from uwb_mitigation.types.tracks import Estimate
-from uwb_mitigation.viewer import playback
+from uwb_mitigation.viewer import page, playback
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, current_card, interval_cards
 from uwb_mitigation.viewer.playback import BagPlayer
@@ -284,7 +285,7 @@ def test_several_namespaces_need_a_choice(tmp_path: Path):
     assert scene.ranges == 4
 
 
-def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
+def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     bag = tmp_path / "flat.mcap"
     done = run("data", "simulate", "--like", "drive", "--ranges", "400", "-o", bag, folder=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -301,6 +302,15 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path):
     assert float(corrected.split()[0]) < 0.8 * float(re.search(r"raw \+ same filter: (\S+) m", references)[1])
     assert cards["Position error, now"][0] != "-"
     assert sum(entry[1] for entry in timeline.heat.values()) == len(timeline.time_s)
+    counted: list[str] = []
+    monkeypatch.setattr(page, "interval_cards", lambda *arguments: counted.append(arguments[3]) or [])
+    document = Document()
+    opened = page.Page(document, page.View(scene, threading.Lock(), player=player))
+    for position_s in (5.0, 8.0):
+        player.seek(position_s)
+        opened._table_due_s = 0.0
+        opened.draw()
+    assert counted == [WHOLE], "a seek in a long recording must not compute its figures again"
     largest = timeline.largest_error()
     assert player.jump(largest) == timeline.pair(largest)
     assert timeline.deviation_m[largest] == np.nanmax(timeline.deviation_m)

@@ -73,7 +73,7 @@ COLUMNS = {
 FIGURES = {
     "map": "Map",
     "strip": f"Range, last {HISTORY_S:.0f} s",
-    "timeline": "Error over time",
+    "timeline": f"Error over time, {WHOLE}",
     "cir": "Last CIR",
     "waterfall": f"Last {WATERFALL} CIRs",
     "errors": "Error histogram",

@@ -629,11 +629,13 @@ def _no_data(scene: Scene, history: History) -> str:
 def _anchor_rows(anchors: dict[int, health.Means]) -> list[list[str]]:
     """Return the texts of the table of anchors; advice for all of them is in the first row."""
     common, advice = health.advice(anchors)
-    rows = [[health.BAD, "all", "", "", "", "", common]] if common else []
+    states = {anchor_id: health.state(means) for anchor_id, means in anchors.items()}
+    worst = health.BAD if health.BAD in states.values() else health.CHECK
+    rows = [[worst, "all", "", "", "", "", common]] if common else []
     for anchor_id, means in anchors.items():
         digits = {"rate": 1, "nlos": 0, "residual": 2, "lost": 0}
         texts = [f"{means[name]:.{count}f}".replace("nan", "-") for name, count in digits.items()]
-        rows.append([health.state(means), format_id(anchor_id), *texts, advice[anchor_id]])
+        rows.append([states[anchor_id], format_id(anchor_id), *texts, advice[anchor_id]])
     return rows
 
 
