@@ -34,7 +34,7 @@ TAG_POSITIONS = ((6.5, 3.1), (6.501, 3.1), (6.5, 3.101))
 RADIO_PARAMETERS = ("radio.channel:=2", "radio.preamble:=1024")
 """Radio settings of the simulator."""
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 180.0
 """Timeout until each anchor has ranged once, on a busy computer."""
 
 

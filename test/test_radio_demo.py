@@ -18,7 +18,7 @@ pytestmark = [
 
 def test_each_anchor_ranges_and_the_demo_succeeds():
     command = [sys.executable, "-m", "benchmarks", "radio-demo", "--seconds", "1"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
     assert result.stdout.endswith("┘\n")
     rows = [line.strip("│ ").split("│") for line in result.stdout.splitlines() if line.startswith("│")]
