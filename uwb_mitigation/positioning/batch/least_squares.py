@@ -22,11 +22,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_matrix
 
 from uwb_mitigation.errors import DatasetError
 
 _DIVERGED = 1e6
-_ROWS = 8192
+_MAX_PRODUCTS = 200_000
+"""Up to this number of products of two derivatives, sums with NumPy are faster than products of sparse matrices."""
 
 
 @contextmanager
@@ -69,11 +71,12 @@ class RowPattern:
 
     Attributes:
         columns: int (n, c).
-        index: int (n, c (c + 1) / 2), element of the normal equations for each pair of columns, in the order of `_pairs`.
+        index: int (n, c (c + 1) / 2), element of the normal equations for each pair of columns, in the order of `_pairs`; None:
+            there are too many.
     """
 
     columns: NDArray[np.intp]
-    index: NDArray[np.intp]
+    index: NDArray[np.intp] | None
 
 
 class LeastSquares:
@@ -109,8 +112,11 @@ class LeastSquares:
 
     def pattern(self, columns: NDArray[np.intp]) -> RowPattern:
         """Return the pattern of rows that depend on the unknowns at columns (n, c), which differ within a row."""
-        n, columns = self.knots * self.unknowns, np.atleast_2d(columns)
+        columns = np.atleast_2d(columns)
+        n = self.knots * self.unknowns
         first, second = _pairs(columns.shape[1])
+        if len(columns) * len(first) > _MAX_PRODUCTS:
+            return RowPattern(columns, None)
         high = np.maximum(columns[:, first], columns[:, second])
         low = np.minimum(columns[:, first], columns[:, second])
         beside = 2 * self.unknowns * n + low * self.shared + high - n
@@ -130,13 +136,36 @@ class LeastSquares:
         weighted = values * np.broadcast_to(weight, n)[:, None]
         right = weighted * np.broadcast_to(target, n)[:, None]
         self._right += np.bincount(pattern.columns.reshape(-1), right.reshape(-1), len(self._right))
+        if pattern.index is None:
+            self._add_sparse(pattern.columns, values, weighted)
+            return
         first, second = _pairs(width)
-        # The products of all rows of a long recording need too much memory.
-        for start in range(0, n, _ROWS):
-            rows = slice(start, start + _ROWS)
-            product = weighted[rows][:, first] * values[rows][:, second]
-            index = pattern.index[rows].reshape(-1)
-            self._normal += np.bincount(index, product.reshape(-1), len(self._normal))
+        product = weighted[:, first] * values[:, second]
+        self._normal += np.bincount(pattern.index.reshape(-1), product.reshape(-1), len(self._normal))
+
+    def _add_sparse(
+        self, columns: NDArray[np.intp], values: NDArray[np.float64], weighted: NDArray[np.float64]
+    ) -> None:
+        """Add the products of many or wide rows: sparse matrices need less memory and time for these."""
+        (rows, width), n, size = columns.shape, self.knots * self.unknowns, len(self._right)
+        starts = np.arange(0, rows * width + 1, width)
+        jacobian, weighted_jacobian = (
+            csr_matrix((factor.reshape(-1), columns.reshape(-1), starts), shape=(rows, size))
+            for factor in (values, weighted)
+        )
+        normal = (weighted_jacobian.T @ jacobian).tocsc()
+        band, border = self._parts()
+        knots = normal[:n, :n]
+        for below in range(min(2 * self.unknowns, n)):
+            band[below, : n - below] += knots.diagonal(-below)
+        border[:n] += normal[:n, n:].toarray()
+        border[n:] += np.triu(normal[n:, n:].toarray())
+
+    def _parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return views of the diagonals of A, and of C above the upper triangle of G."""
+        n = self.knots * self.unknowns
+        band, border = np.split(self._normal, [2 * self.unknowns * n])
+        return band.reshape(2 * self.unknowns, n), border.reshape(n + self.shared, self.shared)
 
     def add_prior(
         self,
@@ -173,8 +202,8 @@ class LeastSquares:
             numpy.linalg.LinAlgError: the rows do not determine it.
         """
         n, b, q = self.knots * self.unknowns, self.unknowns, self.shared
-        band = self._normal[: 2 * b * n].reshape(2 * b, n)
-        border, corner = np.split(self._normal[2 * b * n :].reshape(n + q, q), [n])
+        band, beside = self._parts()
+        border, corner = np.split(beside, [n])
         factor = cholesky_banded(band, lower=True, check_finite=False)
         columns = np.column_stack([self._right[:n], border])
         solved = cho_solve_banded((factor, True), columns, overwrite_b=True, check_finite=False)
