@@ -163,6 +163,13 @@ class Browser:
         )
         return [dict(zip(rows[0], row, strict=True)) for row in rows[1:]]
 
+    def cards(self) -> dict[str, tuple[str, str]]:
+        """Return the large figures of the viewer, {title: (value, explanation)}."""
+        texts = self.run(
+            "return [...document.querySelectorAll('#cards div')].map((c) => [...c.children].map((e) => e.textContent))"
+        )
+        return {title: (value, explanation) for title, value, explanation in texts}
+
     def text(self) -> str:
         """Return the visible text of the page."""
         return self.run("return document.body.innerText")

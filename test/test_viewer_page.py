@@ -95,14 +95,6 @@ def fill_scene(view: View, upto_s: float = 5.0) -> None:
             scene.add_pose("tag", Pose(4 + math.sin(step / 20), 3, 1, (0.4, 0.2, 0.3), stamp_s=time_s))
 
 
-def cards(browser: Browser) -> dict[str, tuple[str, str]]:
-    """Return the large figures of the page, {title: (value, explanation)}."""
-    texts = browser.run(
-        "return [...document.querySelectorAll('#cards div')].map((c) => [...c.children].map((e) => e.textContent))"
-    )
-    return {title: (value, explanation) for title, value, explanation in texts}
-
-
 def empty_figures(browser: Browser) -> dict[str, str]:
     """Return the messages in figures without data, {figure: message}."""
     return browser.run(
@@ -128,7 +120,7 @@ def test_page_shows_the_scene_with_hostile_names_as_text(
     assert sum(browser.column("errors", "raw")) == 100
     assert len(browser.column("strip", "raw")) == 50
     assert browser.column("map", "corrected") == pytest.approx([math.sqrt(5.1**2 - 1), math.sqrt(5.3**2 - 1)])
-    assert cards(browser)["Mean absolute range error, since the start"] == ("0.250 m", "raw: 0.350 m")
+    assert browser.cards()["Mean absolute range error, since the start"] == ("0.250 m", "raw: 0.350 m")
     browser.wait("the hostile name as text", lambda: HOSTILE in browser.text())
     assert browser.run("return window.pwned ?? null") is None
     assert browser.console_messages() == []
@@ -157,7 +149,7 @@ def test_pairs_tags_and_nodes_without_data_are_grey(
     assert "no diagnostics for 12 s; last: 10.0 Hz" in browser.text()
     assert "damaged" in browser.text(), "it is not of a node"
     assert "No ranges for 12 s." in browser.text()
-    assert cards(browser)["Position error, now"] == ("-", "no position of tag 7 in the last 3 s")
+    assert browser.cards()["Position error, now"] == ("-", "no position of tag 7 in the last 3 s")
     browser.wait(
         "the state of the page", lambda: "NO RANGES" in browser.text() and "LIVE" not in browser.text()
     )
@@ -309,7 +301,7 @@ def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, 
         "  const {start, end} = Bokeh.documents[0].get_model_by_name(name)[range]; return [start, end]}))"
     )
     assert max(map(abs, ends)) < 100
-    assert cards(browser)["Mean absolute range error, since the start"][0] == "0.250 m"
+    assert browser.cards()["Mean absolute range error, since the start"][0] == "0.250 m"
 
 
 def drawn_column(document: Document, figure: str, column: str) -> np.ndarray:
@@ -354,6 +346,11 @@ def test_clocks_may_differ_and_jump_back() -> None:
     assert [pair for pair, _, _ in scene.latest()] == [(1, 7)], "a stamp of the future hides nothing for long"
     scene.add_sample((1, 7), Sample(1001.0, 5.3, 5.1, 0.1, Status.OK))
     assert len(scene.pairs[1, 7].samples) == 1, "a replay starts again"
+    scene = Scene()
+    for step in range(100):
+        for tag, clock_s in ((7, 1000.0), (8, 4600.0)):
+            scene.add_sample((1, tag), Sample(clock_s + step / 10, 5.3, 5.1, 0.1, Status.OK))
+    assert [len(scene.pairs[1, tag].samples) for tag in (7, 8)] == [100, 100]
 
 
 def fetch(server: ViewerServer, path: str = "", **headers: str) -> HTTPResponse:
@@ -717,7 +714,7 @@ def test_empty_page_has_axes_and_no_dark_blocks(browser: Browser, view: View, se
         "  const {start, end} = Bokeh.documents[0].get_model_by_name(name)[range]; return [start, end]}))"
     )
     assert all(end is not None and math.isfinite(end) for end in ends)
-    assert cards(browser) == {}
+    assert browser.cards() == {}
     none = "No CIRs: the source sends none, or no raw ranges are received."
     assert empty_figures(browser) == {
         "strip": "No range of this pair yet.", "cir": none, "waterfall": none, "errors": "No true ranges."

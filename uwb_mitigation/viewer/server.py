@@ -29,6 +29,12 @@ from uwb_mitigation.viewer.page import Page, View
 ALL_ADDRESSES = ("0.0.0.0", "::", "*")
 LOCAL_ADDRESSES = ("localhost", "127.0.0.1", "::1")
 
+_UNKNOWN_HOST = (
+    "The viewer does not accept this host name. Set the node's parameter origins, or the option --origins of "
+    "`uwb-mitigation view`, to HOST:PORT of this address.\n"
+)
+_WRONG_TOKEN = "Open the URL that the viewer has printed: it contains a token.\n"
+
 _NONCE, _COOKIE = "X-Nonce", "X-Set-Cookie"
 """Headers that pass the nonce and the cookie of a response; values from the client are replaced."""
 
@@ -150,9 +156,9 @@ class _Application(BokehTornado):  # type: ignore[misc]
         request.headers[_NONCE] = secrets.token_urlsafe(16)
         request.headers.pop(_COOKIE, None)
         if not check_allowlist(request.host.lower(), self._hosts):
-            return self.get_handler_delegate(request, _UnknownHost)
+            return self.get_handler_delegate(request, _Refusal, {"reason": _UNKNOWN_HOST})
         if self._token and not self._is_authorised(request):
-            return self.get_handler_delegate(request, _WrongToken)
+            return self.get_handler_delegate(request, _Refusal, {"reason": _WRONG_TOKEN})
         return super().find_handler(request, **kwargs)
 
     def _is_authorised(self, request: HTTPServerRequest) -> bool:
@@ -194,23 +200,15 @@ class _SecurityPolicy(OutputTransform):  # type: ignore[misc]
         return status_code, headers, chunk
 
 
-class _UnknownHost(RequestHandler):  # type: ignore[misc]
-    """Answers requests whose header Host is not accepted."""
+class _Refusal(RequestHandler):  # type: ignore[misc]
+    """Answers requests that are not accepted."""
+
+    def initialize(self, reason: str) -> None:
+        self._text = reason
 
     def prepare(self) -> None:
         self.set_status(403)
-        self.finish(
-            "The viewer does not accept this host name. Set the node's parameter origins, or the option --origins of "
-            "`uwb-mitigation view`, to HOST:PORT of this address.\n"
-        )
-
-
-class _WrongToken(RequestHandler):  # type: ignore[misc]
-    """Answers requests without the token."""
-
-    def prepare(self) -> None:
-        self.set_status(403)
-        self.finish("Open the URL that the viewer has printed: it contains a token.\n")
+        self.finish(self._text)
 
 
 def accepted_hosts(host: str, port: int, more: tuple[str, ...]) -> list[str]:
