@@ -154,14 +154,14 @@ class LeastSquares:
             for factor in (values, weighted)
         )
         normal = (weighted_jacobian.T @ jacobian).tocsc()
-        band, border = self._parts()
+        band, border = self._blocks()
         knots = normal[:n, :n]
         for below in range(min(2 * self.unknowns, n)):
             band[below, : n - below] += knots.diagonal(-below)
         border[:n] += normal[:n, n:].toarray()
         border[n:] += np.triu(normal[n:, n:].toarray())
 
-    def _parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _blocks(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return views of the diagonals of A, and of C above the upper triangle of G."""
         n = self.knots * self.unknowns
         band, border = np.split(self._normal, [2 * self.unknowns * n])
@@ -202,7 +202,7 @@ class LeastSquares:
             numpy.linalg.LinAlgError: the rows do not determine it.
         """
         n, b, q = self.knots * self.unknowns, self.unknowns, self.shared
-        band, beside = self._parts()
+        band, beside = self._blocks()
         border, corner = np.split(beside, [n])
         factor = cholesky_banded(band, lower=True, check_finite=False)
         columns = np.column_stack([self._right[:n], border])

@@ -209,19 +209,19 @@ def estimate_offset(
             level_dbm = measured.cir.first_path_power_dbm
             sample = offset_m, predicted_m, gap_db, level_dbm, is_los, result.status.name
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
-    if not groups:
-        if without_truth:
-            raise DatasetError(f"none of {without_truth} ranges has a true distance", valid="set --distance")
-        raise DatasetError("no ranges of this anchor and tag")
-    if distance_m is not None:
-        _check_one_pair(sorted({(tag, anchor) for tag, anchor, _ in groups}))
+    pairs = sorted({(tag, anchor) for tag, anchor, _ in groups})
+    _check_pairs(pairs, without_truth, has_one_distance=distance_m is not None)
     limit_m = MAX_EXCESS_M if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else MAX_ERROR_M
     placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
     return _combined(placements, mitigation.bundle.model_id, common, has_cirs)
 
 
-def _check_one_pair(pairs: list[tuple[int, int]]) -> None:
-    if len(pairs) > 1:
+def _check_pairs(pairs: list[tuple[int, int]], without_truth: int, *, has_one_distance: bool) -> None:
+    if not pairs:
+        if without_truth:
+            raise DatasetError(f"none of {without_truth} ranges has a true distance", valid="set --distance")
+        raise DatasetError("no ranges of this anchor and tag")
+    if has_one_distance and len(pairs) > 1:
         listed = ", ".join(f"anchor {format_id(anchor)} tag {format_id(tag)}" for tag, anchor in pairs[:5])
         raise ParameterError(
             f"one distance for {len(pairs)} pairs ({listed}{', ...' if len(pairs) > 5 else ''})",
