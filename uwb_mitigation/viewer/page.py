@@ -31,7 +31,6 @@ from uwb_mitigation.viewer.scene import (
     ERROR_EDGES_M,
     HISTORY_S,
     MAX_RANGE_M,
-    NO_DATA_INTERVALS,
     NO_DATA_S,
     SPEEDS,
     WATERFALL,
@@ -76,6 +75,8 @@ MAX_POINTS = 400
 
 RANGE_SD_M = 0.1
 """Standard deviation for the map of the predicted accuracy if the ranges have none."""
+
+_NO_CIRS = "No CIRs: the source sends none, or no raw ranges are received."
 
 _TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
 
@@ -482,16 +483,14 @@ class Page:
             "true": [_drawable(sample.true_m) for sample in samples],
             "second": self._second_ranges(samples),
         }
-        has_ranges = history is not None and history.latest is not None
         none = (
             f"No range of this pair in the last {HISTORY_S:.0f} s."
-            if has_ranges
+            if history_samples
             else "No range of this pair yet."
         )
         self._models.show_empty("strip", "" if np.isfinite(values["raw"]).any() else none)
-        rate_hz = 0.0 if history is None else finite_or_zero(history.rate_hz())
         table = _thin(np.array(list(values.values()), np.float64).reshape(len(values), -1).T, 3 * MAX_POINTS)
-        table = with_gaps(table, max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0.0 else 0.0))
+        table = with_gaps(table, NO_DATA_S if history is None else history.max_gap_s)
         self._models.strip.data = dict(zip(values, table.T.astype(np.float32), strict=True))
         bad = [
             {
@@ -515,11 +514,7 @@ class Page:
         models = self._models
         if not traces:
             has_cirs = any(history.traces for history in scene.pairs.values())
-            none = (
-                "No CIR of this pair yet."
-                if has_cirs
-                else "No CIRs: the source sends none, or no raw ranges are received."
-            )
+            none = "No CIR of this pair yet." if has_cirs else _NO_CIRS
         models.show_empty("cir", "" if traces else none)
         # Compare the newest trace instead of its stamp, because stamps may be equal.
         if not self._changed("traces", (self._selected, traces[-1] if traces else None)):
@@ -623,7 +618,7 @@ class Page:
 def _no_data(scene: Scene, history: History) -> str:
     """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
     age_s = scene.age_s(history)
-    return "" if history.has_data(age_s) else f"no data for {age_s:.0f} s"
+    return "" if age_s <= history.max_gap_s else f"no data for {age_s:.0f} s"
 
 
 def _anchor_rows(anchors: dict[int, health.Means]) -> list[list[str]]:

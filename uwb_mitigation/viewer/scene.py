@@ -223,10 +223,11 @@ class History:
         rate_hz = (len(recent) - 1) / span
         return rate_hz if age_s * rate_hz <= NO_DATA_INTERVALS else len(recent) / (span + age_s)
 
-    def has_data(self, age_s: float) -> bool:
-        """Return whether the last range is recent, relative to the mean interval of this pair."""
+    @property
+    def max_gap_s(self) -> float:
+        """Age of the last range from which the pair has no data, relative to its mean interval."""
         rate_hz = self.rate_hz()
-        return age_s <= max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0 else 0.0)
+        return max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0 else 0.0)
 
 
 @dataclass(frozen=True, slots=True)
