@@ -112,6 +112,8 @@ def survey_anchors(
     Raises:
         DatasetError: too few anchors, all on a line, or a tag that hardly moves; says which.
     """
+    # The standard deviations of the anchors must be honest: `smooth` enlarges its covariances, a survey does not.
+    config = replace(config, model=replace(config.model, smoother_white=config.model.white))
     guesses, used, needed = config.anchors, np.unique(ranges.anchor), config.dims + 1
     if len(used) < needed:
         raise DatasetError(f"{len(used)} anchors were received", valid=f"{needed} or more for a survey")
