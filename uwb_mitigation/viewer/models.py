@@ -214,7 +214,6 @@ class Models:
             plot.image_url(
                 url=[plan.url], x=plan.x, y=plan.y, w=plan.width, h=plan.height, angle=plan.yaw, anchor="bottom_left"
             )  # fmt: skip
-        walls = ColumnDataSource({name: [math.nan] * (plan is not None) for name in "xy"})
         self.heat_levels, self.accuracy_levels = (
             LinearColorMapper(palette, low=0.0, high=1.0, nan_color="#00000000")
             for palette in ("Viridis256", "Cividis256")
@@ -233,13 +232,26 @@ class Models:
                 "image", "x", "y", "dw", "dh", source=self.accuracy, color_mapper=self.accuracy_levels, alpha=0.6, visible=False
             ), bars[1],
         ]  # fmt: skip
+        items = defaultdict[str, list[Any]](list)
+        for name, glyph, source, style in self._map_layers(plan is not None):
+            items[name].append(getattr(plot, glyph)("x", style.pop("y", "y"), source=source, **style))
+        del items[""]
+        self.layers["circles"] = items["raw range"] + items["corrected range"]
+        self.layers["heat"] = [*items["mean correction"], bars[0]]
+        labels: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
+        self._legend = Legend(items=[LegendItem(label=labels[name], renderers=items[name]) for name in items])
+        return _with_legend(plot, self._legend, "below")
+
+    def _map_layers(self, has_plan: bool) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
+        """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
+        walls = ColumnDataSource({name: [math.nan] * has_plan for name in "xy"})
         tag = CategoricalColorMapper(factors=["OK"], palette=[BLUE], nan_color=GREY)
         on_request: dict[str, Any] = {"fill_color": None, "visible": False}
         label = {
             "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
             "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset",
         }  # fmt: skip
-        layers: list[tuple[str, str, ColumnDataSource, dict[str, Any]]] = [
+        return [
             ("wall", "scatter", walls, {"marker": "square", "size": 12, "color": GREY}),
             ("mean correction", "rect", self.heat, on_request | {
                 "width": CELL_M, "height": CELL_M, "line_color": None, "fill_alpha": 0.8,
@@ -271,15 +283,6 @@ class Models:
             }),
             ("", "text", self.labels, label),
         ]  # fmt: skip
-        items = defaultdict[str, list[Any]](list)
-        for name, glyph, source, style in layers:
-            items[name].append(getattr(plot, glyph)("x", style.pop("y", "y"), source=source, **style))
-        del items[""]
-        self.layers["circles"] = items["raw range"] + items["corrected range"]
-        self.layers["heat"] = [*items["mean correction"], bars[0]]
-        labels: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
-        self._legend = Legend(items=[LegendItem(label=labels[name], renderers=items[name]) for name in items])
-        return _with_legend(plot, self._legend, "below")
 
     def _strip(self) -> figure:
         plot = _figure(230, "time before now, s", "m", x_range=Range1d(-HISTORY_S, 0))
