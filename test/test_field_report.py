@@ -43,7 +43,7 @@ def report(tmp_path: Path) -> Report:
     def run(source: str, ports: int = 2, *options: str) -> dict[str, dict]:
         names = ",".join(str(tmp_path / f"{source}{number}") for number in range(ports))
         command = ["field-report", "--source", source, "--port", names, "--distance", "3.0", "--seconds", "3"]
-        files = ["-o", str(tmp_path / "out.zip"), "--json", str(tmp_path / "out.json")]
+        files = ["--force", "-o", str(tmp_path / "out.zip"), "--json", str(tmp_path / "out.json")]
         result = CliRunner().invoke(cli.app, [*command, *files, *(options or ("--no-unplug",))])
         checks = json.loads((tmp_path / "out.json").read_text())["checks"]
         by_name = {check["name"]: check for check in checks}
