@@ -26,6 +26,7 @@ from uwb_mitigation.errors import DamagedRecordingError, ParameterError
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import save_anchors
+from uwb_mitigation.types.measurement import is_logarithmic
 
 PAGE = REPOSITORY / "docs" / "guides" / "python.md"
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
@@ -123,12 +124,32 @@ def test_cir_that_is_not_finite_is_not_used(mitigation: Mitigation, records: lis
 
 
 @pytest.mark.parametrize(
-    "changes", [{"cir": [1.0, 2.0]}, {"range_m": [1.0, 2.0, 3.0]}, {"first_path_index": "x"}, {"tag_id": -1}]
+    ("changes", "excerpt"),
+    [
+        ({"cir": [1.0, 2.0]}, "cir[None]"),
+        ({"cir": [[1.0], [1.0, 2.0]]}, "different lengths"),
+        ({"cir": [["a"]]}, "real or complex numbers"),
+        ({"cir": np.resize([500, -3], (2, 400))}, "1j * q"),
+        ({"cir": np.linspace(40.0, 80.0, 400)[None]}, "10 ** (level / 20)"),
+        ({"range_m": [1.0, 2.0, 3.0]}, "range_m"),
+        ({"first_path_index": "x"}, "first_path_index"),
+        ({"tag_id": -1}, "tag_id"),
+        ({"preamble": 3}, "preamble_count"),
+    ],
 )
-def test_arrays_of_other_shapes_are_refused(mitigation: Mitigation, changes: dict):
+def test_wrong_arrays_are_refused_with_a_remedy(mitigation: Mitigation, changes: dict, excerpt: str):
     arguments = {"range_m": 1.0, "cir": np.ones((2, 200)), "first_path_index": 20.0} | changes
-    with pytest.raises(ParameterError, match=next(iter(changes))):
+    with pytest.raises(ParameterError, match=re.escape(excerpt)):
         mitigation.correct_arrays(**arguments)
+
+
+def test_magnitudes_in_db_are_detected_and_linear_ones_are_not(records: list[Record]):
+    for record in records:
+        magnitude = np.abs(samples(record.measurement))
+        assert not is_logarithmic(magnitude)
+        assert is_logarithmic(20.0 * np.log10(np.maximum(magnitude, 1.0)))
+    generator = np.random.default_rng(1)
+    assert not any(is_logarithmic(generator.rayleigh(30.0, 157)) for _ in range(1000))
 
 
 def test_records_before_the_damage_are_corrected(mitigation: Mitigation, records: list[Record]):

@@ -168,7 +168,7 @@ class Corrector(ABC):
                 For all CIRs: `radio` and `segment`.
 
         Raises:
-            ParameterError: the shapes are inconsistent.
+            ParameterError: the shapes are inconsistent, all magnitudes are negative or in dB, or a field is unknown.
         """
         return self.correct_columns(RangeColumns.from_arrays(range_m, cir, first_path_index, **fields))
 

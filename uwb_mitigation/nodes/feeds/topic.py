@@ -24,7 +24,13 @@ from uwb_mitigation.recordings.mapping.conversion import (
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows
 from uwb_mitigation.recordings.mapping.tables import LOG_TIME, TOPIC, UNREADABLE, Chunk
-from uwb_mitigation.types.measurement import Cir, RangeMeasurement
+from uwb_mitigation.types.measurement import (
+    LINEAR_MAGNITUDES,
+    Cir,
+    Encoding,
+    RangeMeasurement,
+    is_logarithmic,
+)
 
 _WARNING_PERIOD_S = 10.0
 
@@ -151,6 +157,9 @@ class TopicFeed:
         if source is None or source.files:
             return NO_CIR
         samples, encoding, scale = samples_of(chunk.columns[source.column][row], source.samples)
+        if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
+            self.counts[f"CIR in dB; valid: {LINEAR_MAGNITUDES}"] += 1
+            return NO_CIR
         return Cir(samples, encoding, scale=scale)
 
 

@@ -12,7 +12,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.mapping.conversion import ColumnDict, samples_of
 from uwb_mitigation.recordings.mapping.mapping import CirSource, Join, series
 from uwb_mitigation.recordings.mapping.tables import UNREADABLE, Chunk
-from uwb_mitigation.types.measurement import Cir, Encoding
+from uwb_mitigation.types.measurement import LINEAR_MAGNITUDES, Cir, Encoding, is_logarithmic
 
 MAX_DELAY_S = 1.0
 """Largest delay of a CIR that is searched."""
@@ -49,6 +49,8 @@ class CirFile:
                 raise RecordingError(
                     f"not a CIR: {error}", where=chunk.where(row), valid=source.samples
                 ) from error
+            if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
+                raise RecordingError("a CIR in dB", where=chunk.where(row), valid=LINEAR_MAGNITUDES)
             if len(samples):
                 numbers[row] = len(self._rows)
                 start = self._file.seek(0, 2)
