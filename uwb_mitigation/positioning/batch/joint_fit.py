@@ -302,7 +302,7 @@ class _JointProblem:
         self._parameters = prior.mean.copy() if start.parameters is None else start.parameters
         self._solution: Solution | None = None
         self._without_ranges = self._motion_and_priors()
-        self._pattern = self._without_ranges.pattern(self._columns())
+        self._columns = self._columns_of_ranges()
 
     def improve(self, iteration: int) -> float:
         """Linearise and solve; return the change, m: root mean square of positions, or the largest one of parameters."""
@@ -361,7 +361,7 @@ class _JointProblem:
     ) -> NDArray[np.float64]:
         """Return the covariance of the parameters: of noise, and of errors that stay the same for `SLOW_S`."""
         observations = self._observations
-        rows = solution.reduced(self._pattern.columns, self._derivatives(unit))
+        rows = solution.reduced(self._columns, self._derivatives(unit))
         # The errors of stationary positions are independent, so that the residuals show most of them.
         is_stationary = observations.is_stationary[observations.segment]
         slow_sd_m = np.where(is_stationary, CORRECTED_SLOW_SD_M, self._prior.slow_sd_m)
@@ -390,7 +390,7 @@ class _JointProblem:
         level, observations = unit[:, : self._config.dims], self._observations
         return np.concatenate([level, observations.ahead_s[:, None] * level, observations.rows], axis=1)
 
-    def _columns(self) -> NDArray[np.intp]:
+    def _columns_of_ranges(self) -> NDArray[np.intp]:
         """Return the columns (n, 2 d + q) of the derivatives."""
         observations, problem = self._observations, self._without_ranges
         n, q = observations.rows.shape
@@ -404,8 +404,8 @@ class _JointProblem:
     ) -> LeastSquares:
         problem, rows = self._without_ranges.copy(), self._derivatives(unit)
         # The unknowns are solved for, not their changes: motion and priors are linear in them.
-        x = np.append(self._x.reshape(-1), self._parameters)[self._pattern.columns]
-        problem.add(self._pattern, rows, error_m + np.einsum("nc,nc->n", rows, x), weight)
+        x = np.append(self._x.reshape(-1), self._parameters)[self._columns]
+        problem.add(self._columns, rows, error_m + np.einsum("nc,nc->n", rows, x), weight)
         return problem
 
     def _motion_and_priors(self) -> LeastSquares:

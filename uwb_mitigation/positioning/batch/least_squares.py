@@ -17,7 +17,6 @@ import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +26,6 @@ from scipy.sparse import csr_matrix
 from uwb_mitigation.errors import DatasetError
 
 _DIVERGED = 1e6
-_MAX_PRODUCTS = 200_000
-"""Up to this number of products of two derivatives, sums with NumPy are faster than products of sparse matrices."""
 
 
 @contextmanager
@@ -65,20 +62,6 @@ def gauss_newton(
             return
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RowPattern:
-    """The columns of rows that are added several times, see `LeastSquares.pattern`.
-
-    Attributes:
-        columns: int (n, c).
-        index: int (n, c (c + 1) / 2), element of the normal equations for each pair of columns, in the order of `_pairs`; None:
-            there are too many.
-    """
-
-    columns: NDArray[np.intp]
-    index: NDArray[np.intp] | None
-
-
 class LeastSquares:
     """Normal equations, to which rows are added.
 
@@ -89,14 +72,14 @@ class LeastSquares:
     def __init__(self, knots: int, unknowns: int, shared: int) -> None:
         self.knots, self.unknowns, self.shared = knots, unknowns, shared
         n = knots * unknowns
-        # The lower triangle of A by diagonals (2 b, K b), then C and the upper triangle of G (K b + q, q).
-        self._normal = np.zeros(2 * unknowns * n + (n + shared) * shared)
+        # The diagonals of A on and below its main one, and C above G.
+        self._band, self._border = np.zeros((2 * unknowns, n)), np.zeros((n + shared, shared))
         self._right = np.zeros(n + shared)
 
     def copy(self) -> LeastSquares:
         """Return an independent copy."""
         twin = copy.copy(self)
-        twin._normal, twin._right = self._normal.copy(), self._right.copy()
+        twin._band, twin._border, twin._right = self._band.copy(), self._border.copy(), self._right.copy()
         return twin
 
     def of_knot(
@@ -110,62 +93,28 @@ class LeastSquares:
         """Columns of shared unknowns."""
         return self.knots * self.unknowns + np.asarray(unknown, np.intp)
 
-    def pattern(self, columns: NDArray[np.intp]) -> RowPattern:
-        """Return the pattern of rows that depend on the unknowns at columns (n, c), which differ within a row."""
-        columns = np.atleast_2d(columns)
-        n = self.knots * self.unknowns
-        first, second = _pairs(columns.shape[1])
-        if len(columns) * len(first) > _MAX_PRODUCTS:
-            return RowPattern(columns, None)
-        high = np.maximum(columns[:, first], columns[:, second])
-        low = np.minimum(columns[:, first], columns[:, second])
-        beside = 2 * self.unknowns * n + low * self.shared + high - n
-        return RowPattern(columns, np.where(high < n, (high - low) * n + low, beside))
-
     def add(
         self,
-        columns: NDArray[np.intp] | RowPattern,
+        columns: NDArray[np.intp],
         values: NDArray[np.float64],
         target: NDArray[np.float64] | float,
         weight: NDArray[np.float64] | float,
     ) -> None:
         """Add n rows: values (n, c) at columns (n, c), targets (n,) and inverse variances (n,); all are broadcast."""
-        pattern = columns if isinstance(columns, RowPattern) else self.pattern(columns)
-        values = np.broadcast_to(np.atleast_2d(values), pattern.columns.shape)
-        n, width = values.shape
-        weighted = values * np.broadcast_to(weight, n)[:, None]
-        right = weighted * np.broadcast_to(target, n)[:, None]
-        self._right += np.bincount(pattern.columns.reshape(-1), right.reshape(-1), len(self._right))
-        if pattern.index is None:
-            self._add_sparse(pattern.columns, values, weighted)
-            return
-        first, second = _pairs(width)
-        product = weighted[:, first] * values[:, second]
-        self._normal += np.bincount(pattern.index.reshape(-1), product.reshape(-1), len(self._normal))
-
-    def _add_sparse(
-        self, columns: NDArray[np.intp], values: NDArray[np.float64], weighted: NDArray[np.float64]
-    ) -> None:
-        """Add the products of many or wide rows: sparse matrices need less memory and time for these."""
+        columns, values = np.broadcast_arrays(np.atleast_2d(columns), np.atleast_2d(values))
         (rows, width), n, size = columns.shape, self.knots * self.unknowns, len(self._right)
         starts = np.arange(0, rows * width + 1, width)
+        weighted = values * np.broadcast_to(weight, rows)[:, None]
         jacobian, weighted_jacobian = (
             csr_matrix((factor.reshape(-1), columns.reshape(-1), starts), shape=(rows, size))
             for factor in (values, weighted)
         )
+        self._right += weighted_jacobian.T @ np.broadcast_to(target, rows)
         normal = (weighted_jacobian.T @ jacobian).tocsc()
-        band, border = self._blocks()
         knots = normal[:n, :n]
         for below in range(min(2 * self.unknowns, n)):
-            band[below, : n - below] += knots.diagonal(-below)
-        border[:n] += normal[:n, n:].toarray()
-        border[n:] += np.triu(normal[n:, n:].toarray())
-
-    def _blocks(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return views of the diagonals of A, and of C above the upper triangle of G."""
-        n = self.knots * self.unknowns
-        band, border = np.split(self._normal, [2 * self.unknowns * n])
-        return band.reshape(2 * self.unknowns, n), border.reshape(n + self.shared, self.shared)
+            self._band[below, : n - below] += knots.diagonal(-below)
+        self._border += normal[:, n:].toarray()
 
     def add_prior(
         self,
@@ -202,23 +151,15 @@ class LeastSquares:
             numpy.linalg.LinAlgError: the rows do not determine it.
         """
         n, b, q = self.knots * self.unknowns, self.unknowns, self.shared
-        band, beside = self._blocks()
-        border, corner = np.split(beside, [n])
-        factor = cholesky_banded(band, lower=True, check_finite=False)
+        border, corner = np.split(self._border, [n])
+        factor = cholesky_banded(self._band, lower=True, check_finite=False)
         columns = np.column_stack([self._right[:n], border])
         solved = cho_solve_banded((factor, True), columns, overwrite_b=True, check_finite=False)
         x, y = solved[:, 0], solved[:, 1:]
-        schur = corner + np.triu(corner, 1).T - border.T @ y
+        schur = corner - border.T @ y
         covariance = np.linalg.inv((schur + schur.T) / 2.0) if q else np.zeros((0, 0))
         t = covariance @ (self._right[n:] - border.T @ x)
         return Solution((x - y @ t).reshape(self.knots, b), t, covariance, y, factor)
-
-
-@cache
-def _pairs(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the two columns of each pair of columns of rows with that number of columns, a column with itself included."""
-    first, second = np.triu_indices(width)
-    return first, second
 
 
 @dataclass(frozen=True, slots=True, eq=False)

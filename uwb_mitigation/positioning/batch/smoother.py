@@ -112,7 +112,7 @@ class Smoother:
         self._heights = config.heights if config.height is None else None
         extra = (self._height is not None) + (3 * len(self._used) if find_anchors else 0)
         self._without_ranges = self._motion_and_priors(len(self._offset_sd) + extra)
-        self._pattern = self._without_ranges.pattern(self._columns())
+        self._columns = self._columns_of_ranges()
         self._x, self._shared = np.zeros((0, 0)), np.zeros(0)
         self._solution: Solution | None = None
 
@@ -190,12 +190,12 @@ class Smoother:
         row, problem = np.concatenate(values, axis=1), self._without_ranges.copy()
         # The unknowns are solved for, not their changes: motion and priors are linear in them.
         target = residual - self._x[self._knot, 2 * self._d + self._slot]
-        target += np.einsum("nc,nc->n", row, np.append(self._x, self._shared)[self._pattern.columns])
+        target += np.einsum("nc,nc->n", row, np.append(self._x, self._shared)[self._columns])
         weight = self._model.weight(residual / np.sqrt(self._variance)) / self._white
-        problem.add(self._pattern, row, target, weight)
+        problem.add(self._columns, row, target, weight)
         return problem
 
-    def _columns(self) -> NDArray[np.intp]:
+    def _columns_of_ranges(self) -> NDArray[np.intp]:
         """Return the columns (n, c) of the unknowns on which each range depends."""
         problem, knot, slot = self._without_ranges, self._knot[:, None], self._slot[:, None]
         columns = [
