@@ -334,7 +334,7 @@ def test_ewine(tmp_path: Path):
     head = "NLOS,RANGE,FP_IDX,FP_AMP1,FP_AMP2,FP_AMP3,STDEV_NOISE,CIR_PWR,MAX_NOISE,RXPACC,CH,FRAME_LEN,PREAM_LEN,BITRATE,PRFR,"
     head += ",".join(f"CIR{n}" for n in range(1016))
     row = "{},6.18,749.0,4889.0,13876.0,10464.0,240.0,9048.0,1668.0,1024.0,2.0,39.0,1024.0,110.0,64.0,"
-    row += ",".join(str(float(n)) for n in range(1016))
+    row += ",".join(str(float(n**3)) for n in range(1016))
     for part in (1, 2):
         write(
             tmp_path / f"dataset/uwb_dataset_part{part}.csv",
@@ -371,7 +371,7 @@ def test_miluv(tmp_path: Path):
     write(
         folder / "ifo001/uwb_cir.csv",
         # The CIR of the second row belongs to a receiver on another drone.
-        f'timestamp,my_id,from_id,to_id,idx,cir\n0.625,10,2,2,747.2,"{list(range(1016))}"\n0.73,20,10,2,9,"[1]"\n',
+        f'timestamp,my_id,from_id,to_id,idx,cir\n0.625,10,2,2,747.2,"{[n**3 // 10**5 for n in range(1016)]}"\n0.73,20,10,2,9,"[1]"\n',
     )
     source = open_mapped(folder, "miluv")
     first, second = list(source)

@@ -301,7 +301,7 @@ def test_chunks_without_rows_do_not_change_the_others(tmp_path: Path, monkeypatc
 def test_missing_output_folder_is_an_error_before_reading(tmp_path: Path):
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(PLAIN))
     done = run("data", "import", "absent.csv", "--map", "map.yaml", "-o", "no/x.mcap", folder=tmp_path)
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "the folder of the output does not exist" in done.stderr
 
 
@@ -319,3 +319,13 @@ def test_sigterm_removes_the_partial_file(tmp_path: Path):
     finally:
         process.kill()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_magnitudes_in_db_are_refused_with_their_row(tmp_path: Path):
+    in_db = " ".join(str(round(40.0 + 30.0 / (1.0 + n), 2)) for n in range(200))
+    (tmp_path / "ranges.csv").write_text(f't,a,r,cir\n0,2,3.0,"{in_db}"\n')
+    mapping = PLAIN | {"cir": {"column": "cir", "samples": "magnitude"}}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping))
+    done = run("data", "import", "ranges.csv", "--map", "map.yaml", "-o", "x.mcap", folder=tmp_path)
+    assert done.returncode == 1
+    assert "row 1: a CIR in dB" in done.stderr
