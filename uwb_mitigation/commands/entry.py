@@ -35,9 +35,28 @@ def run_program(module: str, function: str) -> None:
     A signal during the import ends the process without a traceback, with exit code 128 + its number.
     """
     run = _load(module, function)
+    sys.unraisablehook = _raise_again
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     run()
+
+
+def _raise_again(unraisable: Any) -> None:
+    """Raise the exception of a signal handler again, if the signal arrived in a callback (destructor, weak reference).
+
+    Python prints such exceptions and drops them, so that Ctrl-C would have no effect, also while modules are imported.
+    """
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt | SystemExit):
+        sys.__unraisablehook__(unraisable)
+        return
+    error = unraisable.exc_value or unraisable.exc_type()
+
+    def interrupt(number: int, frame: object) -> None:
+        raise error
+
+    # The callback has returned by then.
+    signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 0.01)
 
 
 def _node(name: str) -> None:

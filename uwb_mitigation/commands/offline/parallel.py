@@ -38,6 +38,11 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
     """
     if len(sources) == 1 and _is_one_bag(sources[0]):
         return [PlannedBag(sources[0], output, True)]
+    folders = {source: list(_bags(source, output.resolve())) for source in sources if not _is_one_bag(source)}
+    for source, bags in folders.items():
+        if not bags:
+            valid = "MCAP bags; `uwb-mitigation data import` converts logs and tables"
+            raise RecordingError("the folder contains no MCAP bag", where=str(source), valid=valid)
     if output.suffix == ".mcap" or (output.exists() and not output.is_dir()):
         raise ParameterError(
             "one output file for several bags",
@@ -46,15 +51,13 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
         )
     planned: dict[Path, PlannedBag] = {}
     for source in sources:
-        if _is_one_bag(source):
-            bags = [(source, Path(source.resolve().name))]
+        if source not in folders:
+            named = [(source, Path(source.resolve().name))]
         else:
             # Mirror the contents of a single folder; with several folders, also keep their names.
             root = Path() if len(sources) == 1 else Path(source.resolve().name)
-            bags = [(bag, root / bag.relative_to(source)) for bag in _bags(source, output.resolve())]
-            if not bags:
-                raise RecordingError("the folder contains no MCAP bag", where=str(source))
-        for bag, name in bags:
+            named = [(bag, root / bag.relative_to(source)) for bag in folders[source]]
+        for bag, name in named:
             place = output / name
             if place in planned:
                 raise ParameterError(
