@@ -255,20 +255,7 @@ class RangeColumns:
         Raises:
             ParameterError: the arrays have other shapes, the CIRs are not numbers, negative or in dB, or a field is unknown.
         """
-        try:
-            samples = np.asarray(cir)
-        except ValueError as error:
-            raise ParameterError("rows of the cir have different lengths", valid="(n, m) samples") from error
-        if not np.issubdtype(samples.dtype, np.number):
-            raise ParameterError(f"cir of type {samples.dtype}", valid="real or complex numbers")
-        if samples.ndim != 2:
-            valid = "(n, m) samples: `cir[None]` for one range, `i + 1j * q` for pairs"
-            raise ParameterError(f"cir of shape {samples.shape}", valid=valid)
-        if np.isrealobj(samples) and samples.size and (samples < 0).any(axis=1).all():
-            valid = "magnitudes, or complex samples: `i + 1j * q`"
-            raise ParameterError("every row of the real cir has negative samples", valid=valid)
-        if np.isrealobj(samples) and len(samples) and all(map(is_logarithmic, samples)):
-            raise ParameterError("the cir is in dB", valid=LINEAR_MAGNITUDES)
+        samples = _checked_samples(cir)
         for name in constants:
             check_name("field", name, _ARRAY_FIELDS)
         encoding = Encoding.COMPLEX_INT16 if np.iscomplexobj(samples) else Encoding.MAGNITUDE
@@ -371,6 +358,25 @@ def is_logarithmic(magnitudes: NDArray[Any]) -> bool:
         return False
     share = _FACTOR * math.sqrt(math.pi / 2.0) / math.sqrt(2.0 * math.log(len(finite)))
     return bool(finite.mean() > share * finite.max() > 0.0)
+
+
+def _checked_samples(cir: Any) -> NDArray[Any]:
+    """Return the samples (n, m) of n CIRs from a caller; raises ParameterError, see `RangeColumns.from_arrays`."""
+    try:
+        samples = np.asarray(cir)
+    except ValueError as error:
+        raise ParameterError("rows of the cir have different lengths", valid="(n, m) samples") from error
+    if not np.issubdtype(samples.dtype, np.number):
+        raise ParameterError(f"cir of type {samples.dtype}", valid="real or complex numbers")
+    if samples.ndim != 2:
+        valid = "(n, m) samples: `cir[None]` for one range, `i + 1j * q` for pairs"
+        raise ParameterError(f"cir of shape {samples.shape}", valid=valid)
+    if np.isrealobj(samples) and samples.size and (samples < 0).any(axis=1).all():
+        valid = "magnitudes, or complex samples: `i + 1j * q`"
+        raise ParameterError("every row of the real cir has negative samples", valid=valid)
+    if np.isrealobj(samples) and len(samples) and all(map(is_logarithmic, samples)):
+        raise ParameterError("the cir is in dB", valid=LINEAR_MAGNITUDES)
+    return samples
 
 
 def _as_int16(cir: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
