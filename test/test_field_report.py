@@ -134,7 +134,7 @@ def test_good_evb1000s_pass_and_a_low_supply_fails(
 def test_negative_distances_and_timeouts_are_named_with_their_cause(
     report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("uwb_mitigation.commands.field.test.START_TIMEOUT_S", 2.0)
+    monkeypatch.setattr("uwb_mitigation.commands.field.test.START_TIMEOUT_S", 8.0)
     with EmulatedUciBoards(links=tmp_path / "uci", distance_m=0.2, faults=UciFaults(offset_m=-0.3)):
         checks = report("uci")
     assert checks["failed exchanges: negative distance"]["verdict"] == "fail"
