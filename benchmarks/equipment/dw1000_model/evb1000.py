@@ -28,12 +28,6 @@ ROUND_TRIP_S = 1.5e-3
 PPM = (3.0, -4.0, 7.0, -9.0, 1.0, 12.0, -2.0)
 """Frequency errors of the boards' crystals, in turn; they differ between any two boards that range."""
 
-HOST_S = 0.4e-3
-"""With `waits_for_hosts`: longest time on the boards' clock from an answer to the host's next request."""
-
-IDLE_S = 2.0
-"""With `waits_for_hosts`: the clock does not wait for a host without requests in this time."""
-
 _MAX_WAIT_S = 0.02
 DEFAULT_DISTANCE_M = 3.0
 
@@ -47,11 +41,6 @@ class _Board:
         self.terminal = PseudoTerminal(link)
         self.backlog = bytearray()
         self.requests = 0
-        self.wait_from_s = self.clock_limit_s = -math.inf
-
-    def limit_clock(self, now: float, clock_s: float) -> None:
-        """Let the boards' clock wait at `clock_s` for the next request or answer of this board."""
-        self.wait_from_s, self.clock_limit_s = now, clock_s
 
     def plug(self) -> None:
         """Power the board and create its port."""
@@ -82,8 +71,6 @@ class EmulatedEvb1000s:
         loss, damage: probabilities for every frame of every pair.
         seed: seed of all random numbers.
         antenna_delay: total TX + RX antenna delay of each chip, ticks.
-        waits_for_hosts: the boards' clock stops while an answer or the next request of a host is late, so that exchanges
-            succeed on a busy machine, too. The hosts must use `monotonic_ns` instead of the wall clock.
         distance_m: distance between anchors, and between the tag and boards without an anchor in the source.
 
     Raises:
@@ -108,7 +95,6 @@ class EmulatedEvb1000s:
         damage: float = 0.0,
         seed: int = 1,
         antenna_delay: int = 2 * ANTENNA_DELAY_TICKS,
-        waits_for_hosts: bool = False,
         distance_m: float = DEFAULT_DISTANCE_M,
     ) -> None:
         for name, value, low, high in (
@@ -124,7 +110,6 @@ class EmulatedEvb1000s:
         self.failure: UwbMitigationError | None = None
         self._loss, self._damage = loss, damage
         self._round_trip_s = round_trip_s
-        self._idle_s = IDLE_S if waits_for_hosts else 0.0
         self._period_s = 1 / rate_hz
         self._lock = threading.RLock()
         self._stop = threading.Event()
@@ -154,8 +139,7 @@ class EmulatedEvb1000s:
                 list(itertools.islice(records, boards - 1)), records
             )
             self._num_played = 0
-            self._start_s = self._advanced_at_s = time.monotonic()
-            self._clock_s = 0.0
+            self._start_s = time.monotonic()
             for board in self._boards:
                 board.plug()
         except BaseException:
@@ -169,10 +153,6 @@ class EmulatedEvb1000s:
         """Ports of the boards for the host to open; empty if unplugged."""
         with self._lock:
             return tuple(board.terminal.port for board in self._boards)
-
-    def monotonic_ns(self) -> int:
-        """Return the time of the boards' clock; without `waits_for_hosts` it is the wall clock."""
-        return round((self._start_s + self._clock_s) * 1e9)
 
     @property
     def distances_m(self) -> tuple[float, ...]:
@@ -275,28 +255,23 @@ class EmulatedEvb1000s:
                 self._send_due_answers(time.monotonic())
 
     def _advance_air(self, now: float) -> None:
-        passed_s, self._advanced_at_s = now - self._advanced_at_s, now
-        limits_s = [board.clock_limit_s for board in self._boards if now - board.wait_from_s < self._idle_s]
-        self._clock_s = max(self._clock_s, min([self._clock_s + passed_s, *limits_s]))
-        late_s = self._clock_s - self._boards[0].chip.now()
-        if late_s > 0:
-            self._air.run(late_s)
+        late = now - self._start_s - self._boards[0].chip.now()
+        if late > 0:
+            self._air.run(late)
 
     def _serve(self, number: int, now: float) -> None:
         board = self._boards[number]
         for answer in board.bridge.receive(board.terminal.read()):
             board.requests += 1
             # A long transaction at the slow speed takes longer than the bus.
-            duration_s = max(self._round_trip_s, board.chip.now() - self._clock_s)
-            board.limit_clock(now, self._clock_s + duration_s)
-            heapq.heappush(self._answers, (now + duration_s, next(self._counter), number, answer))
+            due = max(now + self._round_trip_s, self._start_s + board.chip.now())
+            heapq.heappush(self._answers, (due, next(self._counter), number, answer))
 
     def _send_due_answers(self, now: float) -> None:
         while self._answers and self._answers[0][0] <= now:
             _, _, number, answer = heapq.heappop(self._answers)
             board = self._boards[number]
             if board.terminal.fd is not None:
-                board.limit_clock(now, self._clock_s + HOST_S)
                 board.backlog += answer
                 # Keep the bytes that the host does not accept yet.
                 board.terminal.write(board.backlog)
