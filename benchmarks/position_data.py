@@ -7,23 +7,26 @@ a prefix or a suffix such as `_outdoor` does not matter). Each folder below it t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from benchmarks.sites import Drive
 from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.positioning.geometry import Height
+from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank
 from uwb_mitigation.positioning.online.tag_estimator import RobotData
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import load_mapping, shipped_mappings
+from uwb_mitigation.simulation.odometry import RATE_HZ, motion_along, stamps_s
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
 from uwb_mitigation.types.measurement import Record
@@ -50,6 +53,11 @@ SITES = range(10, 20)
 """Seeds of the simulated sites; lower ones are for development."""
 
 DRONES = range(10, 16)
+GEOMETRY_SEEDS = (10, 11)
+"""Seeds of the drives in layouts of real deployments; lower ones are for development."""
+
+GEOMETRIES = "geometries.yaml"
+DRIVE_S = 120.0
 TUTORIAL_OFFSET_M = 0.22
 MAX_RUNS, MIN_TRUE_POSITIONS = 200, 10
 _SIMULATED_HEIGHT = Height(0.0, 0.05)
@@ -66,7 +74,7 @@ class Run:
         anchors: rows of the ranges.
         ranges: as measured; their variances are unknown.
         truth: true path, only where errors are evaluated.
-        height: constant height of the tag; `heights`: measured ones.
+        height: constant height of the tag; `heights`: measured ones; `area` that contains it.
         robot: recorded motion of the robot that carries the tag.
         read_records: reads the complete measurements, in the order of `ranges`.
         has_cirs: whether they contain CIRs.
@@ -84,6 +92,7 @@ class Run:
     robot: RobotData | None = None
     read_records: Callable[[], list[Record]] = list
     has_cirs: bool = False
+    area: Area | None = None
     offsets: Offsets = NO_OFFSETS
 
     def corrected(self, bundle: Bundle | None = None, offsets: Offsets | None = None) -> Ranges:
@@ -148,6 +157,8 @@ def real_runs(data: Path) -> tuple[list[RunSource], list[dict[str, str]]]:
     groups: dict[tuple[object, ...], list[RunSource]] = {}
     skipped: list[dict[str, str]] = []
     for folder in sorted(entry for entry in data.iterdir() if entry.is_dir()):
+        if (folder / GEOMETRIES).exists():
+            continue
         mapping = mapping_of(folder.name)
         if mapping is None:
             skipped.append({"path": str(folder), "reason": "the name is not that of a shipped mapping"})
@@ -396,6 +407,79 @@ def load_hall(set_name: str, name: str, kind: str) -> Run:
     return Run(set_name, name, True, anchors, replace(ranges, range_m=range_m), truth, Height(1.0, 0.05))
 
 
+def geometry_runs(data: Path, seeds: Iterable[int] = GEOMETRY_SEEDS) -> list[RunSource]:
+    """Return simulated drives with the anchors of real deployments, with a known and with an unknown height of the tag.
+
+    Args:
+        data: folder of the data sets, one of which can contain the file of the layouts.
+        seeds: of the drives in each layout.
+    """
+    path = next(data.glob(f"*/{GEOMETRIES}"), None)
+    if path is None:
+        return []
+    names = [layout["name"] for layout in yaml.safe_load(path.read_text())["geometries"]]
+    return [
+        RunSource(f"geometry_{name}_{dims}d", str(seed), "load_geometry", (str(path), name, dims, seed))
+        for name in names
+        for dims in (2, 3)
+        for seed in seeds
+    ]
+
+
+def load_geometry(set_name: str, name: str, file: str, layout_name: str, dims: int, seed: int) -> Run:
+    """Return a drive along smooth waves through the volume of a layout, with odometry.
+
+    With two dimensions the height is constant and known. Anchors on a line have two solutions even then: an area ends at them.
+    """
+    layouts = yaml.safe_load(Path(file).read_text())["geometries"]
+    number, layout = next((n, one) for n, one in enumerate(layouts) if one["name"] == layout_name)
+    rng = np.random.default_rng([0x6E0, number, seed])
+    anchors = AnchorMap([Anchor(n, tuple(place), 0.02) for n, place in enumerate(layout["anchors"], 1)])
+    low, high = (np.array(layout["tag"][corner], float) for corner in ("low", "high"))
+    if dims == 2:
+        low[2] = high[2] = (low[2] + high[2]) / 2.0
+    path = _wave_path(low, high, layout["tag"]["speed"], rng)
+    errors = {
+        f"{kind}_m": layout["errors"][kind] for kind in ("common", "constant", "slow", "length", "white")
+    }
+    nlos_share, rate_hz = layout["errors"]["nlos"], layout["rate_hz"]
+    ranges, truth = _ranges(anchors, path, rng, nlos_share=nlos_share, rate_hz=rate_hz, **errors)
+    time_s = stamps_s(DRIVE_S)
+    position = path(time_s)[:, :2]
+    # The robot faces its direction of travel, averaged over a second.
+    direction = np.gradient(position, axis=0)
+    yaw = uniform_filter1d(np.unwrap(np.arctan2(direction[:, 1], direction[:, 0])), round(RATE_HZ))
+    motion = motion_along(position, yaw, seed)
+    truth = replace(truth, yaw=np.interp(truth.stamp_ns, motion.odometry.stamp_ns, yaw))
+    area = None
+    if anchor_rank(anchors.position) is AnchorRank.LINE:
+        wall = float(anchors.position[:, 0].min()) - 0.1
+        west, south = (low[:2] - 1.0).tolist()
+        area = Area((west, south, 0.0), (wall, float(high[1]) + 1.0, float(high[2]) + 0.5))
+    height = Height(float(low[2]), HEIGHT_SD_M) if dims == 2 else None
+    robot = RobotData(motion.odometry)
+    return Run(set_name, name, True, anchors, ranges, truth, height, None, robot, area=area)
+
+
+def _wave_path(
+    low: NDArray[np.float64], high: NDArray[np.float64], speed: float, rng: np.random.Generator
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return the position at times (n,) in s, of a path with constant speed that fills a box."""
+    extent = high - low
+    rates = rng.uniform(0.7, 1.4, 3) / np.sqrt(np.maximum(extent, 0.1))
+    phase = rng.uniform(0.0, math.tau, 3)
+
+    def at(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+        position: NDArray[np.float64] = (low + high) / 2.0 + extent / 2.0 * np.sin(
+            rates * angle[:, None] + phase
+        )
+        return position
+
+    angle = np.linspace(0.0, 4.0 * speed * (DRIVE_S + 2.0) / float((extent * rates).max()) + 20.0, 20_000)
+    travelled = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at(angle), axis=0), axis=1)))
+    return lambda time_s: at(np.interp(speed * (time_s + 1.0), travelled, angle))
+
+
 def _ranges(
     anchors: AnchorMap,
     path: Callable[[NDArray[np.float64]], NDArray[np.float64]],
@@ -405,7 +489,9 @@ def _ranges(
     slow_m: float = 0.0,
     constant_m: float = 0.0,
     nlos_share: float = 0.0,
-    seconds: float = 120.0,
+    common_m: float = 0.1,
+    length_m: float = 2.0 / math.tau,
+    seconds: float = DRIVE_S,
     rate_hz: float = 40.0,
 ) -> tuple[Ranges, TruePath]:
     """Return ranges to the anchors in turn. The white noise has heavy tails (Student-t with five degrees of freedom)."""
@@ -414,10 +500,10 @@ def _ranges(
     position = path(time_s)
     distance = np.linalg.norm(position - anchors.position[anchor], axis=1)
     error = white_m * rng.standard_t(5.0, n) / math.sqrt(5.0 / 3.0)
-    # Errors that depend on the position of the tag: waves with a length of about two metres.
-    waves = rng.normal(0.0, math.tau / 2.0, (len(anchors), 3))
+    # Errors that depend on the position of the tag: waves that change within `length_m`.
+    waves = rng.normal(0.0, 1.0 / length_m, (len(anchors), 3))
     error += slow_m * math.sqrt(2.0) * np.sin(np.einsum("ni,ni->n", waves[anchor], position))
-    error += rng.normal(0.1, constant_m, len(anchors))[anchor] if constant_m else 0.0
+    error += rng.normal(common_m, constant_m, len(anchors))[anchor] if constant_m else 0.0
     interval = (time_s // 2.0).astype(int)
     blocked = rng.random((len(anchors), interval[-1] + 1)) < nlos_share
     error += (blocked * rng.exponential(0.5, blocked.shape))[anchor, interval]

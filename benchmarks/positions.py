@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines import run_ekf
-from benchmarks.position_data import Run, RunSource, real_runs, simulated_runs
+from benchmarks.position_data import Run, RunSource, geometry_runs, real_runs, simulated_runs
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Area, Height
@@ -37,14 +37,35 @@ from uwb_mitigation.types.tracks import Odometry, Ranges, Track, TruePath
 WARM_UP_S = 5.0
 """As long as a heading takes to be found."""
 
+PUBLISHED_AFTER_S = 10.0
+"""Positions are due from this time on."""
+
 BASELINE_OFFSET_SD_M = 0.15
 BASELINES = ("raw_least_squares", "raw_ekf", "raw_ekf_offset")
-ROWS = (*BASELINES, "raw_locator", "corrected_locator", "calibrated_locator", "odometry_locator", "smoothed")
-SCORES = ("rmse_m", "median_m", "p95_m", "coverage95", "nees_per_dof", "protection_exceeded", "height_rmse_m")
+ROWS = (
+    *BASELINES,
+    "raw_locator",
+    "corrected_locator",
+    "calibrated_locator",
+    "odometry_locator",
+    "corrected_odometry_locator",
+    "smoothed",
+)
+SCORES = (
+    "rmse_m",
+    "median_m",
+    "p95_m",
+    "coverage95",
+    "nees_per_dof",
+    "protection_exceeded",
+    "height_rmse_m",
+    "height_coverage95",
+    "height_exceeded",
+)
 
 
-def evaluate(source: RunSource, *, calibrate: bool = True, smoothed: bool = True) -> dict[str, Any]:
-    """Return the entry of a run.
+def evaluate(source: RunSource, *, calibrate: bool = True, complete: bool = True) -> dict[str, Any]:
+    """Return the entry of a run, if `complete` with a smoothed track and with wrong odometry.
 
     Raises:
         UwbMitigationError: it cannot be read, or has no estimate to compare.
@@ -76,8 +97,10 @@ def evaluate(source: RunSource, *, calibrate: bool = True, smoothed: bool = True
         add("calibrated_locator", lambda: locate(run, calibrated(run, donor.read())))
     if run.robot is not None:
         add("odometry_locator", lambda: locate(run, run.ranges, run.robot))
-    if smoothed and "raw_locator" in tracks:
-        config = EstimatorConfig(run.anchors, NoiseModel(), run.height, heights=run.heights)
+        if run.has_cirs:
+            add("corrected_odometry_locator", lambda: locate(run, run.corrected(), run.robot))
+    if complete and "raw_locator" in tracks:
+        config = EstimatorConfig(run.anchors, NoiseModel(), run.height, run.area, run.heights)
         add("smoothed", lambda: smooth(config, run.ranges, tracks["raw_locator"][0]))
     rows = {
         row: errors | {"us_per_range": took_us}
@@ -89,12 +112,18 @@ def evaluate(source: RunSource, *, calibrate: bool = True, smoothed: bool = True
         "run": run.name,
         "simulated": run.simulated,
         "epochs": rows.get("raw_locator", {}).get("epochs", 0),
-        "availability": _availability(run.ranges, truth, tracks["raw_locator"][0]),
+        "published": _published(run, tracks),
         "rows": rows,
         "failed": failed,
+        "best_baseline": None,
+        "ratio_to_best_baseline": None,
+        "corrected_to_raw": None,
     }
-    result |= _ratio(tracks, truth)
-    if run.robot is not None:
+    if "raw_locator" in rows:
+        result |= _ratio(tracks, truth)
+        if "corrected_locator" in rows:
+            result["corrected_to_raw"] = rows["corrected_locator"]["rmse_m"] / rows["raw_locator"]["rmse_m"]
+    if run.robot is not None and complete and "raw_locator" in rows:
         result["odometry_faults"] = _fault_ratios(run, truth)
     return result
 
@@ -105,7 +134,7 @@ def locate(run: Run, ranges: Ranges, robot: RobotData | None = None) -> Track:
     Raises:
         DatasetError: no position was determined.
     """
-    config = EstimatorConfig(run.anchors, NoiseModel(), run.height, heights=run.heights, robot=robot)
+    config = EstimatorConfig(run.anchors, NoiseModel(), run.height, run.area, run.heights, robot)
     track = make_estimator(config).run(ranges)
     if len(track) < 2:
         raise DatasetError("no position was determined")
@@ -152,9 +181,14 @@ def _after_warm_up(run: Run) -> TruePath:
     return run.truth.take(run.truth.stamp_ns >= begin_ns)
 
 
-def _availability(ranges: Ranges, truth: TruePath, track: Track) -> float:
-    due = np.isfinite(truth.position_at(ranges.stamp_ns)[:, 0])
-    return float(np.isin(ranges.stamp_ns[due], track.stamp_ns).mean()) if due.any() else math.nan
+def _published(run: Run, tracks: dict[str, tuple[Track, float]]) -> float:
+    """Return the share of the ranges with a true position that have a live one, after `PUBLISHED_AFTER_S`."""
+    stamps = run.ranges.stamp_ns
+    is_due = np.isfinite(run.truth.position_at(stamps)[:, 0])
+    is_due &= stamps >= stamps[0] + round(PUBLISHED_AFTER_S * NS_PER_S)
+    if "raw_locator" not in tracks or not is_due.any():
+        return 0.0
+    return float(np.isin(stamps[is_due], tracks["raw_locator"][0].stamp_ns).mean())
 
 
 def _ratio(tracks: dict[str, tuple[Track, float]], truth: TruePath) -> dict[str, Any]:
@@ -169,7 +203,7 @@ def _ratio(tracks: dict[str, tuple[Track, float]], truth: TruePath) -> dict[str,
     errors["raw_least_squares"] = scores(tracks["raw_least_squares"][0], truth)
     compared_errors = {row: error for row, error in errors.items() if error is not None}
     if "raw_locator" not in compared_errors or len(compared_errors) < 2:
-        return {"best_baseline": None, "ratio_to_best_baseline": None}
+        return {}
     locator = compared_errors.pop("raw_locator")
     best = min(compared_errors, key=lambda row: float(compared_errors[row]["rmse_m"]))
     best_3d = min(error["rmse_3d_m"] for error in compared_errors.values())
@@ -284,10 +318,12 @@ def measure(
     """
     sources, skipped = ([], []) if data is None else real_runs(data)
     sources += simulated_runs() if simulated else []
+    num_complete = len(sources)
+    sources += geometry_runs(data) if data is not None and simulated else []
     results: dict[int, dict[str, Any]] = {}
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         futures = {
-            pool.submit(evaluate, source, calibrate=calibrate): number
+            pool.submit(evaluate, source, calibrate=calibrate, complete=number < num_complete): number
             for number, source in enumerate(sources)
         }
         for num_finished, future in enumerate(as_completed(futures), 1):
@@ -331,9 +367,12 @@ def _summary_of(sets: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     ratio = values(lambda entry: entry["ratio_to_best_baseline"])
     coverage = values(lambda entry: row(entry, "raw_locator", "coverage95"))
+    published = values(lambda entry: entry["published"])
+    height = values(lambda entry: row(entry, "raw_locator", "height_exceeded"))
+    exceeded = values(lambda entry: row(entry, "raw_locator", "protection_exceeded"))
     nees = values(lambda entry: row(entry, "raw_locator", "nees_per_dof"))
     by_calibration = values(lambda entry: row(entry, "calibrated_locator") / row(entry, "raw_locator"))
-    by_correction = values(lambda entry: row(entry, "corrected_locator") / row(entry, "raw_locator"))
+    by_correction = values(lambda entry: entry["corrected_to_raw"])
     by_odometry = values(lambda entry: row(entry, "odometry_locator") / row(entry, "raw_locator"))
     faults = values(lambda entry: max(entry["odometry_faults"].values()))
     summary = {
@@ -344,7 +383,11 @@ def _summary_of(sets: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "coverage95_max": max(coverage),
         "nees_per_dof_min": min(nees),
         "nees_per_dof_max": max(nees),
+        "published_min": min(published),
+        "protection_exceeded_max": max(exceeded),
+        "height_exceeded_max": max(height),
         "corrected_to_raw_mean": float(np.mean(by_correction)),
+        "corrected_to_raw_max": max(by_correction),
         "calibrated_to_raw_mean": float(np.mean(by_calibration)),
         "calibrated_to_raw_max": max(by_calibration),
         "odometry_to_raw_mean": float(np.mean(by_odometry)),

@@ -361,7 +361,7 @@ def test_position_is_withheld_after_the_line_of_two_anchors_was_touched():
 @pytest.mark.parametrize("kind", ["clean", "nlos", "outliers"])
 def test_errors_are_near_those_of_simple_filters(kind: str):
     run = next(run for run in simulated_runs() if (run.set_name, run.name) == ("hall", kind))
-    entry = evaluate(run, calibrate=False, smoothed=False)
+    entry = evaluate(run, calibrate=False, complete=False)
     assert entry["ratio_to_best_baseline"] < 1.1
     assert entry["rows"]["raw_locator"]["coverage95"] > 0.89
     assert entry["rows"]["raw_locator"]["rmse_m"] < 0.12

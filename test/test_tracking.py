@@ -370,7 +370,7 @@ def test_real_drives_reach_the_documented_errors(hanyang: Path):
 
 def test_corrected_ranges_improve_live_positions():
     run = next(run for run in simulated_runs() if run.set_name == "flat" and run.arguments[0] == 8)
-    rows = evaluate(run, calibrate=False, smoothed=False)["rows"]
+    rows = evaluate(run, calibrate=False, complete=False)["rows"]
     assert rows["corrected_locator"]["rmse_m"] < 0.75 * rows["raw_locator"]["rmse_m"]
     assert rows["corrected_locator"]["coverage95"] > 0.95
 

@@ -8,11 +8,14 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.geometry import protection_levels
+from uwb_mitigation.positioning.geometry import PROTECTION, protection_levels
 from uwb_mitigation.types.tracks import Track, TruePath
 
 ELLIPSE95 = 5.991
 """95th percentile of chi-squared with two degrees of freedom."""
+
+NORMAL95 = 1.96
+"""Deviations that a normal error exceeds in 5 % of all cases (two-sided)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,8 @@ class TrackErrors:
         height_rmse: RMSE of z.
         heading_rmse_deg: RMSE of the yaw where it is known, degrees; NaN: never, or without a true yaw.
         heading_found_after_s: time from the first estimate to the first one with a yaw; NaN as above.
+        height_coverage95: share of true heights within 1.96 standard deviations; NaN without covariances.
+        height_exceeded: share of epochs with an error in z above its protection level; NaN without covariances.
     """
 
     epochs: int
@@ -41,6 +46,8 @@ class TrackErrors:
     height_rmse: float
     heading_rmse_deg: float = math.nan
     heading_found_after_s: float = math.nan
+    height_coverage95: float = math.nan
+    height_exceeded: float = math.nan
 
     def as_json(self) -> dict[str, float | int | None]:
         """Return the keys of `track --json`; unknown values are null."""
@@ -92,12 +99,16 @@ def errors_of(
     error = position[:, :2] - true[:, :2]
     distance = np.hypot(*error.T)
     plane = covariance[:, :2, :2]
-    coverage = nees = exceeded = math.nan
+    coverage = nees = exceeded = height_coverage = height_exceeded = math.nan
+    height_error = np.abs(position[:, 2] - true[:, 2])
     if len(error) and np.isfinite(plane).all():
         squared = np.einsum("ni,ni->n", error, np.linalg.solve(plane, error[..., None])[..., 0])
         coverage = float((squared <= ELLIPSE95).mean())
         nees = float(squared.mean() / 2.0)
         exceeded = float((np.abs(error) > protection_levels(plane)).any(axis=1).mean())
+        height_sd = np.sqrt(covariance[:, 2, 2])
+        height_coverage = float((height_error <= NORMAL95 * height_sd).mean())
+        height_exceeded = float((height_error > PROTECTION * height_sd).mean())
     return TrackErrors(
         len(error),
         float(np.sqrt(np.mean(distance**2))),
@@ -106,5 +117,7 @@ def errors_of(
         coverage,
         nees,
         exceeded,
-        float(np.sqrt(np.mean((position[:, 2] - true[:, 2]) ** 2))),
+        float(np.sqrt(np.mean(height_error**2))),
+        height_coverage95=height_coverage,
+        height_exceeded=height_exceeded,
     )

@@ -71,11 +71,19 @@ def simulate_motion(route: tuple[Point, ...], speed: float, seconds: float, seed
         seconds: Duration.
         seed: Seed of all measurement errors.
     """
+    travelled_m = speed * stamps_s(seconds)
+    return motion_along(along_route(route, travelled_m), yaw_along_route(route, travelled_m), seed)
+
+
+def stamps_s(seconds: float) -> NDArray[np.float64]:
+    """Return the times of the odometry, float64 (n,), s."""
+    return np.arange(math.ceil(seconds * RATE_HZ) + 1, dtype=np.float64) / RATE_HZ
+
+
+def motion_along(position: NDArray[np.float64], yaw: NDArray[np.float64], seed: int) -> SimulatedMotion:
+    """Return the motion of a robot with these true positions (n, 2) and continuous headings (n,) at `stamps_s`."""
     rng = np.random.default_rng([seed, 0x0D0])
-    step_s = 1.0 / RATE_HZ
-    time_s = np.arange(math.ceil(seconds * RATE_HZ) + 1, dtype=np.float64) / RATE_HZ
-    position, yaw = along_route(route, speed * time_s), yaw_along_route(route, speed * time_s)
-    n = len(time_s)
+    n, step_s = len(yaw), 1.0 / RATE_HZ
 
     # The true twist is the mean over the interval that ends at a stamp.
     middle = (yaw[1:] + yaw[:-1]) / 2.0
@@ -85,7 +93,7 @@ def simulate_motion(route: tuple[Point, ...], speed: float, seconds: float, seed
     driven = np.cumsum(np.hypot(twist[:, 0], twist[:, 1])) * step_s
 
     imu_rate = twist[:, 2] + rng.normal(0.0, GYRO_BIAS_SD) + rng.normal(0.0, GYRO_SD, n)
-    stamp_ns = np.rint(time_s * NS_PER_S).astype(np.int64)
+    stamp_ns = np.rint(np.arange(n) * step_s * NS_PER_S).astype(np.int64)
     imu = Imu(stamp_ns, imu_rate, np.full(n, GYRO_SD**2 + GYRO_BIAS_SD**2), np.full(n, np.nan), np.zeros(n))
 
     distance_scale, turn_scale = 1.0 + SCALE_ERROR * rng.choice([-1.0, 1.0], 2)
