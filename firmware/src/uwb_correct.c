@@ -86,6 +86,9 @@ static float ood_score(const uwb_model *model, const float *window, float range_
 
 static const float MAX_RANGE_M = 1.0e6f;
 
+/* As in uwb_mitigation/mitigation/early_path.py. */
+static const float MIN_EARLY_RANGE_M = 0.3f;
+
 static int in_limits(float value, float low, float high) {
     return value >= low && value <= high;
 }
@@ -136,7 +139,9 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     /* volatile: the host rounds the network's product before it adds the linear bias. */
     volatile float rounded;
     float network_m;
-    if (!model->early_path || !uwb_early_path(model, cir, &network_m)) {
+    const volatile float unbiased_m = range_m - bias_m;
+    if (!model->early_path || !uwb_early_path(model, cir, &network_m) ||
+        !(unbiased_m - network_m >= MIN_EARLY_RANGE_M)) {
         status = uwb_network(model, window, arena, arena_bytes, &network_m);
         if (status != UWB_OK) {
             return status;
@@ -180,11 +185,13 @@ uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, co
     float error_m = 0.0f;
     float score = 0.0f;
     const float offset_range_m = offset_m != 0.0f ? range_m - offset_m : range_m;
-    const uwb_status status = predict(model, offset_range_m, cir, arena, arena_bytes, &error_m, &score);
-    corrected->status = range_status(status);
+    uwb_status status = predict(model, offset_range_m, cir, arena, arena_bytes, &error_m, &score);
     if (status == UWB_OK) {
         write_corrected(model, range_m, offset_m, error_m, score, corrected);
-    } else {
+        status = corrected->range_m >= 0.0f ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
+    }
+    corrected->status = range_status(status);
+    if (status != UWB_OK) {
         const int valid = model != NULL && in_limits(offset_range_m, 0.0f, MAX_RANGE_M);
         corrected->range_m = offset_range_m;
         corrected->correction_m = offset_m;

@@ -91,7 +91,7 @@ uwb_status uwb_preprocess(const uwb_model *model, const uwb_cir *cir, float *win
 
 /* As in uwb_mitigation/mitigation/early_path.py, with its constants. */
 enum {
-    SEARCH_TAPS = 40,
+    SEARCH_TAPS = 19,
     EDGE_TAPS = 3,
     NOISE_TAPS = 128,
     MIN_NOISE_RATIO = 3,
@@ -147,7 +147,7 @@ int uwb_early_path(const uwb_model *model, const uwb_cir *cir, float *error_m) {
         return 0;
     }
     size_t low = top;
-    while (low > begin - NOISE_TAPS && 4 * (uint64_t)tap_power(cir, low) > peak) {
+    while (low > begin && 4 * (uint64_t)tap_power(cir, low) > peak) {
         low--;
     }
     if (4 * (uint64_t)tap_power(cir, low) > peak) {

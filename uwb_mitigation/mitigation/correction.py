@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.mitigation.early_path import early_path_error_m
+from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
 from uwb_mitigation.types.measurement import (
@@ -226,8 +226,8 @@ class Mitigation(Corrector):
     through with a status that gives the reason and a larger variance:
 
     NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: the bundle was
-    trained for another radio or segment, the range minus offset is negative or not finite, the predicted error is outside
-    the bundle's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
+    trained for another radio or segment, the range minus offset or the corrected range is negative or not finite, the
+    predicted error is outside the bundle's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
 
     The further a measurement is outside the bundle's training data (`Card.ood_bands`), the more its correction shrinks
     from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
@@ -272,7 +272,7 @@ class Mitigation(Corrector):
             predicted[~is_predictable] = np.nan
         if len(windows):
             try:
-                predicted[rows] += self._network_m(ranges, rows, windows)
+                predicted[rows] += self._network_m(ranges, rows, windows, range_m[rows], predicted[rows])
             except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
                 predicted[rows] = np.nan
             score[rows] = self._rule.score(windows, range_m[rows], *(power[rows] for power in powers))
@@ -288,6 +288,13 @@ class Mitigation(Corrector):
         excess, variance = self._rule.apply(predicted[rows], score[rows])
         correction = offset[rows] + excess
         corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
+        if np.minimum.reduce(corrected_m, initial=0.0) < 0.0:
+            kept = corrected_m >= 0.0
+            accepted[accepted] = kept
+            rows = accepted
+            corrected_m, correction, variance = (
+                values[kept] for values in (corrected_m, correction, variance)
+            )
         if rows is _ALL_ROWS:
             model_id = self.bundle.model_id
             return CorrectedColumns(corrected_m, correction, variance, status, CorrectedBy.HOST, model_id)
@@ -302,15 +309,25 @@ class Mitigation(Corrector):
         return corrected
 
     def _network_m(
-        self, ranges: RangeColumns, rows: slice | NDArray[np.bool_], windows: NDArray[np.float32]
+        self,
+        ranges: RangeColumns,
+        rows: slice | NDArray[np.bool_],
+        windows: NDArray[np.float32],
+        range_m: NDArray[np.floating],
+        bias_m: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Return the output of the network for `rows`, or the error of a missed direct path, m, float32 (m,)."""
+        """Return the output of the network for `rows`, or the error of a missed direct path, m, float32 (m,).
+
+        `range_m` and `bias_m`: their ranges minus offsets and their linear biases, (m,).
+        """
         network_m = self._session.predict_m(windows)
-        if not self.bundle.card.early_path:
-            return network_m
-        indices = np.arange(len(ranges))[rows]
-        early_m = early_path_error_m(ranges, indices, self.bundle.preprocessing.samples)
-        return np.where(np.isnan(early_m), network_m, early_m)
+        if self.bundle.card.early_path:
+            indices = np.arange(len(ranges))[rows]
+            early_m = find_early_paths(ranges, indices, self.bundle.preprocessing.samples)
+            for index, error_m in early_m.items():
+                if (np.float32(range_m[index]) - bias_m[index]) - error_m >= MIN_RANGE_M:
+                    network_m[index] = error_m
+        return network_m
 
 
 def _row_index(mask: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:

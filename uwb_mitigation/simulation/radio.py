@@ -47,6 +47,11 @@ SIDE_LOBE_SIGMAS = 5.0
 """Minimum of the detection threshold in standard deviations of the side lobes of the strongest tap. An assumption: with
 a threshold that only follows the noise, 0.3 % of simulated LOS frames are detected at a side lobe."""
 
+FALSE_PEAK_M, FALSE_PEAK_DB = (5.0, 12.0), (10.0, 16.0)
+"""False peaks: how long before the straight-line path, and their power above the mean noise. The upper limit is the detection
+threshold with the default multiplier; the strongest of 128 noise taps is 7 dB above the mean. Assumptions, see the logs of other
+buildings: 5 to 12 m."""
+
 _SPAN = 8
 _PHASES = 64
 _EDGE_STEPS = 32
@@ -159,6 +164,7 @@ class Receiver:
         pulses_per_symbol: pulses of a pseudo-random sequence, whose correlation has side lobes at multiples of
             `PULSE_SPACING_TAPS`; 0: a preamble, whose periodic correlation is perfect.
         kind, segment: source of the CIRs.
+        false_peak_share: share of frames with a peak before the direct path that is no path (`FALSE_PEAK_M`).
 
     Raises:
         ParameterError: a value is not finite or is out of its range.
@@ -178,6 +184,7 @@ class Receiver:
     pulses_per_symbol: int = 0
     kind: RadioType = RadioType.DW1000
     segment: Segment = Segment.IPATOV
+    false_peak_share: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
@@ -190,6 +197,7 @@ class Receiver:
             ("noise_multiplier", self.noise_multiplier, 1, 31),
             ("range_offset_m", self.range_offset_m, -10, 10),
             ("timestamp_std_m", self.timestamp_std_m, 0, 1),
+            ("false_peak_share", self.false_peak_share, 0, 1),
         ):
             check_range("radio", name, value, low, high)
         check_range("radio", "preamble_symbols", self.preamble_symbols, 16, 4096, whole=True)
@@ -288,6 +296,8 @@ class Receiver:
         accumulator = rng.standard_normal(components.shape, dtype=np.float32)
         accumulator *= np.sqrt(noise / 2.0).astype(np.float32)[:, None]
         accumulator += components * count.astype(np.float32)[:, None]
+        if self.false_peak_share:
+            accumulator += _false_peaks(place, noise, self.false_peak_share, rng)
         samples = np.clip(np.rint(accumulator), -32768, 32767).astype(np.int16)
         direct = np.abs(multipath.gain[:, 0]) * scale * gain * count * PULSE_PEAK
         return self._report(samples, count, direct, place, above_sensitivity, boards, rng)
@@ -358,6 +368,26 @@ def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) ->
     for component, weight in ((result.real, value.real), (result.imag, value.imag)):
         component[:] = np.bincount(where, (shape * weight[:, None]).ravel(), n * TAPS).reshape(n, TAPS)
     return result
+
+
+def _false_peaks(
+    place: NDArray[np.float64], noise: NDArray[np.float64], share: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Return one false peak in a `share` of n frames, interleaved real and imaginary, float32 (n, 2 TAPS).
+
+    Args:
+        place: index of the straight-line path, (n,).
+        noise: mean power of the noise in each tap, (n,).
+        share: share of frames with a peak.
+        rng: random generator.
+    """
+    n = len(place)
+    early_m = rng.uniform(*FALSE_PEAK_M, n)
+    amplitude = np.sqrt(noise * 10.0 ** (rng.uniform(*FALSE_PEAK_DB, n) / 10.0)) / PULSE_PEAK
+    amplitude *= rng.random(n) < share
+    gain = amplitude * np.exp(1j * rng.uniform(0.0, 2.0 * math.pi, n))
+    taps = _place_paths((place - early_m / (SPEED_OF_LIGHT_M_PER_NS * TAP_NS))[:, None], gain[:, None])
+    return taps.view(np.float32)
 
 
 def noise_threshold(magnitude: NDArray[np.float32], multiplier: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.mitigation.early_path import early_path_error_m
+from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, early_path_error_m
 from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing
 from uwb_mitigation.types.measurement import (
     Cir,
@@ -105,7 +105,8 @@ class Dataset:
         """Return the output of a network, (n,), m, with missed direct paths in place of it."""
         if self.early_path_m is None:
             return predicted_m
-        return np.where(np.isnan(self.early_path_m), predicted_m, self.early_path_m)
+        is_far_enough = self.range_m - self.early_path_m >= MIN_RANGE_M  # False for NaN.
+        return np.where(is_far_enough, self.early_path_m, predicted_m)
 
     @property
     def names(self) -> list[str]:

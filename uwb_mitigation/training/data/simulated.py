@@ -16,7 +16,7 @@ from uwb_mitigation.simulation.antenna_pairs import label
 from uwb_mitigation.simulation.buildings import RADIO, WIDE_SHARE, block_of
 from uwb_mitigation.simulation.radio import Receiver, Reception
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.types.measurement import Encoding, RangeColumns
+from uwb_mitigation.types.measurement import Encoding, RangeColumns, Segment
 
 
 def building_dataset(
@@ -34,7 +34,7 @@ def building_dataset(
     Ranges that are not received, or whose window is not usable, are omitted. The result does not depend on the number
     of `workers` (processes); `on_block` is called after each block. `radio`, `wide_share`: see `block_of`.
     """
-    simulate = partial(_block, seed, preprocessing, radio, wide_share)
+    simulate = partial(block_dataset, seed, preprocessing, radio, wide_share)
     blocks_of_ranges = []
     # Do not fork: the caller may run threads (torch, a progress bar).
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
@@ -44,9 +44,10 @@ def building_dataset(
     return replace(Dataset.joined(blocks_of_ranges), radios=(radio.kind,), segments=(radio.segment,))
 
 
-def _block(
+def block_dataset(
     seed: int, preprocessing: Preprocessing, radio: Receiver, wide_share: float, number: int
 ) -> Dataset:
+    """Return one range of each placement of block `number`; see `building_dataset`."""
     block, rng = block_of(seed, number, radio=radio, wide_share=wide_share)
     reception = radio.receive(block.pairs.multipath(rng), rng, block.boards)
     distance = block.pairs.distance_m
@@ -54,7 +55,7 @@ def _block(
     columns = _columns(reception, distance, received)
     faults, inputs = preprocessing.apply(columns)
     early_m = None
-    if radio == RADIO:  # Other radios deliver too few taps before the first path.
+    if radio.segment is Segment.IPATOV:  # Other radios deliver too few taps before the first path.
         early_m = early_path_error_m(columns, np.flatnonzero(faults == 0), preprocessing.samples)
     rows = received[faults == 0]
     is_blocked, is_direct = block.pairs.path.crossings > 0, reception.direct_above_threshold
