@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,25 +40,28 @@ class Browser:
 
     def open(self, url: str, width: int = 1280, height: int = 1000) -> None:
         self.resize(width, height)
-        # Discard errors of an earlier page.
-        self._load("about:blank")
+        # An earlier page that reloads itself would cancel the navigation: leave it first.
+        self._navigate("about:blank")
+        self.wait("an empty page", lambda: self._shows("about:blank") or self._navigate("about:blank"))
+        # Discard errors of the earlier page.
         self.driver.get_log("browser")
-        self._load(url)
+        # Once: a second call cancels a load that is slow on a busy machine.
+        self._navigate(url)
+        self.wait(url, lambda: self._shows(url.partition("#")[0]))
 
-    def _load(self, url: str) -> None:
-        """Open a URL, and wait for the document. Another fragment does not load it again."""
-        loaded = "return document.readyState === 'complete' && location.href.startsWith(arguments[0])"
-        next_s = 0.0
+    def _navigate(self, url: str) -> None:
+        """Start to load a page; the browser continues if it does not answer in time."""
+        from selenium.common.exceptions import TimeoutException
+        from urllib3.exceptions import ReadTimeoutError
 
-        def is_loaded() -> bool:
-            nonlocal next_s
-            # A page that reloads itself at the same time cancels the navigation.
-            if time.monotonic() > next_s:
-                self.driver.get(url)
-                next_s = time.monotonic() + CALL_S / 2
-            return self.run(loaded, url.partition("#")[0])
+        with suppress(TimeoutException, ReadTimeoutError):
+            self.driver.get(url)
 
-        self.wait(url, is_loaded)
+    def _shows(self, url: str) -> bool:
+        """Return whether a page with this begin of its URL is loaded."""
+        return self.run(
+            "return document.readyState === 'complete' && location.href.startsWith(arguments[0])", url
+        )
 
     def resize(self, width: int, height: int) -> None:
         self.driver.execute_cdp_cmd(

@@ -188,7 +188,8 @@ class SlowLink:
         self._target, self.rate = port, 1e9
         self._listener = socket.create_server(("localhost", 0))
         self.port = self._listener.getsockname()[1]
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._thread = threading.Thread(target=self._accept)
+        self._thread.start()
 
     def _accept(self) -> None:
         while True:
@@ -216,6 +217,9 @@ class SlowLink:
             sink.close()
 
     def close(self) -> None:
+        # Closing alone does not end an `accept` that waits in another thread.
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
         self._listener.close()
 
 
