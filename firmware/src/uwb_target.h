@@ -14,9 +14,19 @@
 #endif
 #endif
 
-/* It holds weights in FPU registers and multiplies with the DSP extension of ARMv7E-M. */
-#if defined(__ARM_ARCH_7EM__) && defined(__ARM_FEATURE_DSP) && defined(__ARM_FP) && !defined(UWB_PORTABLE)
+/* The assembler kernels hold weights in FPU registers and multiply with the DSP extension of ARMv7E-M. Only C decides
+ * whether they are used, because only C gets every flag: the Arduino core assembles without -mfloat-abi, and then
+ * __ARM_FP is undefined as in a build without FPU. The assembler files always contain their kernels on this
+ * architecture, with names of their own: C that does not use them has the portable kernels, and the linker drops these. */
+#if defined(__ARM_ARCH_7EM__) && \
+    (defined(__ASSEMBLER__) || (defined(__ARM_FEATURE_DSP) && defined(__ARM_FP) && !defined(UWB_PORTABLE)))
 #define UWB_CORTEX_M4 1
+#define uwb_conv_first uwb_conv_first_cortex_m4
+#define uwb_conv_residual uwb_conv_residual_cortex_m4
+#define uwb_conv_reduce_odd uwb_conv_reduce_odd_cortex_m4
+#define uwb_conv_reduce_even uwb_conv_reduce_even_cortex_m4
+#define uwb_dense uwb_dense_cortex_m4
+#define uwb_dot uwb_dot_cortex_m4
 #else
 #define UWB_CORTEX_M4 0
 #endif

@@ -17,6 +17,7 @@
 
         .syntax unified
         .thumb
+        .fpu fpv4-sp-d16
         .altmacro
 
         .macro function name

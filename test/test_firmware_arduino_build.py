@@ -1,0 +1,85 @@
+"""Library and sketches, compiled with the flags of the Arduino core for the nRF52840 and linked with `ld -r`."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run_tool
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi"
+)
+SOURCES = firmware_folder() / "src"
+KERNELS = ("conv_first", "conv_residual", "conv_reduce_odd", "conv_reduce_even", "dense", "dot")
+
+# ArduinoCore-mbed, variant ARDUINO_NANO33BLE: platform.txt and cflags.txt. The assembler gets no -mfloat-abi.
+FPU = "-mfpu=fpv4-sp-d16"
+SOFTFP = ("-mfloat-abi=softfp", FPU)
+COMMON = ("-c", "-Os", "-funsigned-char", "-mcpu=cortex-m4", "-mthumb", "-ffunction-sections", "-fdata-sections",
+          "-nostdlib", "-fno-exceptions", "-fomit-frame-pointer", "-Wall", "-Wextra")  # fmt: skip
+C = ("arm-none-eabi-gcc", "-std=gnu11", *COMMON)
+ASSEMBLER = ("arm-none-eabi-g++", "-c", "-x", "assembler-with-cpp", "-mcpu=cortex-m4")
+
+
+def compile_each(compiler: tuple[str, ...], sources: list[Path], folder: Path) -> list[str]:
+    """Compile every source to an object file; return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    objects = [str(folder / f"{source.stem}{source.suffix[1:]}.o") for source in sources]
+    for source, target in zip(sources, objects, strict=True):
+        run_tool([*compiler, str(source), "-o", target])
+    return objects
+
+
+def undefined_symbols(objects: list[str], folder: Path) -> set[str]:
+    """Link with `ld -r`; return the undefined symbols of the library."""
+    linked = folder / "linked.o"
+    run_tool(["arm-none-eabi-ld", "-r", *objects, "-o", str(linked)])
+    listed = subprocess.run(
+        ["arm-none-eabi-nm", "-u", str(linked)], capture_output=True, text=True, check=True
+    )
+    return {name for name in listed.stdout.split() if name.startswith("uwb_")}
+
+
+def defined_symbols(objects: list[str]) -> set[str]:
+    """Names of the global functions in object files."""
+    listed = subprocess.run(["arm-none-eabi-nm", *objects], capture_output=True, text=True, check=True)
+    return {line.split()[-1] for line in listed.stdout.splitlines() if " T " in line}
+
+
+C_VARIANTS = [
+    SOFTFP,
+    ("-mfloat-abi=hard", FPU),
+    ("-mfloat-abi=soft",),
+    (*SOFTFP, "-DUWB_PORTABLE"),
+]
+ASSEMBLER_VARIANTS = [
+    (FPU,),
+    (),
+    ("-mthumb", "-mfloat-abi=hard", FPU),
+    ("-mthumb", "-mfloat-abi=soft"),
+    (FPU, "-DUWB_PORTABLE"),
+]
+
+
+@pytest.mark.parametrize("c_flags", C_VARIANTS, ids=lambda flags: " ".join(flags))
+def test_c_and_assembler_agree_for_every_combination_of_flags(tmp_path: Path, c_flags: tuple[str, ...]):
+    c = compile_each((*C, *c_flags), sorted(SOURCES.rglob("*.c")), tmp_path / "c")
+    portable = "-DUWB_PORTABLE" in c_flags or "-mfloat-abi=soft" in c_flags
+    for number, assembler_flags in enumerate(ASSEMBLER_VARIANTS):
+        folder = tmp_path / str(number)
+        assembled = compile_each((*ASSEMBLER, *assembler_flags), sorted(SOURCES.rglob("*.S")), folder)
+        assert undefined_symbols(c + assembled, folder) == set(), assembler_flags
+        # The portable kernels are in the C objects exactly if the assembler kernels are not used.
+        assert {f"uwb_{kernel}" for kernel in KERNELS} <= defined_symbols(c) or not portable
+        assert not ({f"uwb_{kernel}" for kernel in KERNELS} & defined_symbols(c)) or portable
+
+
+@pytest.mark.parametrize("cpu", ["cortex-m3", "cortex-m0"])
+def test_other_processors_use_portable_c(tmp_path: Path, cpu: str):
+    objects = compile_each((*C, f"-mcpu={cpu}"), sorted(SOURCES.rglob("*.c")), tmp_path)
+    objects += compile_each((*ASSEMBLER, f"-mcpu={cpu}"), sorted(SOURCES.rglob("*.S")), tmp_path)
+    assert undefined_symbols(objects, tmp_path) == set()
