@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -9,6 +10,9 @@ from pathlib import Path
 import pytest
 
 from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run_tool
+from uwb_mitigation.mitigation.embedded.export import export_bundle
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 
 pytestmark = pytest.mark.skipif(
     shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi"
@@ -25,6 +29,13 @@ C = ("arm-none-eabi-gcc", "-std=gnu11", *COMMON)
 ASSEMBLER = ("arm-none-eabi-g++", "-c", "-x", "assembler-with-cpp", "-mcpu=cortex-m4")
 
 
+CXX = ("arm-none-eabi-g++", "-std=gnu++14", "-fno-rtti", "-Wvla", *COMMON, *SOFTFP)
+
+STUB = firmware_folder() / "test" / "arduino_stub"
+CATEGORIES = ("Display", "Communication", "Signal Input/Output", "Sensors", "Device Control", "Timing",
+              "Data Storage", "Data Processing", "Other")  # fmt: skip
+
+
 def compile_each(compiler: tuple[str, ...], sources: list[Path], folder: Path) -> list[str]:
     """Compile every source to an object file; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -35,19 +46,56 @@ def compile_each(compiler: tuple[str, ...], sources: list[Path], folder: Path) -
 
 
 def undefined_symbols(objects: list[str], folder: Path) -> set[str]:
-    """Link with `ld -r`; return the undefined symbols of the library."""
+    """Link with `ld -r`; return the undefined symbols."""
     linked = folder / "linked.o"
     run_tool(["arm-none-eabi-ld", "-r", *objects, "-o", str(linked)])
     listed = subprocess.run(
         ["arm-none-eabi-nm", "-u", str(linked)], capture_output=True, text=True, check=True
     )
-    return {name for name in listed.stdout.split() if name.startswith("uwb_")}
+    return {line.split()[-1] for line in listed.stdout.splitlines() if line.strip()}
 
 
 def defined_symbols(objects: list[str]) -> set[str]:
     """Names of the global functions in object files."""
     listed = subprocess.run(["arm-none-eabi-nm", *objects], capture_output=True, text=True, check=True)
     return {line.split()[-1] for line in listed.stdout.splitlines() if " T " in line}
+
+
+@pytest.mark.parametrize("name", ["UwbMitigation", "UwbRanger"])
+def test_sketch_and_library_link_with_the_flags_of_the_core(tmp_path: Path, name: str):
+    """The symbols of the core, which the stub only declares, stay undefined."""
+    export_bundle(load_bundle(default_model_path()), tmp_path)
+    sketch = tmp_path / f"{name}.cpp"
+    sketch.write_text((firmware_folder() / "examples" / name / f"{name}.ino").read_text())
+    includes = (f"-I{STUB}", f"-I{SOURCES}", "-include", str(STUB / "Arduino.h"))
+    objects = compile_each((*CXX, *includes), [sketch], tmp_path)
+    objects += compile_each((*C, *SOFTFP), sorted(SOURCES.rglob("*.c")), tmp_path)
+    objects += compile_each((*ASSEMBLER, FPU), sorted(SOURCES.rglob("*.S")), tmp_path)
+
+    undefined = undefined_symbols(objects, tmp_path)
+    assert not {symbol for symbol in undefined if symbol.startswith("uwb_")}
+    assert any("send_nb" in symbol for symbol in undefined), "the compiler removed the sending"
+
+
+def test_library_properties_follow_the_rules_of_the_library_manager():
+    """Rules LP of arduino-lint. That `url` is reachable is not tested."""
+    lines = (firmware_folder() / "library.properties").read_text().splitlines()
+    fields = dict(line.split("=", 1) for line in lines)
+    required = {"name", "version", "author", "maintainer", "sentence", "paragraph", "category", "url"}
+    assert required | {"architectures", "includes"} <= set(fields)
+    assert re.fullmatch("[A-Za-z0-9][A-Za-z0-9 _.-]{0,62}", fields["name"])
+    assert "arduino" not in fields["name"].lower()
+    assert re.fullmatch(r"\d+\.\d+\.\d+", fields["version"])
+    assert fields["category"] in CATEGORIES
+    assert (
+        f'<url type="repository">{fields["url"]}</url>'
+        in (firmware_folder().parent / "package.xml").read_text()
+    )
+    assert "arduino" not in (fields["author"] + fields["maintainer"]).lower()
+    assert not fields["paragraph"].startswith(fields["sentence"])
+    assert all((SOURCES / header).is_file() for header in fields["includes"].split(","))
+    # The sketches include only headers of the library, of the core and of the exported model.
+    assert "depends" not in fields or fields["depends"]
 
 
 C_VARIANTS = [
@@ -72,7 +120,8 @@ def test_c_and_assembler_agree_for_every_combination_of_flags(tmp_path: Path, c_
     for number, assembler_flags in enumerate(ASSEMBLER_VARIANTS):
         folder = tmp_path / str(number)
         assembled = compile_each((*ASSEMBLER, *assembler_flags), sorted(SOURCES.rglob("*.S")), folder)
-        assert undefined_symbols(c + assembled, folder) == set(), assembler_flags
+        undefined = undefined_symbols(c + assembled, folder)
+        assert not {name for name in undefined if name.startswith("uwb_")}, assembler_flags
         # The portable kernels are in the C objects exactly if the assembler kernels are not used.
         assert {f"uwb_{kernel}" for kernel in KERNELS} <= defined_symbols(c) or not portable
         assert not ({f"uwb_{kernel}" for kernel in KERNELS} & defined_symbols(c)) or portable
@@ -82,4 +131,4 @@ def test_c_and_assembler_agree_for_every_combination_of_flags(tmp_path: Path, c_
 def test_other_processors_use_portable_c(tmp_path: Path, cpu: str):
     objects = compile_each((*C, f"-mcpu={cpu}"), sorted(SOURCES.rglob("*.c")), tmp_path)
     objects += compile_each((*ASSEMBLER, f"-mcpu={cpu}"), sorted(SOURCES.rglob("*.S")), tmp_path)
-    assert undefined_symbols(objects, tmp_path) == set()
+    assert not {name for name in undefined_symbols(objects, tmp_path) if name.startswith("uwb_")}

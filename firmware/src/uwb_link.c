@@ -223,3 +223,9 @@ void uwb_queue_drop(uwb_queue *queue, size_t count) {
     const size_t unsent = queue->encoded - queue->sent;
     queue->sent += count < unsent ? count : unsent;
 }
+
+void uwb_queue_restart(uwb_queue *queue) {
+    if (queue->sent != queue->encoded) {
+        queue->sent = 0;
+    }
+}

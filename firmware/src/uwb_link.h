@@ -77,6 +77,9 @@ size_t uwb_queue_peek(uwb_queue *queue, uint64_t now_us, const uint8_t **bytes);
 /* Remove `count` bytes that were sent. */
 void uwb_queue_drop(uwb_queue *queue, size_t count);
 
+/* Send the current frame again from its first byte, unless it was sent completely: the host has closed the port. */
+void uwb_queue_restart(uwb_queue *queue);
+
 /* Parse a RANGE_CIR at `payload`, which is aligned to 2 bytes. The samples of the CIR stay in the payload. Returns
  * whether it is well formed. */
 int uwb_read_measurement(const uint8_t *payload, size_t payload_bytes, uwb_range_cir_t *fields, uwb_cir *cir);

@@ -8,6 +8,7 @@
  *
  * SPI is done from loop() only, never from an interrupt, and in complete buffers: single bytes cost 20 us each. */
 #include <SPI.h>
+#include <uwb_nano33ble.h>
 #include <uwb_ranger.h>
 
 #if defined(__has_include)
@@ -19,9 +20,7 @@ static uint32_t arena[12288 / 4];
 #endif
 
 static const int RADIO_CS = 10, RADIO_IRQ = 2, RADIO_RESET = 9, TAG_SWITCH = 3;
-static const size_t PACKET = 64; /* size of a USB packet; packets are written completely */
 static const size_t MAX_SAMPLES = 1016;
-static const uint32_t WATCHDOG_S = 4;
 static const SPISettings SLOW(2000000, MSBFIRST, SPI_MODE0), FAST(8000000, MSBFIRST, SPI_MODE0);
 
 static uwb_ranger ranger;
@@ -30,33 +29,13 @@ static uint64_t measurement[UWB_TWR_MEASUREMENT_BYTES(MAX_SAMPLES) / 8 + 1];
 static uint8_t spi_buffer[8 + 4 * MAX_SAMPLES];
 static bool spi_fast;
 
-/* micros() wraps after 71 minutes; loop() reads it far more often. */
 static uint64_t uptime_us(void *) {
-    static uint64_t wraps;
-    static uint32_t last;
-    const uint32_t now = micros();
-    if (now < last) {
-        wraps += (uint64_t)1 << 32;
-    }
-    last = now;
-    return wraps + now;
+    return nano33ble::uptime_us();
 }
 
-static uint32_t clock_us() {
-    return micros();
-}
-
+/* Without waiting: an exchange has deadlines of less than a millisecond. */
 static void send_pending() {
-    const uint8_t *waiting;
-    if (!(bool)Serial) {
-        return;
-    }
-    size_t length = uwb_queue_peek(&ranger.board.queue, uptime_us(nullptr), &waiting);
-    /* One byte less than a packet: a transfer of full packets would have to end with an empty one. */
-    length = length < PACKET - 1 ? length : PACKET - 1;
-    if (length != 0 && Serial.availableForWrite() >= (int)length) {
-        uwb_queue_drop(&ranger.board.queue, Serial.write(waiting, length));
-    }
+    nano33ble::send_to_host(&ranger.board.queue, 0);
 }
 
 /* One chip-select period. */
@@ -106,19 +85,6 @@ static void wait(void *, uint64_t until_us) {
     }
 }
 
-static uint64_t random_number() {
-    uint64_t value = 0;
-    NRF_RNG->TASKS_START = 1;
-    for (int i = 0; i < 8; i++) {
-        NRF_RNG->EVENTS_VALRDY = 0;
-        for (int tries = 0; tries < 100000 && NRF_RNG->EVENTS_VALRDY == 0; tries++) {
-        }
-        value = value << 8 | (NRF_RNG->VALUE & 0xFFu);
-    }
-    NRF_RNG->TASKS_STOP = 1;
-    return value;
-}
-
 void setup() {
     pinMode(LED_BUILTIN, OUTPUT);
     pinMode(LED_PWR, OUTPUT);
@@ -130,9 +96,9 @@ void setup() {
     SPI.begin();
     Serial.begin(921600);
 
-    const uint64_t random = random_number();
+    const uint64_t random = nano33ble::random_number();
     uwb_board_config board = {};
-    board.board_id = (uint64_t)NRF_FICR->DEVICEID[1] << 32 | NRF_FICR->DEVICEID[0];
+    board.board_id = nano33ble::board_id();
     board.boot_id = (uint32_t)random;
     board.firmware_version[1] = 2;
     board.mode = UWB_MODE_HOST;
@@ -144,28 +110,22 @@ void setup() {
 #endif
     board.queue = queue;
     board.queue_bytes = sizeof queue;
-    board.clock_us = clock_us;
+    board.clock_us = nano33ble::clock_us;
     const uwb_dw1000_io io = {nullptr, transfer, speed, reset, uptime_us, wait, sleep_us};
     uwb_twr_config config = uwb_twr_defaults;
     config.role = digitalRead(TAG_SWITCH) == LOW ? UWB_ROLE_TAG : UWB_ROLE_ANCHOR;
     uwb_ranger_start(&ranger, &board, &io, &config, random, (uint8_t *)measurement, sizeof measurement);
-    NRF_WDT->CONFIG = 1; /* also while asleep; once started it cannot be stopped */
-    NRF_WDT->CRV = 32768u * WATCHDOG_S - 1u;
-    NRF_WDT->RREN = 1;
-    NRF_WDT->TASKS_START = 1;
+    nano33ble::start_watchdog();
 }
 
 /* Power LED: the host has the port open. Orange LED: changes with each range. */
 void loop() {
-    uint8_t bytes[PACKET];
-    size_t count = 0;
-    NRF_WDT->RR[0] = 0x6E524635u;
-    while (count < sizeof bytes && Serial.available() > 0) {
-        bytes[count++] = (uint8_t)Serial.read();
-    }
+    uint8_t bytes[64];
+    nano33ble::feed_watchdog();
+    const size_t count = nano33ble::read_host(bytes, sizeof bytes);
     uwb_board_receive(&ranger.board, bytes, count, uptime_us(nullptr));
     (void)uwb_ranger_step(&ranger);
     send_pending();
-    digitalWrite(LED_PWR, (bool)Serial ? HIGH : LOW);
+    digitalWrite(LED_PWR, nano33ble::host_connected() ? HIGH : LOW);
     digitalWrite(LED_BUILTIN, (ranger.twr.counts.ranged & 1u) ? HIGH : LOW);
 }

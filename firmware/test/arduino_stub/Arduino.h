@@ -1,5 +1,5 @@
-/* The part of the Arduino API and of the nRF52840's registers that the sketch uses, to compile and run it without a
- * board. The declarations are those of the Arduino core API; what a real core does may differ. */
+/* The part of the Arduino API and of the nRF52840's registers that the sketches use, to compile and run them without a
+ * board. The ports behave as those of the core "Arduino Mbed OS Boards" on the Nano 33 BLE. */
 #ifndef ARDUINO_H
 #define ARDUINO_H
 
@@ -9,24 +9,21 @@
 
 enum { LOW = 0, HIGH = 1, INPUT = 0, OUTPUT = 1, INPUT_PULLUP = 2, LED_BUILTIN = 13, LED_PWR = 25 };
 
-/* A port whose two ends are memory. */
+/* Serial (USB) and Serial1. Received bytes are lost if the ring is full. */
 struct StubPort {
-    const uint8_t *input;
-    size_t input_left;
-    uint8_t output[1 << 16];
-    size_t output_count;
-    size_t longest_write;
-    int room;
+    static const size_t RING_BYTES = 256;
+    bool is_usb;
+    uint8_t ring[RING_BYTES];
+    size_t first, used;
+    size_t overrun;
 
     void begin(unsigned long) {}
-    int available() { return (int)input_left; }
-    int read() {
-        input_left--;
-        return *input++;
-    }
-    int availableForWrite() { return room; }
-    size_t write(const uint8_t *bytes, size_t count);
-    explicit operator bool() { return true; }
+    int available() { return (int)used; }
+    int read();
+    int availableForWrite() { return 0; }              /* Print's: no port of this core overrides it */
+    size_t write(const uint8_t *bytes, size_t count);  /* USB: 0 without a terminal; else waits until it has read */
+    operator bool();                                   /* USB: sleeps for 1 ms */
+    void put(uint8_t byte);
 };
 
 struct StubWatchdog {

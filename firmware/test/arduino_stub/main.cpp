@@ -1,26 +1,37 @@
-/* Runs the sketch on memory: standard input is Serial1's, what the sketch writes to Serial goes to standard output.
- * Exit 2: a write was longer than a USB packet's safe length, or than the room there was. */
-#include "Arduino.h"
+/* Runs the sketch on emulated time: main <prefix> <host> <from s> <until s> <gap us> <compute us> <end s>. Standard
+ * input are frames for Serial1: they arrive at 921,600 baud with `gap us` between two. <host>: reads, silent or closed
+ * in the period (core.h). A run of the network takes `compute us`. Exit 3: the watchdog fired; 4: the ring of Serial1
+ * lost bytes. */
+#include "core.h"
 
 #include <stdio.h>
+#include <stdlib.h>
 
-StubPort Serial, Serial1;
-static StubWatchdog watchdog;
-static StubFactory factory = {{0x386, 1}};
-static StubRandom randomness;
-StubWatchdog *NRF_WDT = &watchdog;
-StubFactory *NRF_FICR = &factory;
-StubRandom *NRF_RNG = &randomness;
-static uint32_t now_us;
+static const uint32_t STEP_US = 1;
+static const double BYTE_US = 1e7 / 921600;
 
-size_t StubPort::write(const uint8_t *bytes, size_t count) {
-    longest_write = count > longest_write ? count : longest_write;
-    if ((int)count > room || count > sizeof output - output_count) {
-        return 0;
+static uint8_t input[1 << 22];
+static size_t input_bytes, input_at;
+static double byte_due_us = 100000, gap_us;
+static uint64_t now_us;
+static uint32_t compute_us;
+
+void stub_pass(uint32_t us) {
+    for (uint32_t passed = 0; passed < us; passed += STEP_US) {
+        now_us += STEP_US;
+        while (input_at < input_bytes && byte_due_us <= (double)now_us) {
+            const bool ends_frame = input_at > 0 && input[input_at] == 0 && input[input_at - 1] != 0;
+            Serial1.put(input[input_at++]);
+            byte_due_us += BYTE_US + (ends_frame ? gap_us : 0);
+        }
+        stub_run_events(now_us);
     }
-    memcpy(output + output_count, bytes, count);
-    output_count += count;
-    return count;
+}
+
+extern "C" int __real_uwb_network(const void *, const float *, void *, size_t, float *);
+extern "C" int __wrap_uwb_network(const void *model, const float *window, void *arena, size_t bytes, float *output) {
+    stub_pass(compute_us);
+    return __real_uwb_network(model, window, arena, bytes, output);
 }
 
 void pinMode(int, int) {}
@@ -29,19 +40,22 @@ int digitalRead(int) {
     return LOW;
 }
 uint32_t micros() {
-    return now_us += 10;
+    stub_pass(STEP_US);
+    return (uint32_t)now_us;
 }
 
-int main() {
-    static uint8_t input[1 << 16];
-    Serial1.input = input;
-    Serial1.input_left = fread(input, 1, sizeof input, stdin);
+int main(int argc, char **argv) {
+    if (argc != 8) {
+        return 2;
+    }
+    stub_start(argv[1], stub_host_of(argv[2]), (uint64_t)(atof(argv[3]) * 1e6), (uint64_t)(atof(argv[4]) * 1e6));
+    gap_us = atof(argv[5]);
+    compute_us = (uint32_t)atoi(argv[6]);
+    input_bytes = fread(input, 1, sizeof input, stdin);
     setup();
-    for (int turn = 0; turn < 20000; turn++) {
-        /* Now and then the host reads slowly. */
-        Serial.room = turn % 3 == 0 ? 0 : 64;
+    while ((double)now_us < atof(argv[7]) * 1e6) {
         loop();
     }
-    fwrite(Serial.output, 1, Serial.output_count, stdout);
-    return Serial.longest_write < 64 && watchdog.RR[0] == 0x6E524635u ? 0 : 2;
+    stub_finish();
+    return Serial1.overrun == 0 ? 0 : 4;
 }

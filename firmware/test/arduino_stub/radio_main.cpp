@@ -1,7 +1,7 @@
-/* Runs the sketch with a radio on a modelled chip, with an anchor 7 m away: radio_main <seconds>. What the sketch writes
- * to Serial goes to standard output. Exit 2: it drove RSTn high, held the chip select wrongly, or wrote more than is safe
- * on USB. */
+/* Runs the sketch with a radio on a modelled chip, with an anchor 7 m away: radio_main <prefix> <host> <from s>
+ * <until s> <end s>, as main.cpp. Exit 2: it drove RSTn high, or held the chip select wrongly; 3: the watchdog fired. */
 #include "SPI.h"
+#include "core.h"
 
 #include <stdio.h>
 #include <stdlib.h>
@@ -13,22 +13,9 @@ extern "C" {
 
 enum { CS = 10, IRQ = 2, RESET = 9, TAG_SWITCH = 3 };
 
-StubPort Serial, Serial1;
 StubSpi SPI;
-static StubWatchdog watchdog;
-static StubFactory factory = {{0x386, 1}};
-static StubRandom randomness;
-StubWatchdog *NRF_WDT = &watchdog;
-StubFactory *NRF_FICR = &factory;
-StubRandom *NRF_RNG = &randomness;
-
 static dw1000_chip *chip;
 static int modes[64], levels[64], wrong;
-
-size_t StubPort::write(const uint8_t *bytes, size_t count) {
-    longest_write = count > longest_write ? count : longest_write;
-    return fwrite(bytes, 1, count, stdout);
-}
 
 static void drive_reset() {
     static int held;
@@ -54,8 +41,13 @@ int digitalRead(int pin) {
     return pin == IRQ ? dw1000_irq(chip) : LOW;
 }
 
+void stub_pass(uint32_t us) {
+    dw1000_delay(chip, us * 1e-6);
+    stub_run_events((uint64_t)(dw1000_now(chip) * 1e6));
+}
+
 uint32_t micros() {
-    dw1000_delay(chip, 1e-6);
+    stub_pass(1);
     return (uint32_t)(dw1000_now(chip) * 1e6);
 }
 
@@ -69,7 +61,6 @@ void StubSpi::transfer(void *bytes, size_t count) {
 static void run_sketch(dw1000_chip *, void *) {
     setup();
     for (;;) {
-        Serial.room = 64;
         loop();
     }
 }
@@ -129,10 +120,10 @@ static void run_anchor(dw1000_chip *anchor, void *context) {
 
 int main(int argc, char **argv) {
     static anchor_host host;
-    if (argc != 2) {
+    if (argc != 6) {
         return 2;
     }
-    randomness.EVENTS_VALRDY = 1;
+    stub_start(argv[1], stub_host_of(argv[2]), (uint64_t)(atof(argv[3]) * 1e6), (uint64_t)(atof(argv[4]) * 1e6));
     dw1000_air *const air = dw1000_air_new(1);
     chip = dw1000_chip_new(air, 8, 0, 16436, 16436);
     dw1000_chip *const anchor = dw1000_chip_new(air, -5, 77, 16436, 16436);
@@ -141,8 +132,7 @@ int main(int argc, char **argv) {
     dw1000_set_pair(air, chip, anchor, &pair);
     dw1000_program(chip, run_sketch, NULL);
     dw1000_program(anchor, run_anchor, &host);
-    dw1000_run(air, atof(argv[1]));
-    fflush(stdout);
-    return wrong == 0 && Serial.longest_write < 64 && dw1000_fault(chip) == NULL && watchdog.RR[0] == 0x6E524635u ? 0
-                                                                                                                  : 2;
+    dw1000_run(air, atof(argv[5]));
+    stub_finish();
+    return wrong == 0 && dw1000_fault(chip) == NULL ? 0 : 2;
 }
