@@ -100,6 +100,7 @@ def run_mitigation(
 
 def received_messages(stream: bytes) -> list[object]:
     """Decode a session from its start, without a damaged frame except an incomplete last one."""
+    assert stream[:1] == b"\0", "a session starts with a complete frame"
     decoder = FrameDecoder()
     received: list[object] = [messages.decode(frame.type, frame.payload) for frame in decoder.feed(stream)]
     assert decoder.counts.corrupt == 0

@@ -54,7 +54,11 @@ void stub_finish() {
 }
 
 static void run_host() {
-    const StubHost host = now_us >= special_from_us && now_us < special_until_us ? special : HOST_READS;
+    StubHost host = now_us >= special_from_us && now_us < special_until_us ? special : HOST_READS;
+    const bool in_frame = packet_bytes != 0 && packet[packet_bytes - 1] != 0;
+    if (host == HOST_CLOSED && terminal && !in_frame) {
+        host = HOST_READS;
+    }
     if (host == HOST_CLOSED) {
         terminal = false;
         packet_bytes = 0; /* the core aborts the transfer */

@@ -6,7 +6,8 @@
 
 enum StubHost { HOST_READS, HOST_SILENT, HOST_CLOSED };
 
-/* The host behaves as `host` from `from_us` until `until_us`, else it reads. The bytes that it reads in session n, with
+/* The host behaves as `host` from `from_us` until `until_us`, else it reads; it closes the port in
+ * the middle of a frame. The bytes that it reads in session n, with
  * the port open, are written to the file `<prefix><n>`. */
 void stub_start(const char *prefix, StubHost host, uint64_t from_us, uint64_t until_us);
 
