@@ -69,7 +69,7 @@ setup(
             "py.typed",
             "types/ros/interfaces/*.msg",
             "recordings/mappings/*.yaml",
-            "training/templates/*.j2",
+            "calibration/templates/*.j2",
             "commands/field/templates/*.j2",
             "viewer/templates/*",
         ]

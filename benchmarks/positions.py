@@ -147,11 +147,11 @@ def calibrated(run: Run, donor: Run) -> Ranges:
     Raises:
         DatasetError: the calibration was refused.
     """
+    from uwb_mitigation.calibration.site import calibrate_site
+    from uwb_mitigation.calibration.site_data import read_site
+    from uwb_mitigation.calibration.solution import solve_without_truth
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.mitigation.model.shipped import default_model_path
-    from uwb_mitigation.training.site.calibration import calibrate_site
-    from uwb_mitigation.training.site.data import read_site
-    from uwb_mitigation.training.site.solution import solve_without_truth
 
     universal = load_bundle(default_model_path())
     heights = None if donor.heights is None else [donor.heights]

@@ -35,7 +35,7 @@ from uwb_mitigation.recordings.recorded_ranges import read_ranges  # noqa: E402
 from uwb_mitigation.simulation.scene import FLAT  # noqa: E402
 from uwb_mitigation.simulation.simulated import SimulatedSource  # noqa: E402
 from uwb_mitigation.types.anchors import dump_anchors, load_anchors  # noqa: E402
-from uwb_mitigation.types.palette import BLUE, GREY, NIGHT, VERMILLION  # noqa: E402
+from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, VERMILLION  # noqa: E402
 
 PICTURES = REPOSITORY / "docs" / "pictures"
 SIMULATED_HZ = 40.0

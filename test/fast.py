@@ -16,7 +16,7 @@ SLOW_MODULES = {
     # They compile the firmware, or start commands.
     *("uwb_mitigation.mitigation.embedded.compiling", "compilers", "command_line"),
     # They simulate and solve many drives.
-    *("uwb_mitigation.positioning.batch.self_calibration", "uwb_mitigation.positioning.batch.survey"),
+    *("uwb_mitigation.calibration.self_calibration", "uwb_mitigation.calibration.survey"),
 }
 SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading"}
 

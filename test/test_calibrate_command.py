@@ -12,13 +12,13 @@ from command_line import run, succeed
 from drives import HALL, drive
 from rosbags.typesys import Stores, get_typestore
 
+from uwb_mitigation.calibration.live_position import LiveError
+from uwb_mitigation.calibration.selection import SiteErrors
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.training.site.live_position import LiveError
-from uwb_mitigation.training.site.selection import SiteErrors
 from uwb_mitigation.types.anchors import load_anchors, save_anchors
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.types.offsets import read_offsets
@@ -149,7 +149,7 @@ def test_delayed_localisation_provides_the_truth(site):
 
 @pytest.mark.parametrize("truth", ["", "--truth-topic /odom --estimate-lever-arm"])
 def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, monkeypatch):
-    from uwb_mitigation.training.site import calibration
+    from uwb_mitigation.calibration import site as calibration
 
     seen = []
 
@@ -170,7 +170,7 @@ def test_offsets_are_found_without_the_segments_that_are_held_out(site, truth, m
 
 
 def test_ranges_of_unknown_truth_are_held_out_with_their_segment():
-    from uwb_mitigation.training.site.solution import _whole_segments
+    from uwb_mitigation.calibration.solution import _whole_segments
 
     segment = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 2, 2])
     labelled = np.array([1, 2, 4, 7, 8])
@@ -280,7 +280,7 @@ def worse_live_position(fields):
 
 
 def test_calibration_without_gain_is_written_only_with_force(site, monkeypatch):
-    from uwb_mitigation.training.site import calibration as site_calibration
+    from uwb_mitigation.calibration import site as site_calibration
 
     make = site_calibration.SiteCalibration
     words = f"calibrate drive.mcap {LEVEL} {WITH_TRUTH} -o harm.onnx --json h.json"
@@ -321,7 +321,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
 
 
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
-    from uwb_mitigation.positioning.batch.anchor_errors import validate_anchor_map
+    from uwb_mitigation.calibration.anchor_errors import validate_anchor_map
 
     ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
     rng = np.random.default_rng(4)

@@ -12,11 +12,11 @@ import yaml
 from browser import Browser
 from conftest import REPOSITORY
 
-from uwb_mitigation.types import palette
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.types.tracks import Estimate
+from uwb_mitigation.viewer import palette
 
 TYPES = {
     topics.RANGE_RAW: topics.RANGE_CIR_TYPE,

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from model_material import amplitudes_only
 
+from uwb_mitigation.calibration.radio_offsets import OffsetEstimate, bundle_with_line, estimate_offset
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
@@ -19,7 +20,6 @@ from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.training.site.radio_offsets import OffsetEstimate, bundle_with_line, estimate_offset
 from uwb_mitigation.types.measurement import RadioType, Record, Segment, Status
 from uwb_mitigation.types.offsets import Offsets, parse_offsets
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from drives import HALL, circuit, drive
 
+from uwb_mitigation.calibration.anchor_errors import position_scatter
+from uwb_mitigation.calibration.motion_segments import find_segments
+from uwb_mitigation.calibration.pose_alignment import align_poses
+from uwb_mitigation.calibration.self_calibration import self_calibrate
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.anchor_errors import position_scatter
-from uwb_mitigation.positioning.batch.motion_segments import find_segments
-from uwb_mitigation.positioning.batch.pose_alignment import align_poses
-from uwb_mitigation.positioning.batch.self_calibration import self_calibrate
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import SLOPE_SD, NoiseModel, Regressors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap

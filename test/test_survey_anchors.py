@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from drives import HALL, NANOSECONDS, circuit, drive
 
+from uwb_mitigation.calibration.survey import displacements, survey_anchors
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.survey import displacements, survey_anchors
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import Anchor, AnchorMap

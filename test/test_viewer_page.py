@@ -28,11 +28,11 @@ from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
-from uwb_mitigation.types.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.headline import live_cards
 from uwb_mitigation.viewer.page import Page, View
+from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
     AnchorPosition,

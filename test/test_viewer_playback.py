@@ -31,7 +31,6 @@ from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import anchors_path, dump_anchors, load_anchors
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Status
-from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.codec import encode_range
 from uwb_mitigation.types.ros.poses import encode_pose, encode_true_position, tag_topic
 from uwb_mitigation.types.ros.topics import (
@@ -46,6 +45,7 @@ from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import page, playback
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, current_card, interval_cards
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import AnchorPosition, Scene
 

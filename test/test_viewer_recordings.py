@@ -19,13 +19,13 @@ from drives import HALL, drive
 
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
 from uwb_mitigation.viewer import timeline as timeline_module
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.page import View
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Pose, Sample, Scene
 from uwb_mitigation.viewer.server import ViewerServer

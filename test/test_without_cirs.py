@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command_line import run, succeed
 
+from uwb_mitigation.calibration.radio_offsets import estimate_offset
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
@@ -20,7 +21,6 @@ from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.fit.candidates import fit_line
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias_to_rows
-from uwb_mitigation.training.site.radio_offsets import estimate_offset
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Truth
 
 EMPTY = np.zeros(0, np.int16)

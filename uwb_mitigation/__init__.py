@@ -16,20 +16,22 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
+from uwb_mitigation.files import VERSION
+
 if TYPE_CHECKING:
+    from uwb_mitigation.calibration.site import SiteCalibration, calibrate
     from uwb_mitigation.errors import UwbMitigationError
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.positioning.tag_locator import TagLocator
     from uwb_mitigation.recordings.dataframe import to_dataframe
     from uwb_mitigation.recordings.formats import open_recording
-    from uwb_mitigation.training.site.calibration import SiteCalibration, calibrate
     from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
     from uwb_mitigation.types.measurement import Cir, CorrectedRange, RangeMeasurement, Record, Status
     from uwb_mitigation.types.offsets import Offsets
     from uwb_mitigation.types.tracks import Estimate
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 # ONNX Runtime reads this when it is imported. By default it stores a device id in ~/.cache and sends usage data to Microsoft.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
@@ -65,11 +67,11 @@ _MODULES = {
     "Offsets": "types.offsets",
     "RangeMeasurement": "types.measurement",
     "Record": "types.measurement",
-    "SiteCalibration": "training.site.calibration",
+    "SiteCalibration": "calibration.site",
     "Status": "types.measurement",
     "TagLocator": "positioning.tag_locator",
     "UwbMitigationError": "errors",
-    "calibrate": "training.site.calibration",
+    "calibrate": "calibration.site",
     "load_anchors": "types.anchors",
     "load_model": "mitigation.model.shipped",
     "open_recording": "recordings.formats",

@@ -1,4 +1,4 @@
-"""Reading files up to a maximum size, and atomic writing."""
+"""Reading files up to a maximum size, and atomic writing; the version that files state."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from uwb_mitigation.errors import UwbMitigationError
+
+VERSION = "0.1.0"
+"""Version of this package; files that it writes state it."""
 
 
 def read_bounded(path: Path, limit: int, error: type[UwbMitigationError], valid: str = "") -> bytes:

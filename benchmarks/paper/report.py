@@ -16,10 +16,10 @@ from benchmarks.paper.data import TEST_ROOM
 from benchmarks.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
 from benchmarks.paper.rooms import ROOM_ROWS, has_rooms, parse_configuration
 from benchmarks.paper.tables import Cell, Provenance, ReportTable
+from uwb_mitigation.calibration.html import render_page
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.deepuwb import ROOMS
 from uwb_mitigation.training.evaluation.baselines import scikit_learn
-from uwb_mitigation.training.html import render_page
 
 LOS = "LOS"
 MAX_SAMPLES = 3

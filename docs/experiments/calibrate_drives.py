@@ -26,6 +26,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.sites import RATE_HZ, Drive
+from uwb_mitigation.calibration import site as site_calibration
+from uwb_mitigation.calibration import solution as site_solution
+from uwb_mitigation.calibration.site_data import read_site
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
@@ -36,9 +39,6 @@ from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, Tag
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.training import train
 from uwb_mitigation.training.data.dataset import build_dataset
-from uwb_mitigation.training.site import calibration as site_calibration
-from uwb_mitigation.training.site import solution as site_solution
-from uwb_mitigation.training.site.data import read_site
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets

@@ -21,6 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.position_data import HANYANG_TIME_OFFSET_S, hanyang_run
+from uwb_mitigation.calibration.site import SiteCalibration, calibrate_site
+from uwb_mitigation.calibration.site_data import read_site
+from uwb_mitigation.calibration.solution import solve_without_truth
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
@@ -33,9 +36,6 @@ from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.recordings.decaranging import DecaRangingFolder
 from uwb_mitigation.recordings.formats import open_mapped
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-from uwb_mitigation.training.site.calibration import SiteCalibration, calibrate_site
-from uwb_mitigation.training.site.data import read_site
-from uwb_mitigation.training.site.solution import solve_without_truth
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets

@@ -24,10 +24,10 @@ from uwb_mitigation.commands.support.console import JsonOption, print_line, show
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
+    from uwb_mitigation.calibration.site import SiteCalibration
+    from uwb_mitigation.calibration.site_data import SiteData
+    from uwb_mitigation.calibration.solution import LivePrior, Localisation, SiteSolution
     from uwb_mitigation.mitigation.model.bundle import Bundle
-    from uwb_mitigation.training.site.calibration import SiteCalibration
-    from uwb_mitigation.training.site.data import SiteData
-    from uwb_mitigation.training.site.solution import LivePrior, Localisation, SiteSolution
     from uwb_mitigation.types.anchors import AnchorMap
 
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
@@ -116,11 +116,11 @@ def calibrate(
 
         uwb-mitigation process other.mcap --model site.onnx --offsets site.offsets.yaml -o corrected.mcap
     """
+    from uwb_mitigation.calibration.site import calibrate_site
+    from uwb_mitigation.calibration.solution import LivePrior
     from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
-    from uwb_mitigation.training.site.calibration import calibrate_site
-    from uwb_mitigation.training.site.solution import LivePrior
     from uwb_mitigation.types.anchors import anchors_path, load_anchors
 
     _check_files(output, report, force)
@@ -186,7 +186,7 @@ class _PoseOptions:
 
 
 def _check_files(output: Path, report: Path | None, force: bool) -> None:
-    from uwb_mitigation.training.site.calibration import offsets_file
+    from uwb_mitigation.calibration.site import offsets_file
 
     check_output(output)
     for file in (output, offsets_file(output), *([report] if report else [])):
@@ -202,7 +202,7 @@ def _solve(
     pose_options: _PoseOptions,
     on_progress: Callable[[str, float], None],
 ) -> SiteSolution:
-    from uwb_mitigation.training.site import solution
+    from uwb_mitigation.calibration import solution
 
     if pose_options.topic is not None:
         localisation = _localisation(bags, site, pose_options.topic, pose_options)
@@ -227,8 +227,8 @@ def _write(
     bundle, offsets_path = calibration.write(output, source, name)
     print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     if report is not None:
+        from uwb_mitigation.calibration.page import site_page
         from uwb_mitigation.files import write_atomically
-        from uwb_mitigation.training.site.page import site_page
 
         write_atomically(report, site_page(calibration, name, bundle, (str(output), str(offsets_path))))
         print_line(f"Wrote {report}.")
@@ -245,9 +245,9 @@ def _gather(
 ) -> SiteData:
     from contextlib import ExitStack
 
+    from uwb_mitigation.calibration.site_data import read_site
     from uwb_mitigation.recordings.bag.pose_paths import read_heights
     from uwb_mitigation.recordings.formats import open_recording
-    from uwb_mitigation.training.site.data import read_site
 
     heights = None if height_topic is None else [read_heights(bag, height_topic, height_sd) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
@@ -270,8 +270,8 @@ def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOp
     """Read for each tag the poses of its body in each bag, and its lever arm."""
     import numpy as np
 
+    from uwb_mitigation.calibration.solution import Localisation
     from uwb_mitigation.recordings.bag.pose_paths import read_bodies
-    from uwb_mitigation.training.site.solution import Localisation
     from uwb_mitigation.types.ros.poses import UWB_TAG, tag_of_frame
 
     lever_arm_m = options.lever_arm_m
@@ -341,7 +341,7 @@ def _lever_arm_in(
 
 
 def _show(calibration: SiteCalibration) -> None:
-    from uwb_mitigation.training.site.live_position import RAW
+    from uwb_mitigation.calibration.live_position import RAW
 
     solution = calibration.solution
     if solution.alignment is not None:

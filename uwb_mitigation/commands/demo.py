@@ -62,10 +62,10 @@ def simulated(rate: float) -> DemoPlan:
 
 def offset_of(source: Source) -> float | None:
     """Return the offset of the boards (m) from LOS ranges with truth; None if it is unknown."""
+    from uwb_mitigation.calibration.radio_offsets import estimate_offset
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.mitigation.model.shipped import default_model_path
-    from uwb_mitigation.training.site.radio_offsets import estimate_offset
 
     try:
         return estimate_offset(Mitigation(load_bundle(default_model_path())), source).offset_m

@@ -120,9 +120,9 @@ def _correct(observation: Observation) -> None:
 
 def _write(folder: Path, source: str, observation: Observation, checks: list[Check]) -> None:
     """Write the page, the values and the ranges."""
+    from uwb_mitigation.calibration.html import render_page
     from uwb_mitigation.commands.field.test import SOURCES
     from uwb_mitigation.recordings.bag.writer import BagWriter
-    from uwb_mitigation.training.html import render_page
     from uwb_mitigation.types.measurement import Record, Truth
 
     system = {

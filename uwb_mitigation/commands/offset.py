@@ -15,7 +15,7 @@ from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import DatasetError, ParameterError, parse_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.training.site.radio_offsets import OffsetEstimate
+    from uwb_mitigation.calibration.radio_offsets import OffsetEstimate
 
 MAX_DISTANCE_M = 1000.0
 
@@ -72,10 +72,10 @@ def offset(
         uwb-mitigation offset los.mcap --distance 5.00 -o offsets.yaml
         ros2 param set /mitigator offsets offsets.yaml
     """
+    from uwb_mitigation.calibration import radio_offsets
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.recordings.formats import open_recording
-    from uwb_mitigation.training.site import radio_offsets
     from uwb_mitigation.types.offsets import dump_offsets
 
     if (distance is None) == (not truth):

@@ -14,8 +14,8 @@ from uwb_mitigation.commands.support.console import JsonOption, print_line, show
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
 
 if TYPE_CHECKING:
+    from uwb_mitigation.calibration.survey import SurveyResult
     from uwb_mitigation.commands.offline.track import HoldoutErrors, TagTracks
-    from uwb_mitigation.positioning.batch.survey import SurveyResult
     from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap
@@ -210,7 +210,7 @@ def survey(
     not at the position in the file, and swapped pairs. Translation and rotation of all anchors are unobservable from
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
-    from uwb_mitigation.positioning.batch.survey import survey_anchors
+    from uwb_mitigation.calibration.survey import survey_anchors
     from uwb_mitigation.types.anchors import save_anchors
 
     if not 0.0 < off <= 100.0:

@@ -13,11 +13,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.positioning.geometry import horizontal_ellipse
-from uwb_mitigation.types import palette
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.types.palette import STATUS_LOOKS
 from uwb_mitigation.types.tracks import Estimate
+from uwb_mitigation.viewer import palette
+from uwb_mitigation.viewer.palette import STATUS_LOOKS
 
 TRAIL = 400
 

@@ -18,11 +18,11 @@ from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
-from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
     DEFAULT_TAG,
     MAX_TRUTHS,

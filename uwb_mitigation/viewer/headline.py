@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import TruePath
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, HISTORY_S, Pair, Scene, tag_label, tag_name
 from uwb_mitigation.viewer.timeline import Timeline
 

@@ -25,7 +25,10 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from bokeh.transform import factor_mark
 
-from uwb_mitigation.types.palette import (
+from uwb_mitigation.viewer.floor_plan import MapImage
+from uwb_mitigation.viewer.headline import WHOLE
+from uwb_mitigation.viewer.health import STATES
+from uwb_mitigation.viewer.palette import (
     BLUE,
     GREEN,
     GREY,
@@ -36,9 +39,6 @@ from uwb_mitigation.types.palette import (
     VERMILLION,
     TrackKind,
 )
-from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.headline import WHOLE
-from uwb_mitigation.viewer.health import STATES
 from uwb_mitigation.viewer.scene import CELL_M, HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.types.palette import STATUS_LOOKS, TrackKind
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.headline import LIVE, RECENT, WHOLE, Card, current_card, interval_cards, live_cards
 from uwb_mitigation.viewer.models import COLUMNS, FADING, FIGURES, TRACE_AFTER, TRACE_BEFORE, Models
+from uwb_mitigation.viewer.palette import STATUS_LOOKS, TrackKind
 from uwb_mitigation.viewer.scene import (
     CELL_M,
     ERROR_EDGES_M,

@@ -21,11 +21,11 @@ from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import RangeMeasurement
-from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording
 from uwb_mitigation.viewer.scene import HISTORY_S, MAX_MESSAGES, SPEEDS, MissingData, NodeStatus, Pair
 from uwb_mitigation.viewer.timeline import BATCH, Timeline, index_recording

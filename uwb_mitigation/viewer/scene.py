@@ -23,9 +23,9 @@ from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, CorrectedRange, Encoding, Status, Truth
-from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.viewer.palette import TrackKind
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
 MAX_PAIRS, MAX_TAGS, MAX_NODES = 256, 64, 64

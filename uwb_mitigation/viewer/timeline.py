@@ -22,7 +22,6 @@ from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Status
-from uwb_mitigation.types.palette import TrackKind
 from uwb_mitigation.types.ros.codec import MeasurementKey, measurement_key
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.ros.topics import (
@@ -34,6 +33,7 @@ from uwb_mitigation.types.ros.topics import (
 )
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Ranges, Track
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
 from uwb_mitigation.viewer.scene import (
     MAX_CELLS,

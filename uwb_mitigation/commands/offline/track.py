@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.anchor_errors import MIN_LOSS_GAIN, is_displaced
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning.batch.anchor_errors import MIN_LOSS_GAIN, is_displaced
 from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, dop
 from uwb_mitigation.positioning.online.initialization import snapshot

@@ -1,1 +1,1 @@
-"""Estimation from a whole recording: smoother, least squares, calibration, survey of anchors."""
+"""Estimation from a whole recording: least squares, smoother."""

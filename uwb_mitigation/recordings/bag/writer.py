@@ -18,9 +18,8 @@ from typing import BinaryIO
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
-import uwb_mitigation
 from uwb_mitigation.errors import ParameterError, RecordingError
-from uwb_mitigation.files import partial_path, write_atomically
+from uwb_mitigation.files import VERSION, partial_path, write_atomically
 from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import Channel, Schema
 from uwb_mitigation.recordings.bag.rosbag2 import (
@@ -101,7 +100,7 @@ class BagWriter:
         self._folder = None if path.suffix == ".mcap" else path
         self.file = _bag_file(path)
         self._partial = partial_file(path)
-        self._metadata = {"version": uwb_mitigation.__version__, **metadata}
+        self._metadata = {"version": VERSION, **metadata}
         self._own_channels: dict[str, int] = {}
         self._channel_ids: dict[tuple[object, ...], int] = {}
         self._topic_of_channel: dict[int, str] = {}
@@ -116,7 +115,7 @@ class BagWriter:
                 if self._folder is not None:
                     self._folder.mkdir(parents=True, exist_ok=True)
                 self._stream = self._partial.open("wb")
-                self._mcap = McapFile(self._stream, f"uwb_mitigation {uwb_mitigation.__version__}")
+                self._mcap = McapFile(self._stream, f"uwb_mitigation {VERSION}")
                 self._mcap.add_metadata(METADATA_RECORD, self._metadata)
         except BaseException:
             # Ctrl-C before the `with` block of the caller.

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.site_data import SiteData
+from uwb_mitigation.calibration.solution import SiteSolution
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
-from uwb_mitigation.training.site.data import SiteData
-from uwb_mitigation.training.site.solution import SiteSolution
 from uwb_mitigation.types.tracks import Heights, Ranges, TruePath
 
 RAW = "raw"

@@ -10,6 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.live_position import RAW, LiveError, live_errors
+from uwb_mitigation.calibration.selection import SiteErrors, held_out_site_errors
+from uwb_mitigation.calibration.site_data import SiteData, read_site
+from uwb_mitigation.calibration.solution import (
+    Pairs,
+    Progress,
+    SiteSolution,
+    solve_without_truth,
+    usable_ranges,
+)
 from uwb_mitigation.errors import DatasetError, ModelError, format_id
 from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.model import graph
@@ -21,16 +31,6 @@ from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.fit.candidates import FittedModel, site_models
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
 from uwb_mitigation.training.fit.selection import MIN_GAIN
-from uwb_mitigation.training.site.data import SiteData, read_site
-from uwb_mitigation.training.site.live_position import RAW, LiveError, live_errors
-from uwb_mitigation.training.site.selection import SiteErrors, held_out_site_errors
-from uwb_mitigation.training.site.solution import (
-    Pairs,
-    Progress,
-    SiteSolution,
-    solve_without_truth,
-    usable_ranges,
-)
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import Offsets, dump_offsets

@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.anchor_errors import validate_anchor_map
+from uwb_mitigation.calibration.pose_alignment import PoseAlignment, align_poses
+from uwb_mitigation.calibration.self_calibration import SelfCalibration, self_calibrate
+from uwb_mitigation.calibration.site_data import SiteData
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.floating import float_network
-from uwb_mitigation.positioning.batch.anchor_errors import validate_anchor_map
-from uwb_mitigation.positioning.batch.pose_alignment import PoseAlignment, align_poses
-from uwb_mitigation.positioning.batch.self_calibration import SelfCalibration, self_calibrate
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import (
     CORRECTED_SLOW_SD_M,
@@ -26,7 +27,6 @@ from uwb_mitigation.positioning.noise_model import (
     Regressors,
 )
 from uwb_mitigation.training.fit.candidates import network_m
-from uwb_mitigation.training.site.data import SiteData
 from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.tracks import PosePath
 

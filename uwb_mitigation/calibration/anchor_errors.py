@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.first_positions import first_positions
-from uwb_mitigation.positioning.batch.joint_fit import (
+from uwb_mitigation.calibration.first_positions import first_positions
+from uwb_mitigation.calibration.joint_fit import (
     FAR_S,
     JointFit,
     Observations,
@@ -25,7 +24,8 @@ from uwb_mitigation.positioning.batch.joint_fit import (
     fit_joint,
     observations_of,
 )
-from uwb_mitigation.positioning.batch.motion_segments import GAP_S, Segments
+from uwb_mitigation.calibration.motion_segments import GAP_S, Segments
+from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank, unit_vectors
 from uwb_mitigation.positioning.noise_model import MAD_TO_SD, Regressors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.joint_fit import KNOT_S
+from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.joint_fit import KNOT_S
-from uwb_mitigation.positioning.batch.motion_segments import Segments
 from uwb_mitigation.positioning.online.initialization import CandidatePosition, candidate_positions
 from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution, gauss_newton
-from uwb_mitigation.positioning.batch.motion_segments import Segments
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import CORRECTED_SLOW_SD_M, NoiseModel, Regressors, scatter_of
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.anchor_errors import (
+from uwb_mitigation.calibration.anchor_errors import (
     check_anchor_positions,
     check_height,
     check_motion,
@@ -25,14 +24,15 @@ from uwb_mitigation.positioning.batch.anchor_errors import (
     mirrored,
     position_scatter,
 )
-from uwb_mitigation.positioning.batch.first_positions import (
+from uwb_mitigation.calibration.first_positions import (
     START_SD_M,
     first_positions,
     likely_offset,
     suspects,
 )
-from uwb_mitigation.positioning.batch.joint_fit import SLOW_S, JointFit, Start, fit_segments
-from uwb_mitigation.positioning.batch.motion_segments import Segments, find_segments
+from uwb_mitigation.calibration.joint_fit import SLOW_S, JointFit, Start, fit_segments
+from uwb_mitigation.calibration.motion_segments import Segments, find_segments
+from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig

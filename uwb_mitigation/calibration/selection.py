@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.live_position import LiveError
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.splits import Split
 from uwb_mitigation.training.fit.candidates import Candidate
 from uwb_mitigation.training.fit.selection import MIN_GAIN, held_out_errors, step_counter
-from uwb_mitigation.training.site.live_position import LiveError
 
 SEGMENT_FOLDS, ANCHOR_FOLDS = 4, 2
 """Number of folds over segments of the track and over anchors."""

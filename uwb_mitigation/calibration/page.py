@@ -7,10 +7,10 @@ from datetime import datetime, timezone
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.html import render_page
+from uwb_mitigation.calibration.site import SiteCalibration
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.training.html import render_page
-from uwb_mitigation.training.site.calibration import SiteCalibration
 
 MAX_POINTS = 2000
 WIDTH, HEIGHT, MARGIN = 380.0, 280.0, 24.0
