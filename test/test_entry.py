@@ -47,6 +47,15 @@ def test_help_lists_every_parameter_without_ros(node: str, tables: list[str], tm
     assert all(f"\n  {row.name}:=" in output for table in tables for row in TABLES[table])
 
 
+def test_module_without_a_node_names_the_nodes_in_one_line():
+    command = [sys.executable, "-m", "uwb_mitigation.commands.entry"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "driver, mitigator, locator" in line
+    assert "demo" in line
+
+
 @pytest.mark.parametrize(
     ("executable", "number"),
     [

@@ -104,6 +104,8 @@ def _end(number: int, frame: Any) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(f"error: no node is named (one of {', '.join(_NODES)}, or demo)")
     name = sys.argv.pop(1)
     if name == "demo":
         run_program("uwb_mitigation.commands.demo", "run_demo_command")
