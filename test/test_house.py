@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
@@ -37,6 +38,44 @@ def test_drawing_of_the_layers_agrees_with_the_contract_and_its_files_exist():
     paths = re.findall(r"`((?:uwb_mitigation|firmware|docs|msg_defs)/[\w/.]+)`", page)
     assert len(paths) > 10
     assert [path for path in paths if not (REPOSITORY / path).exists()] == []
+
+
+def imported_files(path: Path) -> set[Path]:
+    """Return the files of the package that a file imports, also inside functions; not for type checks."""
+    files, waiting = set[Path](), list[ast.AST](ast.parse(path.read_text(encoding="utf-8")).body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            waiting += node.orelse
+            continue
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [str(node.module), *(f"{node.module}.{name}" for name in names)]
+        for place in (REPOSITORY / name.replace(".", "/") for name in names if name.startswith(PACKAGE.name)):
+            files |= {file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()}
+        waiting += ast.iter_child_nodes(node)
+    return files - {PACKAGE / "__init__.py"}
+
+
+def test_modules_have_few_arrows():
+    arrows = {
+        (path.relative_to(PACKAGE).parts[0], file.relative_to(PACKAGE).parts[0])
+        for path in PACKAGE.rglob("*.py")
+        if path.parent != PACKAGE
+        for file in imported_files(path)
+    }
+    assert 40 < len({(one, other) for one, other in arrows if one != other}) <= 56
+
+
+@pytest.mark.parametrize(("module", "limit"), [("radios/serial", 4000), ("training/train", 5000)])
+def test_a_module_imports_few_lines(module: str, limit: int):
+    """Count the lines of the files that a module imports, directly or not."""
+    seen, waiting = set[Path](), {PACKAGE / f"{module}.py"}
+    while waiting:
+        seen.add(path := waiting.pop())
+        waiting |= imported_files(path) - seen
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in seen)
+    assert 1000 < lines <= limit
 
 
 def test_only_nodes_import_rclpy_at_run_time():
