@@ -253,12 +253,9 @@ class Smoother:
         if self._height is not None:
             index, column = [*index, 2], [*column, problem.of_shared(p)]
             state[2] -= self._height.value
-        selection = np.eye(len(state))[index]
-        # The errors of this window are the persisting and the constant ones of the filter.
-        selection[np.arange(2 * d, 2 * d + m), len(state) - len(self._anchor_position) + self._used] = 1.0
-        information = np.linalg.inv(selection @ self._after.P @ selection.T + 1e-9 * np.eye(len(index)))
+        information = np.linalg.inv(self._after.P[np.ix_(index, index)] + 1e-9 * np.eye(len(index)))
         root = np.linalg.cholesky((information + information.T) / 2.0).T
-        problem.add(np.tile(column, (len(index), 1)), root, root @ (selection @ state), 1.0)
+        problem.add(np.tile(column, (len(index), 1)), root, root @ state[index], 1.0)
 
 
 def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:

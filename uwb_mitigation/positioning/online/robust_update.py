@@ -1,9 +1,9 @@
 """State of a tag or robot with the errors of its ranges, and the robust Kalman update that all filters share.
 
-State: motion (0 to k - 1), the offset that the tag's ranges have in common (k), and of each anchor's ranges the persisting error
-(k + 1, ...) and after these the constant error. While the position is searched, offset and errors are only considered
-(S. F. Schmidt, 1966): they keep their uncertainty and their correlations, so that no candidate position explains its ranges by
-wrong offsets. Afterwards they are estimated; constant errors only with ranges that have a variance.
+State: motion (0 to k - 1), the offset that the tag's ranges have in common (k), and the persisting error of each anchor's ranges
+(k + 1, ...). While the position is searched, offset and errors are only considered (S. F. Schmidt, 1966): they keep their
+uncertainty and their correlations, so that no candidate position explains its ranges by wrong offsets. Afterwards they are
+estimated. Covariances in Joseph's form, which is valid for any gain.
 """
 
 from __future__ import annotations
@@ -20,17 +20,13 @@ from uwb_mitigation.types.anchors import AnchorMap
 MIN_VARIANCE_M2 = 1e-6
 """Of white noise: measurements with less would make the covariance singular."""
 
-CONSTANT_SD_M = 0.06
-"""Standard deviation of the constant error of each anchor: what remains of antenna delays, and errors of the positions of anchors.
-Chosen on simulated sites."""
-
 CONSISTENCY_RATE = 0.01
 """Share of a new range in the running mean `consistency`: it includes about a hundred ranges."""
 
 MAX_RATIO = 9.0
 """Limit of the contribution of a range to `consistency`: a single anchor with a large error must not dominate it."""
 
-SCALE, MAX_SCALE = 2.0, 20.0
+SCALE, POWER, MIN_SCALE, MAX_SCALE = 2.2, 4.0, 0.2, 12.0
 """See `RobustUpdate.covariance_scale`."""
 
 
@@ -49,33 +45,19 @@ class RobustUpdate:
         consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
     """
 
-    __slots__ = (
-        "H",
-        "P",
-        "_considered",
-        "_constant",
-        "_error_variance",
-        "_model",
-        "_offset",
-        "consistency",
-        "estimates_errors",
-        "x",
-    )
+    __slots__ = ("H", "P", "_error_variance", "_model", "_offset", "consistency", "estimates_errors", "x")
 
     def __init__(self, anchors: AnchorMap, model: NoiseModel, motion: NDArray[np.float64]) -> None:
         self._model, self._offset = model, len(motion)
-        self._constant = len(motion) + 1 + len(anchors)
-        n = self._constant + len(anchors)
+        n = len(motion) + 1 + len(anchors)
         # The unconditional variance of each anchor's persisting error: what its last ranges' variances claim.
         self._error_variance = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
         self.estimates_errors, self.consistency = False, 1.0
-        self._considered = self._constant
         self.H, self.x, self.P = np.zeros(n), np.zeros(n), np.zeros((n, n))
         self.x[: len(motion)] = motion
         self.P[self._offset, self._offset] = model.offset_sd**2
-        diagonal = self.P.reshape(-1)[:: n + 1]
-        diagonal[self._offset + 1 : self._constant] = self._error_variance
-        diagonal[self._constant :] = CONSTANT_SD_M**2
+        errors = np.arange(self._offset + 1, n)
+        self.P[errors, errors] = self._error_variance
 
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
@@ -88,7 +70,6 @@ class RobustUpdate:
         """Return a state with other motion states (k,), the same errors, and the covariance of position and errors."""
         twin, k, old = copy.copy(self), len(motion), self._offset
         twin._offset, twin._error_variance = k, self._error_variance.copy()
-        twin._constant = twin._considered = self._constant + k - old
         twin.x = np.concatenate([motion, self.x[old:]])
         n = len(twin.x)
         twin.H, twin.P = np.zeros(n), np.zeros((n, n))
@@ -99,13 +80,12 @@ class RobustUpdate:
 
     def predict_errors(self, elapsed: float) -> None:
         """Predict the persisting errors after `elapsed` time constants."""
-        decay, P = math.exp(-elapsed), self.P
-        errors = slice(self._offset + 1, self._constant)
-        self.x[errors] *= decay
-        P[errors] *= decay
-        P[:, errors] *= decay
+        decay, first, P = math.exp(-elapsed), self._offset + 1, self.P
+        self.x[first:] *= decay
+        P[first:] *= decay
+        P[:, first:] *= decay
         diagonal = P.reshape(-1)[:: len(P) + 1]
-        diagonal[errors] += (1.0 - decay * decay) * self._error_variance
+        diagonal[first:] += (1.0 - decay * decay) * self._error_variance
 
     def update_range(self, anchor: int, residual_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with a range; `H` is set.
@@ -119,17 +99,14 @@ class RobustUpdate:
             The innovation divided by its standard deviation, and this standard deviation in m.
         """
         model, x, H, k = self._model, self.x, self.H, self._offset
-        row, constant = k + 1 + anchor, self._constant + anchor
+        row = k + 1 + anchor
         variance, error_variance = model.variance(variance_m2), self._error_variance[anchor]
         # The part of the variance that the persisting error does not explain is white noise.
         white = max(model.white * variance, variance - error_variance)
         self._error_variance[anchor] += 0.1 * ((1.0 - model.white) * variance - error_variance)
         H[k:] = 0.0
-        H[k] = H[row] = H[constant] = 1.0
-        innovation = float(residual_m - x[k] - x[row] - x[constant])
-        # The errors of raw ranges also change slowly, which constants would follow: there they are only considered.
-        self._considered = len(x) if variance_m2 > 0.0 else self._constant
-        z, sd = self.update(H, innovation, white)
+        H[k] = H[row] = 1.0
+        z, sd = self.update(H, float(residual_m - x[k] - x[row]), white)
         ratio = (self.x[row] ** 2 + self.P[row, row]) / error_variance
         self.consistency += CONSISTENCY_RATE * (min(float(ratio), MAX_RATIO) - self.consistency)
         return z, sd
@@ -138,21 +115,20 @@ class RobustUpdate:
         self, H: NDArray[np.float64], innovation: float, R: float, *, robust: bool = True
     ) -> tuple[float, float]:
         """Update with a measurement with Jacobian H (n,) and noise variance R; return as `update_range`."""
-        P, R = self.P, max(R, MIN_VARIANCE_M2)
-        considered = self._considered if self.estimates_errors else self._offset
-        PH = P @ H
+        R = max(R, MIN_VARIANCE_M2)
+        PH = self.P @ H
         HPH = float(H @ PH)
         sd = math.sqrt(HPH + R)
         z = innovation / sd
         S = (HPH + R) * (self._model.inflation(z) if robust else 1.0)
         K = PH / S
-        # With K = PH / S in the rows of estimated states and 0 in the others, Joseph's form is P - PH PH' / S outside of
-        # the covariance of the considered states among themselves, which stays.
-        of_considered = P[considered:, considered:].copy()
-        P -= np.multiply.outer(K, PH)
-        P[considered:, considered:] = of_considered
-        K[considered:] = 0.0
+        if not self.estimates_errors:
+            K[self._offset :] = 0.0
         self.x += K * innovation
+        # Joseph's form (I - K H) P (I - K H)' + K R K', as updates of rank one.
+        P = self.P - np.multiply.outer(K, PH)
+        P -= np.multiply.outer(P @ H - (S - HPH) * K, K)
+        self.P = P
         return z, sd
 
     def project(self, axis: int, value: float) -> None:
@@ -164,13 +140,14 @@ class RobustUpdate:
         K = self.P[:, axis] / max(self.P[axis, axis], 1e-12)
         # If the correlation with another coordinate is steep, the linear model is not valid.
         K[:3] = np.clip(K[:3], -1.0, 1.0)
-        K[self._considered if self.estimates_errors else self._offset :] = 0.0
+        if not self.estimates_errors:
+            K[self._offset :] = 0.0
         self.x -= K * (self.x[axis] - value)
 
     def covariance_scale(self) -> float:
         """Return the factor of published covariances.
 
-        The filter sees only a part of the errors of anchors, so that their true variance differs from the model by more than
-        `consistency`. Factors were chosen on simulated drives, the Hanyang runs and the labyrinth.
+        The filter sees only a part of the persisting errors, so that their true variance differs from the model by more than
+        `consistency`. The power and the limits were chosen on simulated drives, the Hanyang runs and the labyrinth.
         """
-        return min(SCALE * self.consistency * max(self.consistency, 1.0), MAX_SCALE)
+        return min(max(SCALE * math.pow(self.consistency, POWER), MIN_SCALE), MAX_SCALE)
