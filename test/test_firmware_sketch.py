@@ -40,7 +40,7 @@ def compile_sketch(name: str, folder: Path, standard: str, *files: str) -> Path:
     # Use the exported header; the committed one has a separate test.
     sketch, program = folder / f"{name}.cpp", folder / "sketch"
     sketch.write_text((EXAMPLES / name / f"{name}.ino").read_text())
-    options = (f"-std={standard}", "-O1", "-funsigned-char", "-Wall", "-Wextra", "-Werror")
+    options = (f"-std={standard}", "-O1", "-funsigned-char", "-Wall", "-Wextra", "-Werror", "-no-pie")
     includes = (f"-I{STUB}", f"-I{firmware_folder() / 'src'}", f"-I{MODEL_FOLDER}", f"-I{folder}")
     stub = ("-include", str(STUB / "Arduino.h"), str(STUB / "core.cpp"))
     run_tool(["c++", *options, *includes, *stub, str(sketch), *files, "-o", str(program)])
@@ -84,6 +84,7 @@ def run_mitigation(
     measurements: Sequence[RangeMeasurement],
     count: int,
     *arguments: object,
+    upload_s: float = 0,
 ) -> list[list[object]]:
     """Send `count` measurements to the sketch and run it, see main.cpp; return the messages of every session.
 
@@ -92,7 +93,7 @@ def run_mitigation(
     encoder = FrameEncoder()
     sent = (messages.encode(m) for m in itertools.islice(itertools.cycle(measurements), count))
     wire = b"".join(encoder.encode(*message) for message in sent)
-    command = [sketch, f"{folder}/session", *map(str, arguments)]
+    command = [sketch, f"{folder}/session", *map(str, arguments), str(upload_s)]
     done = subprocess.run(command, input=wire, capture_output=True, timeout=240, check=False)
     assert done.returncode == 0
     return [received_messages(path.read_bytes()) for path in sorted(folder.glob("session*"))]
@@ -151,6 +152,12 @@ def test_sketch_counts_what_it_drops_if_the_radio_is_faster(
     assert status.measurements == 150
     assert 0 < status.measurements_lost == 150 - len(corrections)
     assert not of_type(Log, received), "complete frames are dropped: none is damaged"
+
+
+@NEEDS_CXX
+def test_next_sketch_can_be_uploaded_while_the_watchdog_runs(tmp_path: Path, mitigation_sketch: Path):
+    """A started watchdog runs on during the reset into the boot loader, which does not feed it."""
+    run_mitigation(mitigation_sketch, tmp_path, [], 0, "reads", 0, 0, 0, 0, 0.2, upload_s=45)
 
 
 @NEEDS_CXX

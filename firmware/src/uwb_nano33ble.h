@@ -14,7 +14,9 @@ namespace nano33ble {
 
 /* One byte less than a USB packet: a transfer of full packets would have to end with an empty one. */
 static const size_t SEND_BYTES = 63;
-static const uint32_t WATCHDOG_S = 4;
+/* A started watchdog runs on while the boot loader writes the next sketch, and the boot loader does not feed it. The
+ * largest sketch takes about 40 s; the next sketch may be reset once. */
+static const uint32_t WATCHDOG_S = 60;
 
 /* micros() wraps after 71 minutes; loop() calls this far more often. Not for interrupts. */
 static inline uint64_t uptime_us() {
@@ -47,6 +49,11 @@ static inline uint64_t random_number() {
     }
     NRF_RNG->TASKS_STOP = 1;
     return value;
+}
+
+/* Code runs from flash with wait states unless the instruction cache is enabled, and the core does not enable it. */
+static inline void enable_cache() {
+    NRF_NVMC->ICACHECNF = 1;
 }
 
 /* nRF52840 product specification, section 6.36: once started it cannot be stopped, and resets a board that hangs. */
@@ -104,24 +111,67 @@ static inline void send_to_host(uwb_queue *queue, uint32_t limit_us) {
     host_reads = accepted != 0 || (host_reads && limit_us == 0);
 }
 
-/* Serial1 receives into a ring of 256 bytes, which is full after 2.8 ms at 921,600 baud, and a correction takes longer.
- * An interrupt empties it every millisecond. */
+/* Reception of frames on pin RX with UARTE1, without Serial1.
+ *
+ * Serial1 takes two interrupts for each byte. It loses bytes if USB or another part of the core disables interrupts for
+ * longer than a byte lasts (11 us at 921,600 baud), or if any interrupt handler takes longer than its 32 bytes last. Here
+ * DMA fills two halves of a buffer in turn, and TIMER4 counts the bytes of the present half, by PPI. A periodic
+ * interrupt only has to be faster than a half lasts. */
+static const uint32_t HALF_BYTES = 512; /* 5.5 ms */
 static const std::chrono::microseconds EMPTY_INTERVAL(1000);
+static const uint32_t MIN_INTERVAL_US = 100;
+static const uint32_t COUNT_CHANNEL = 18, CLEAR_CHANNEL = 19; /* of the PPI; the core allocates from 0 */
 static uwb_frame_ring *radio_ring;
+static volatile uint8_t received[2][HALF_BYTES];
 static mbed::Ticker ticker;
 
-static inline void empty_serial1() {
+static inline void empty_uart() {
+    static uint32_t half = 1, position = HALF_BYTES, counted, counted_us;
     const uint32_t now_us = micros();
-    for (int left = Serial1.available(); left > 0; left--) {
-        uwb_frame_ring_put(radio_ring, (uint8_t)Serial1.read(), now_us);
+    if (now_us - counted_us < MIN_INTERVAL_US) {
+        return; /* late calls follow each other at once */
+    }
+    /* A counted byte may still be on its way to memory: read those of the previous call. */
+    uint32_t end = counted;
+    const uint32_t end_us = counted_us;
+    NRF_TIMER4->TASKS_CAPTURE[0] = 1;
+    counted = NRF_TIMER4->CC[0];
+    counted_us = now_us;
+    const bool half_started = NRF_UARTE1->EVENTS_RXSTARTED != 0;
+    end = half_started ? HALF_BYTES : end;
+    for (; position < end; position++) {
+        uwb_frame_ring_put(radio_ring, received[half][position], end_us);
+    }
+    if (half_started) {
+        NRF_UARTE1->EVENTS_RXSTARTED = 0;
+        half ^= 1u;
+        NRF_UARTE1->RXD.PTR = (uint32_t)(uintptr_t)received[half ^ 1u]; /* for the next half */
+        position = counted = 0;
     }
 }
 
-/* Receive frames on Serial1 (D0) into a ring. */
-static inline void receive_frames(uwb_frame_ring *ring, unsigned long baud) {
+static inline void connect(uint32_t channel, volatile const uint32_t &event, volatile const uint32_t &task) {
+    NRF_PPI->CH[channel].EEP = (uint32_t)(uintptr_t)&event;
+    NRF_PPI->CH[channel].TEP = (uint32_t)(uintptr_t)&task;
+    NRF_PPI->CHENSET = 1u << channel;
+}
+
+/* Receive frames at 921,600 baud on pin RX into a ring. */
+static inline void receive_frames(uwb_frame_ring *ring) {
     radio_ring = ring;
-    Serial1.begin(baud);
-    ticker.attach(empty_serial1, EMPTY_INTERVAL);
+    pinMode(PIN_SERIAL_RX, INPUT_PULLUP);
+    NRF_TIMER4->MODE = 1; /* counter, 16 bits */
+    NRF_TIMER4->TASKS_START = 1;
+    connect(COUNT_CHANNEL, NRF_UARTE1->EVENTS_RXDRDY, NRF_TIMER4->TASKS_COUNT);
+    connect(CLEAR_CHANNEL, NRF_UARTE1->EVENTS_ENDRX, NRF_TIMER4->TASKS_CLEAR);
+    NRF_UARTE1->PSEL.RXD = (uint32_t)digitalPinToPinName(PIN_SERIAL_RX);
+    NRF_UARTE1->BAUDRATE = UARTE_BAUDRATE_BAUDRATE_Baud921600;
+    NRF_UARTE1->SHORTS = UARTE_SHORTS_ENDRX_STARTRX_Msk;
+    NRF_UARTE1->ENABLE = UARTE_ENABLE_ENABLE_Enabled;
+    NRF_UARTE1->RXD.PTR = (uint32_t)(uintptr_t)received[0];
+    NRF_UARTE1->RXD.MAXCNT = HALF_BYTES;
+    NRF_UARTE1->TASKS_STARTRX = 1;
+    ticker.attach(empty_uart, EMPTY_INTERVAL);
 }
 
 } // namespace nano33ble

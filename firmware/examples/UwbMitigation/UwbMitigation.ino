@@ -1,17 +1,16 @@
 /* Arduino Nano 33 BLE Sense between an EVB1000 and the host: corrects ranges, or passes them on.
  *
- * Serial  (USB)     the host, wire protocol of docs/reference/protocol.md
- * Serial1 (D0, D1)  the EVB1000, 921600 baud: frames RANGE_CIR of the same protocol (docs/guides/boards.md)
+ * Serial (USB)  the host, wire protocol of docs/reference/protocol.md
+ * Pin RX        the EVB1000, 921600 baud: frames RANGE_CIR of the same protocol (docs/guides/boards.md)
  *
  * Green LED: the host has the port open. Orange LED: blinks with the measurements. A correction takes a few
- * milliseconds; meanwhile an interrupt receives Serial1. uwb_model.h is the shipped model; another one:
+ * milliseconds; meanwhile DMA and an interrupt receive. uwb_model.h is the shipped model; another one:
  * uwb-mitigation board export-c -o UwbMitigation. */
 #include <uwb_board.h>
 #include <uwb_nano33ble.h>
 
 #include "uwb_model.h"
 
-static const unsigned long RADIO_BAUD = 921600;
 /* For the frames of one measurement, so that the next is not late. */
 static const uint32_t SEND_LIMIT_US = 1000;
 
@@ -24,7 +23,8 @@ static uwb_frame_ring radio;
 void setup() {
     pinMode(LED_BUILTIN, OUTPUT);
     pinMode(LED_PWR, OUTPUT);
-    Serial.begin(RADIO_BAUD);
+    nano33ble::enable_cache();
+    Serial.begin(921600);
 
     uwb_board_config config = {};
     config.board_id = nano33ble::board_id();
@@ -41,7 +41,7 @@ void setup() {
     uwb_board_start(&board, &config, nano33ble::uptime_us());
     radio.bytes = radio_bytes;
     radio.capacity = sizeof radio_bytes;
-    nano33ble::receive_frames(&radio, RADIO_BAUD);
+    nano33ble::receive_frames(&radio);
     nano33ble::start_watchdog();
 }
 

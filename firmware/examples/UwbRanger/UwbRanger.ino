@@ -86,7 +86,8 @@ static void wait(void *, uint64_t until_us) {
 }
 
 void setup() {
-    pinMode(LED_BUILTIN, OUTPUT);
+    nano33ble::enable_cache();
+    pinMode(LEDB, OUTPUT);
     pinMode(LED_PWR, OUTPUT);
     pinMode(TAG_SWITCH, INPUT_PULLUP);
     pinMode(RADIO_IRQ, INPUT);
@@ -118,7 +119,7 @@ void setup() {
     nano33ble::start_watchdog();
 }
 
-/* Power LED: the host has the port open. Orange LED: changes with each range. */
+/* Power LED: the host has the port open. Blue LED: changes with each range; the orange one is on the clock of the SPI. */
 void loop() {
     uint8_t bytes[64];
     nano33ble::feed_watchdog();
@@ -127,5 +128,5 @@ void loop() {
     (void)uwb_ranger_step(&ranger);
     send_pending();
     digitalWrite(LED_PWR, nano33ble::host_connected() ? HIGH : LOW);
-    digitalWrite(LED_BUILTIN, (ranger.twr.counts.ranged & 1u) ? HIGH : LOW);
+    digitalWrite(LEDB, (ranger.twr.counts.ranged & 1u) ? HIGH : LOW);
 }

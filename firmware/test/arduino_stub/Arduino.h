@@ -7,23 +7,31 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { LOW = 0, HIGH = 1, INPUT = 0, OUTPUT = 1, INPUT_PULLUP = 2, LED_BUILTIN = 13, LED_PWR = 25 };
+enum { LOW = 0, HIGH = 1, INPUT = 0, OUTPUT = 1, INPUT_PULLUP = 2, LED_BUILTIN = 13, LEDB = 24, LED_PWR = 25,
+       PIN_SERIAL_RX = 1 };
 
-/* Serial (USB) and Serial1. Received bytes are lost if the ring is full. */
+/* Serial (USB). Received bytes are lost if the ring is full. */
 struct StubPort {
     static const size_t RING_BYTES = 256;
-    bool is_usb;
     uint8_t ring[RING_BYTES];
     size_t first, used;
-    size_t overrun;
 
     void begin(unsigned long) {}
     int available() { return (int)used; }
     int read();
-    int availableForWrite() { return 0; }              /* Print's: no port of this core overrides it */
-    size_t write(const uint8_t *bytes, size_t count);  /* USB: 0 without a terminal; else waits until it has read */
-    operator bool();                                   /* USB: sleeps for 1 ms */
-    void put(uint8_t byte);
+    int availableForWrite() { return 0; }             /* Print's: no port of this core overrides it */
+    size_t write(const uint8_t *bytes, size_t count); /* 0 without a terminal; else waits until it has read */
+    operator bool();                                  /* sleeps for 1 ms */
+};
+
+/* Registers that act when they are written. */
+struct StubTask {
+    void (*act)();
+    void operator=(uint32_t) { act(); }
+};
+struct StubSet {
+    uint32_t bits;
+    void operator=(uint32_t mask) { bits |= mask; }
 };
 
 struct StubWatchdog {
@@ -35,12 +43,44 @@ struct StubFactory {
 struct StubRandom {
     volatile uint32_t TASKS_START, TASKS_STOP, EVENTS_VALRDY, VALUE;
 };
+struct StubFlash {
+    volatile uint32_t ICACHECNF;
+};
+struct StubTimer {
+    volatile uint32_t MODE, TASKS_START, TASKS_COUNT, TASKS_CLEAR, CC[1];
+    StubTask TASKS_CAPTURE[1];
+};
+struct StubPpi {
+    struct {
+        volatile uint32_t EEP, TEP;
+    } CH[20];
+    StubSet CHENSET;
+};
+struct StubUart {
+    volatile uint32_t TASKS_STARTRX, EVENTS_RXDRDY, EVENTS_ENDRX, EVENTS_RXSTARTED, SHORTS, ENABLE, BAUDRATE;
+    struct {
+        volatile uint32_t RXD;
+    } PSEL;
+    struct {
+        volatile uint32_t PTR, MAXCNT;
+    } RXD;
+};
+enum : uint32_t {
+    UARTE_BAUDRATE_BAUDRATE_Baud921600 = 0x0F000000,
+    UARTE_SHORTS_ENDRX_STARTRX_Msk = 32,
+    UARTE_ENABLE_ENABLE_Enabled = 8
+};
 
-extern StubPort Serial, Serial1;
+extern StubPort Serial;
 extern StubWatchdog *NRF_WDT;
 extern StubFactory *NRF_FICR;
 extern StubRandom *NRF_RNG;
+extern StubFlash *NRF_NVMC;
+extern StubTimer *NRF_TIMER4;
+extern StubPpi *NRF_PPI;
+extern StubUart *NRF_UARTE1;
 
+int digitalPinToPinName(int pin);
 void pinMode(int pin, int mode);
 void digitalWrite(int pin, int level);
 int digitalRead(int pin);

@@ -11,6 +11,12 @@ enum StubHost { HOST_READS, HOST_SILENT, HOST_CLOSED };
  * the port open, are written to the file `<prefix><n>`. */
 void stub_start(const char *prefix, StubHost host, uint64_t from_us, uint64_t until_us);
 
+/* A byte arrives on pin RX. */
+void stub_receive(uint8_t byte);
+
+/* Bytes and buffers that the UART has lost. */
+int stub_overruns();
+
 /* Do what is due at `now_us`: interrupts, USB packets, watchdog (exit 3). */
 void stub_run_events(uint64_t now_us);
 

@@ -1,7 +1,7 @@
-/* Runs the sketch on emulated time: main <prefix> <host> <from s> <until s> <gap us> <compute us> <end s>. Standard
- * input are frames for Serial1: they arrive at 921,600 baud with `gap us` between two. <host>: reads, silent or closed
- * in the period (core.h). A run of the network takes `compute us`. Exit 3: the watchdog fired; 4: the ring of Serial1
- * lost bytes. */
+/* Runs the sketch on emulated time: main <prefix> <host> <from s> <until s> <gap us> <compute us> <end s> <upload s>.
+ * Standard input are frames for pin RX: they arrive at 921,600 baud with `gap us` between two. <host>: reads, silent or
+ * closed in the period (core.h). A run of the network takes `compute us`. At the end the boot loader writes the next
+ * sketch for `upload s`. Exit 3: the watchdog fired; 4: the UART lost bytes; 5: no instruction cache. */
 #include "core.h"
 
 #include <stdio.h>
@@ -21,7 +21,7 @@ void stub_pass(uint32_t us) {
         now_us += STEP_US;
         while (input_at < input_bytes && byte_due_us <= (double)now_us) {
             const bool ends_frame = input_at > 0 && input[input_at] == 0 && input[input_at - 1] != 0;
-            Serial1.put(input[input_at++]);
+            stub_receive(input[input_at++]);
             byte_due_us += BYTE_US + (ends_frame ? gap_us : 0);
         }
         stub_run_events(now_us);
@@ -45,7 +45,7 @@ uint32_t micros() {
 }
 
 int main(int argc, char **argv) {
-    if (argc != 8) {
+    if (argc != 9) {
         return 2;
     }
     stub_start(argv[1], stub_host_of(argv[2]), (uint64_t)(atof(argv[3]) * 1e6), (uint64_t)(atof(argv[4]) * 1e6));
@@ -56,6 +56,7 @@ int main(int argc, char **argv) {
     while ((double)now_us < atof(argv[7]) * 1e6) {
         loop();
     }
+    stub_pass((uint32_t)(atof(argv[8]) * 1e6));
     stub_finish();
-    return Serial1.overrun == 0 ? 0 : 4;
+    return stub_overruns() != 0 ? 4 : NRF_NVMC->ICACHECNF == 1 ? 0 : 5;
 }

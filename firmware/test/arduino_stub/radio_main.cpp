@@ -1,5 +1,6 @@
 /* Runs the sketch with a radio on a modelled chip, with an anchor 7 m away: radio_main <prefix> <host> <from s>
- * <until s> <end s>, as main.cpp. Exit 2: it drove RSTn high, or held the chip select wrongly; 3: the watchdog fired. */
+ * <until s> <end s>, as main.cpp. Exit 2: it drove RSTn high or the clock of the SPI, or held the chip select wrongly; 3:
+ * the watchdog fired. */
 #include "SPI.h"
 #include "core.h"
 
@@ -11,7 +12,7 @@ extern "C" {
 #include "uwb_twr.h"
 }
 
-enum { CS = 10, IRQ = 2, RESET = 9, TAG_SWITCH = 3 };
+enum { CS = 10, IRQ = 2, RESET = 9, TAG_SWITCH = 3, CLOCK = 13 };
 
 StubSpi SPI;
 static dw1000_chip *chip;
@@ -33,6 +34,7 @@ void pinMode(int pin, int mode) {
 }
 
 void digitalWrite(int pin, int level) {
+    wrong |= pin == CLOCK;
     levels[pin] = level;
     drive_reset();
 }
