@@ -4,13 +4,20 @@ Instructions are counted with the virtual time of the emulator: with `-icount sh
 SysTick ticks every 40 ns, so that the count is exact to one instruction. The emulator does not model wait states,
 caches and power.
 
-Cycles are estimated from the executed instructions and the instruction table of the Cortex-M4 r0p1 Technical Reference
-Manual (section 3.3.1): zero wait states, a taken branch refills the pipeline in two cycles, loads are not
-pipelined. A board that fetches code or weights from flash with wait states, or has cache misses, takes longer.
+Cycles are estimated from the executed instructions with the Cortex-M4 Technical Reference Manual (Arm 100166_0001, sections
+3.3.1 to 3.3.3, and 7.2.3 for the FPU), at zero wait states:
+
+- every instruction by its table; a taken branch refills the pipeline in two cycles (the table: one to three);
+- a load of one register directly after another one takes one cycle instead of two, if its address does not need the first one;
+- a load or store takes one cycle more if its address is the result of the data-processing instruction directly before it;
+- a floating-point result takes one cycle more if the next instruction needs it.
+
+A board that fetches code or weights from flash with wait states, or has cache misses, takes longer.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -33,7 +40,11 @@ _REFILL = 2
 _DIVIDE = 12
 _FLOAT_DIVIDE = 14
 
-_LINE = re.compile(r"^\s*([0-9a-f]+):\t[0-9a-f ]+\t(\S+)(?:\t(.*))?$")
+_LINE = re.compile(r"^\s*([0-9a-f]+):\t[0-9a-f ]+\t(\S+)(?:\t([^\t]*).*)?$")
+_SINGLE_LOAD = re.compile("ldr(?!d)")
+_IMMEDIATE_OFFSET = re.compile(r"\[\w+(, #-?\d+)?\]$")
+_FLOAT_ARITHMETIC = re.compile("v(abs|add|cvt|div|f|m(?!ov|rs)|n|sqrt|sub)")
+_NO_DATA_PROCESSING = re.compile("v|ldm|ldr|st|push|pop|b(?!ic|f)|cb|cm|tst|teq|it|nop")
 
 _SIZE_STUB = """\
 #include "uwb_model.h"
@@ -261,6 +272,9 @@ def estimate_cycles(image: Image, executed: Counter[tuple[int, bool]]) -> int:
         if address not in instructions:
             raise UwbMitigationError(f"no instruction at {address:#x}", where=str(image.elf))
         total += count * (_cycles(*instructions[address]) + (_REFILL if branched else 0))
+    for address, following in itertools.pairwise(sorted(instructions)):
+        # After an instruction that did not branch, the processor executed the one behind it.
+        total += executed[address, False] * _pairing(instructions[address], instructions[following])
     return total
 
 
@@ -272,6 +286,8 @@ def _cycles(mnemonic: str, operands: str) -> int:
         return 3
     if name.startswith(("vldr", "vstr", "ldr")):
         return 2
+    if name.startswith("str"):
+        return 1 if _IMMEDIATE_OFFSET.search(operands) else 2
     if name.startswith(("vdiv", "vsqrt")):
         return _FLOAT_DIVIDE
     if name.startswith(("vfma", "vfms", "vmla", "vmls", "vfnma", "vfnms")):
@@ -281,6 +297,23 @@ def _cycles(mnemonic: str, operands: str) -> int:
     if name.startswith("vmov") and operands.count(",") == 3:
         return 2
     return 1
+
+
+def _pairing(first: tuple[str, str], second: tuple[str, str]) -> int:
+    """Return the cycles that an instruction takes more, or less, directly after another one."""
+    (name, operands), (next_name, next_operands) = first, second
+    result = operands.split(",")[0]
+    if _FLOAT_ARITHMETIC.match(name):
+        return int(result in re.findall(r"\w+", next_operands.partition(",")[2]))
+    addressed = re.search(r"\[(.*?)\]", next_operands)
+    if next_name.startswith(("ldm", "stm", "vldm", "vstm")):
+        registers = [next_operands.split(",")[0].rstrip("!")]
+    else:
+        registers = re.findall(r"\w+", addressed[1]) if addressed else []
+    if _SINGLE_LOAD.match(name):
+        updates_base = not _IMMEDIATE_OFFSET.search(operands) and not re.search(r", \w+\]$", operands)
+        return -1 if _SINGLE_LOAD.match(next_name) and result not in registers and not updates_base else 0
+    return int(not _NO_DATA_PROCESSING.match(name) and result in registers)
 
 
 def _registers(operands: str) -> int:
