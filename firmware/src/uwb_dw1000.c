@@ -50,28 +50,23 @@ const uwb_dw1000_settings uwb_dw1000_defaults = {
 #define COUNT(array) (sizeof(array) / sizeof(array)[0])
 
 /* Indices in the tables above; the number of entries if the value is not in the table. */
+#define RETURN_INDEX(table, is_entry) \
+    size_t i = 0; \
+    while (i < COUNT(table) && !(is_entry)) { \
+        i++; \
+    } \
+    return i
+
 static size_t channel_index(const uwb_dw1000_settings *settings) {
-    size_t i = 0;
-    while (i < COUNT(channels) && channels[i].number != settings->channel) {
-        i++;
-    }
-    return i;
+    RETURN_INDEX(channels, channels[i].number == settings->channel);
 }
 
 static size_t preamble_index(const uwb_dw1000_settings *settings) {
-    size_t i = 0;
-    while (i < COUNT(preambles) && preambles[i].symbols != settings->preamble) {
-        i++;
-    }
-    return i;
+    RETURN_INDEX(preambles, preambles[i].symbols == settings->preamble);
 }
 
 static size_t rate_index(const uwb_dw1000_settings *settings) {
-    size_t i = 0;
-    while (i < COUNT(rates) && rates[i] != settings->rate_kbps) {
-        i++;
-    }
-    return i;
+    RETURN_INDEX(rates, rates[i] == settings->rate_kbps);
 }
 
 /* Two codes for each channel at 16 MHz, four at 64 MHz. */

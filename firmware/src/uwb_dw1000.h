@@ -177,6 +177,15 @@ float uwb_dw1000_true_power_dbm(float rx_power_dbm, uint8_t prf_mhz);
 /* Return the range error at a true power, m, positive if the range is too long (application note APS011). */
 float uwb_dw1000_range_bias_m(float true_power_dbm, uint8_t channel, uint8_t prf_mhz);
 
+/* Return from the calling function if the status is not OK. */
+#define DW1000_TRY(call)                                                                                               \
+    do {                                                                                                               \
+        const uwb_dw1000_status tried_ = (call);                                                                       \
+        if (tried_ != UWB_DW1000_OK) {                                                                                 \
+            return tried_;                                                                                             \
+        }                                                                                                              \
+    } while (0)
+
 #ifdef __cplusplus
 }
 #endif

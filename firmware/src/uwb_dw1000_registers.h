@@ -133,13 +133,4 @@ uint32_t uwb_dw1000_sfd_symbols(const uwb_dw1000_settings *settings);
 /* Decode a little-endian number. */
 uint64_t uwb_dw1000_from_little_endian(const uint8_t *octets, size_t bytes);
 
-/* Return from the calling function if the status is not OK. */
-#define DW1000_TRY(call)                                                                                               \
-    do {                                                                                                               \
-        const uwb_dw1000_status tried_ = (call);                                                                       \
-        if (tried_ != UWB_DW1000_OK) {                                                                                 \
-            return tried_;                                                                                             \
-        }                                                                                                              \
-    } while (0)
-
 #endif

@@ -11,10 +11,7 @@ enum {
 /* Send a frame and wait until it was sent. */
 static uwb_dw1000_status send_frame(uwb_twr *twr, const uwb_twr_frame *frame) {
     uint8_t octets[UWB_TWR_MAX_FRAME_BYTES];
-    const uwb_dw1000_status status = uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(frame, octets), 0);
-    if (status != UWB_DW1000_OK) {
-        return status;
-    }
+    DW1000_TRY(uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(frame, octets), 0));
     return uwb_dw1000_await_sent(&twr->chip, uwb_twr_now_us(twr) + SEND_TIMEOUT_US, NULL);
 }
 
@@ -41,29 +38,18 @@ static uwb_dw1000_status range_with_tag(uwb_twr *twr, const uwb_twr_frame *polle
     report.kind = UWB_TWR_REPORT;
     report.stamps[0] = poll_received;
     *failure_count = &twr->counts.timeout;
-    uwb_dw1000_status status =
-        uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(&answer, octets), UWB_DW1000_NO_LIMIT);
+    DW1000_TRY(uwb_dw1000_send(&twr->chip, octets, uwb_twr_write(&answer, octets), UWB_DW1000_NO_LIMIT));
     const uint64_t until_us = uwb_twr_now_us(twr) + wait_us;
-    if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_await_sent(&twr->chip, until_us, &report.stamps[1]);
-    }
-    if (status == UWB_DW1000_OK) {
-        status = uwb_twr_await_frame(twr, &answer, UWB_TWR_FINAL, until_us, &received, &final);
-    }
-    if (status != UWB_DW1000_OK) {
-        return status;
-    }
+    DW1000_TRY(uwb_dw1000_await_sent(&twr->chip, until_us, &report.stamps[1]));
+    DW1000_TRY(uwb_twr_await_frame(twr, &answer, UWB_TWR_FINAL, until_us, &received, &final));
     report.stamps[2] = received.stamp;
     if (!uwb_twr_range_m(final.stamps, report.stamps, &range_m)) {
         *failure_count = &twr->counts.implausible;
-        status = uwb_dw1000_check(&twr->chip);
-        return status == UWB_DW1000_OK ? UWB_DW1000_TIMEOUT : status;
+        DW1000_TRY(uwb_dw1000_check(&twr->chip));
+        return UWB_DW1000_TIMEOUT;
     }
     if (twr->config.report) {
-        status = uwb_twr_write_measurement(twr, &received, polled->from, twr->address, range_m, NULL);
-        if (status != UWB_DW1000_OK) {
-            return status;
-        }
+        DW1000_TRY(uwb_twr_write_measurement(twr, &received, polled->from, twr->address, range_m, NULL));
     }
     /* This side has its range even if REPORT is lost. A chip that was reset cannot send it. */
     (void)send_frame(twr, &report);

@@ -59,7 +59,7 @@ uwb_dw1000_status uwb_twr_await_frame(uwb_twr *twr, const uwb_twr_frame *sent, u
                                  uwb_dw1000_frame *received, uwb_twr_frame *frame) {
     uwb_dw1000_status result = UWB_DW1000_TIMEOUT;
     for (;;) {
-        uwb_dw1000_status status = uwb_dw1000_receive(&twr->chip, received, until_us);
+        const uwb_dw1000_status status = uwb_dw1000_receive(&twr->chip, received, until_us);
         if (status == UWB_DW1000_OK) {
             if (uwb_twr_read(received->octets, received->bytes, frame) && is_expected(twr, frame, sent, kind)) {
                 return UWB_DW1000_OK;
@@ -74,10 +74,7 @@ uwb_dw1000_status uwb_twr_await_frame(uwb_twr *twr, const uwb_twr_frame *sent, u
         if (now_us >= until_us) {
             return result;
         }
-        status = uwb_dw1000_listen(&twr->chip, (uint32_t)(until_us - now_us));
-        if (status != UWB_DW1000_OK) {
-            return status;
-        }
+        DW1000_TRY(uwb_dw1000_listen(&twr->chip, (uint32_t)(until_us - now_us)));
     }
 }
 
@@ -92,17 +89,12 @@ uwb_dw1000_status uwb_twr_write_measurement(uwb_twr *twr, const uwb_dw1000_frame
     size_t first = index > UWB_WINDOW_LEAD ? index - UWB_WINDOW_LEAD : 0;
     first = first < max_count - count ? first : max_count - count;
     uwb_dw1000_quality quality;
-    uwb_dw1000_status status = uwb_dw1000_read_quality(&twr->chip, received, &quality);
-    if (status == UWB_DW1000_OK && count != 0) {
+    DW1000_TRY(uwb_dw1000_read_quality(&twr->chip, received, &quality));
+    if (count != 0) {
         /* The first octet is invalid. It overwrites the last octet of the fields, which are written afterwards. */
-        status = uwb_dw1000_read_cir(&twr->chip, first, count, twr->measurement + sizeof *fields - 1);
+        DW1000_TRY(uwb_dw1000_read_cir(&twr->chip, first, count, twr->measurement + sizeof *fields - 1));
     }
-    if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_check(&twr->chip);
-    }
-    if (status != UWB_DW1000_OK) {
-        return status;
-    }
+    DW1000_TRY(uwb_dw1000_check(&twr->chip));
     if (twr->config.bias_correction) {
         const float power_dbm = uwb_dw1000_true_power_dbm(quality.rx_power_dbm, radio->prf_mhz);
         range_m -= uwb_dw1000_range_bias_m(power_dbm, radio->channel, radio->prf_mhz);

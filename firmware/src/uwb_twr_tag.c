@@ -125,19 +125,10 @@ static uwb_dw1000_status poll_anchor(uwb_twr *twr, uwb_twr_anchor *anchor, uwb_t
     const uint64_t until_us = uwb_twr_now_us(twr) + wait_us;
     frame.time_us = twr->reply_us;
     *failure_count = &twr->counts.no_answer;
-    uwb_dw1000_status status = send_frame(twr, &frame, twr->config.timeout_us);
-    if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_await_sent(&twr->chip, until_us, &final->stamps[0]);
-    }
-    if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_force_clock(&twr->chip); /* before ANSWER: afterwards the time may be too short */
-    }
-    if (status == UWB_DW1000_OK) {
-        status = uwb_twr_await_frame(twr, &frame, UWB_TWR_ANSWER, until_us, &received, &answer);
-    }
-    if (status != UWB_DW1000_OK) {
-        return status;
-    }
+    DW1000_TRY(send_frame(twr, &frame, twr->config.timeout_us));
+    DW1000_TRY(uwb_dw1000_await_sent(&twr->chip, until_us, &final->stamps[0]));
+    DW1000_TRY(uwb_dw1000_force_clock(&twr->chip)); /* before ANSWER: afterwards the time may be too short */
+    DW1000_TRY(uwb_twr_await_frame(twr, &frame, UWB_TWR_ANSWER, until_us, &received, &answer));
     const uint64_t polled = final->stamps[0];
     *final = uwb_twr_make_frame(twr, UWB_TWR_FINAL, anchor->address, frame.tag_number, answer.anchor_number);
     final->stamps[0] = polled;
@@ -156,30 +147,18 @@ static uwb_dw1000_status range_with_anchor(uwb_twr *twr, uwb_twr_anchor *anchor,
     uwb_twr_frame final, report;
     uint64_t sent;
     double range_m;
-    uwb_dw1000_status status = poll_anchor(twr, anchor, &final, failure_count);
-    if (status != UWB_DW1000_OK) {
-        return status;
-    }
+    DW1000_TRY(poll_anchor(twr, anchor, &final, failure_count));
     *failure_count = &twr->counts.timeout;
     const uint64_t until_us = uwb_twr_now_us(twr) + twr->reply_us + twr->config.timeout_us;
     const size_t bytes = uwb_twr_write(&final, octets);
-    status = uwb_dw1000_send_at(&twr->chip, octets, bytes, final.stamps[2], twr->config.timeout_us);
-    if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_await_sent(&twr->chip, until_us, &sent);
-    }
-    if (status == UWB_DW1000_OK) {
-        status = uwb_dw1000_release_clock(&twr->chip);
-    }
-    if (status == UWB_DW1000_OK) {
-        status = uwb_twr_await_frame(twr, &final, UWB_TWR_REPORT, until_us, &received, &report);
-    }
-    if (status != UWB_DW1000_OK) {
-        return status;
-    }
+    DW1000_TRY(uwb_dw1000_send_at(&twr->chip, octets, bytes, final.stamps[2], twr->config.timeout_us));
+    DW1000_TRY(uwb_dw1000_await_sent(&twr->chip, until_us, &sent));
+    DW1000_TRY(uwb_dw1000_release_clock(&twr->chip));
+    DW1000_TRY(uwb_twr_await_frame(twr, &final, UWB_TWR_REPORT, until_us, &received, &report));
     if (sent != final.stamps[2] || !uwb_twr_range_m(final.stamps, report.stamps, &range_m)) {
         *failure_count = &twr->counts.implausible;
-        status = uwb_dw1000_check(&twr->chip);
-        return status == UWB_DW1000_OK ? UWB_DW1000_TIMEOUT : status;
+        DW1000_TRY(uwb_dw1000_check(&twr->chip));
+        return UWB_DW1000_TIMEOUT;
     }
     return uwb_twr_write_measurement(twr, &received, twr->address, anchor->address, range_m, &anchor->rx_power_dbm);
 }
