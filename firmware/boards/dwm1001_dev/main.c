@@ -190,6 +190,7 @@ static uint64_t random_number(void) {
 }
 
 static void start_peripherals(void) {
+    NVMC_ICACHECNF = 1; /* without the cache, code runs from flash with wait states */
     TASKS_HFCLKSTART = 1;
     while (EVENTS_HFCLKSTARTED == 0) {
     }
