@@ -29,7 +29,7 @@ from uwb_mitigation.types.measurement import DEVICE_TIME_WRAP
 PPM_PAIRS = ((-20.0, 20.0), (-10.0, 10.0), (0.0, 0.0), (10.0, -10.0), (20.0, -20.0))
 DISTANCES_M = (0.3, 1.0, 5.01, 20.0, 100.0)
 
-INFERENCE_CYCLES = 458_934
+INFERENCE_CYCLES = 412_570
 """Estimated cycles of the shipped network with K = 157 (`python -m benchmarks firmware`)."""
 
 PROCESSOR_HZ = 64e6

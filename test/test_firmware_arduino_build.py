@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(
     shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi"
 )
 SOURCES = firmware_folder() / "src"
-KERNELS = ("conv_first", "conv_residual", "conv_reduce_odd", "conv_reduce_even", "dense", "dot")
+KERNELS = ("quantise", "conv_first", "conv_residual", "conv_reduce_odd", "conv_reduce_even", "dense", "dot")
 
 # ArduinoCore-mbed, variant ARDUINO_NANO33BLE: platform.txt and cflags.txt. The assembler gets no -mfloat-abi.
 FPU = "-mfpu=fpv4-sp-d16"

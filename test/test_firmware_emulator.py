@@ -10,6 +10,7 @@ import os
 import select
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import command_line
@@ -21,11 +22,14 @@ from firmware_models import Exported, bits
 
 from benchmarks.equipment import emulator, random_networks
 from benchmarks.equipment.emulated_firmware import EmulatedFirmware, cut_to_window
+from benchmarks.firmware import CLOCK_HZ
+from benchmarks.paper import published
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded import toolchain
 from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, firmware_folder, run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target
+from uwb_mitigation.mitigation.model import requantisation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
@@ -39,8 +43,8 @@ from uwb_mitigation.types.offsets import Offsets
 MISSING = toolchain.missing_tools()
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not found: {toolchain.APT}")
 
-# Instructions of one inference, k0 = 3. The paper's rate at K = 157 means about 3.7 million cycles.
-BUDGET = {157: 360_000, 128: 320_000, 64: 162_000, 32: 82_000, 16: 48_000, 8: 40_000}
+TIMES_THE_PAPER = {157: 9.0, 128: 9.0, 64: 9.0, 32: 9.0, 16: 8.5}
+"""Minimum rate at 64 MHz, estimated, k0 = 3."""
 
 
 @pytest.fixture(scope="module", params=firmware_models.SHAPES, ids=firmware_models.shape_name)
@@ -62,11 +66,35 @@ def test_kernels_equal_onnx_runtime_within_the_budgets(exported: Exported, image
     assert result.stack_bytes <= 512
     if subject.network == "mlp":
         assert result.instructions <= 75_000
-    else:
-        samples = exported.weights.architecture.samples
-        assert result.instructions <= (1.05 if subject.first_kernel == 5 else 1) * BUDGET[samples]
-        assert result.arena_bytes <= 11_000
-        assert emulator.measure_size(exported.folder, exported.folder).flash_bytes <= 20_000
+        return
+    assert result.arena_bytes <= 10_600
+    assert emulator.measure_size(exported.folder, exported.folder).flash_bytes <= 27_000
+    samples = exported.weights.architecture.samples
+    if samples in TIMES_THE_PAPER:
+        cycles = emulator.estimate_cycles(image, emulator.count_executed(image, windows[0]))
+        paper_hz = published.MODELS["remnet", samples].board[0]
+        slower = 0.98 if subject.first_kernel == 5 else 1.0
+        assert CLOCK_HZ / cycles >= slower * TIMES_THE_PAPER[samples] * paper_hz
+
+
+@pytest.mark.parametrize("kernels", list(Kernels))
+def test_packed_sums_do_not_overflow_with_the_largest_weights_and_inputs(tmp_path: Path, kernels: Kernels):
+    weights = random_networks.remnet(32, 3)
+    largest = np.full((16, 16, 3), 63, np.int8)
+    largest[1::4] = -63
+    largest[2::4, :, 1] = -63
+    largest[3::4, :, ::2] = -63
+    extreme = {**weights.weight, "module1.residual": largest, "module2.residual": -largest}
+    bias = {**weights.bias, "first": np.full(16, 100_000, np.int32)}
+    weights = requantisation.nudge(replace(weights, weight=extreme, bias=bias))
+    firmware_models.write_model(tmp_path, weights)
+    windows = np.full((1, 32), 1e4, np.float32)
+    assert (IntegerNetwork(weights).tensors(windows)["first"] == 255).all(), (
+        "the test needs the largest inputs"
+    )
+    image = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2, kernels)
+    result = emulator.run_windows(image, windows)
+    assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
 
 
 @pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
@@ -169,7 +197,7 @@ def test_burst_into_the_serial_port_is_answered_completely(tmp_path: Path):
 def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):
     export_bundle(load_bundle(default_model_path()), tmp_path)
     image = emulator.measure_size(tmp_path, tmp_path)
-    assert image.flash_bytes < 24 << 10
+    assert image.flash_bytes < 27_000
     assert (image.available_flash_bytes, image.available_ram_bytes) == (512 << 10, 64 << 10)
     text, data, bss = map(int, run_tool(["arm-none-eabi-size", str(image.elf)]).splitlines()[1].split()[:3])
     assert (image.flash_bytes, image.static_bytes) == (text + data, data + bss)

@@ -80,6 +80,14 @@ def test_scale_without_exact_integers_is_refused_by_layer_and_channel():
         pack(inexact)
 
 
+def test_weights_of_more_than_7_bits_are_refused_by_layer():
+    weights = random_networks.remnet(16, 3)
+    larger = weights.weight["module1.residual"].copy()
+    larger[3, 2, 1] = -64
+    with pytest.raises(ModelError, match=r"7 bits.*module1\.residual|module1\.residual.*7 bits"):
+        pack(replace(weights, weight={**weights.weight, "module1.residual": larger}))
+
+
 def test_sum_without_exact_integers_is_refused_by_name():
     weights = random_networks.remnet(16, 3)
     scales = {**weights.activation_scale, "module1.sum": weights.activation_scale["first"] / np.float32(3)}

@@ -50,10 +50,11 @@ typedef struct {
     float first_path_power_dbm;
 } uwb_cir;
 
-/* Requantisation of a 256-fold accumulator: clip((acc + bias) * multiplier >> 43, 0, 255). */
+/* Requantisation of an accumulator: clip(((acc + bias) * multiplier >> 32) + offset >> 3, 0, 255). */
 typedef struct {
     int32_t bias;
     int32_t multiplier;
+    int32_t offset;
 } uwb_channel;
 
 /* Sum of two uint8: clip(first * a + second * b + offset >> 22, 0, 255). */
@@ -63,19 +64,19 @@ typedef struct {
     int32_t offset;
 } uwb_sum;
 
-/* One residual reduction module. Weights are pairs of int8 for pairs of inputs, and two pairs (p, q) share
- * a word as the bytes p0 q0 p1 q1: two ANDs unpack them to int16 pairs, scaled by 256. */
+/* One residual reduction module. */
 typedef struct {
-    const int8_t *residual_weights; /* [filter][channel pair][tap 0..2] pairs */
+    const int32_t *residual_weights; /* [filter][channel]: tap 1, tap 2 + (tap 0 << 21) */
     const uwb_channel *residual;
     uwb_sum residual_sum; /* of the convolution (first) and the module's input (second) */
-    const int8_t *reduce_weights; /* [filter][channel pair][tap 0, tap 2, tap 1, skip] pairs */
+    const int16_t *reduce_weights; /* [filter][channel pair][tap 0, tap 2, tap 1, skip] pairs */
     const uwb_channel *reduce;
     const uwb_channel *skip;
     uwb_sum output_sum; /* of reduce (first) and skip (second) */
 } uwb_module;
 
-/* Dense layer with ReLU. Inputs a multiple of 8, outputs of 4, both padded with zeros. */
+/* Dense layer with ReLU. Inputs and outputs are multiples of 8, padded with zeros. Weights are pairs of int8 for pairs of
+ * inputs, and two pairs (p, q) share a word as the bytes p0 q0 p1 q1: SXTB16 unpacks a pair. */
 typedef struct {
     const int8_t *weights; /* [output / 4][input / 4][output % 4] words of two pairs */
     const uwb_channel *channels;
@@ -107,16 +108,16 @@ typedef struct {
 
     uint16_t first_kernel; /* 3 or 5 */
     uint16_t module_count;
-    const int16_t *first_weights; /* [filter][first_kernel + 1], times 256, the last one zero */
+    const int16_t *first_weights; /* [filter][first_kernel + 1], the last one zero */
     const uwb_channel *first;
     const uwb_module *modules;
 
     uint16_t layer_count;
     const uwb_dense_layer *layers;
 
-    const int8_t *head_weights; /* pairs, in the order of the last activation in memory */
+    const int16_t *head_weights; /* pairs, the first one 32-fold, in the order of the last activation in memory */
     uint16_t head_inputs;       /* a multiple of 8 */
-    int32_t head_bias;          /* times 256 */
+    int32_t head_bias;
     float head_scale;           /* m per unit of the accumulator */
 
     float linear_bias_offset_m;

@@ -21,6 +21,7 @@
 #if defined(__ARM_ARCH_7EM__) && \
     (defined(__ASSEMBLER__) || (defined(__ARM_FEATURE_DSP) && defined(__ARM_FP) && !defined(UWB_PORTABLE)))
 #define UWB_CORTEX_M4 1
+#define uwb_quantise uwb_quantise_cortex_m4
 #define uwb_conv_first uwb_conv_first_cortex_m4
 #define uwb_conv_residual uwb_conv_residual_cortex_m4
 #define uwb_conv_reduce_odd uwb_conv_reduce_odd_cortex_m4
@@ -31,7 +32,8 @@
 #define UWB_CORTEX_M4 0
 #endif
 
-#define UWB_REQUANTISATION_SHIFT 11
+#define UWB_REQUANTISATION_SHIFT 3
 #define UWB_SUM_SHIFT 22
+#define UWB_POSITION_SHIFT 21 /* of the second position in a word of a layer's input */
 
 #endif

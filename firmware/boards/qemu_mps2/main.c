@@ -44,8 +44,10 @@ typedef struct {
 
 void board_exit(int code);
 
-/* A guard area follows the part that the library may use. */
-static uint32_t arena[ARENA_BYTES / sizeof(uint32_t)];
+/* A guard area follows the part that the library may use. It is aligned to 4 bytes only. */
+static uint64_t memory[ARENA_BYTES / sizeof(uint64_t)];
+static uint32_t *const arena = (uint32_t *)memory + 1;
+static const size_t available_bytes = ARENA_BYTES - sizeof(uint32_t);
 static size_t arena_bytes;
 
 __attribute__((noreturn)) void board_exit(int code) {
@@ -57,7 +59,7 @@ static uint8_t *guard(void) {
 }
 
 static int guard_is_intact(void) {
-    for (const uint8_t *byte = guard(); byte < (const uint8_t *)arena + sizeof arena; byte++) {
+    for (const uint8_t *byte = guard(); byte < (const uint8_t *)arena + available_bytes; byte++) {
         if (*byte != 0x5A) {
             return 0;
         }
@@ -69,14 +71,20 @@ static uint32_t ticks_since(uint32_t start) {
     return (start - SYST_CVR) & SYST_MAX;
 }
 
-/* Measure the stack of uwb_network: fill the free stack below this frame, call, and find the overwritten part. */
-static __attribute__((noinline)) uint32_t stack_bytes(const float *window) {
-    float output_m;
+/* Fill the free stack below the frame of the caller; returns its end. */
+static __attribute__((noinline)) volatile uint8_t *fill_stack(void) {
     volatile uint8_t *top;
     __asm volatile("mov %0, sp" : "=r"(top));
-    for (volatile uint8_t *free = top - STACK_PROBE_BYTES; free < top; free++) {
-        *free = 0xA5;
+    for (volatile uint32_t *free = (volatile uint32_t *)(top - STACK_PROBE_BYTES); free < (volatile uint32_t *)top; free++) {
+        *free = 0xA5A5A5A5u;
     }
+    return top;
+}
+
+/* Measure the stack of uwb_network: fill the stack, call, and find the overwritten part. */
+static __attribute__((noinline)) uint32_t stack_bytes(const float *window) {
+    float output_m;
+    volatile uint8_t *const top = fill_stack();
     (void)uwb_network(&uwb_model_data, window, arena, arena_bytes, &output_m);
     volatile uint8_t *reached = top - STACK_PROBE_BYTES;
     while (reached < top && *reached == 0xA5) {
@@ -108,6 +116,7 @@ static int run_windows(int32_t input, int32_t output, uint32_t count, report *re
             }
         }
         for (uint32_t i = 0; i < chunk; i++) {
+            (void)fill_stack(); /* the library must not depend on it */
             run_window(windows[i], result, answers[i]);
         }
         if (!semihosting_write(output, answers, chunk * sizeof answers[0])) {
@@ -163,10 +172,10 @@ int main(void) {
         return 2;
     }
     arena_bytes = uwb_arena_size(&uwb_model_data);
-    if (arena_bytes == 0 || arena_bytes >= sizeof arena) {
+    if (arena_bytes == 0 || arena_bytes >= available_bytes) {
         return 5;
     }
-    memset(guard(), 0x5A, sizeof arena - arena_bytes);
+    memset(guard(), 0x5A, available_bytes - arena_bytes);
     SYST_RVR = SYST_MAX;
     SYST_CVR = 0;
     SYST_CSR = 5; /* processor clock, no interrupt */

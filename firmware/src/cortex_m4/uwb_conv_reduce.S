@@ -1,172 +1,146 @@
 /* y = relu(conv3 stride 2(r)) + relu(conv1 stride 2(r)), for odd and even lengths, which differ in their taps only:
- * outputs centre on even positions, or windows begin on them. A block of r becomes four
- * positions of both branches, wide in r0 to r3 and narrow in r4 to r7. All 32 FPU registers hold
- * weights: for each channel pair tap 0, tap 2, tap 1, skip. */
+ * outputs centre on even positions, or windows begin on them. A block of r becomes four positions of both branches, wide
+ * in r0 to r3 and narrow in r4 to r7. The FPU registers contain for each channel pair tap 0, tap 2, tap 1, skip. */
 #include "uwb_assembly.h"
 
 #if UWB_CORTEX_M4
 
 /* Frame */
-#define BIAS 0        /* wide, narrow */
-#define MULTIPLIER 8  /* wide, narrow */
-#define SUM 16        /* first, second, offset */
-#define Y_FILTER 28   /* y, at the filter's place in a row */
-#define R 32
-#define R_END 36
-#define Y_OFFSET 40   /* of the half row that is next */
-#define WEIGHTS 44
-#define REDUCE 48
-#define SKIP 52
-#define FILTER 56
-#define Y 60
-#define FRAME 64
+#define MULTIPLIER 0 /* and offset: wide, narrow */
+#define SUM 16       /* first, second, offset */
+#define Y_WORD 28    /* next even positions of the filter; the word of the odd ones is two after it */
+#define R_END 32
+#define STEP 36      /* to the next word: two blocks of r make one of y */
+#define BIAS 40      /* wide, narrow */
+#define WEIGHTS 48
+#define R 52
+#define CHANNELS 56  /* wide, narrow */
+#define Y 64         /* of the filter, and of the one after the last */
+#define FRAME 72
 
-        .macro combine wide, narrow
-        mla     \narrow, \narrow, r9, r10
-        mla     \wide, \wide, r8, \narrow
-        usat    \wide, #8, \wide, asr #UWB_SUM_SHIFT
+#define ROW_BYTES 32
+
+        /* Products of a tap in r8 with the four positions in r9 to r12, added to \from0 ... */
+        .macro four_sums sum0, from0, sum1, from1, sum2, from2, sum3, from3
+        smlad   \sum0, r9, r8, \from0
+        smlad   \sum1, r10, r8, \from1
+        smlad   \sum2, r11, r8, \from2
+        smlad   \sum3, r12, r8, \from3
         .endm
 
-        /* \taps pair, start_wide, start_narrow, ... computes one channel pair. r3 and r7 start as the biases
-         * of all four, because their own first products come last. */
+        /* One channel pair. r3 and r7 begin as the biases of all four. */
+        .macro taps_odd pair, wide0, wide1, wide2, narrow0, narrow1, narrow2
+        ldmia   lr!, {r9-r12}                   /* even positions */
+        fetch   r8, 4 * \pair + 2
+        four_sums r0, \wide0, r1, \wide1, r2, \wide2, r3, r3
+        fetch   r8, 4 * \pair + 3
+        four_sums r4, \narrow0, r5, \narrow1, r6, \narrow2, r7, r7
+        ldr     r9, [lr, #(12 - BLOCK_BYTES)]   /* the odd position before the block */
+        fetch   r8, 4 * \pair
+        smlad   r0, r9, r8, r0
+        ldmia   lr!, {r9-r12}                   /* odd positions */
+        smlad   r1, r9, r8, r1
+        smlad   r2, r10, r8, r2
+        smlad   r3, r11, r8, r3
+        fetch   r8, 4 * \pair + 1
+        four_sums r0, r0, r1, r1, r2, r2, r3, r3
+        .endm
+
+        .macro taps_even pair, wide0, wide1, wide2, narrow0, narrow1, narrow2
+        ldmia   lr!, {r9-r12}                   /* even positions */
+        fetch   r8, 4 * \pair
+        four_sums r0, \wide0, r1, \wide1, r2, \wide2, r3, r3
+        fetch   r8, 4 * \pair + 3
+        four_sums r4, \narrow0, r5, \narrow1, r6, \narrow2, r7, r7
+        fetch   r8, 4 * \pair + 1
+        smlad   r0, r10, r8, r0
+        smlad   r1, r11, r8, r1
+        smlad   r2, r12, r8, r2
+        ldr     r9, [lr, #(BLOCK_BYTES - 16)]   /* the even position after the block */
+        smlad   r3, r9, r8, r3
+        ldmia   lr!, {r9-r12}                   /* odd positions */
+        fetch   r8, 4 * \pair + 2
+        four_sums r0, r0, r1, r1, r2, r2, r3, r3
+        .endm
+
         .macro reduce name, taps
         function \name
         push    {r4-r11, lr}
         vpush   {s16-s31}
         sub     sp, sp, #FRAME
-        add     r4, r0, r2, lsl #8
-        strd    r0, r4, [sp, #R]
-        mov     r11, #0
-        strd    r11, r1, [sp, #FILTER]
+        add     r2, r0, r2, lsl #8
+        str     r0, [sp, #R]
+        str     r2, [sp, #R_END]
+        add     r2, r1, #BLOCK_BYTES
+        strd    r1, r2, [sp, #Y]
         ldrd    r4, r5, [r3, #32]
         strd    r4, r5, [sp, #SUM]
-        ldr     r6, [r3, #40]
-        str     r6, [sp, #(SUM + 8)]
+        ldr     r4, [r3, #40]
+        str     r4, [sp, #(SUM + 8)]
         ldr     r4, [r3, #20]
-        ldrd    r5, r10, [r3, #24]
+        ldrd    r10, r11, [r3, #24]
 
-1:      /* filter: weights r4, channels r5 r10, place r11, y r1 */
-        mov     r2, #UPPER_BYTES
-        park_words 0, r4, r2, r3
-        park_words 8, r4, r2, r3
-        park_words 16, r4, r2, r3
-        park_words 24, r4, r2, r3
-        ldrd    r6, r7, [r5], #8
-        ldrd    r8, r9, [r10], #8
-        strd    r6, r8, [sp, #BIAS]
-        strd    r7, r9, [sp, #MULTIPLIER]
-        strd    r4, r5, [sp, #WEIGHTS]
-        str     r10, [sp, #SKIP]
-        add     r1, r1, r11
-        str     r1, [sp, #Y_FILTER]
-        mov     r12, #0
+1:      /* filter: weights r4, channels r10 r11, y r1 */
+        vldmia  r4!, {s0-s31}
+        ldmia   r10!, {r3, r5, r6}
+        ldmia   r11!, {r7, r8, r9}
+        str     r4, [sp, #WEIGHTS]
+        str     r10, [sp, #CHANNELS]
+        str     r11, [sp, #(CHANNELS + 4)]
+        str     r3, [sp, #BIAS]
+        str     r7, [sp, #(BIAS + 4)]
+        str     r5, [sp, #MULTIPLIER]
+        str     r6, [sp, #(MULTIPLIER + 4)]
+        str     r8, [sp, #(MULTIPLIER + 8)]
+        str     r9, [sp, #(MULTIPLIER + 12)]
+        str     r1, [sp, #Y_WORD]
+        mov     r1, #4
+        str     r1, [sp, #STEP]
         ldr     lr, [sp, #R]
 
 2:      /* block */
-        str     r12, [sp, #Y_OFFSET]
-        ldrd    r3, r7, [sp, #BIAS]
         \taps   0, r3, r3, r3, r7, r7, r7
-        \taps   1, r0, r1, r2, r4, r5, r6
-        \taps   2, r0, r1, r2, r4, r5, r6
-        \taps   3, r0, r1, r2, r4, r5, r6
-        \taps   4, r0, r1, r2, r4, r5, r6
-        \taps   5, r0, r1, r2, r4, r5, r6
-        \taps   6, r0, r1, r2, r4, r5, r6
-        \taps   7, r0, r1, r2, r4, r5, r6
-        ldrd    r8, r9, [sp, #MULTIPLIER]
+        .irp pair, 1, 2, 3, 4, 5, 6, 7
+        \taps   \pair, r0, r1, r2, r4, r5, r6
+        .endr
+        ldmia   sp, {r8-r11}
         .irp accumulator, r0, r1, r2, r3
-        requantise \accumulator, r8
+        requantise \accumulator, r8, r9
         .endr
         .irp accumulator, r4, r5, r6, r7
-        requantise \accumulator, r9
+        requantise \accumulator, r10, r11
         .endr
         ldrd    r8, r9, [sp, #SUM]
-        ldrd    r10, r11, [sp, #(SUM + 8)]
-        ldr     r12, [sp, #Y_OFFSET]
-        combine r0, r4
-        combine r1, r5
-        combine r2, r6
-        combine r3, r7
-        add     r11, r11, r12
-        strh    r0, [r11]
-        strh    r1, [r11, #4]
-        strh    r2, [r11, #8]
-        strh    r3, [r11, #12]
-        /* Two blocks of r make one of y. */
-        eor     r12, r12, #16
-        tst     r12, #16
-        it      eq
-        addeq   r12, r12, #BLOCK_BYTES
-        ldr     r8, [sp, #R_END]
-        add     lr, lr, #BLOCK_BYTES
+        ldrd    r10, r11, [sp, #(SUM + 8)]      /* offset, Y_WORD */
+        add_scaled r0, r8, r4, r9, r10
+        add_scaled r1, r8, r5, r9, r10
+        add_scaled r2, r8, r6, r9, r10
+        add_scaled r3, r8, r7, r9, r10
+        orr     r0, r0, r2, lsl #UWB_POSITION_SHIFT
+        str     r0, [r11]
+        orr     r1, r1, r3, lsl #UWB_POSITION_SHIFT
+        str     r1, [r11, #8]
+        ldrd    r8, r9, [sp, #R_END]            /* and STEP */
+        ldrd    r3, r7, [sp, #BIAS]
+        add     r11, r11, r9
+        str     r11, [sp, #Y_WORD]
+        rsb     r9, r9, #BLOCK_BYTES
+        str     r9, [sp, #STEP]
         cmp     lr, r8
         bne     2b
 
-        ldrd    r4, r5, [sp, #WEIGHTS]
-        ldr     r10, [sp, #SKIP]
-        ldrd    r11, r1, [sp, #FILTER]
-        next_filter r11
-        str     r11, [sp, #FILTER]
-        cmp     r11, #BLOCK_BYTES
+        ldr     r4, [sp, #WEIGHTS]
+        ldrd    r10, r11, [sp, #CHANNELS]
+        ldrd    r1, r2, [sp, #Y]
+        add     r1, r1, #16
+        str     r1, [sp, #Y]
+        cmp     r1, r2
         bne     1b
 
         add     sp, sp, #FRAME
         vpop    {s16-s31}
         pop     {r4-r11, pc}
         end_function \name
-        .endm
-
-        .macro taps_odd pair, wide0, wide1, wide2, narrow0, narrow1, narrow2
-        fetch_pair r8, r9, 4 * \pair + 2        /* tap 1, skip: even positions */
-        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair)]
-        smlad   r0, r10, r8, \wide0
-        smlad   r4, r10, r9, \narrow0
-        smlad   r1, r11, r8, \wide1
-        smlad   r5, r11, r9, \narrow1
-        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair + 8)]
-        smlad   r2, r10, r8, \wide2
-        smlad   r6, r10, r9, \narrow2
-        smlad   r3, r11, r8, r3
-        smlad   r7, r11, r9, r7
-        fetch_pair r8, r9, 4 * \pair            /* tap 0, tap 2: odd positions */
-        ldr     r10, [lr, #(ROW_BYTES * \pair + BEFORE_BLOCK)]
-        smlad   r0, r10, r8, r0
-        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair + 16)]
-        smlad   r0, r10, r9, r0
-        smlad   r1, r10, r8, r1
-        smlad   r1, r11, r9, r1
-        smlad   r2, r11, r8, r2
-        ldrd    r10, r11, [lr, #(ROW_BYTES * \pair + 24)]
-        smlad   r2, r10, r9, r2
-        smlad   r3, r10, r8, r3
-        smlad   r3, r11, r9, r3
-        .endm
-
-        .macro taps_even pair, wide0, wide1, wide2, narrow0, narrow1, narrow2
-        fetch_pair r8, r9, 4 * \pair            /* tap 0, tap 2: even positions */
-        fetch   r10, 4 * \pair + 3              /* skip: the same */
-        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair)]
-        smlad   r0, r11, r8, \wide0
-        smlad   r4, r11, r10, \narrow0
-        smlad   r0, r12, r9, r0
-        smlad   r1, r12, r8, \wide1
-        smlad   r5, r12, r10, \narrow1
-        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 8)]
-        smlad   r1, r11, r9, r1
-        smlad   r2, r11, r8, \wide2
-        smlad   r6, r11, r10, \narrow2
-        smlad   r2, r12, r9, r2
-        smlad   r3, r12, r8, r3
-        smlad   r7, r12, r10, r7
-        ldr     r11, [lr, #(ROW_BYTES * \pair + BLOCK_BYTES)]
-        smlad   r3, r11, r9, r3
-        fetch   r8, 4 * \pair + 2               /* tap 1: odd positions */
-        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 16)]
-        smlad   r0, r11, r8, r0
-        smlad   r1, r12, r8, r1
-        ldrd    r11, r12, [lr, #(ROW_BYTES * \pair + 24)]
-        smlad   r2, r11, r8, r2
-        smlad   r3, r12, r8, r3
         .endm
 
         reduce  uwb_conv_reduce_odd, taps_odd

@@ -3,13 +3,13 @@
 
 #if UWB_CORTEX_M4
 
-/* r0 x, r1 weights, r2 mask, r3 scratch, r4-r7 sums, r8-r11 words, r12 lr inputs.
- * s0 y, s1 channels, s2 x, s3 end of x, s4 end of y. */
+/* r0 x, r1 weights, r2 channels, r3 scratch, r4-r7 sums, r8-r11 words, r12 lr inputs.
+ * s0 x, s1 end of x, s2 y, s3 end of y. */
 
         .macro row sum, word
-        and     r3, r2, \word, lsl #8
+        sxtb16  r3, \word
         smlad   \sum, r12, r3, \sum
-        and     r3, r2, \word
+        sxtb16  r3, \word, ror #8
         smlad   \sum, lr, r3, \sum
         .endm
 
@@ -22,50 +22,43 @@
         row     r7, r11
         .endm
 
+        .macro store sum, at
+        ldrd    r8, r9, [r2, #(12 * \at + 4)]
+        requantise \sum, r8, r9
+        strh    \sum, [r12, #(2 * \at)]
+        .endm
+
         function uwb_dense
         push    {r4-r11, lr}
         ldrh    r3, [r2, #8]
         add     r3, r0, r3, lsl #1
-        vmov    s2, s3, r0, r3
+        vmov    s0, s1, r0, r3
         ldrh    r3, [r2, #10]
         add     r3, r1, r3, lsl #1
-        vmov    s4, r3
-        ldrd    r4, r5, [r2]
-        vmov    s0, s1, r1, r5
-        mov     r1, r4
-        mov     r2, #UPPER_BYTES
+        vmov    s2, s3, r1, r3
+        ldrd    r1, r2, [r2]
 
 .Loutputs:
-        vmov    r0, s2
-        vmov    r3, s1
-        ldr     r4, [r3]
-        ldr     r5, [r3, #8]
-        ldr     r6, [r3, #16]
-        ldr     r7, [r3, #24]
+        vmov    r0, s0
+        ldr     r4, [r2]
+        ldr     r5, [r2, #12]
+        ldr     r6, [r2, #24]
+        ldr     r7, [r2, #36]
 .Linputs:
         four_inputs
         four_inputs
-        vmov    r3, s3
+        vmov    r3, s1
         cmp     r0, r3
         bne     .Linputs
 
-        vmov    r12, r3, s0, s1
-        ldr     r8, [r3, #4]
-        requantise r4, r8
-        ldr     r8, [r3, #12]
-        requantise r5, r8
-        ldr     r8, [r3, #20]
-        requantise r6, r8
-        ldr     r8, [r3, #28]
-        requantise r7, r8
-        strh    r4, [r12]
-        strh    r5, [r12, #2]
-        strh    r6, [r12, #4]
-        strh    r7, [r12, #6]
+        vmov    r12, r3, s2, s3
+        store   r4, 0
+        store   r5, 1
+        store   r6, 2
+        store   r7, 3
+        add     r2, r2, #48
         add     r12, r12, #8
-        add     r3, r3, #32
-        vmov    s0, s1, r12, r3
-        vmov    r3, s4
+        vmov    s2, r12
         cmp     r12, r3
         bne     .Loutputs
         pop     {r4-r11, pc}

@@ -102,7 +102,7 @@ def render(network: PackedNetwork, card: ModelCard, model_id: int, golden: Golde
         '#include "uwb_mitigation.h"\n',
     ]
     sections += _remnet(network) if network.modules else _mlp(network)
-    sections.append(_array("int8_t", "uwb_head_weights", network.head_weights))
+    sections.append(_array("int16_t", "uwb_head_weights", network.head_weights))
     if card.ood_bands is not None:
         sections.append(_ood_bands(card.ood_bands))
     sections.append(_model(network, card, model_id))
@@ -117,9 +117,9 @@ def _remnet(network: PackedNetwork) -> Iterable[str]:
     yield _channels("uwb_first", network.first)
     for number, module in enumerate(network.modules, start=1):
         prefix = f"uwb_module{number}"
-        yield _array("int8_t", f"{prefix}_residual_weights", module.residual_weights)
+        yield _array("int32_t", f"{prefix}_residual_weights", module.residual_weights)
         yield _channels(f"{prefix}_residual", module.residual)
-        yield _array("int8_t", f"{prefix}_reduce_weights", module.reduce_weights)
+        yield _array("int16_t", f"{prefix}_reduce_weights", module.reduce_weights)
         yield _channels(f"{prefix}_reduce", module.reduce)
         yield _channels(f"{prefix}_skip", module.skip)
     yield "static const uwb_module uwb_modules[] = {"
@@ -222,9 +222,7 @@ def _array(kind: str, name: str, values: NDArray[np.generic]) -> str:
 
 
 def _channels(name: str, channels: Channels) -> str:
-    pairs = zip(channels.bias.tolist(), channels.multiplier.tolist(), strict=True)
-    # In C, -2147483648 is the negation of a number that is too large for int.
-    texts = (f"{{{'INT32_MIN' if bias == -(2**31) else bias}, {multiplier}}}" for bias, multiplier in pairs)
+    texts = (f"{{{', '.join(map(str, row))}}}" for row in np.stack(channels, -1).tolist())
     return f"static const uwb_channel {name}[{len(channels.bias)}] = {{\n{_wrapped(texts)}}};\n"
 
 

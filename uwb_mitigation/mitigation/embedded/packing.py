@@ -6,7 +6,7 @@ The layouts are documented in `firmware/src/uwb_mitigation.h` and `uwb_kernels.h
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,27 +28,29 @@ SAMPLES = range(8, 158)
 MODULES = range(1, 4)
 
 _BLOCK = 8
-_UNIT = 256
+_POSITION_ORDER = [0, 2, 4, 6, 1, 3, 5, 7]
+_POSITION_SHIFT = 21
+_MAX_WEIGHT = 63
 _Integer = TypeVar("_Integer", np.int8, np.int32)
 _REMEDY = "quantise with `requantisation.nudge`, which moves scales by a few ulps"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Channels:
-    """int32 (n,) each: bias times 256 including the rounding offset, and multiplier."""
+class Channels(NamedTuple):
+    """int32 (n,) each: the constants of `Requantisation`."""
 
     bias: NDArray[np.int32]
     multiplier: NDArray[np.int32]
+    offset: NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedModule:
     """Weights and requantisation of one residual reduction module."""
 
-    residual_weights: NDArray[np.int8]
+    residual_weights: NDArray[np.int32]
     residual: Channels
     residual_sum: Sum
-    reduce_weights: NDArray[np.int8]
+    reduce_weights: NDArray[np.int16]
     reduce: Channels
     skip: Channels
     output_sum: Sum
@@ -70,7 +72,7 @@ class PackedNetwork:
 
     samples: int
     input_scale: np.float32
-    head_weights: NDArray[np.int8]
+    head_weights: NDArray[np.int16]
     head_bias: int
     head_scale: np.float32
     first_kernel: int = 0
@@ -112,7 +114,7 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
         return exact
 
     first = np.zeros((FILTERS, shape.first_kernel + 1), np.int16)
-    first[:, :-1] = weights.weight["first"][:, 0].astype(np.int16) * _UNIT
+    first[:, :-1] = weights.weight["first"][:, 0]
     modules = []
     tensor = "first"
     for number in range(1, shape.modules + 1):
@@ -123,10 +125,10 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
         )
         modules.append(
             PackedModule(
-                _share_words(_channel_pairs(weights.weight[f"{name}.residual"])),
+                _packed_taps(f"{name}.residual", weights.weight[f"{name}.residual"]),
                 channels(f"{name}.residual"),
                 total(f"{name}.sum", f"{name}.residual", tensor),
-                _share_words(_channel_pairs(taps)),
+                _channel_pairs(taps).astype(np.int16).reshape(-1),
                 channels(f"{name}.reduce"),
                 channels(f"{name}.skip"),
                 total(name, f"{name}.reduce", f"{name}.skip"),
@@ -136,7 +138,7 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
     return PackedNetwork(
         samples=shape.samples,
         input_scale=scale["input"],
-        head_weights=_share_words(_head_in_blocks(weights.weight[HEAD], shape)),
+        head_weights=_head_words(_head_in_blocks(weights.weight[HEAD], shape)),
         head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
         head_scale=np.float32(scale[tensor] * weights.weight_scale[HEAD][0]),
         first_kernel=shape.first_kernel,
@@ -182,7 +184,7 @@ def _pack_mlp(weights: Int8Weights, shape: Mlp) -> PackedNetwork:
         layers.append(
             PackedLayer(
                 _share_words(quads.reshape(-1, 2)),
-                Channels(_padded(channels.bias, outputs), _padded(channels.multiplier, outputs)),
+                Channels(*(_padded(values, outputs) for values in channels)),
                 inputs,
                 outputs,
             )
@@ -192,7 +194,7 @@ def _pack_mlp(weights: Int8Weights, shape: Mlp) -> PackedNetwork:
     return PackedNetwork(
         samples=shape.samples,
         input_scale=weights.activation_scale["input"],
-        head_weights=_share_words(head.reshape(-1, 2)),
+        head_weights=_head_words(head),
         head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
         head_scale=np.float32(scale * weights.weight_scale[HEAD][0]),
         layers=tuple(layers),
@@ -203,18 +205,30 @@ def _channels(
     name: str, weight: NDArray[np.int8], bias: NDArray[np.int32], scales: NDArray[np.float32]
 ) -> Channels:
     low, high = accumulator_range(weight, bias)
-    constants = np.empty((2, len(bias)), np.int32)
+    constants = np.empty((3, len(bias)), np.int32)
     for channel, scale in enumerate(scales):
-        requantisation = solve_requantisation(scale, int(low[channel]), int(high[channel]))
-        if requantisation is None:
+        found = solve_requantisation(scale, int(low[channel]), int(high[channel]), int(bias[channel]))
+        if found is None:
             raise ModelError(
                 f"channel {channel} has no exact integer requantisation (scale {scale!r}, "
                 f"accumulators {low[channel]} to {high[channel]})",
                 where=name,
                 valid=_REMEDY,
             )
-        constants[:, channel] = _UNIT * int(bias[channel]) + requantisation.offset, requantisation.multiplier
+        constants[:, channel] = found.bias, found.multiplier, found.offset
     return Channels(*constants)
+
+
+def _packed_taps(name: str, weight: NDArray[np.int8]) -> NDArray[np.int32]:
+    """Convert (filters, inputs, 3) to the words of `uwb_conv_residual.S`, int32 (filters * inputs * 2,).
+
+    Raises:
+        ModelError: weights with which the packed sums could overflow.
+    """
+    before, centre, after = np.moveaxis(weight.astype(np.int32), -1, 0)
+    if np.abs([before, centre, after]).max() > _MAX_WEIGHT:
+        raise ModelError("weights of more than 7 bits", where=name, valid=f"-{_MAX_WEIGHT} to {_MAX_WEIGHT}")
+    return np.stack([centre, after + (before << _POSITION_SHIFT)], -1).reshape(-1)
 
 
 def _channel_pairs(weight: NDArray[np.int8]) -> NDArray[np.int8]:
@@ -232,25 +246,29 @@ def _share_words(pairs: NDArray[np.int8]) -> NDArray[np.int8]:
 
 
 def _head_in_blocks(weight: NDArray[np.int8], shape: Remnet) -> NDArray[np.int8]:
-    """Return the head's weights as pairs, in the order of the last module's blocks, padded with zeros."""
+    """Return the head's weights in the order of the words of the last module, padded with zeros."""
     length = shape.lengths[-1]
     blocks = -(-length // _BLOCK)
     padded = np.zeros((FILTERS, blocks * _BLOCK), np.int8)
     padded[:, :length] = weight[:, 0].reshape(FILTERS, length)
-    pairs: NDArray[np.int8] = (
-        padded.reshape(FILTERS // 2, 2, blocks, _BLOCK).transpose(2, 0, 3, 1).reshape(-1, 2)
-    )
-    return pairs
+    in_words: NDArray[np.int8] = padded.reshape(FILTERS, blocks, _BLOCK)[..., _POSITION_ORDER].swapaxes(0, 1)
+    return in_words
+
+
+def _head_words(weight: NDArray[np.int8]) -> NDArray[np.int16]:
+    """Return pairs for `uwb_dot.S`, in which the first weight is multiplied."""
+    factors = np.array([1 << (_POSITION_SHIFT - 16), 1], np.int16)
+    return (weight.reshape(-1, 2) * factors).reshape(-1)
 
 
 def _head_bias(weight: NDArray[np.int8], bias: NDArray[np.int32]) -> int:
     low, high = accumulator_range(weight, bias)
-    # Up to 2^23 the conversion to float is exact, and the 256-fold accumulator fits 32 bits.
+    # Up to 2^23 the conversion to float is exact.
     if int(low[0]) < -(2**23) or int(high[0]) >= 2**23:
         raise ModelError(
             f"accumulators from {low[0]} to {high[0]}", where=HEAD, valid="magnitudes below 2^23"
         )
-    return _UNIT * int(bias[0])
+    return int(bias[0])
 
 
 def _padded(values: NDArray[_Integer], length: int) -> NDArray[_Integer]:

@@ -10,8 +10,8 @@ ONNX Runtime (MLAS) computes, in float32:
 `rint` rounds half to even. Each function of integers has at most 255 steps, so a line with suitable
 integer constants gives the same function:
 
-- `clip((256 acc + offset) * multiplier >> 32 + REQUANTISATION_SHIFT, 0, 255)`: SMMUL, then USAT with
-  its shift. Weights are scaled by 256, and bias and offset are combined into one constant;
+- `clip(((acc + bias) * multiplier >> 32) + offset >> REQUANTISATION_SHIFT, 0, 255)`: SMMLA, then USAT with its shift.
+  Bias and offset together are finer than one accumulator, because `2^32 offset` is no multiple of the multiplier;
 - `clip(first * a + second * b + offset >> SUM_SHIFT, 0, 255)`: two MLA, then USAT.
 
 `solve_*` search for such constants and return None if they do not exist, which happens if two steps differ by less
@@ -35,10 +35,10 @@ from uwb_mitigation.mitigation.model.weights import (
     sum_operands,
 )
 
-WEIGHT_SCALE_BITS = 8
-"""Weights are multiplied by 2^8 before the dot product, so that the offset can have fraction bits."""
+BIASES = range(3 << 18, 5 << 18)
+"""Biases of the firmware's accumulators. They keep the three packed sums of `uwb_conv_residual.S` positive."""
 
-REQUANTISATION_SHIFT = 11
+REQUANTISATION_SHIFT = 3
 """Right shift after the high word of the product: scales below 2^-4 keep 31 bits of multiplier."""
 
 SUM_SHIFT = 22
@@ -46,19 +46,22 @@ SUM_SHIFT = 22
 
 _LEVELS = 255
 _MAX_ULPS = 64
+_UNIT = 1 << (32 + REQUANTISATION_SHIFT)
+_CHUNK = 1 << 13
 
 
 @dataclass(frozen=True, slots=True)
 class Requantisation:
-    """`clip((256 acc + offset) * multiplier >> 32 + REQUANTISATION_SHIFT, 0, 255)`."""
+    """`clip(((acc + bias) * multiplier >> 32) + offset >> REQUANTISATION_SHIFT, 0, 255)`."""
 
+    bias: int
     multiplier: int
     offset: int
 
     def apply(self, accumulator: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return the requantised values of int32 accumulators."""
-        product = ((accumulator << WEIGHT_SCALE_BITS) + self.offset) * self.multiplier
-        return saturate(product >> (32 + REQUANTISATION_SHIFT))
+        """Return the requantised values of int32 accumulators without the bias of the layer."""
+        high = ((accumulator + self.bias) * self.multiplier) >> 32
+        return saturate((high + self.offset) >> REQUANTISATION_SHIFT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,13 +142,14 @@ def _thresholds(scale: np.float32, low: int, high: int) -> NDArray[np.int64]:
     return thresholds
 
 
-def solve_requantisation(scale: np.float32, low: int, high: int) -> Requantisation | None:
+def solve_requantisation(scale: np.float32, low: int, high: int, bias: int = 0) -> Requantisation | None:
     """Return constants that reproduce `requantise` for every accumulator from `low` to `high`, or None.
 
-    None: there are no such constants, 256 times an accumulator exceeds 31 bits, or the scale is 2^-4 or more.
+    `low` and `high` include the `bias` of the layer, and the result replaces it. None: there are no such constants, or the
+    scale is 2^-4 or more.
     """
     scale = np.float32(scale)
-    nominal = float(scale) * 2.0 ** (32 - WEIGHT_SCALE_BITS + REQUANTISATION_SHIFT)
+    nominal = float(scale) * _UNIT
     if not 1.0 <= nominal < 2**31 - 1:
         return None
     steps = _thresholds(scale, low, high)
@@ -157,39 +161,28 @@ def solve_requantisation(scale: np.float32, low: int, high: int) -> Requantisati
     multipliers = np.unique(np.rint(nominal + np.linspace(-search_width, search_width, 129)).astype(np.int64))
     multipliers = multipliers[(multipliers > 0) & (multipliers < 2**31)]
     for multiplier in multipliers[np.argsort(np.abs(multipliers - nominal), kind="stable")].tolist():
-        # Accumulator t reaches level k when 256 t + offset >= ceil(k D / multiplier).
-        offset = _offset_between(
-            _reaching(k, multiplier) - (steps << WEIGHT_SCALE_BITS),
-            at_least=int(_reaching(level, multiplier)) - 256 * low if level > 0 else None,
-            at_most=int(_reaching(level + len(k) + 1, multiplier)) - 1 - 256 * high
-            if level + len(k) < _LEVELS
-            else None,
-            nominal=round(128 / float(scale)),
-        )
-        if offset is not None:
-            fits = all(-(2**31) <= 256 * end + offset < 2**31 for end in (low, high))
-            return Requantisation(multiplier, offset) if fits else None
+        # Accumulator t reaches level k when t * multiplier + intercept >= k * unit, and t - 1 does not.
+        lowest = k * _UNIT - steps * multiplier
+        at_least, at_most = int(lowest.max(initial=-(2**62))), int(lowest.min(initial=2**62)) + multiplier - 1
+        if level > 0:
+            at_least = max(at_least, level * _UNIT - low * multiplier)
+        if level + len(k) < _LEVELS:
+            at_most = min(at_most, (level + len(k) + 1) * _UNIT - 1 - high * multiplier)
+        if at_least <= at_most and (found := _split(at_least, at_most, multiplier, bias)):
+            return found
     return None
 
 
-def _reaching(level: NDArray[np.int64] | int, multiplier: int) -> NDArray[np.int64]:
-    """Return the smallest scaled accumulator whose product reaches `level`."""
-    return -((-(np.asarray(level, np.int64) << (32 + REQUANTISATION_SHIFT))) // multiplier)
-
-
-def _offset_between(
-    lowest: NDArray[np.int64], *, at_least: int | None, at_most: int | None, nominal: int
-) -> int | None:
-    """Return the middle of the offsets for which every step is in its gap of width 256, or None."""
-    floors = [int(lowest.max())] if lowest.size else []
-    ceilings = [int(lowest.min()) + 255] if lowest.size else []
-    floors += [at_least] if at_least is not None else []
-    ceilings += [at_most] if at_most is not None else []
-    if not (floors and ceilings):
-        return max([nominal, *floors]) if floors else min([nominal, *ceilings])
-    if max(floors) > min(ceilings):
-        return None
-    return (max(floors) + min(ceilings)) // 2
+def _split(at_least: int, at_most: int, multiplier: int, bias: int) -> Requantisation | None:
+    """Return bias and offset with `(new bias - bias) * multiplier + 2^32 offset` between the limits, or None."""
+    for start in range(BIASES.start, BIASES.stop, _CHUNK):
+        biases = np.arange(start, start + _CHUNK)
+        products = (biases - bias) * multiplier
+        offsets = (at_most - products) >> 32
+        suitable = np.flatnonzero(products + (offsets << 32) >= at_least)
+        if suitable.size:
+            return Requantisation(int(biases[suitable[0]]), multiplier, int(offsets[suitable[0]]))
+    return None
 
 
 def solve_sum(first: np.float32, second: np.float32) -> Sum | None:
