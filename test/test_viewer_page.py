@@ -335,6 +335,18 @@ def test_only_the_latest_pairs_are_kept() -> None:
     assert {anchor for anchor, _ in scene.pairs} == set(range(100, MAX_PAIRS + 100))
 
 
+def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:
+    scene = Scene()
+    for number in range(40):
+        if number in range(30, 36):
+            scene.count_dropped(1)
+            continue
+        scene.add_sample((1, 7), Sample(1000.0 + number / 10, 5.3, 5.1, 0.1, Status.OK))
+        scene.pairs[1, 7].count_lost(number)
+    assert scene.pairs[1, 7].rate_hz() == pytest.approx(10.0)
+    assert scene.pairs[1, 7].lost == 0
+
+
 def test_clocks_may_differ_and_jump_back() -> None:
     scene = Scene()
     for step in range(50):

@@ -11,7 +11,6 @@ import threading
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
@@ -43,14 +42,17 @@ _QOS = QoSProfile(
     reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
     history=HistoryPolicy.KEEP_LAST,
-    depth=2000,
+    depth=5000,
 )
+
+MAX_BATCH = 500
+"""Maximum number of ranges of a topic that are read at once, so that pages are served while many wait."""
 
 DISCOVERY_PERIOD_S = 0.5
 """Interval of the search for new topics."""
 
 READ_PERIOD_S = 0.1
-"""Interval at which the queued ranges are read; a queue holds those of 2 s at 1000 ranges per second."""
+"""Interval at which the queued ranges are read; a queue holds those of 5 s at 1000 ranges per second."""
 
 
 class Viewer(ManagedNode):
@@ -162,24 +164,20 @@ class Viewer(ManagedNode):
     def _read_queued_ranges(self) -> None:
         # A truth is published before its corrected range: reading truths last and adding them first misses none.
         corrected, truths, raw = (
-            list(endpoints.take_queued(self._ranges[topic], _QOS.depth)) if topic in self._ranges else []
+            list(endpoints.take_queued(self._ranges[topic], MAX_BATCH)) if topic in self._ranges else []
             for topic in (topics.RANGE_CORRECTED, topics.RANGE_TRUTH, topics.RANGE_RAW)
         )
-        if corrected:
-            # The gaps are messages that did not reach the viewer: their ranges are not lost by the radio.
-            numbers = np.array([self._last_sequence, *(number for _, number in corrected)], np.int64)
-            dropped = int((np.diff(numbers)[int(self._last_sequence == 0) :] - 1).clip(0).sum())
-            self._last_sequence = int(numbers[-1])
-            if dropped and self._has_single_publisher:
-                with self._lock:
-                    self._scene.count_dropped(dropped)
-        for topic, queued in (
-            (topics.RANGE_TRUTH, truths),
-            (topics.RANGE_RAW, raw),
-            (topics.RANGE_CORRECTED, corrected),
-        ):
+        for topic, queued in ((topics.RANGE_TRUTH, truths), (topics.RANGE_RAW, raw)):
             for data, _ in queued:
                 self._feed.add_encoded(topic, data)
+        for data, number in corrected:
+            # The gaps are messages that did not reach the viewer: their ranges are not lost by the radio.
+            dropped = number - self._last_sequence - 1 if self._last_sequence else 0
+            self._last_sequence = number
+            if dropped > 0 and self._has_single_publisher:
+                with self._lock:
+                    self._scene.count_dropped(dropped)
+            self._feed.add_encoded(topics.RANGE_CORRECTED, data)
 
     def _discover_topics(self) -> None:
         """Subscribe to topics that have become available or necessary."""

@@ -96,6 +96,7 @@ class Sample:
         raw_m, range_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
         true_m, label: true range and label; NaN and empty if unknown.
         residual_m: corrected range minus the distance of the anchor from the estimated position; NaN: unknown.
+        interval_s: time since the previous range of the pair; NaN: unknown, because the viewer has dropped ranges.
     """
 
     time_s: float
@@ -106,6 +107,7 @@ class Sample:
     true_m: float = math.nan
     label: str = ""
     residual_m: float = math.nan
+    interval_s: float = math.nan
 
     @classmethod
     def from_corrected(cls, time_s: float, corrected: CorrectedRange, truth: Truth | None) -> Sample:
@@ -165,12 +167,16 @@ class History:
     lost: int = 0
     received: int = 0
     _sequence: int = -1
+    _is_interrupted: bool = False
     _steps: deque[int] = field(default_factory=lambda: deque(maxlen=20))
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
     traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=WATERFALL))
 
     def add(self, sample: Sample, now_s: float) -> None:
         """Add a range, and remove ranges that are older than a minute."""
+        if self.samples and not self._is_interrupted:
+            sample.interval_s = sample.time_s - self.samples[-1].time_s
+        self._is_interrupted = False
         self.samples.append(sample)
         self.received += 1
         while self.samples[0].time_s < now_s - HISTORY_S:
@@ -185,8 +191,8 @@ class History:
         self._sequence = sequence
 
     def restart_count(self) -> None:
-        """Do not count the ranges until the next one as lost, because the viewer itself has dropped ranges."""
-        self._sequence = -1
+        """Exclude the time until the next range from losses and rate: the viewer itself has dropped ranges."""
+        self._sequence, self._is_interrupted = -1, True
 
     def statistics(self) -> dict[str, float]:
         """Return means and shares (%) of the latest ranges and CIRs; NaN: unknown."""
@@ -210,18 +216,19 @@ class History:
         return self.samples[-1] if self.samples else None
 
     def rate_hz(self, age_s: float = 0.0) -> float:
-        """Return the rate of the last `RATE_RANGES` ranges; NaN before the second one.
+        """Return the rate of the last `RATE_RANGES` ranges by their stamps; NaN before the second one.
 
         Args:
             age_s: time since the last range; the rate decreases if this is several mean intervals.
         """
         # Copy in one step: the monitor draws its table in another thread than the one that adds ranges.
-        recent = [sample.time_s for sample in list(islice(reversed(self.samples), RATE_RANGES))]
-        span = recent[0] - recent[-1] if recent else 0.0
-        if not span > 0:
+        recent = list(islice(reversed(self.samples), RATE_RANGES))
+        intervals_s = [sample.interval_s for sample in recent[:-1] if math.isfinite(sample.interval_s)]
+        span_s = sum(intervals_s)
+        if not span_s > 0:
             return math.nan
-        rate_hz = (len(recent) - 1) / span
-        return rate_hz if age_s * rate_hz <= NO_DATA_INTERVALS else len(recent) / (span + age_s)
+        rate_hz = len(intervals_s) / span_s
+        return rate_hz if age_s * rate_hz <= NO_DATA_INTERVALS else (len(intervals_s) + 1) / (span_s + age_s)
 
     @property
     def max_gap_s(self) -> float:
