@@ -383,7 +383,7 @@ def test_miluv(tmp_path: Path):
     assert first.tag_position == pytest.approx((0.13189, 0.6 - 0.17245, 1.8 - 0.05249))
     assert source.dropped == {"to_id above 9.0": 1}
     assert source.warnings == ["5 anchors have a position but no range: 0, 1, 3, 4, 5"]
-    assert source.notes == ["CIRs attached: 1 of 2; typical delay +0.00 s"]
+    assert source.notes == ["CIRs attached: 1 of 1 (1 of other pairs); typical delay +0.00 s"]
     assert source.anchors.position[2].tolist() == [5.0, 0.5, 1.8]
 
 
@@ -464,7 +464,8 @@ def test_ghent_university(tmp_path: Path):
     assert first.truth.configuration == "hwhw"
     assert first.truth.label == "NLOS"
     assert source.errors_m.tolist() == pytest.approx([1.776, -0.162])
-    assert (second.measurement.tag_id, second.measurement.anchor_id) == (2, 2)
+    # The tag `hw` and the anchor `hw` are the same radio.
+    assert [(one.measurement.tag_id, one.measurement.anchor_id) for one in source] == [(1, 1), (2, 3)]
 
 
 def test_starloc(tmp_path: Path):
@@ -566,7 +567,6 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
         ),
         ("t,a,r\n1700000000000,1,2\n", {}, "stamp = 1700000000000 is outside .*unit: ms"),
         ("t,a,r\n2024-06-09T19:39:13,1,2\n", {}, "is not a number .*dates: set unit: iso8601"),
-        ("t,a,r\n0,9007199254740993,2\n1,,2\n", {}, "is not an id"),
         ("", {}, "the file is empty"),
     ],
 )
@@ -636,9 +636,9 @@ def test_an_error_column_of_the_opposite_sign_is_reported(tmp_path: Path):
 
 
 def test_unsorted_and_repeated_stamps_and_nan_are_reported(tmp_path: Path):
-    write(tmp_path / "x.csv", "t,a,r\n2,1,3\n1,1,2\n1,1,2\n1,2,9\n3,1,nan\n4,1,-1\n")
+    write(tmp_path / "x.csv", "t,a,r\n2,1,3\n1,1,2\n1,1,2.1\n1,2,9\n3,1,nan\n4,1,-1\n")
     source = read(PLAIN, tmp_path / "x.csv")
-    assert ranges_of(source) == [2.0, 2.0, 9.0, 3.0, -1.0]
+    assert ranges_of(source) == [2.0, 2.1, 9.0, 3.0, -1.0]
     assert source.dropped == {"range is not a number": 1}
     assert [warning.split(" ", 1)[1] for warning in source.warnings] == [
         "stamps are earlier than the one before; the ranges were sorted",
@@ -667,6 +667,7 @@ def test_single_impossible_values_are_dropped_and_counted(tmp_path: Path):
         "x": "0",
     }
     rows = [usual, *(usual | {name: "1e297"} for name in usual if name != "a"), usual | {"level": "-inf"}]
+    rows = [row | ({"t": str(n)} if row["t"] == "1.5" else {}) for n, row in enumerate(rows)]
     write(tmp_path / "x.csv", "\n".join([",".join(usual), *(",".join(row.values()) for row in rows)]))
     expected = {
         "stamp is not a number": 1, "range is above 10000": 1, "true range is above 10000": 1, "rx_power is above 10000": 1,

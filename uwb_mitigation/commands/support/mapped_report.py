@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 
 _ROWS = 5
-_LARGE_M, _LARGE_ERROR_M = 100.0, 5.0
-"""Larger ranges and errors are counted."""
-
 _BAR = 40
 _FIELDS = (
     ("range, m", "range", 3),
@@ -39,11 +36,9 @@ def show(sources: Sequence[MappedRecording], *, preview: bool) -> dict[str, Any]
     for source in sources:
         for note in source.notes:
             print_line(note)
-        for kind, names in source.names.items():
-            if names:
-                show_table(
-                    "", (f"{kind} name", "id"), [[name, str(number)] for name, number in names.items()]
-                )
+        if source.names:
+            rows = [[name, str(number)] for name, number in source.names.items()]
+            show_table("", ("tag or anchor name", "id"), rows)
     for warning in warnings:
         console.warn(f"warning: {warning}")
     for source in sources if preview else ():
@@ -93,21 +88,13 @@ def show_preview(source: MappedRecording) -> None:
 
 
 def _extent(source: MappedRecording) -> str:
-    """Return the duration, the rates of pairs, and the number of outliers."""
-    from uwb_mitigation.recordings.mapping.checks import median
-
+    """Return the duration and the rates of pairs."""
     values = source.values
     duration_s = int(values["stamp"].max() - values["stamp"].min()) / 1e9
     counts = np.unique(np.stack([values["tag"], values["anchor"]]), axis=1, return_counts=True)[1]
     text = f"{duration_s:.1f} s, {len(counts)} pairs with {counts.min()} to {counts.max()} ranges"
     if duration_s > 0:
         text += f" ({counts.min() / duration_s:.2g} to {counts.max() / duration_s:.2g} Hz)"
-    for name, numbers, limit in (
-        ("ranges", values["range"], max(_LARGE_M, 5 * median(values["range"]))),
-        ("errors", np.abs(source.errors_m), _LARGE_ERROR_M),
-    ):
-        if count := int(np.count_nonzero(numbers > limit)):
-            text += f"; {count} {name} above {limit:.0f} m"
     return text
 
 

@@ -1,21 +1,33 @@
-"""Checks of the values of a mapped recording: units, rates, and positions of anchors."""
+"""Checks of the columns of a mapped recording: rows that are dropped, clocks that start again, errors and warnings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, format_id
-from uwb_mitigation.recordings.mapping.conversion import ColumnDict
-from uwb_mitigation.recordings.mapping.mapping import LENGTHS
+from uwb_mitigation.recordings.mapping.conversion import UNKNOWN_ID, UNKNOWN_STAMP, ColumnDict
+from uwb_mitigation.recordings.mapping.mapping import LENGTHS, TIME, FieldRule
+from uwb_mitigation.recordings.summary import FIRST_DATE_NS
+from uwb_mitigation.types.stamps import NS_PER_S
 
 MAX_PLAUSIBLE_M, MIN_PLAUSIBLE_M = 300.0, 0.03
 """A median range outside of these limits shows a wrong unit: UWB reaches 300 m."""
 
+MAX_POSSIBLE = 10_000.0
+"""Rows with a larger range (m), level (dBm) or first-path index are not used."""
+
 MAX_INTERVAL_S, MAX_RATE_HZ = 5.0, 1000.0
 """Plausible median interval between ranges, and plausible mean rate."""
+
+PAUSE_S = 5.0
+"""Time between the parts of a recording whose clock starts again, or between placements without stamps."""
+
+MIN_RESTART_S, MIN_PART_ROWS = 1.0, 10
+"""If the stamps of a pair go back by more, its clock starts again, unless the parts are so short that rows are unsorted."""
 
 MAX_DIFFERENCE_M = 0.1
 """Largest plausible median difference of the true ranges of an anchor and the distances of positions."""
@@ -23,8 +35,19 @@ MAX_DIFFERENCE_M = 0.1
 MAX_ERROR_M = 20.0
 """Largest plausible median error of ranges."""
 
+MAX_NEGATIVE, MAX_RATIO = 0.25, 20.0
+"""Largest plausible share of negative ranges, and ratio of the median range of an anchor to that of all."""
+
 MAX_INDEX = 1016
+_LARGE_M, _LARGE_ERROR_M = 100.0, 5.0
 _MAX_LISTED = 12
+_LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
+_PLACES = ("row", "file", "cir")
+_NO_RANGE_M = (0.0, 32.767, 65.535, 327.67, 655.35)
+"""Ranges that radios report without a measurement: zero, and the largest 16-bit numbers of mm and cm."""
+
+_DAY_S = 86_400
+_SCALES = {"scale: 60 (minutes)": 60, "scale: 3600 (hours)": 3600, f"scale: {_DAY_S} (days)": _DAY_S}
 
 
 def median(numbers: NDArray[np.float64]) -> float:
@@ -33,17 +56,193 @@ def median(numbers: NDArray[np.float64]) -> float:
     return float(np.median(finite)) if len(finite) else np.nan
 
 
-def pair_intervals_s(values: ColumnDict) -> NDArray[np.float64]:
-    """Return the times between successive ranges of the same pair, s."""
-    order = np.lexsort((values["stamp"], values["anchor"], values["tag"]))
-    tag, anchor, stamp = (values[name][order] for name in ("tag", "anchor", "stamp"))
-    same = (tag[1:] == tag[:-1]) & (anchor[1:] == anchor[:-1])
-    intervals: NDArray[np.float64] = np.diff(stamp)[same] / 1e9
-    return intervals
+# Rows that are dropped -------------------------------------------------------------------------------------------
 
 
-def check_units(values: ColumnDict, name: str) -> None:
-    """Raise RecordingError for wrong units of lengths or of the first-path index."""
+def unknown_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+    """Return {reason: rows} without a range, stamp or id."""
+    return {
+        "range is not a number": ~np.isfinite(values["range"]),
+        "stamp is not a number": values["stamp"] == UNKNOWN_STAMP,
+        "tag or anchor is unknown": (values["tag"] == UNKNOWN_ID) | (values["anchor"] == UNKNOWN_ID),
+    }
+
+
+def invalid_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+    """Return {reason: rows} that repeat another row, or with a number that means that there is no range."""
+    rules = {"repeated row": _repeated(values)[1]}
+    for number in _NO_RANGE_M:
+        same = np.abs(values["range"] - number) < 1e-6
+        near = np.abs(values["range"] - number) < max(0.05, 0.2 * number)
+        is_true = np.abs(values["true range"] - number) < 1.0
+        if np.array_equal(same, near) and not (same & is_true).any():
+            rules[f"range is {number:g}, which means no measurement"] = same
+    return rules
+
+
+def impossible_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+    """Return {reason: rows} with a number above `MAX_POSSIBLE`."""
+    return {f"{name} is above {MAX_POSSIBLE:g}": np.abs(values[name]) > MAX_POSSIBLE for name in _LIMITED}
+
+
+def _repeated(values: ColumnDict) -> tuple[int, NDArray[np.bool_]]:
+    """Return the number of ranges with the stamp of another range of the pair, and which of them are equal rows.
+
+    Rows with a coarse clock may be equal: if some of the pair's ranges with the same stamp differ, none is returned.
+    """
+    import pandas as pd
+
+    keys = ["stamp", "tag", "anchor"]
+    # Constant columns have no strides.
+    names = [name for name, column in values.items() if column.strides != (0,) and name not in _PLACES]
+    frame = pd.DataFrame({name: values[name] for name in {*keys, *names}}, copy=False)
+    count = int((same := frame.duplicated(keys)).sum())
+    equal = frame.duplicated() if count else same
+    return count, np.asarray(equal if int(equal.sum()) == count else np.zeros(len(frame), bool))
+
+
+# Clocks ----------------------------------------------------------------------------------------------------------
+
+
+def continue_clocks(values: ColumnDict, stamp: FieldRule, files: Sequence[Path]) -> str:
+    """Continue the stamps after an overflow or a restart of the clock; `values` are in the order of the files.
+
+    Returns:
+        What happened, for the user; empty: nothing.
+    """
+    unwrapped = _without_overflow(values, stamp)
+    if unwrapped is not None:
+        values["stamp"] = unwrapped
+        return "the stamps overflow or pass midnight; they were continued"
+    if (part := _parts(values)) is None:
+        return ""
+    stamps, end = values["stamp"].copy(), 0
+    for number in range(int(part.max()) + 1):
+        rows = part == number
+        shift = end - stamps[rows].min() if number else 0
+        stamps[rows] += shift
+        end = stamps[rows].max() + round(PAUSE_S * NS_PER_S)
+    values["stamp"] = stamps
+    row = int(np.flatnonzero(part)[0])
+    where = f"row {values['row'][row] + 1} of {files[values['file'][row]].name}"
+    return f"the clock starts again at {where}: {number + 1} parts, with pauses of {PAUSE_S:g} s between them"
+
+
+def _without_overflow(values: ColumnDict, rule: FieldRule) -> NDArray[np.int64] | None:
+    """Return the continued stamps if a 32-bit counter overflows or times without a date pass midnight; None: neither."""
+    is_date = rule.unit == "iso8601" or "%" in rule.unit
+    period = _DAY_S * NS_PER_S if is_date else round((TIME[rule.unit or "s"] * rule.scale) * 2**32)
+    stamps, has_overflow = values["stamp"].copy(), False
+    for number in np.unique(values["file"]):
+        rows = np.flatnonzero(values["file"] == number)
+        one = (stamps[rows] - round(rule.offset * NS_PER_S)) / period
+        back, forward = np.diff(one) < -0.96, np.diff(one) > 0.96
+        # Unsigned counters overflow at the period, signed ones at half of it.
+        for start in (0.0, 0.5):
+            before, after = one[:-1][back] + start, one[1:][back] + start
+            if back.any() and (np.abs(before - 0.99) <= 0.01).all() and (np.abs(after - 0.01) <= 0.01).all():
+                stamps[rows[1:]] += np.cumsum(back.astype(np.int64) - forward) * period
+                has_overflow = True
+    return stamps if has_overflow else None
+
+
+def _parts(values: ColumnDict) -> NDArray[np.int64] | None:
+    """Return the number of the part of each row, if a clock without a date starts again; None: it does not.
+
+    Rows that are sorted by pairs, and files of different pairs, have one clock.
+    """
+    import pandas as pd
+
+    stamps = values["stamp"]
+    if len(stamps) == 0 or stamps.max() >= FIRST_DATE_NS:
+        return None
+    pair = (
+        pd.DataFrame({name: values[name] for name in ("tag", "anchor")}).groupby(["tag", "anchor"]).ngroup()
+    )
+    order = np.argsort(pair.to_numpy(), kind="stable")
+    limit, same = -round(MIN_RESTART_S * NS_PER_S), np.diff(pair.to_numpy()[order]) == 0
+    restarts = np.zeros(len(stamps), np.int64)
+    restarts[order[1:]] = (np.diff(stamps[order]) < limit) & same
+    of_pair = pd.Series(restarts).groupby(pair).cumsum().to_numpy()
+    count = int(of_pair.max())
+    if count == 0 or len(stamps) < MIN_PART_ROWS * (count + 1):
+        return None
+    # A device that logs all pairs starts them again together, also pairs that it has not measured before.
+    of_file: NDArray[np.int64] = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < limit)
+    part = of_file if of_file[-1] == count else of_pair
+    # A copy of the rows is no second part.
+    is_copy = _repeated(values)[1]
+    return None if is_copy[part > 0].mean() > 0.9 else part
+
+
+# Errors ----------------------------------------------------------------------------------------------------------
+
+
+def check_stamps(values: ColumnDict, name: str, stamp: FieldRule, *, moving: bool) -> None:
+    """Raise RecordingError for equal stamps, or an implausible rate, which shows a wrong unit of stamps."""
+    # Several ranges may have the same stamp.
+    intervals_s = np.diff(np.unique(values["stamp"])) / 1e9
+    if not len(intervals_s) and _repeated(values)[0]:
+        valid = "stamp: another column, or {rate_hz: ranges per second}"
+        raise RecordingError("all stamps are equal", where=name, valid=valid)
+    if len(intervals_s) < 10:
+        return
+    middle, rate_hz = float(np.median(intervals_s)), len(intervals_s) / float(intervals_s.sum())
+    if not (moving and middle > MAX_INTERVAL_S) and rate_hz <= MAX_RATE_HZ:
+        return
+    what = f"the ranges are {middle:.3g} s apart, in {intervals_s.sum():.3g} s"
+    hint = f"; probably set {unit}" if (unit := _unit_of_time(middle, stamp)) else "; check unit and scale"
+    hint += " of the stamps"
+    if middle > MAX_INTERVAL_S:
+        hint += "; for slow recordings without motion set moving: false"
+    raise RecordingError(what, where=name, valid=f"{1 / MAX_RATE_HZ:g} to {MAX_INTERVAL_S:g} s{hint}")
+
+
+def _unit_of_time(interval_s: float, rule: FieldRule) -> str:
+    """Return the line of a mapping that makes an interval plausible; empty: none."""
+    now_s = TIME[rule.unit or "s"] * rule.scale / NS_PER_S if rule.unit in ("", *TIME) else 0.0
+    units = {
+        f"unit: {unit}": factor / NS_PER_S for unit, factor in TIME.items() if unit != "iso8601"
+    } | _SCALES
+    intervals = {line: interval_s / now_s * unit_s for line, unit_s in units.items()} if now_s > 0 else {}
+    plausible = {
+        line: abs(np.log(interval / 0.1))
+        for line, interval in intervals.items()
+        if 1 / MAX_RATE_HZ <= interval <= MAX_INTERVAL_S
+    }
+    return min(plausible, key=plausible.__getitem__, default="")
+
+
+def check_units(values: ColumnDict, name: str, units: Mapping[str, str]) -> None:
+    """Raise RecordingError for wrong units of lengths or of the first-path index, or for differences of ranges.
+
+    Args:
+        values: the columns.
+        name: the recording, for errors.
+        units: units of `range` and `truth.range` in the mapping; empty: m.
+    """
+    import pandas as pd
+
+    negative = float((values["range"] < 0).mean())
+    if len(values["range"]) >= 20 and negative > MAX_NEGATIVE:
+        valid = "ranges: differences of ranges (TDoA) are not used; if the sign is wrong, set scale: -1"
+        raise RecordingError(f"{negative:.0%} of the ranges are negative", where=name, valid=valid)
+    ranges, true = np.abs(values["range"]), values["true range"]
+    rows_of = pd.Series(ranges).groupby(values["anchor"]).indices
+    medians = {anchor: median(ranges[rows]) for anchor, rows in rows_of.items()}
+    typical = median(np.array([*medians.values()]))
+    wrong: dict[int, tuple[str, str]] = {}
+    for anchor, rows in rows_of.items():
+        error = _unit_of_length(_scale(ranges[rows], true[rows]), units)
+        if not error and (medians[anchor] > MAX_PLAUSIBLE_M or 0 < medians[anchor] < MIN_PLAUSIBLE_M):
+            error = _unit_of_length(medians[anchor] / typical, units, nearest=True)
+        if error:
+            wrong[anchor] = error
+    if 0 < len(wrong) < len(rows_of):
+        anchor, (_, quantity) = next(iter(wrong.items()))
+        lines = ", ".join(f"{anchor}: {unit}" for anchor, (unit, _) in wrong.items())
+        what = f"the median range of anchor {format_id(anchor)} is {medians[anchor]:,.4g} m, of all {typical:,.4g} m"
+        raise RecordingError(what, where=name, valid=f"probably set units: {{{lines}}} of {quantity}")
     for column, low, high, unit, alternative in (
         ("range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
         ("true range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
@@ -56,14 +255,29 @@ def check_units(values: ColumnDict, name: str) -> None:
                 where=name,
                 valid=f"{low:g} to {high:g}; probably set unit: {alternative if middle > high else unit}",
             )
-    factor = _scale(values["range"], values["true range"])
-    for unit, metres in LENGTHS.items():
-        for ratio, quantity in ((1 / metres, "range"), (metres, "truth.range")):
-            if unit != "m" and abs(factor / ratio - 1) < 0.08:
-                raise RecordingError(
-                    f"the ranges are {factor:.3g} times the true ranges", where=name,
-                    valid=f"the same unit: probably set unit: {unit} of {quantity}",
-                )  # fmt: skip
+    factor = _scale(values["range"], true)
+    if error := _unit_of_length(factor, units):
+        raise RecordingError(
+            f"the ranges are {factor:.3g} times the true ranges", where=name,
+            valid=f"the same unit: probably set unit: {error[0]} of {error[1]}",
+        )  # fmt: skip
+
+
+def _unit_of_length(
+    factor: float, units: Mapping[str, str], *, nearest: bool = False
+) -> tuple[str, str] | None:
+    """Return the unit, and whether of `range` or `truth.range`, that explains a factor of ranges; None: none does."""
+    candidates = {
+        (unit, quantity): abs(np.log(ratio * metres / LENGTHS[units[quantity] or "m"]))
+        for quantity, ratio in (
+            ("range", factor),
+            ("truth.range", 0.0 if nearest or factor == 0 else 1 / factor),
+        )
+        for unit, metres in LENGTHS.items()
+        if unit != (units[quantity] or "m") and ratio > 0
+    }
+    best = min(candidates, key=candidates.__getitem__, default=None)
+    return best if best and (nearest or candidates[best] < np.log(1.08)) else None
 
 
 def _scale(ranges_m: NDArray[np.float64], true_m: NDArray[np.float64]) -> float:
@@ -81,21 +295,7 @@ def _scale(ranges_m: NDArray[np.float64], true_m: NDArray[np.float64]) -> float:
     return slope if abs(slope / ratio - 1) < 0.15 else np.nan
 
 
-def check_rate(values: ColumnDict, name: str, *, moving: bool) -> None:
-    """Raise RecordingError for an implausible rate, which shows a wrong unit of stamps."""
-    # Several ranges may have the same stamp.
-    intervals_s = np.diff(np.unique(values["stamp"])) / 1e9
-    if len(intervals_s) < 10:
-        return
-    middle, rate_hz = float(np.median(intervals_s)), len(intervals_s) / float(intervals_s.sum())
-    if moving and middle > MAX_INTERVAL_S:
-        hint = "probably set unit: ms of the stamps; for slow recordings without motion set moving: false"
-    elif rate_hz > MAX_RATE_HZ:
-        hint = "probably set unit: s of the stamps"
-    else:
-        return
-    what = f"the ranges are {middle:.3g} s apart, in {intervals_s.sum():.3g} s"
-    raise RecordingError(what, where=name, valid=f"{1 / MAX_RATE_HZ:g} to {MAX_INTERVAL_S:g} s; {hint}")
+# Warnings --------------------------------------------------------------------------------------------------------
 
 
 def anchor_warnings(
@@ -136,10 +336,22 @@ def _listed(texts: list[str]) -> str:
 
 def value_warnings(values: ColumnDict, *, errors_measured: bool) -> Iterator[str]:
     """Yield warnings of implausible values; `errors_measured`: the recording has errors, but no true ranges."""
-    if repeated := int(np.count_nonzero(pair_intervals_s(values) == 0)):
+    import pandas as pd
+
+    if repeated := _repeated(values)[0]:
         yield f"{repeated} ranges repeat the stamp of another range of the same pair"
-    errors = values["range"] - values["true range"]
+    ranges, errors = values["range"], values["range"] - values["true range"]
     errors = errors[np.isfinite(errors)]
+    for name, numbers, limit in (("ranges", ranges, _LARGE_M), ("errors", np.abs(errors), _LARGE_ERROR_M)):
+        limit = max(limit, 5 * median(numbers))
+        if count := int(np.count_nonzero(numbers > limit)):
+            yield f"{count} {name} are above {limit:.0f} m"
+    medians = pd.Series(ranges).groupby(values["anchor"]).median()
+    for anchor, ratio in (medians / medians.median())[lambda ratios: ratios > MAX_RATIO].items():
+        yield (
+            f"the median range of anchor {format_id(anchor)} is {ratio:.0f} times that of the others: if its unit "
+            f"differs, set units: {{{anchor}: cm}} of range"
+        )
     if (middle := median(np.abs(errors))) > MAX_ERROR_M:
         yield f"the median error is {middle:.0f} m: do range and truth have the same unit?"
     if errors_measured and len(errors) >= 20:

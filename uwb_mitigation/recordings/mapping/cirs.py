@@ -37,7 +37,8 @@ class CirFile:
         names = series(source.column)
         lists: Any = chunk.columns[names[0]]
         if len(names) > 1:
-            lists = np.stack([np.asarray(chunk.columns[name], np.float64) for name in names], axis=1)
+            kind = object if source.samples == "complex" else np.float64
+            lists = np.stack([np.asarray(chunk.columns[name], kind) for name in names], axis=1)
         numbers = np.full(chunk.count, -1)
         for row in range(chunk.count):
             values = lists[row]
@@ -107,8 +108,12 @@ def join_by_time(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, join:
 
 def _summary(ranges: Any, cirs: Any, attached: int, join: Join) -> tuple[str, bool]:
     """Return how many CIRs were attached, their typical delay, and the offset that would attach more."""
-    text = f"CIRs attached: {attached} of {len(cirs)}"
     stamps = {key: group["stamp"].to_numpy() for key, group in ranges.groupby(["tag", "anchor"])}
+    # Those of other pairs belong to ranges that were dropped.
+    is_paired = np.array([key in stamps for key in zip(cirs["tag"], cirs["anchor"], strict=True)], bool)
+    if others := int(np.count_nonzero(~is_paired)) if is_paired.any() else 0:
+        cirs = cirs[is_paired]
+    text = f"CIRs attached: {attached} of {len(cirs)}" + (f" ({others} of other pairs)" if others else "")
     delays = []
     for key, group in cirs.iloc[:_MAX_SEARCHED].groupby(["tag", "anchor"]):
         if key in stamps:

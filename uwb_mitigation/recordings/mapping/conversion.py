@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -14,8 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import RecordingError, UwbMitigationError
-from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter, TableFormat
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.recordings.mapping.mapping import (
+    LENGTHS,
+    SCALES,
+    TIME,
+    FieldRule,
+    RowFilter,
+    TableFormat,
+)
 from uwb_mitigation.recordings.mapping.tables import (
     CHUNK_ROWS,
     LOG_TIME,
@@ -25,6 +32,7 @@ from uwb_mitigation.recordings.mapping.tables import (
     read_chunks,
 )
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
+from uwb_mitigation.types.stamps import NS_PER_S
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
@@ -33,10 +41,20 @@ UNKNOWN_ID = (1 << 64) - 1
 UNKNOWN_STAMP = np.iinfo(np.int64).min
 """Id and stamp of a row without one."""
 
+_HINTS = (
+    (r"[-+]?[\d.]*,\d+$", "decimal commas: set decimal: ','"),
+    (r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d", "dates: set unit: iso8601"),
+    (r"\d{1,2}([/.-])\d{1,2}\1\d{2,4}", "dates: set unit: '%d/%m/%Y %H:%M:%S', in the order of the file"),
+    (r"[#%;]|//", "comments: set comment: '#'; other lines: drop them with `matches`"),
+    (r"[-+]?\d[\d.]*\s*[^\d.]", r"a number in a text: set pattern: '([-\d.]+)'"),
+)
+"""Forms of texts that are not numbers, and what a mapping needs."""
+
 MAX_STAMP_S = 4.6e9
 """Stamps are within the years 1824 to 2115, so that differences fit into 64 bits."""
 
 NO_CIR = Cir(np.zeros(0, np.int16))
+_TIME_OF_DAY = r"\d{1,2}:\d\d:\d\d(\.\d+)?"
 _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
 """Constant A of the DW1000's levels by PRF in MHz (user manual, section 4.7)."""
 
@@ -109,10 +127,12 @@ class Converter:
     Args:
         values: the columns of the result; None: unknown.
         names: numbers of named tags and anchors.
+        ids: the values that are ids.
     """
 
     values: Mapping[str, FieldRule | None]
-    names: Mapping[str, dict[str, int]] = field(default_factory=lambda: {"tag": {}, "anchor": {}})
+    names: dict[str, int] = field(default_factory=dict)
+    ids: Collection[str] = ("tag", "anchor")
 
     @property
     def columns(self) -> dict[str, bool]:
@@ -121,6 +141,11 @@ class Converter:
         for value in filter(None, self.values.values()):
             columns |= {name: value.optional and columns.get(name, True) for name in value.columns}
         return columns
+
+    @property
+    def id_columns(self) -> set[str]:
+        """Return the columns of the table that contain ids."""
+        return {column for name in self.ids if (value := self.values.get(name)) for column in value.columns}
 
     def convert(self, chunk: Chunk, file: str = "") -> ColumnDict:
         """Return the values of all rows of a chunk; `file`: its path for `file_name`.
@@ -133,18 +158,28 @@ class Converter:
             for name, value in self.values.items():
                 if name == "stamp":
                     columns[name] = read_stamps(value, chunk, file)
-                elif name in self.names:
+                elif name in self.ids:
                     ids = value or FieldRule(constant=1)
-                    columns[name] = _read_ids(ids, chunk, name, file, self.names[name])
+                    columns[name] = _read_ids(ids, chunk, name, file, self.names)
                 elif name in ("label", "configuration"):
                     columns[name] = _read_texts(value, chunk, name, file)
                 else:
                     columns[name] = read_numbers(value, chunk, name, file)
+                if value and value.units:
+                    columns[name] = columns[name] * _factors(value, columns["anchor"])
         except UNREADABLE as error:
             raise RecordingError(f"{name} cannot be read: {error!s:.200}", where=str(chunk.path)) from error
         if "cir_power" in columns:
             _add_levels(columns)
         return columns
+
+
+def _factors(value: FieldRule, anchors: NDArray[np.uint64]) -> NDArray[np.float64]:
+    """Return the factors of values whose anchors have other units, (n,)."""
+    factors = np.ones(len(anchors))
+    for anchor, unit in value.units.items():
+        factors[anchors == anchor] = LENGTHS[unit] / LENGTHS[value.unit or "m"]
+    return factors
 
 
 def _add_levels(columns: ColumnDict) -> None:
@@ -155,7 +190,7 @@ def _add_levels(columns: ColumnDict) -> None:
     for name, power in (("rx_power", columns["cir_power"] * 2.0**17), ("first_path_power", first)):
         with np.errstate(divide="ignore", invalid="ignore"):
             level = 10 * np.log10(power / count**2) - constant
-        columns[name] = np.where(np.isfinite(level), level, np.nan)
+        columns[name] = np.where(np.isfinite(level), level, columns[name])
 
 
 def _read_texts(value: FieldRule | None, chunk: Chunk, name: str, file: str) -> NDArray[Any]:
@@ -163,19 +198,24 @@ def _read_texts(value: FieldRule | None, chunk: Chunk, name: str, file: str) -> 
     raw = None if value is None else _raw(value, chunk, file)
     if value is None or raw is None:
         return np.broadcast_to(np.array([""], object), chunk.count)
-    # None and NaN are missing values.
-    cells = ["" if cell is None or cell != cell else cell for cell in raw.tolist()]
-    texts = {cell: _text(value, cell, name) if cell != "" else "" for cell in dict.fromkeys(cells)}
+    texts: dict[Any, str] = {}
+    for row, cell in enumerate(cells := raw.tolist()):
+        if cell not in texts:
+            texts[cell] = _text(value, cell, name, chunk.where(row))
     return np.array([texts[cell] for cell in cells], object)
 
 
-def _text(value: FieldRule, cell: Any, name: str) -> str:
+def _text(value: FieldRule, cell: Any, name: str, where: str) -> str:
+    # None and NaN are missing values.
+    if cell is None or cell != cell:
+        return ""
     text = str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
-    if value.pattern:
+    if value.pattern and text.lower() not in _MISSING:
         match = re.search(value.pattern, text)
-        if match is None:
-            raise RecordingError(f"{name} = {text!r:.60} does not match {value.pattern!r}")
-        text = match[1]
+        if match is None and not value.optional:
+            what = f"{name} = {text!r:.60} does not match {value.pattern!r}"
+            raise RecordingError(what, where=where, valid="optional: true makes such values unknown")
+        text = (match[1] if match else None) or ""
     return value.values.get(text, text)
 
 
@@ -208,12 +248,10 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
     texts = pd.Series([str(item).strip() for item in raw.tolist()], dtype=object)
     numbers = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
     for row in np.flatnonzero(np.isnan(numbers) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
-        comma, date = (re.match(form, texts[row]) for form in (r"[-+]?\d+,\d+$", r"\d{4}-\d\d-\d\d"))
-        number = "dates: set unit: iso8601" if date else f"a number in column {column}"
+        hints = (hint for form, hint in _HINTS if re.match(form, texts[row]))
+        valid = next(hints, f"a number in column {column}")
         raise RecordingError(
-            f"{name} = {texts[row]!r:.40} is not a number",
-            where=chunk.where(row),
-            valid="decimal commas: set decimal: ','" if comma else number,
+            f"{name} = {texts[row]!r:.40} is not a number", where=chunk.where(row), valid=valid
         )
     return numbers
 
@@ -256,20 +294,10 @@ def read_stamps(value: FieldRule | None, chunk: Chunk, file: str) -> NDArray[np.
         if LOG_TIME in chunk.columns:
             return np.asarray(chunk.columns[LOG_TIME], np.int64)
         raise RecordingError("no stamp", where=str(chunk.path), valid="fields.stamp: a column, or rate_hz")
-    if value.unit == "iso8601":
-        import pandas as pd
-
-        times = pd.to_datetime(pd.Series(raw).astype(str), utc=True, errors="coerce", format="ISO8601")
-        is_known = times.notna().to_numpy()
-        for row in np.flatnonzero(~is_known).tolist():
-            if str(raw[row]).strip().lower() not in _MISSING:
-                raise RecordingError(
-                    f"stamp = {raw[row]!r:.40} is not a date",
-                    where=chunk.where(row),
-                    valid="2024-06-09T19:39:13.4387",
-                )
-        stamps = times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64)
+    if value.unit == "iso8601" or "%" in value.unit:
+        stamps, is_known = _dates(raw, value.unit, chunk)
         possible = is_known & (np.abs(stamps / 1e9) < MAX_STAMP_S)
+        raw = stamps / NS_PER_S
     else:
         # Without a unit: seconds; the stamp of a message is an integer in nanoseconds.
         is_stamp = LOG_TIME in chunk.columns and raw.dtype.kind in "iu"
@@ -289,14 +317,36 @@ def read_stamps(value: FieldRule | None, chunk: Chunk, file: str) -> NDArray[np.
             stamps = seconds.astype(np.int64) * factor + fraction
     if 2 * np.count_nonzero(possible) < np.count_nonzero(is_known):
         first = raw[np.flatnonzero(is_known & ~possible)[0]]
+        dates_s = [(unit, abs(float(first) * TIME[unit] / 1e9)) for unit in ("s", "ms", "us", "ns")]
+        unit = next((f"unit: {unit}" for unit, date_s in dates_s if 9e8 < date_s < MAX_STAMP_S), "")
+        what = f"stamp = {first} is outside of the years 1824 to 2115"
         raise RecordingError(
-            f"stamp = {first} is outside of the years 1824 to 2115",
-            where=str(chunk.path),
-            valid="unit: ms, us or ns",
+            what, where=str(chunk.path), valid=unit or "seconds since 1970: unit, scale, offset"
         )
     possible &= np.abs(stamps / 1e9 + value.offset) < MAX_STAMP_S
     offset = round(min(max(value.offset, -MAX_STAMP_S), MAX_STAMP_S) * 1e9)
     return np.where(possible, stamps + offset, UNKNOWN_STAMP)
+
+
+def _dates(raw: NDArray[Any], unit: str, chunk: Chunk) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the stamps of dates in ns, and which are known; times without a date are on 1970-01-01."""
+    import pandas as pd
+
+    # Python's logging writes a comma.
+    texts = pd.Series([str(cell).strip().replace(",", ".") for cell in raw.tolist()], dtype=object)
+    if unit == "iso8601":
+        times = pd.to_datetime(texts, utc=True, errors="coerce", format="ISO8601")
+        of_day = pd.to_timedelta(texts.where(texts.str.fullmatch(_TIME_OF_DAY)), errors="coerce")
+        times = times.fillna(pd.Timestamp(0, tz="UTC") + of_day)
+    else:
+        times = pd.to_datetime(texts, utc=True, errors="coerce", format=unit)
+        if not re.search("%[YyGcx]", unit):
+            times -= pd.Timestamp(1900, 1, 1) - pd.Timestamp(0)
+    is_known = times.notna().to_numpy()
+    for row in np.flatnonzero(~is_known & ~texts.str.lower().isin(_MISSING).to_numpy())[:1].tolist():
+        valid = "2024-06-09T19:39:13.43, 19:39:13.43, or a format such as unit: '%d/%m/%Y %H:%M:%S.%f'"
+        raise RecordingError(f"stamp = {raw[row]!r:.40} is not a date", where=chunk.where(row), valid=valid)
+    return times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64), is_known
 
 
 def _read_ids(
@@ -306,42 +356,41 @@ def _read_ids(
     raw = _raw(value, chunk, file)
     if raw is None:
         raise RecordingError(f"no column {value.column} for the {name}", where=str(chunk.path))
-    plain = not (value.pattern or value.values or value.names or value.offset)
-    if plain and (raw.dtype.kind == "u" or (raw.dtype.kind == "i" and (len(raw) == 0 or raw.min() >= 0))):
+    if raw.dtype.kind in "iu" and value.is_plain_id and (len(raw) == 0 or raw.min() >= 0):
         return np.asarray(raw, np.uint64)
     numbers: dict[Any, int] = {}
-    items = raw.tolist()
-    for row, item in enumerate(items):
+    for row, item in enumerate(items := raw.tolist()):
         if item in numbers:
             continue
+        where = chunk.where(row)
+        text = _text(value, item, name, where)
+        if text.lower() in _MISSING:
+            numbers[item] = UNKNOWN_ID
+            continue
         try:
-            if str(item).strip().lower() in _MISSING:
-                numbers[item] = UNKNOWN_ID
-                continue
-            # Tables read whole numbers in a column with missing values as float64, which merges larger ids.
+            # A float64 merges larger ids.
             if isinstance(item, float) and abs(item) >= 2**53:
                 raise ValueError(item)
-            text = _text(value, item, name)
-            number = names.setdefault(text, len(names) + 1) if value.names else _id(text)
-            numbers[item] = number + round(value.offset)
+            number = names.setdefault(text, len(names) + 1) if value.names else _id(text, value.hex)
+            numbers[item] = round(number * value.scale if value.scale != 1 else number) + round(value.offset)
             if not 0 <= numbers[item] < UNKNOWN_ID:
                 raise ValueError(text)
-        except (ValueError, UwbMitigationError) as error:
-            raise RecordingError(
-                error.what
-                if isinstance(error, UwbMitigationError)
-                else f"{name} = {item!r:.40} is not an id",
-                where=chunk.where(row),
-                valid="a whole number such as 3 or 0x1f; `pattern` takes a number from a text, `names: true` numbers texts",
-            ) from error
+        except ValueError as error:
+            valid = "a whole number such as 3 or 0x1f; hexadecimal without 0x: `hex: true`; `pattern` takes a number from "
+            valid += "a text, `names: true` numbers texts"
+            raise RecordingError(f"{name} = {item!r:.40} is not an id", where=where, valid=valid) from error
     return np.array([numbers[item] for item in items], np.uint64)
 
 
-def _id(text: str) -> int:
+def _id(text: str, is_hex: bool) -> int:
     if re.fullmatch(r"[0-9a-fA-F]{2}([:-][0-9a-fA-F]{2}){1,7}", text):
         return int(re.sub("[:-]", "", text), 16)
+    if is_hex or text.lower().startswith("0x"):
+        return int(text, 16)
     # A column with unknown values contains texts such as 10.0.
-    return int(text, 16) if text.lower().startswith("0x") else int(re.sub(r"\.0+$", "", text))
+    if not (match := re.fullmatch(r"\+?([0-9]+)(\.0+)?", text)):
+        raise ValueError(text)
+    return int(match[1])
 
 
 def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, float]:
@@ -353,9 +402,10 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
     if isinstance(values, str):
         if form == "complex" and not re.search("[ij]", values):
             form = "interleaved"  # pairs such as [[1, 2], [3, 4]]
-        items = [item.strip("[]()") for item in re.split(r"[,;\s]+", values.strip())]
+        values = [item.strip("[]()") for item in re.split(r"[,;\s]+", values.strip())]
+    if len(values) and isinstance(values[0], str):
         parse: Any = complex if form == "complex" else float
-        values = [parse(item.replace("i", "j")) for item in items if item]
+        values = [parse(str(item).replace("i", "j")) for item in values if item]
     array = np.asarray(values)
     if array.dtype == object and array.ndim:
         array = np.stack(list(array))
@@ -390,6 +440,9 @@ def filter_rows(
                 if raw.dtype.kind in "iuf":
                     same |= np.isin(raw, [value for value in listed if isinstance(value, float)])
                 bad |= same == is_bad
+        if rule.matches is not None:
+            expression = re.compile(rule.matches)
+            bad |= np.array([bool(expression.search(str(cell))) for cell in raw.tolist()], bool)
         if rule.below is not None or rule.above is not None:
             numbers = _floats(raw, chunk, rule.column, rule.column)
             bad |= numbers < (-np.inf if rule.below is None else rule.below)
@@ -420,9 +473,9 @@ def read_csv(
         RecordingError: a column or a value is missing or invalid; `where` gives the row.
     """
     values = {name: FieldRule(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
-    converter = Converter(values, {name: {} for name in ids})
-    chunks = list(islice(read_chunks(TableFormat(format="csv"), path, converter.columns), 2))
-    if len(chunks) != 1 or not chunks[0].count:
+    converter = Converter(values, ids=ids)
+    chunks = list(islice(read_chunks(TableFormat(format="csv"), path, converter.columns, ids), 2))
+    if len(chunks) != 1 or not 0 < chunks[0].count <= CHUNK_ROWS:
         raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
     columns = converter.convert(chunks[0])
     for name, (low, high) in [*((name, (0, UNKNOWN_ID - 1)) for name in ids), *numbers.items()]:

@@ -14,13 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, format_id
-from uwb_mitigation.recordings.mapping.checks import (
-    anchor_warnings,
-    check_rate,
-    check_units,
-    median,
-    value_warnings,
-)
+from uwb_mitigation.recordings.mapping import checks
+from uwb_mitigation.recordings.mapping.checks import median
 from uwb_mitigation.recordings.mapping.cirs import CirFile, join_by_row, join_by_time
 from uwb_mitigation.recordings.mapping.conversion import (
     NO_CIR,
@@ -40,6 +35,7 @@ from uwb_mitigation.recordings.mapping.mapping import (
     Mapping,
     Poses,
     TableFormat,
+    TrueRanges,
     axes,
     series,
 )
@@ -54,13 +50,6 @@ MAX_RANGES = 20_000_000
 MAX_STAMP_NS = 2**31 * NS_PER_S
 """Stamps of ROS are from 1970 to 2038."""
 
-PLACEMENT_PAUSE_S = 5.0
-"""Time between the ranges of two placements of a recording without stamps."""
-
-MAX_POSSIBLE = 10_000.0
-"""Rows with a larger range (m), level (dBm) or first-path index are not used."""
-
-_LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 _TAG, _ANCHOR, _POSE = (tuple(axes(name, None)) for name in ("tag", "anchor", "pose"))
 
 
@@ -75,7 +64,7 @@ class MappedRecording(Source):
 
     Attributes:
         values: the ranges in SI units, and `cir` (-1: none).
-        names: {tag or anchor: {text: number}}, of ids with `names: true`.
+        names: {name of a tag or anchor: its number}, of ids with `names: true`.
         notes: how the recording was understood, for the user.
         warnings: implausible values, for the user.
         dropped: {rule: number of rows that are not used}.
@@ -98,37 +87,36 @@ class MappedRecording(Source):
         self.notes: list[str] = []
         self.warnings: list[str] = []
         self.truth = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
-        self.names: dict[str, dict[str, int]] = {"tag": {}, "anchor": {}}
+        self.names: dict[str, int] = {}
         self._folder = path if path.is_dir() else path.parent
         self._cirs = CirFile()
         self._damage: DamagedRecordingError | None = None
         self._files = find_files(mapping, path)
         inline = mapping.cir if mapping.cir and not mapping.cir.files else None
         self.values = values = self._read(mapping, self._files, mapping.values, cir=inline)
-        self._keep(
-            {
-                "range is not a number": np.isfinite(values["range"]),
-                "stamp is not a number": values["stamp"] != UNKNOWN_STAMP,
-                "tag or anchor is unknown": (values["tag"] != UNKNOWN_ID) & (values["anchor"] != UNKNOWN_ID),
-            }
-        )
+        self._drop(checks.unknown_rows(values))
         del values
+        stamp = mapping.fields.stamp or FieldRule(constant=0)
+        if not stamp.rate_hz:
+            self._continue_clocks(stamp)
+        if not stamp.rate_hz and not mapping.topics:
+            checks.check_stamps(self.values, self.name, stamp, moving=mapping.moving)
+        self._drop(checks.invalid_rows(self.values))
         if mapping.cir and mapping.cir.files:
             self._add_other_cirs(mapping.cir)
         del self.values["row"]
-        if is_numbered := bool(mapping.fields.stamp and mapping.fields.stamp.rate_hz):
-            self._separate_placements(mapping.fields.stamp.rate_hz if mapping.fields.stamp else 1.0)
+        if stamp.rate_hz:
+            self._separate_placements(stamp.rate_hz)
         late = int(np.count_nonzero(np.diff(self.values["stamp"]) < 0))
-        if late and len(self._files) == 1 and not is_numbered:
+        if late and len(self._files) == 1 and not stamp.rate_hz:
             self.warnings.append(f"{late} stamps are earlier than the one before; the ranges were sorted")
         if late:
             self.values = take(self.values, np.argsort(self.values["stamp"], kind="stable"))
-        if not is_numbered and not mapping.topics:
-            check_rate(self.values, self.name, moving=mapping.moving)
         self._add_truth(self._anchor_positions())
-        check_units(self.values, self.name)
-        limited = {f"{name} is above {MAX_POSSIBLE:g}": np.abs(self.values[name]) for name in _LIMITED}
-        self._keep({what: ~(numbers > MAX_POSSIBLE) for what, numbers in limited.items()})
+        truth = mapping.truth.ranges.range if mapping.truth.ranges else mapping.truth.range
+        units = {"range": mapping.fields.range.unit, "truth.range": truth.unit if truth else ""}
+        checks.check_units(self.values, self.name, units)
+        self._drop(checks.impossible_rows(self.values))
         self._warn()
         self.motion = self._read_motion()
         self._shift_stamps()
@@ -177,11 +165,14 @@ class MappedRecording(Source):
         medians = {f"{what}{rule}": rule for rule in table.drop if rule.from_median is not None}
         values = values | {name: FieldRule(column=rule.column) for name, rule in medians.items()}
         converter, tables, before = Converter(values, self.names), list[ColumnDict](), 0
+        dropped = Counter[str]()
         columns = converter.columns | dict.fromkeys(series(cir.column) if cir else (), False)
         for number, path in enumerate(paths):
             name = Path(os.path.relpath(path, self._folder)).as_posix()
             try:
-                for chunk in read_chunks(table, path, columns, before, self.warnings.append):
+                for chunk in read_chunks(
+                    table, path, columns, converter.id_columns, before, dropped, self.warnings.append
+                ):
                     before += chunk.count
                     if before > MAX_RANGES:
                         raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
@@ -196,6 +187,7 @@ class MappedRecording(Source):
             except DamagedRecordingError as error:
                 self._damage = error
                 self.warnings.append(f"{error}: only the rows before are used")
+        self.dropped.update({f"{what}{reason}": count for reason, count in dropped.items()})
         if not tables:
             raise self._damage or RecordingError("no rows", where=str(paths[0]))
         rows = concat(tables)
@@ -213,15 +205,23 @@ class MappedRecording(Source):
             return find_files(table, file.parent, file)
         return []
 
-    def _keep(self, rules: dict[str, NDArray[np.bool_]]) -> None:
-        """Drop and count the ranges that do not satisfy all rules."""
+    def _drop(self, rules: dict[str, NDArray[np.bool_]]) -> None:
+        """Drop and count the ranges to which a rule applies."""
         mask = np.ones(len(self), bool)
-        for what, good in rules.items():
-            mask &= ~count_bad(~good & mask, self.dropped, what)
+        for what, bad in rules.items():
+            mask &= ~count_bad(bad & mask, self.dropped, what)
         if not mask.any():
             where, valid = str(self._files[0]), f"dropped: {dict(self.dropped) or 'none'}"
             raise self._damage or RecordingError("no ranges", where=where, valid=valid)
         self.values = take(self.values, mask)
+
+    def _continue_clocks(self, stamp: FieldRule) -> None:
+        mapping, truth = self._mapping, self._mapping.truth
+        if what := checks.continue_clocks(self.values, stamp, self._files):
+            if mapping.odometry or truth.poses or truth.ranges or (mapping.cir and mapping.cir.join):
+                valid = "one recording for each part, because other tables are joined by time"
+                raise RecordingError(what, where=self.name, valid=valid)
+            self.warnings.append(what)
 
     def _add_other_cirs(self, source: CirSource) -> None:
         """Join the CIRs of other files, by row or by time and ids."""
@@ -251,10 +251,12 @@ class MappedRecording(Source):
         group = groups.to_numpy()
         if (count := int(group.max()) + 1) > 1 and not self._mapping.moving:
             self.values = values = take(values, np.argsort(group, kind="stable"))
-            pause_s = max(PLACEMENT_PAUSE_S - 1 / rate_hz, 0.0)
+            pause_s = max(checks.PAUSE_S - 1 / rate_hz, 0.0)
             times = np.arange(len(group)) / rate_hz + np.sort(group) * pause_s
             values["stamp"] = np.rint(times * 1e9).astype(np.int64)
-            self.notes.append(f"{count} placements, with pauses of {PLACEMENT_PAUSE_S:g} s between them")
+            if names[-1] != "configuration" and not self._mapping.truth.configuration:
+                values["configuration"] = np.array([f"placement {n + 1}" for n in np.sort(group)], object)
+            self.notes.append(f"{count} placements, with pauses of {checks.PAUSE_S:g} s between them")
 
     def _anchor_positions(self) -> dict[int, NDArray[np.float64]]:
         """Return the positions from the ranges or from another file, and set `anchors`."""
@@ -281,7 +283,7 @@ class MappedRecording(Source):
         if len(ids) > MAX_ANCHORS:
             self.warnings.append(f"{len(ids)} anchors, of which none is written: at most {MAX_ANCHORS}")
         elif len(ids) and self._mapping.anchors:
-            names = {number: text for text, number in self.names["anchor"].items()}
+            names = {number: text for text, number in self.names.items()}
             self.anchors = AnchorMap(
                 [
                     Anchor(key, (x, y, z), sd, names.get(key, "")[:100])
@@ -295,6 +297,8 @@ class MappedRecording(Source):
         values, truth = self.values, self._mapping.truth
         if truth.poses:
             self._add_poses(truth.poses)
+        if truth.ranges:
+            self._add_true_ranges(truth.ranges)
         anchors = np.full((len(self), 3), np.nan)
         for key, position in positions.items():
             anchors[values["anchor"] == key] = position
@@ -318,7 +322,38 @@ class MappedRecording(Source):
                 raise RecordingError(
                     "the error is true - measured", where=self.name, valid="truth.error: scale: -1"
                 )
-        self.warnings += anchor_warnings(values, positions, distance - values["true range"])
+        self.warnings += checks.anchor_warnings(values, positions, distance - values["true range"])
+
+    def _add_true_ranges(self, source: TrueRanges) -> None:
+        """Interpolate the true ranges of all pairs in another file."""
+        import pandas as pd
+
+        values, pair = self.values, ["tag", "anchor"]
+        true = np.full(len(self), np.nan)
+        targets = (
+            pd.DataFrame({name: values[name] for name in (*pair, "file")}).groupby([*pair, "file"]).indices
+        )
+        rules: dict[str, FieldRule | None] = {
+            "tag": source.tag,
+            "anchor": source.anchor,
+            "true": source.range,
+        }
+        rules["stamp"] = source.stamp or FieldRule(constant=0)
+        for number, file in enumerate(self._files):
+            paths = self._files_of(source, file)
+            rows = self._read(source, paths, rules, "true range ")
+            rows = take(rows, np.isfinite(rows["true"]) & (rows["stamp"] != UNKNOWN_STAMP))
+            rows = take(rows, np.argsort(rows["stamp"], kind="stable"))
+            for key, at in pd.DataFrame({name: rows[name] for name in pair}).groupby(pair).indices.items():
+                path = TruePath(rows["stamp"][at], rows["true"][at][:, np.newaxis])
+                if not source.stamp and np.ptp(rows["true"][at]) > 0:
+                    what = f"tag {format_id(key[0])} and anchor {format_id(key[1])} have several true ranges"
+                    raise RecordingError(what, where=str(paths[0]), valid="truth.ranges.stamp: their times")
+                to = targets.get((*key, number), np.zeros(0, np.int64))
+                stamps = values["stamp"][to] if source.stamp else np.zeros(len(to), np.int64)
+                true[to] = path.position_at(stamps)[:, 0]
+        values["true range"] = true
+        self.notes.append(f"true ranges joined: {np.isfinite(true).sum()} of {len(true)}")
 
     def _add_poses(self, poses: Poses) -> None:
         """Interpolate the true positions of the antennas of all tags."""
@@ -355,7 +390,8 @@ class MappedRecording(Source):
     def _warn(self) -> None:
         """Collect warnings of implausible values."""
         truth = self._mapping.truth
-        self.warnings += value_warnings(self.values, errors_measured=bool(truth.error and not truth.range))
+        errors_measured = bool(truth.error and not truth.range)
+        self.warnings += checks.value_warnings(self.values, errors_measured=errors_measured)
         if truth.poses and not np.isfinite(self.values["tag x"]).any():
             self.warnings.append("no range is within the times of the true poses: compare the stamps")
 

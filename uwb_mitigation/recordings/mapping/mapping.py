@@ -61,6 +61,16 @@ def _listed(value: Any) -> Any:
     return value if isinstance(value, list) else [value] if value else []
 
 
+def series(column: str) -> list[str]:
+    """Return the columns of `CIR{0..1015}`; another name is returned alone."""
+    match = re.fullmatch(r"(.*)\{(\d{1,5})\.\.(\d{1,5})\}", column)
+    return [f"{match[1]}{n}" for n in range(int(match[2]), int(match[3]) + 1)] if match else [column]
+
+
+def _expanded(names: Any) -> Any:
+    return [column for name in names for column in series(str(name))] if isinstance(names, list) else names
+
+
 def _texts(values: Any) -> Any:
     """YAML reads the keys 0 and 1 as numbers."""
     return {str(key): str(value) for key, value in values.items()} if isinstance(values, dict) else values
@@ -83,11 +93,14 @@ class FieldRule(_Strict):
         file_name, topic_name: regular expression; its first group in the path of the file or topic.
         rate_hz: row number divided by this (stamps only).
         pattern: regular expression; its first group in the text of the value is used.
+        hex: ids are hexadecimal numbers without `0x`.
         values: {text: other text}; any other text is kept.
-        names: texts are numbered from 1 in the order of their appearance (ids only).
-        unit: a key of `TIME` or `SCALES`.
+        names: texts are numbered from 1 in the order of their appearance (ids only); a tag and an anchor of the same name
+            have the same number.
+        unit: a key of `TIME` or `SCALES`; of dates also their format, such as `%d/%m/%Y %H:%M:%S`.
+        units: {anchor: unit} of lengths whose unit differs from `unit`.
         scale, offset: value * scale + offset, after the unit; of stamps the offset is in s.
-        optional: if the column is absent, the value is unknown.
+        optional: if the column is absent or the pattern does not match, the value is unknown.
     """
 
     column: str = ""
@@ -98,8 +111,10 @@ class FieldRule(_Strict):
     rate_hz: float = Field(default=0.0, ge=0.0)
     pattern: str = ""
     values: Annotated[dict[str, str], BeforeValidator(_texts)] = {}
+    hex: bool = False
     names: bool = False
     unit: str = ""
+    units: dict[int, Literal["m", "cm", "mm", "ft", "in"]] = {}
     scale: float = Field(default=1.0, allow_inf_nan=False)
     offset: float = Field(default=0.0, allow_inf_nan=False)
     optional: bool = False
@@ -112,9 +127,14 @@ class FieldRule(_Strict):
         for text in filter(None, (self.pattern, self.file_name, self.topic_name)):
             if not _compiled(text).groups:
                 raise ValueError(f"the pattern {text!r} has no group (...)")
-        if self.unit == "iso8601" and self.scale != 1:
+        if (self.unit == "iso8601" or "%" in self.unit) and self.scale != 1:
             raise ValueError("a date has no scale")
         return self
+
+    @property
+    def is_plain_id(self) -> bool:
+        """Return whether integers are ids without a conversion."""
+        return not (self.pattern or self.values or self.hex or self.names or self.offset) and self.scale == 1
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -127,7 +147,7 @@ def _value(*units: str) -> WrapValidator:
         if isinstance(value, str | int | float):
             value = {"column" if isinstance(value, str) else "constant": value}
         rule = validate(value)
-        if rule.unit and rule.unit not in units:
+        if rule.unit and rule.unit not in units and not ("%" in rule.unit and "iso8601" in units):
             raise ValueError(f"unit {rule.unit!r}; valid: {', '.join(units) or 'none'}")
         return rule
 
@@ -147,6 +167,7 @@ class RowFilter(_Strict):
 
     Attributes:
         equals, differs: text or number; or list of them.
+        matches: regular expression that is found in the text.
         below, above: limits of a number in the unit of the file.
         from_median: largest distance from the median of the column in all files of the table.
     """
@@ -154,6 +175,7 @@ class RowFilter(_Strict):
     column: str
     equals: list[str | float] | str | float | None = None
     differs: list[str | float] | str | float | None = None
+    matches: str | None = None
     below: float | None = None
     above: float | None = None
     from_median: float | None = None
@@ -161,7 +183,8 @@ class RowFilter(_Strict):
     @model_validator(mode="after")
     def _check(self) -> RowFilter:
         if not self.model_fields_set - {"column"}:
-            raise ValueError("a rule needs equals, differs, below, above or from_median")
+            raise ValueError("a rule needs equals, differs, matches, below, above or from_median")
+        _compiled(self.matches or "")
         return self
 
     def __str__(self) -> str:
@@ -173,25 +196,34 @@ class TableFormat(_Strict):
     r"""Files that contain rows.
 
     Attributes:
-        format: empty: detected from the name of each file.
+        format: empty: detected from the name of each file, and `lines` with a pattern or text.
         files: glob, below the folder that is imported, or next to the file of the ranges; or {pattern: glob}, of which
             the first is used whose regular expression is found in the path of the recording.
         separator, decimal: of CSV; the separator may be a regular expression, such as `\\s+`.
-        columns: names of the columns of files without header.
+        columns: names of the columns of files without header; `CIR{0..1015}` stands for 1016 columns.
+        skip, comment: number of lines before the table or its header, and character with which comments start.
+        pattern: regular expression for lines of a log, or for the texts of messages: each match is a row, and its named
+            groups `(?P<name>...)` are the columns.
         group: name of the array, variable or group (MATLAB, HDF5), or key of the mapping (YAML).
         topics, type: topics of messages, and their type.
-        text: the field `data` of the message contains JSON, or `key:value` pairs.
+        file_name: regular expression for the path of the file, whose named groups are columns.
+        text: each line, or the field `data` of the message, contains JSON or `key:value` pairs.
         unpivot: {new column: regular expression}: one row for each column that matches, such as {value: 'r(\\d+)'} for
-            r1 to r24. The column `variable` contains the first group, or without one the name of the column; columns of
-            several expressions with the same `variable` are in the same row. A matrix has the columns 1, 2, and so on.
+            r1 to r24. The column `variable` contains the first group, or without one the name of the column; named groups
+            are columns, too. Columns of several expressions with the same groups are in the same row. A matrix has the
+            columns 1, 2, and so on.
         drop: rules for rows that are not used.
     """
 
-    format: Literal["", "csv", "matlab", "hdf5", "messages", "yaml"] = ""
+    format: Literal["", "csv", "lines", "json", "matlab", "hdf5", "messages", "yaml"] = ""
     files: str | dict[str, str] = "*"
     separator: str = ","
     decimal: Literal[".", ","] = "."
-    columns: list[str] = []
+    columns: Annotated[list[str], BeforeValidator(_expanded)] = []
+    skip: int = Field(default=0, ge=0)
+    comment: str = Field(default="", max_length=1)
+    pattern: str = ""
+    file_name: str = ""
     group: str = ""
     topics: list[str] = []
     type: str = ""
@@ -203,6 +235,9 @@ class TableFormat(_Strict):
     def _check_unpivot(self) -> TableFormat:
         for text in self.unpivot.values():
             _compiled(text)
+        for text in filter(None, (self.pattern, self.file_name)):
+            if not _compiled(text).groupindex:
+                raise ValueError(f"the expression {text!r} has no named group (?P<name>...)")
         return self
 
 
@@ -222,9 +257,12 @@ class Fields(_Strict):
 
 
 class Registers(_Strict):
-    """Registers of a DW1000, from which both levels are computed (user manual, section 4.7): CIR_PWR, FP_AMPL1 to 3, MHz."""
+    """Registers of a DW1000, from which levels are computed (user manual, section 4.7): CIR_PWR, FP_AMPL1 to 3, MHz.
 
-    cir_power: Number
+    Without `cir_power` the receive level is unknown.
+    """
+
+    cir_power: Number | None = None
     amplitudes: tuple[Number, Number, Number]
     prf: Number = FieldRule(constant=64)
 
@@ -272,10 +310,24 @@ class Poses(TableFormat):
     lever_arm: tuple[float, float, float] | dict[int, tuple[float, float, float]] = (0.0, 0.0, 0.0)
 
 
+class TrueRanges(TableFormat):
+    """True ranges of pairs in another file, interpolated at the stamps of the ranges in gaps of at most 1 s.
+
+    Attributes:
+        stamp: without it, each pair has one true range.
+    """
+
+    stamp: Time | None = None
+    tag: Number = FieldRule(constant=1)
+    anchor: Number
+    range: Length
+
+
 class TruthSource(_Strict):
     """Ground truth: true range, error (measured - true), label (LOS, NLOS, other), name of the placement, positions."""
 
     range: Length | None = None
+    ranges: TrueRanges | None = None
     error: Length | None = None
     label: Number | None = None
     configuration: Number | None = None
@@ -360,12 +412,6 @@ def axes(name: str, point: Point | None) -> dict[str, FieldRule | None]:
     return {f"{name} {axis}": value for axis, value in zip("xyz", point or (None,) * 3, strict=True)}
 
 
-def series(column: str) -> list[str]:
-    """Return the columns of `CIR{0..1015}`; another name is returned alone."""
-    match = re.fullmatch(r"(.*)\{(\d{1,5})\.\.(\d{1,5})\}", column)
-    return [f"{match[1]}{n}" for n in range(int(match[2]), int(match[3]) + 1)] if match else [column]
-
-
 def shipped_mappings() -> list[str]:
     """Return the names of the mappings of this package."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
@@ -375,7 +421,8 @@ def load_mapping(name: str) -> Mapping:
     """Read a mapping file, or a shipped mapping by its name.
 
     Raises:
-        ParameterError: it cannot be read, or is not a mapping; the message names the field and what is valid.
+        ParameterError: it cannot be read, or is not a mapping; the message names the field and what is valid. Or its key
+            `refused` contains the reason why this data set contains no ranges.
     """
     path, shipped = Path(name).expanduser(), shipped_mappings()
     if name in shipped:
@@ -388,6 +435,8 @@ def load_mapping(name: str) -> Mapping:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ParameterError(f"not YAML: {first}", where=str(path)) from error
+    if isinstance(document, dict) and "refused" in document:
+        raise ParameterError(f"{document.get('name')} cannot be imported: {document['refused']}")
     try:
         return Mapping.model_validate(document)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""Values of mapped columns in messages: ROS messages of any type, JSON, and lines such as `AT+RANGE=...`."""
+"""Values of mapped columns in messages: ROS messages of any type, JSON, and lines of text such as `AT+RANGE=...`."""
 
 from __future__ import annotations
 
@@ -20,58 +20,72 @@ _PAIRS = re.compile(r"(\w+)\s*[:=]\s*(\([^()]*\)|\[[^\[\]]*\]|[^,\s()\[\]]+)")
 
 
 class MessageRows:
-    """Reads the columns of a table from messages; a path with `[]` gives one row per element of the list, also of lists in lists.
+    """Reads the columns of a table from messages; a path with `[]` gives a row for each element, also of lists in lists.
 
     Args:
-        table: the mapping.
+        table: the mapping; with `pattern` or `text` it describes lines of text.
         columns: {path of a field, such as `nodes[].dis`: whether it is left out if a message does not contain it}.
     """
 
     def __init__(self, table: TableFormat, columns: Mapping[str, bool]) -> None:
         self._table, self._columns = table, columns
+        self._pattern = re.compile(table.pattern) if table.pattern else None
         self._paths = {
             column: [step for step in re.split(r"\.|(\[\])", column) if step]
             for column in columns
             if column != LIST_INDEX
         }
 
-    def rows(self, message: Any) -> dict[str, list[Any]]:
+    def rows(self, message: Any, limit: int = MAX_ROWS) -> dict[str, list[Any]]:
         """Return {column: list} of the rows of a message; all have the same length.
+
+        Args:
+            message: a message, document, or line of text; the text of a message is in its field `data`.
+            limit: largest number of rows.
 
         Raises:
             RecordingError: a field is missing, or a text is not in the format of the mapping.
         """
-        if self._table.text:
-            message = self._parsed(_step(message, "data", "data"))
-        values: dict[str, tuple[Any, int]] = {}
-        for column, path in self._paths.items():
-            try:
-                values[column] = _walk(message, path, column), path.count("[]")
-            except RecordingError:  # noqa: PERF203
-                if not self._columns[column]:
-                    raise
-                values[column] = None, 0
-        rows: dict[str, list[Any]] = {name: [] for name in (LIST_INDEX, *values)}
-        _append_rows(rows, values, 0)
+        if self._table.text or self._pattern:
+            text = message if isinstance(message, str) else _step(message, "data", "data")
+            items = self._parsed(text)
+        else:
+            items = [message]
+        rows: dict[str, list[Any]] = {name: [] for name in (LIST_INDEX, *self._paths)}
+        for item in items:
+            values: dict[str, tuple[Any, int]] = {}
+            for column, path in self._paths.items():
+                try:
+                    values[column] = _walk(item, path, column), path.count("[]")
+                except RecordingError:  # noqa: PERF203
+                    if not self._columns[column]:
+                        raise
+                    values[column] = None, 0
+            _append_rows(rows, values, 0, limit)
         return rows
 
-    def _parsed(self, text: Any) -> Any:
+    def _parsed(self, text: Any) -> list[Any]:
+        """Return the matches of the pattern, or the JSON object or pairs of a text."""
         if not isinstance(text, str) or len(text) > MAX_TEXT:
             raise RecordingError("data is not a text", valid="a field of type string")
+        if self._pattern:
+            return [match.groupdict() for match in self._pattern.finditer(text)]
         if self._table.text == "json":
             try:
-                return json.loads(text)
+                return [json.loads(text)]
             except (ValueError, RecursionError) as error:
                 raise RecordingError(f"not JSON: {text!r:.60}") from error
-        return {name: _items(value) for name, value in _PAIRS.findall(_COMMAND.sub("", text))}
+        return [{name: _items(value) for name, value in _PAIRS.findall(_COMMAND.sub("", text))}]
 
 
-def _append_rows(rows: dict[str, list[Any]], values: dict[str, tuple[Any, int]], index: int) -> None:
+def _append_rows(
+    rows: dict[str, list[Any]], values: dict[str, tuple[Any, int]], index: int, limit: int
+) -> None:
     """Append one row for each element of the innermost lists; `values`: (value, depth of its lists)."""
     lists = [value for value, depth in values.values() if depth]
     if not lists:
-        if len(rows[LIST_INDEX]) >= MAX_ROWS:
-            raise RecordingError(f"more than {MAX_ROWS} ranges in one message", valid=f"at most {MAX_ROWS}")
+        if len(rows[LIST_INDEX]) >= limit:
+            raise RecordingError(f"more than {limit} ranges in one message", valid=f"at most {limit}")
         rows[LIST_INDEX].append(index)
         for name, (value, _) in values.items():
             rows[name].append(value)
@@ -80,7 +94,7 @@ def _append_rows(rows: dict[str, list[Any]], values: dict[str, tuple[Any, int]],
             name: (value[number], depth - 1) if depth else (value, 0)
             for name, (value, depth) in values.items()
         }
-        _append_rows(rows, element, number)
+        _append_rows(rows, element, number, limit)
 
 
 def _items(text: str) -> Any:
@@ -91,7 +105,8 @@ def _items(text: str) -> Any:
 def _walk(value: Any, path: list[str], column: str) -> Any:
     for number, step in enumerate(path):
         if step == "[]":
-            if isinstance(value, str | dict) or not hasattr(value, "__len__"):
+            value = list(value.values()) if isinstance(value, dict) else value
+            if isinstance(value, str) or not hasattr(value, "__len__"):
                 raise RecordingError(f"{column} is not a list")
             return [_walk(item, path[number + 1 :], column) for item in value]
         value = _step(value, step, column)

@@ -1,20 +1,17 @@
-"""Rows of CSV, MATLAB, HDF5 and YAML files and of ROS bags, in chunks of bounded size."""
+"""Rows of files of all formats and of ROS bags, in chunks of bounded size."""
 
 from __future__ import annotations
 
 import contextlib
-import csv
-import gzip
-import io
-import lzma
+import json
 import re
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import yaml
@@ -22,20 +19,30 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import (
     DamagedRecordingError,
+    MissingDependencyError,
     RecordingError,
     UwbMitigationError,
     did_you_mean,
-    not_installed,
 )
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MessageRows
+from uwb_mitigation.recordings.mapping.text_files import (
+    ChooseColumns,
+    OnWarning,
+    Rows,
+    TextBlocks,
+    read_csv_rows,
+)
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 """Largest number of rows, and of values in columns, of a chunk."""
 
 MAX_ARRAY_BYTES = 4 << 30
 """Largest size of a file that is loaded."""
+
+MAX_JSON_ROWS = 20_000_000
+"""Largest number of rows of a JSON document."""
 
 MAX_YAML_BYTES, MAX_YAML_VALUES = 1 << 20, 1000
 """Largest size of a YAML file, and largest number of values of an entry."""
@@ -47,14 +54,12 @@ TOPIC = "@topic"
 """Column with the topic of a message."""
 
 _SUFFIXES = {
-    ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".mat": "matlab", ".h5": "hdf5", ".hdf5": "hdf5", ".bag": "messages",
-    ".db3": "messages", ".mcap": "messages", ".yaml": "yaml", ".yml": "yaml",
+    ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".log": "lines", ".jsonl": "lines", ".json": "json", ".mat": "matlab",
+    ".h5": "hdf5", ".hdf5": "hdf5", ".bag": "messages", ".db3": "messages", ".mcap": "messages", ".yaml": "yaml",
+    ".yml": "yaml",
 }  # fmt: skip
-_OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
 UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError)
 """Errors of values that do not have the expected form."""
-
-OnWarning = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +101,15 @@ def _kind_of(path: Path) -> str:
     return "messages" if path.is_dir() else _SUFFIXES.get(Path(name).suffix, "")
 
 
+def _lines(table: TableFormat) -> str:
+    return "lines" if table.pattern or table.text else ""
+
+
 def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> list[Path]:
     """Return the files of a table below a folder, or the file `root` itself, in the order of their names.
 
     Args:
-        table: description of the files; without `files`, all whose names show a format, except YAML.
+        table: description of the files; without `files`, all tables and bags.
         root: the folder, or the only file.
         ranges: the file of the ranges, if the table contains other values; a pattern in `files` is searched in its path.
 
@@ -118,23 +127,25 @@ def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> li
     except (ValueError, NotImplementedError, OSError, re.error) as error:
         raise RecordingError(f"files = {pattern!r}: {error}", where=str(root), valid="a glob") from error
     if pattern == "*":
-        paths = [path for path in paths if (_kind_of(path) or table.format or "yaml") != "yaml"]
+        # The folder may contain the mapping, logs and descriptions.
+        kinds = {"csv", "matlab", "hdf5", "messages", table.format, _lines(table)} - {"", "yaml"}
+        paths = [path for path in paths if (_kind_of(path) or table.format) in kinds]
     if not paths:
         what = "no such file or folder" if not root.exists() else f"no file {pattern!r}"
-        raise RecordingError(what, where=str(root), valid="the folder that contains the files of the mapping")
+        valid = "the folder that contains the files of the mapping"
+        if ranges:
+            valid = f"relative to the folder of the ranges, {root}"
+        raise RecordingError(what, where=str(root), valid=valid)
     return paths
-
-
-_Rows = Iterator[tuple[dict[str, Any], int]]
-_Choose = Callable[[Sequence[str]], dict[str, str]]
-"""Returns {column: column of the file}, from all columns of the file."""
 
 
 def read_chunks(
     table: TableFormat,
     path: Path,
     columns: Mapping[str, bool],
+    ids: Collection[str] = (),
     before: int = 0,
+    dropped: Counter[str] | None = None,
     on_warning: OnWarning | None = None,
 ) -> Iterator[Chunk]:
     """Yield the rows of a file, only the given columns and those of the rules to drop rows.
@@ -143,38 +154,50 @@ def read_chunks(
         table: format of the file.
         path: the file.
         columns: {name: whether it is left out if it is missing}.
+        ids: columns that contain ids.
         before: number of rows in the files before.
-        on_warning: called if the last row of a CSV file is cut, and not yielded; None: it is yielded.
+        dropped: counts damaged rows, by reason; None: not counted.
+        on_warning: called if the last row of a text file is cut, and not yielded; None: it is yielded.
 
     Raises:
         RecordingError: the file cannot be read, or a column is missing; the message names similar columns.
         DamagedRecordingError: the file is truncated, after yielding the rows before.
     """
     kind = ("" if path.is_dir() else table.format) or _kind_of(path)
+    kind = kind if kind == "messages" else _lines(table) or kind
+    dropped = Counter() if dropped is None else dropped
+    groups = re.search(table.file_name, path.as_posix())
+    if groups is None:
+        raise RecordingError(f"the path does not match {table.file_name!r}", where=str(path))
+    constant = groups.groupdict()
     needed = {**columns, **{rule.column: False for rule in table.drop}}
-    choose, first = partial(_choose, table, needed, path), 0
+    needed = {name: optional for name, optional in needed.items() if name not in constant}
     try:
         if kind == "messages":
             rows = _messages(table, path, needed)
+        elif kind == "lines":
+            rows = _log(table, path, needed, dropped, on_warning)
+        elif kind == "json":
+            document = json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError))
+            content: dict[str, Any] = {**MessageRows(table, needed).rows(document, MAX_JSON_ROWS)}
+            rows = iter([(content, np.arange(len(content[LIST_INDEX])))])
         elif kind == "csv":
-            rows = _csv(table, path, choose, on_warning)
+            rows = read_csv_rows(table, path, partial(_choose, table, needed, path), ids, dropped, on_warning)
         elif kind:
-            rows = _arrays(table, path, choose)
+            rows = _arrays(table, path, partial(_choose, table, needed, path))
         else:
-            raise RecordingError(
-                "unknown format", where=str(path), valid=", ".join(sorted({*_SUFFIXES.values()}))
+            valid = (
+                f"{', '.join(sorted({*_SUFFIXES.values()}))}; tables of other software as CSV, such as with "
             )
-        for values, count in rows:
-            numbers = np.arange(first, first + count)
-            first += count
+            raise RecordingError(
+                f"unknown format {path.suffix}", where=str(path), valid=valid + "pandas: to_csv"
+            )
+        for values, numbers in rows:
+            values |= {name: np.full(len(numbers), text, object) for name, text in constant.items()}
             if table.unpivot:
-                values, repeats = _unpivot(table, values, count)
+                values, repeats = _unpivot(table, values, len(numbers))
                 numbers = np.repeat(numbers, repeats)
             yield Chunk(values, len(numbers), path, numbers, before)
-    except (EOFError, lzma.LZMAError, zlib.error, gzip.BadGzipFile) as error:
-        raise DamagedRecordingError(
-            f"truncated or corrupt: {error}", where=f"{path}: after row {first}"
-        ) from error
     except UwbMitigationError:
         raise
     except Exception as error:
@@ -188,7 +211,8 @@ def _choose(
     """Return the columns that exist, also with other case; raise RecordingError if a required one is missing."""
     folded = {name.strip().lower(): name for name in names}
     chosen = {name: name if name in names else folded.get(name.lower(), "") for name in columns}
-    for name in (*table.unpivot, *([VARIABLE] if table.unpivot else ())):
+    groups = [name for rule in table.unpivot.values() for name in re.compile(rule).groupindex]
+    for name in (*table.unpivot, *groups, *([VARIABLE] if table.unpivot else ())):
         chosen.pop(name, None)
     for rule in table.unpivot.values():
         if not (matches := [name for name in names if re.fullmatch(rule, name)]):
@@ -217,84 +241,25 @@ def _unpivot(table: TableFormat, columns: Mapping[str, Any], count: int) -> tupl
         for name, values in columns.items():
             if match := re.fullmatch(rule, name):
                 sources.add(name)
-                keys = [match[1] if match.re.groups == 1 else name]
+                groups = match.groupdict()
+                keys = ["_".join(groups.values()) if groups else match[1] if match.re.groups == 1 else name]
                 if is_matrix := np.ndim(values) == 2:
                     keys = [str(number + 1) for number in range(values.shape[1])]
                 for key, column in zip(keys, values.T if is_matrix else [values], strict=True):
-                    melted.setdefault(key, {})[target] = column
+                    cells = {name: np.full(count, text, object) for name, text in groups.items()}
+                    melted.setdefault(key, cells)[target] = column
     rows = {
         name: np.repeat(values, len(melted), axis=0)
         for name, values in columns.items()
         if name not in sources
     }
     unknown = np.full(count, np.nan)
-    for target in table.unpivot:
+    for target in dict.fromkeys(name for cells in melted.values() for name in cells):
         rows[target] = np.stack([cells.get(target, unknown) for cells in melted.values()], axis=1).reshape(-1)
     return rows | {VARIABLE: np.tile(np.array(list(melted), object), count)}, len(melted)
 
 
-class _Tail(io.RawIOBase):
-    """A stream that keeps the last bytes that were read."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream, self.tail = stream, b""
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        data = self._stream.read(len(buffer))
-        self.tail = (self.tail + data)[-(1 << 16) :]
-        buffer[: len(data)] = data
-        return len(data)
-
-    def fault(self, separator: str, columns: int) -> str:
-        """Return why the last line is not complete; empty: it is."""
-        if not self.tail.endswith((b"\n", b"\r")):
-            return "the file does not end with a line break"
-        widths = []
-        for line in self.tail.rstrip().splitlines()[-2:]:
-            text = line.decode(errors="replace")
-            fields = (
-                next(csv.reader([text], delimiter=separator), []) if len(separator) == 1 else text.split()
-            )
-            widths.append(len(fields))
-        return "the last row is short" if widths[-1:] < [columns] and widths[-1:] < widths[:1] else ""
-
-
-def _csv(table: TableFormat, path: Path, choose: _Choose, on_warning: OnWarning | None) -> _Rows:
-    import pandas as pd
-
-    options: dict[str, Any] = {
-        "sep": table.separator, "decimal": table.decimal, "encoding": "utf-8-sig", "skipinitialspace": True,
-        "engine": "c" if len(table.separator) == 1 or table.separator == r"\s+" else "python",
-    }  # fmt: skip
-    if table.columns:
-        options |= {"names": table.columns, "header": None, "index_col": False}
-    try:
-        names = table.columns or [str(name) for name in pd.read_csv(path, nrows=0, **options).columns]
-        chosen = choose(names)
-        rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(len(chosen), 1)))
-        # Unused columns cost most of the time of a file with CIRs.
-        options |= {"usecols": list(chosen.values()), "chunksize": rows}
-        with _OPENERS.get(path.suffix, open)(path, "rb") as stream:
-            tail, previous = _Tail(stream), None
-            for frame in pd.read_csv(io.BufferedReader(tail), **options):
-                if previous is not None:
-                    yield previous
-                previous = {name: frame[column].to_numpy() for name, column in chosen.items()}, len(frame)
-        if previous is not None:
-            # The rows of a file without a header may have several widths.
-            fault = tail.fault(table.separator, 0 if table.columns else len(names))
-            if fault and on_warning:
-                on_warning(f"{path.name}: {fault}; the last row is not used")
-                previous = {name: values[:-1] for name, values in previous[0].items()}, previous[1] - 1
-            yield previous
-    except pd.errors.EmptyDataError as error:
-        raise RecordingError("the file is empty", where=str(path)) from error
-
-
-def _arrays(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
+def _arrays(table: TableFormat, path: Path, choose: ChooseColumns) -> Rows:
     """Read a MATLAB, HDF5 or YAML file in slices."""
     with contextlib.ExitStack() as stack:
         arrays = _as_columns(_load(table, path, stack), table, path)
@@ -313,7 +278,7 @@ def _arrays(table: TableFormat, path: Path, choose: _Choose) -> _Rows:
         count = max(lengths.values(), default=0)
         for first in range(0, count, rows):
             values = {name: np.asarray(array[first : first + rows]) for name, array in columns.items()}
-            yield values, min(rows, count - first)
+            yield values, np.arange(first, min(first + rows, count))
 
 
 def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Any:
@@ -334,7 +299,7 @@ def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Any:
         try:
             import h5py
         except ImportError as error:
-            raise not_installed("h5py") from error
+            raise MissingDependencyError("h5py is not installed", valid="pip install h5py") from error
         content = stack.enter_context(h5py.File(path, "r"))
     if table.group:
         if table.group not in content:
@@ -390,10 +355,10 @@ def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
         yield prefix.rstrip("."), value
 
 
-def _messages(table: TableFormat, path: Path, columns: Mapping[str, bool]) -> _Rows:
+def _messages(table: TableFormat, path: Path, columns: Mapping[str, bool]) -> Rows:
     from uwb_mitigation.recordings.mapping.bag_messages import read_messages
 
-    reader, damage = MessageRows(table, columns), None
+    reader, damage, first = MessageRows(table, columns), None, 0
     messages = read_messages(path, table.topics)
     while damage is None:
         rows: dict[str, list[Any]] = {LIST_INDEX: []}
@@ -413,6 +378,40 @@ def _messages(table: TableFormat, path: Path, columns: Mapping[str, bool]) -> _R
             damage = error
         if count == 0:
             break
-        yield rows, len(rows[LIST_INDEX])
+        yield rows, np.arange(first, first + len(rows[LIST_INDEX]))
+        first += len(rows[LIST_INDEX])
     if damage:
         raise damage
+
+
+def _log(
+    table: TableFormat,
+    path: Path,
+    columns: Mapping[str, bool],
+    dropped: Counter[str],
+    on_warning: OnWarning | None,
+) -> Rows:
+    """Read the lines of a text file as messages; lines without a range are counted."""
+    reader, blocks, number, reason = MessageRows(table, columns), TextBlocks(path), 0, ""
+    for block in blocks:
+        rows, numbers = defaultdict[str, list[Any]](list), list[int]()
+        for line in block.removesuffix("\n").split("\n"):
+            problem = f"lines without a range, such as {line.strip()!r:.60}"
+            try:
+                values = reader.rows(line)
+            except RecordingError as error:
+                values, problem = {}, f"{problem} ({error.what})"
+            count = len(values.get(LIST_INDEX, ()))
+            if count == 0 and line.strip():
+                reason = reason or problem
+                dropped[reason] += 1
+            numbers += [number] * count
+            number += 1
+            for name, cells in values.items():
+                rows[name].extend(cells)
+        yield rows, np.array(numbers, np.int64)
+    if blocks.damage:
+        where = f"{path}: after line {number}"
+        raise DamagedRecordingError(f"truncated or corrupt: {blocks.damage}", where=where)
+    if blocks.rest.strip() and on_warning:
+        on_warning(f"{path.name}: the file does not end with a line break; the last line is not used")
