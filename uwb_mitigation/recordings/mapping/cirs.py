@@ -39,6 +39,8 @@ class CirFile:
         if len(names) > 1:
             kind = object if source.samples == "complex" else np.float64
             lists = np.stack([np.asarray(chunk.columns[name], kind) for name in names], axis=1)
+            # At a PRF of 16 MHz, a CIR has 992 samples instead of 1016.
+            lists = [row[: np.flatnonzero(row == row).max(initial=-1) + 1] for row in lists]
         numbers = np.full(chunk.count, -1)
         for row in range(chunk.count):
             values = lists[row]

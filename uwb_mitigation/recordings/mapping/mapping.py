@@ -204,7 +204,8 @@ class TableFormat(_Strict):
         skip, comment: number of lines before the table or its header, and character with which comments start.
         pattern: regular expression for lines of a log, or for the texts of messages: each match is a row, and its named
             groups `(?P<name>...)` are the columns.
-        group: name of the array, variable or group (MATLAB, HDF5), or key of the mapping (YAML).
+        group: name of the array, variable or group (MATLAB, HDF5), key of the mapping (YAML), or path of the objects with
+            the columns (JSON, messages).
         topics, type: topics of messages, and their type.
         file_name: regular expression for the path of the file, whose named groups are columns.
         text: each line, or the field `data` of the message, contains JSON or `key:value` pairs.

@@ -31,7 +31,7 @@ class MessageRows:
         self._table, self._columns = table, columns
         self._pattern = re.compile(table.pattern) if table.pattern else None
         self._paths = {
-            column: [step for step in re.split(r"\.|(\[\])", column) if step]
+            column: [step for step in re.split(r"\.|(\[\])", f"{table.group}.{column}") if step]
             for column in columns
             if column != LIST_INDEX
         }
