@@ -46,8 +46,9 @@ _PLACES = ("row", "file", "cir")
 _NO_RANGE_M = (0.0, 32.767, 65.535, 327.67, 655.35)
 """Ranges that radios report without a measurement: zero, and the largest 16-bit numbers of mm and cm."""
 
+_MAX_MISFIT = 0.08
 _DAY_S = 86_400
-_SCALES = {"scale: 60 (minutes)": 60, "scale: 3600 (hours)": 3600, f"scale: {_DAY_S} (days)": _DAY_S}
+_TIMES_S = {"minutes": 60, "hours": 3600, "days": _DAY_S}
 
 
 def median(numbers: NDArray[np.float64]) -> float:
@@ -187,97 +188,82 @@ def check_stamps(values: ColumnDict, name: str, stamp: FieldRule, *, moving: boo
         raise RecordingError("all stamps are equal", where=name, valid=valid)
     if len(intervals_s) < 10:
         return
-    middle, rate_hz = float(np.median(intervals_s)), len(intervals_s) / float(intervals_s.sum())
-    if not (moving and middle > MAX_INTERVAL_S) and rate_hz <= MAX_RATE_HZ:
-        return
-    what = f"the ranges are {middle:.3g} s apart, in {intervals_s.sum():.3g} s"
-    hint = f"; probably set {unit}" if (unit := _unit_of_time(middle, stamp)) else "; check unit and scale"
-    hint += " of the stamps"
-    if middle > MAX_INTERVAL_S:
-        hint += "; for slow recordings without motion set moving: false"
-    raise RecordingError(what, where=name, valid=f"{1 / MAX_RATE_HZ:g} to {MAX_INTERVAL_S:g} s{hint}")
+    middle, duration_s = float(np.median(intervals_s)), float(intervals_s.sum())
+    is_slow = moving and middle > MAX_INTERVAL_S
+    if is_slow or len(intervals_s) / duration_s > MAX_RATE_HZ:
+        hint = (
+            _unit_of_time(middle, stamp) + "; for slow recordings without motion set moving: false" * is_slow
+        )
+        what, valid = (
+            f"the ranges are {middle:.3g} s apart, in {duration_s:.3g} s",
+            f"0.001 to {MAX_INTERVAL_S:g} s",
+        )
+        raise RecordingError(what, where=name, valid=f"{valid}; probably set {hint}")
 
 
 def _unit_of_time(interval_s: float, rule: FieldRule) -> str:
-    """Return the line of a mapping that makes an interval plausible; empty: none."""
-    now_s = TIME[rule.unit or "s"] * rule.scale / NS_PER_S if rule.unit in ("", *TIME) else 0.0
-    units = {
-        f"unit: {unit}": factor / NS_PER_S for unit, factor in TIME.items() if unit != "iso8601"
-    } | _SCALES
-    intervals = {line: interval_s / now_s * unit_s for line, unit_s in units.items()} if now_s > 0 else {}
-    plausible = {
-        line: abs(np.log(interval / 0.1))
-        for line, interval in intervals.items()
-        if 1 / MAX_RATE_HZ <= interval <= MAX_INTERVAL_S
+    """Return the line of a mapping that makes an interval most plausible."""
+    now_ns = TIME.get(rule.unit or "s", NS_PER_S) * rule.scale
+    units = {f"unit: {unit} of the stamps": factor for unit, factor in TIME.items() if unit != "iso8601"}
+    units |= {f"scale: {s} ({name}) of the stamps": s * NS_PER_S for name, s in _TIMES_S.items()}
+    distances = {
+        line: abs(np.log(interval_s * ns / now_ns / 0.1)) for line, ns in units.items() if ns != now_ns
     }
-    return min(plausible, key=plausible.__getitem__, default="")
+    return min(distances, key=distances.__getitem__)
 
 
-def check_units(values: ColumnDict, name: str, units: Mapping[str, str]) -> None:
-    """Raise RecordingError for wrong units of lengths or of the first-path index, or for differences of ranges.
-
-    Args:
-        values: the columns.
-        name: the recording, for errors.
-        units: units of `range` and `truth.range` in the mapping; empty: m.
-    """
+def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> None:
+    """Raise RecordingError for wrong units of lengths or of the first-path index, or for differences of ranges."""
     import pandas as pd
 
-    negative = float((values["range"] < 0).mean())
-    if len(values["range"]) >= 20 and negative > MAX_NEGATIVE:
+    ranges, true, negative = (
+        np.abs(values["range"]),
+        values["true range"],
+        float((values["range"] < 0).mean()),
+    )
+    if len(ranges) >= 20 and negative > MAX_NEGATIVE:
         valid = "ranges: differences of ranges (TDoA) are not used; if the sign is wrong, set scale: -1"
         raise RecordingError(f"{negative:.0%} of the ranges are negative", where=name, valid=valid)
-    ranges, true = np.abs(values["range"]), values["true range"]
-    rows_of = pd.Series(ranges).groupby(values["anchor"]).indices
-    medians = {anchor: median(ranges[rows]) for anchor, rows in rows_of.items()}
-    typical = median(np.array([*medians.values()]))
-    wrong: dict[int, tuple[str, str]] = {}
-    for anchor, rows in rows_of.items():
-        error = _unit_of_length(_scale(ranges[rows], true[rows]), units)
-        if not error and (medians[anchor] > MAX_PLAUSIBLE_M or 0 < medians[anchor] < MIN_PLAUSIBLE_M):
-            error = _unit_of_length(medians[anchor] / typical, units, nearest=True)
-        if error:
-            wrong[anchor] = error
-    if 0 < len(wrong) < len(rows_of):
-        anchor, (_, quantity) = next(iter(wrong.items()))
-        lines = ", ".join(f"{anchor}: {unit}" for anchor, (unit, _) in wrong.items())
+    by_anchor, wrong = pd.Series(ranges).groupby(values["anchor"]), dict[int, str]()
+    medians, rows_of = by_anchor.median(), by_anchor.indices
+    typical = medians.median()
+    for anchor, middle in medians.items():
+        factor = _scale(ranges[rows_of[anchor]], true[rows_of[anchor]])
+        fitting, misfit = _unit_of_length(factor if np.isfinite(factor) else middle / typical, unit)
+        # An offset may also explain the factor, but not if it is that of one anchor.
+        is_other = fitting != (unit or "m") and misfit < _MAX_MISFIT and not 0.4 < middle / typical < 2.5
+        if (is_other and np.isfinite(factor)) or middle > MAX_PLAUSIBLE_M or 0 < middle < MIN_PLAUSIBLE_M:
+            wrong[anchor] = fitting
+    if 0 < len(wrong) < len(medians):
+        anchor = next(iter(wrong))
         what = f"the median range of anchor {format_id(anchor)} is {medians[anchor]:,.4g} m, of all {typical:,.4g} m"
-        raise RecordingError(what, where=name, valid=f"probably set units: {{{lines}}} of {quantity}")
-    for column, low, high, unit, alternative in (
+        lines = ", ".join(f"{anchor}: {fitting}" for anchor, fitting in wrong.items())
+        raise RecordingError(what, where=name, valid=f"probably set units: {{{lines}}} of range")
+    for column, low, high, si, alternative in (
         ("range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
         ("true range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
         ("first_path_index", 0.0, MAX_INDEX, "samples", "'10.6'"),
     ):
         middle = median(np.abs(values[column]))
         if middle > high or 0 < middle < low:
-            raise RecordingError(
-                f"the median {column} is {middle:,.{0 if middle > high else 4}f} {unit}",
-                where=name,
-                valid=f"{low:g} to {high:g}; probably set unit: {alternative if middle > high else unit}",
-            )
-    factor = _scale(values["range"], true)
-    if error := _unit_of_length(factor, units):
-        raise RecordingError(
-            f"the ranges are {factor:.3g} times the true ranges", where=name,
-            valid=f"the same unit: probably set unit: {error[0]} of {error[1]}",
-        )  # fmt: skip
+            what = f"the median {column} is {middle:,.{0 if middle > high else 4}f} {si}"
+            valid = f"{low:g} to {high:g}; probably set unit: {alternative if middle > high else si}"
+            raise RecordingError(what, where=name, valid=valid)
+    factor = _scale(ranges, true)
+    for quantity, ratio, now in (("range", factor, unit), ("truth.range", 1 / factor, true_unit)):
+        fitting, misfit = _unit_of_length(ratio, now)
+        if misfit < _MAX_MISFIT and fitting != (now or "m"):
+            what = f"the ranges are {factor:.3g} times the true ranges"
+            valid = f"the same unit: probably set unit: {fitting} of {quantity}"
+            raise RecordingError(what, where=name, valid=valid)
 
 
-def _unit_of_length(
-    factor: float, units: Mapping[str, str], *, nearest: bool = False
-) -> tuple[str, str] | None:
-    """Return the unit, and whether of `range` or `truth.range`, that explains a factor of ranges; None: none does."""
-    candidates = {
-        (unit, quantity): abs(np.log(ratio * metres / LENGTHS[units[quantity] or "m"]))
-        for quantity, ratio in (
-            ("range", factor),
-            ("truth.range", 0.0 if nearest or factor == 0 else 1 / factor),
-        )
-        for unit, metres in LENGTHS.items()
-        if unit != (units[quantity] or "m") and ratio > 0
+def _unit_of_length(factor: float, unit: str) -> tuple[str, float]:
+    """Return the unit that explains a factor of lengths in `unit` best, and the logarithm of the rest of the factor."""
+    misfits = {
+        other: abs(np.log(factor * metres / LENGTHS[unit or "m"])) for other, metres in LENGTHS.items()
     }
-    best = min(candidates, key=candidates.__getitem__, default=None)
-    return best if best and (nearest or candidates[best] < np.log(1.08)) else None
+    return min(misfits.items(), key=lambda item: item[1])
 
 
 def _scale(ranges_m: NDArray[np.float64], true_m: NDArray[np.float64]) -> float:

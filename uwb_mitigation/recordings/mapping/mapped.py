@@ -114,8 +114,7 @@ class MappedRecording(Source):
             self.values = take(self.values, np.argsort(self.values["stamp"], kind="stable"))
         self._add_truth(self._anchor_positions())
         truth = mapping.truth.ranges.range if mapping.truth.ranges else mapping.truth.range
-        units = {"range": mapping.fields.range.unit, "truth.range": truth.unit if truth else ""}
-        checks.check_units(self.values, self.name, units)
+        checks.check_units(self.values, self.name, mapping.fields.range.unit, truth.unit if truth else "")
         self._drop(checks.impossible_rows(self.values))
         self._warn()
         self.motion = self._read_motion()

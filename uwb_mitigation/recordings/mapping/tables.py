@@ -26,13 +26,13 @@ from uwb_mitigation.errors import (
 )
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, VARIABLE, TableFormat
-from uwb_mitigation.recordings.mapping.messages import MessageRows
+from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
 from uwb_mitigation.recordings.mapping.text_files import (
     ChooseColumns,
+    CsvRows,
     OnWarning,
     Rows,
     TextBlocks,
-    read_csv_rows,
 )
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
@@ -41,11 +41,8 @@ CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 MAX_ARRAY_BYTES = 4 << 30
 """Largest size of a file that is loaded."""
 
-MAX_JSON_ROWS = 20_000_000
-"""Largest number of rows of a JSON document."""
-
-MAX_YAML_BYTES, MAX_YAML_VALUES = 1 << 20, 1000
-"""Largest size of a YAML file, and largest number of values of an entry."""
+MAX_DOCUMENT_ROWS, MAX_YAML_BYTES = 20_000_000, 1 << 20
+"""Largest number of rows of a JSON or YAML document, and largest size of a YAML file."""
 
 LOG_TIME = "@stamp"
 """Column with the time at which a message was recorded, ns."""
@@ -101,10 +98,6 @@ def _kind_of(path: Path) -> str:
     return "messages" if path.is_dir() else _SUFFIXES.get(Path(name).suffix, "")
 
 
-def _lines(table: TableFormat) -> str:
-    return "lines" if table.pattern or table.text else ""
-
-
 def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> list[Path]:
     """Return the files of a table below a folder, or the file `root` itself, in the order of their names.
 
@@ -128,7 +121,8 @@ def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> li
         raise RecordingError(f"files = {pattern!r}: {error}", where=str(root), valid="a glob") from error
     if pattern == "*":
         # The folder may contain the mapping, logs and descriptions.
-        kinds = {"csv", "matlab", "hdf5", "messages", table.format, _lines(table)} - {"", "yaml"}
+        kinds = {"csv", "matlab", "hdf5", "messages", table.format} - {"", "yaml"}
+        kinds |= {"lines"} if table.pattern or table.text else set()
         paths = [path for path in paths if (_kind_of(path) or table.format) in kinds]
     if not paths:
         what = "no such file or folder" if not root.exists() else f"no file {pattern!r}"
@@ -164,36 +158,26 @@ def read_chunks(
         DamagedRecordingError: the file is truncated, after yielding the rows before.
     """
     kind = ("" if path.is_dir() else table.format) or _kind_of(path)
-    kind = kind if kind == "messages" else _lines(table) or kind
+    kind = "lines" if kind != "messages" and (table.pattern or table.text) else kind
     dropped = Counter() if dropped is None else dropped
-    groups = re.search(table.file_name, path.as_posix())
-    if groups is None:
+    if (groups := re.search(table.file_name, path.as_posix())) is None:
         raise RecordingError(f"the path does not match {table.file_name!r}", where=str(path))
-    constant = groups.groupdict()
+    constants = groups.groupdict()
     needed = {**columns, **{rule.column: False for rule in table.drop}}
-    needed = {name: optional for name, optional in needed.items() if name not in constant}
+    needed = {name: optional for name, optional in needed.items() if name not in constants}
+    choose = partial(_choose, table, needed, path)
     try:
-        if kind == "messages":
-            rows = _messages(table, path, needed)
-        elif kind == "lines":
-            rows = _log(table, path, needed, dropped, on_warning)
-        elif kind == "json":
-            document = json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError))
-            content: dict[str, Any] = {**MessageRows(table, needed).rows(document, MAX_JSON_ROWS)}
-            rows = iter([(content, np.arange(len(content[LIST_INDEX])))])
+        if kind in ("messages", "lines", "json", "yaml"):
+            rows = _messages(kind, table, path, needed, dropped, on_warning)
         elif kind == "csv":
-            rows = read_csv_rows(table, path, partial(_choose, table, needed, path), ids, dropped, on_warning)
+            rows = iter(CsvRows(table, path, choose, ids, dropped, on_warning))
         elif kind:
-            rows = _arrays(table, path, partial(_choose, table, needed, path))
+            rows = _arrays(table, path, choose)
         else:
-            valid = (
-                f"{', '.join(sorted({*_SUFFIXES.values()}))}; tables of other software as CSV, such as with "
-            )
-            raise RecordingError(
-                f"unknown format {path.suffix}", where=str(path), valid=valid + "pandas: to_csv"
-            )
+            valid = f"{', '.join(sorted({*_SUFFIXES.values()}))}; others as CSV, such as with pandas.DataFrame.to_csv"
+            raise RecordingError(f"unknown format {path.suffix}", where=str(path), valid=valid)
         for values, numbers in rows:
-            values |= {name: np.full(len(numbers), text, object) for name, text in constant.items()}
+            values |= {name: np.full(len(numbers), text, object) for name, text in constants.items()}
             if table.unpivot:
                 values, repeats = _unpivot(table, values, len(numbers))
                 numbers = np.repeat(numbers, repeats)
@@ -260,36 +244,31 @@ def _unpivot(table: TableFormat, columns: Mapping[str, Any], count: int) -> tupl
 
 
 def _arrays(table: TableFormat, path: Path, choose: ChooseColumns) -> Rows:
-    """Read a MATLAB, HDF5 or YAML file in slices."""
+    """Read a MATLAB or HDF5 file in slices."""
     with contextlib.ExitStack() as stack:
-        arrays = _as_columns(_load(table, path, stack), table, path)
+        arrays = _load(table, path, stack)
         chosen = choose([str(name) for name in arrays if not str(name).startswith("__")])
-        columns = {name: arrays[column] for name, column in chosen.items()}
         # Slices of large files are read later, other values are arrays of one row at least.
+        columns = {name: arrays[column] for name, column in chosen.items()}
         columns = {
-            name: array if getattr(array, "ndim", 0) else np.atleast_1d(array)
-            for name, array in columns.items()
+            n: array if getattr(array, "ndim", 0) else np.atleast_1d(array) for n, array in columns.items()
         }
         lengths = {name: len(array) for name, array in columns.items()}
         if len(set(lengths.values())) > 1:
             raise RecordingError("columns of different length", where=str(path), valid=str(lengths))
         width = max([int(np.prod(array.shape[1:])) for array in columns.values()], default=1)
         rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(width, 1)))
-        count = max(lengths.values(), default=0)
-        for first in range(0, count, rows):
+        for first in range(0, count := max(lengths.values(), default=0), rows):
             values = {name: np.asarray(array[first : first + rows]) for name, array in columns.items()}
             yield values, np.arange(first, min(first + rows, count))
 
 
-def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Any:
-    """Return an array, or {name: array}: the variables of a file, or of its variable `group`."""
-    kind = table.format or _kind_of(path)
-    if kind == "matlab" and path.stat().st_size > MAX_ARRAY_BYTES:
+def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Mapping[str, Any]:
+    """Return {name: array with one entry a row}: the variables of a file, or the fields of its variable `group`."""
+    is_matlab, content = (table.format or _kind_of(path)) == "matlab", None
+    if is_matlab and path.stat().st_size > MAX_ARRAY_BYTES:
         raise RecordingError(f"more than {MAX_ARRAY_BYTES >> 30} GiB", where=str(path), valid="CSV, HDF5")
-    content: Any = None
-    if kind == "yaml":
-        content = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
-    elif kind == "matlab":
+    if is_matlab:
         from scipy.io import loadmat
 
         # Version 7.3 is HDF5.
@@ -303,80 +282,80 @@ def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Any:
         content = stack.enter_context(h5py.File(path, "r"))
     if table.group:
         if table.group not in content:
-            raise RecordingError(
-                f"no variable {table.group}", where=str(path), valid=", ".join(map(str, content))
-            )
+            valid = ", ".join(map(str, content))
+            raise RecordingError(f"no variable {table.group}", where=str(path), valid=valid)
         content = content[table.group]
-    if kind == "yaml":
-        return _yaml_rows(content)
-    if is_hdf5 and kind == "matlab":
+    if is_hdf5 and is_matlab:
         # MATLAB writes the transposed array.
-        if hasattr(content, "dtype"):
-            return content[()].T
-        return {name: np.squeeze(item[()].T) for name, item in content.items() if hasattr(item, "dtype")}
-    return content
+        is_array = hasattr(content, "dtype")
+        content = (
+            content[()].T
+            if is_array
+            else {n: np.squeeze(item[()].T) for n, item in content.items() if hasattr(item, "dtype")}
+        )
+    if isinstance(content, Mapping):
+        return content
+    if np.ndim(content) > 1 and not table.columns:
+        return {"": content}
+    import pandas as pd
+
+    # The fields of a structure, or the columns of a matrix.
+    frame = pd.DataFrame(
+        content if isinstance(content, list) else np.asarray(content), columns=table.columns or None
+    )
+    return {str(name): column.to_numpy() for name, column in frame.items()}
 
 
-def _as_columns(arrays: Any, table: TableFormat, path: Path) -> Mapping[str, Any]:
-    """Return {name: array with one entry a row}: the fields of a structure, or the columns of a matrix."""
-    if isinstance(arrays, Mapping):
-        return arrays
-    if isinstance(arrays, list) and arrays and isinstance(arrays[0], dict):
-        return {name: np.array([row[name] for row in arrays]) for name in arrays[0]}
-    if names := getattr(getattr(arrays, "dtype", None), "names", None):
-        return {name: arrays[name] for name in names}
-    shape: tuple[int, ...] = getattr(arrays, "shape", ())
-    if table.columns and len(shape) == 2 and shape[1] == len(table.columns):
-        return {name: arrays[:, column] for column, name in enumerate(table.columns)}
-    if not table.columns and len(shape) > 1:
-        return {"": arrays}
-    raise RecordingError(f"an array of shape {shape}", where=str(path), valid="`columns` names its columns")
-
-
-def _yaml_rows(document: Any) -> dict[str, NDArray[Any]]:
-    """Return the entries of a mapping or list as rows: `key`, and nested names joined with dots."""
-    entries = document.items() if isinstance(document, dict) else enumerate(document)
-    rows = [{"key": str(key), **dict(islice(_flat(value, ""), MAX_YAML_VALUES))} for key, value in entries]
-    names = sorted(set.intersection(*map(set, rows))) if rows else []
-    return {name: np.array([row[name] for row in rows], object) for name in names}
-
-
-def _flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, str) and value.startswith("["):
-        value = yaml.safe_load(value)
-    if isinstance(value, dict):
-        for name, item in value.items():
-            yield from _flat(item, f"{prefix}{name}.")
-    elif isinstance(value, list):
-        for number, item in enumerate(value):
-            # A list of mappings is one mapping, such as `- position: ...` and `- orientation: ...`.
-            yield from _flat(item, prefix if isinstance(item, dict) else f"{prefix}{number}.")
+def _messages(
+    kind: str,
+    table: TableFormat,
+    path: Path,
+    columns: Mapping[str, bool],
+    dropped: Counter[str],
+    on_warning: OnWarning | None,
+) -> Rows:
+    """Read the messages of a bag, the lines of a log, or the objects of a document."""
+    messages: Iterator[tuple[dict[str, Any], Any]]
+    if kind == "messages":
+        messages = _bag(path, table)
+    elif kind == "lines":
+        messages = _lines(path, on_warning)
+    elif kind == "json":
+        messages = iter([({}, json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError)))])
     else:
-        yield prefix.rstrip("."), value
-
-
-def _messages(table: TableFormat, path: Path, columns: Mapping[str, bool]) -> Rows:
-    from uwb_mitigation.recordings.mapping.bag_messages import read_messages
-
-    reader, damage, first = MessageRows(table, columns), None, 0
-    messages = read_messages(path, table.topics)
+        document = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
+        messages = iter([({}, _entries(document[table.group] if table.group else document))])
+        table = table.model_copy(update={"group": "[]"})
+    reader, first, reason, limit = (
+        MessageRows(table, columns),
+        0,
+        "",
+        MAX_ROWS if kind == "messages" else MAX_DOCUMENT_ROWS,
+    )
+    damage: DamagedRecordingError | None = None
     while damage is None:
-        rows: dict[str, list[Any]] = {LIST_INDEX: []}
-        count = 0
+        rows, count = defaultdict[str, list[Any]](list), 0
         try:
-            for topic, stamp_ns, message in islice(messages, 1000):
-                count += 1
+            for count, (constants, message) in enumerate(islice(messages, 1000), 1):
+                values, problem = dict[str, list[Any]](), ""
                 try:
-                    values = reader.rows(message)
+                    values = reader.rows(message, limit)
                 except RecordingError as error:
-                    raise RecordingError(error.what, where=f"{path}: {topic}", valid=error.valid) from error
-                repeats = len(values[LIST_INDEX])
-                values |= {LOG_TIME: [stamp_ns] * repeats, TOPIC: [topic] * repeats}
-                for name, cells in values.items():
-                    rows.setdefault(name, []).extend(cells)
+                    where, problem = ": ".join([str(path), *constants.values()][:2]), f" ({error.what})"
+                    if kind != "lines":
+                        raise RecordingError(error.what, where=where, valid=error.valid) from error
+                repeats = len(values.get(LIST_INDEX, ()))
+                if kind == "lines" and not repeats and message.strip():
+                    reason = reason or f"lines without a range, such as {message.strip()!r:.60}{problem}"
+                    dropped[reason] += 1
+                for name, cells in [
+                    *values.items(),
+                    *((name, [cell] * repeats) for name, cell in constants.items()),
+                ]:
+                    rows[name] += cells
         except DamagedRecordingError as error:
             damage = error
-        if count == 0:
+        if not count:
             break
         yield rows, np.arange(first, first + len(rows[LIST_INDEX]))
         first += len(rows[LIST_INDEX])
@@ -384,34 +363,34 @@ def _messages(table: TableFormat, path: Path, columns: Mapping[str, bool]) -> Ro
         raise damage
 
 
-def _log(
-    table: TableFormat,
-    path: Path,
-    columns: Mapping[str, bool],
-    dropped: Counter[str],
-    on_warning: OnWarning | None,
-) -> Rows:
-    """Read the lines of a text file as messages; lines without a range are counted."""
-    reader, blocks, number, reason = MessageRows(table, columns), TextBlocks(path), 0, ""
+def _bag(path: Path, table: TableFormat) -> Iterator[tuple[dict[str, Any], Any]]:
+    from uwb_mitigation.recordings.bag.foreign_messages import read_messages
+
+    for topic, stamp_ns, message in read_messages(path, table.topics):
+        yield {TOPIC: topic, LOG_TIME: stamp_ns}, message
+
+
+def _lines(path: Path, on_warning: OnWarning | None) -> Iterator[tuple[dict[str, Any], Any]]:
+    blocks = TextBlocks(path)
     for block in blocks:
-        rows, numbers = defaultdict[str, list[Any]](list), list[int]()
-        for line in block.removesuffix("\n").split("\n"):
-            problem = f"lines without a range, such as {line.strip()!r:.60}"
-            try:
-                values = reader.rows(line)
-            except RecordingError as error:
-                values, problem = {}, f"{problem} ({error.what})"
-            count = len(values.get(LIST_INDEX, ()))
-            if count == 0 and line.strip():
-                reason = reason or problem
-                dropped[reason] += 1
-            numbers += [number] * count
-            number += 1
-            for name, cells in values.items():
-                rows[name].extend(cells)
-        yield rows, np.array(numbers, np.int64)
+        yield from (({}, line) for line in block.removesuffix("\n").split("\n"))
     if blocks.damage:
-        where = f"{path}: after line {number}"
-        raise DamagedRecordingError(f"truncated or corrupt: {blocks.damage}", where=where)
+        raise DamagedRecordingError(f"truncated or corrupt: {blocks.damage}", where=str(path))
     if blocks.rest.strip() and on_warning:
         on_warning(f"{path.name}: the file does not end with a line break; the last line is not used")
+
+
+def _entries(document: Any) -> list[dict[str, Any]]:
+    """Return the entries of a YAML mapping or list as objects: `key`, and the fields or elements of its value."""
+    entries = []
+    for key, value in document.items() if isinstance(document, dict) else enumerate(document):
+        # Such as a text `[1.0, 2.0]`, or a list `- position: ...` and `- orientation: ...`.
+        value = yaml.safe_load(value) if isinstance(value, str) and value.startswith("[") else value
+        items = value if isinstance(value, list) else [value]
+        fields = {str(number): item for number, item in enumerate(items)}
+        entries.append(
+            {"key": str(key)}
+            | fields
+            | {k: v for item in items if isinstance(item, dict) for k, v in item.items()}
+        )
+    return entries

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import csv
 import gzip
 import io
 import lzma
@@ -11,7 +10,6 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,9 +27,6 @@ MAX_EXPANSION, MIN_BOMB_CHARS = 500, 1 << 28
 
 _DAMAGES = (EOFError, lzma.LZMAError, zlib.error, gzip.BadGzipFile)
 _OPENERS: dict[str, Any] = {".xz": lzma.open, ".gz": gzip.open}
-# CIRs in one field are longer than the default.
-csv.field_size_limit(MAX_ROW_CHARS)
-
 OnWarning = Callable[[str], None]
 Rows = Iterator[tuple[dict[str, Any], NDArray[np.int64]]]
 """Columns, and the numbers of their rows in the file from 0."""
@@ -116,15 +111,8 @@ def _encoding(head: bytes) -> str:
     return "utf-8-sig"
 
 
-def read_csv_rows(
-    table: TableFormat,
-    path: Path,
-    choose: ChooseColumns,
-    ids: Collection[str],
-    dropped: Counter[str],
-    on_warning: OnWarning | None,
-) -> Rows:
-    """Yield the rows of a CSV file.
+class CsvRows:
+    """The rows of a CSV file.
 
     Args:
         table: format of the file.
@@ -135,132 +123,107 @@ def read_csv_rows(
         on_warning: called if the last row is cut, and not yielded; None: it is yielded.
 
     Raises:
-        RecordingError: the header does not describe the rows, or a quote is not closed.
-        DamagedRecordingError: the file is truncated, after yielding the rows before.
+        RecordingError: from the iteration: there is no header, a name is not unique, or a quote is not closed.
+        DamagedRecordingError: from the iteration: the file is truncated, after yielding the rows before.
     """
-    blocks, first = TextBlocks(path, '"', keep_rest=on_warning is None), 0
-    reader: _CsvReader | None = None
-    previous: Any = None
-    for block in blocks:
-        if reader is None:
-            reader, block = _csv_reader(table, path, block, choose)
+
+    def __init__(
+        self, table: TableFormat, path: Path, choose: ChooseColumns, ids: Collection[str],
+        dropped: Counter[str], on_warning: OnWarning | None,
+    ) -> None:  # fmt: skip
+        self._table, self._path, self._choose, self._ids = table, path, choose, set(ids)
+        self._dropped, self._on_warning = dropped, on_warning
+        regex = table.separator if len(table.separator) > 1 else ""
+        self._regex, self._mark = regex, " " if regex == r"\s+" else "\t" if regex else table.separator
+        self._chosen, self._header, self._width = dict[str, str](), "", 0
+        self._options: dict[str, Any] = {
+            "sep": regex if regex == r"\s+" else self._mark, "decimal": table.decimal, "comment": table.comment or None,
+            "index_col": False, "skipinitialspace": True,
+        }  # fmt: skip
+
+    def __iter__(self) -> Rows:
+        blocks, first = TextBlocks(self._path, '"', keep_rest=self._on_warning is None), 0
+        previous: Any = None
+        for block in blocks:
+            lines = self._lines(block)
+            if not self._chosen:
+                lines = self._after_header(lines[self._table.skip :])
+            if previous:
+                yield previous
+            columns, numbers = self._parsed(lines)
+            previous = columns, first + numbers
+            first += int(numbers[-1]) + 1 if len(numbers) else 0
+        if not self._chosen and not blocks.damage:
+            raise RecordingError("the file is empty", where=str(self._path))
+        if previous and self._on_warning and not blocks.damage:
+            widths = [self._count(line) for line in lines if line.strip()][-2:]
+            is_short = widths[-1:] < [self._width] and widths[-1:] < widths[:1]
+            if is_short:
+                previous = {name: values[:-1] for name, values in previous[0].items()}, previous[1][:-1]
+            if is_short or blocks.rest:
+                fault = "the last row is short" if is_short else "the file does not end with a line break"
+                self._on_warning(f"{self._path.name}: {fault}; the last row is not used")
         if previous:
             yield previous
-        columns, numbers = reader.read(block, ids, dropped)
-        previous = columns, first + numbers
-        first += int(numbers[-1]) + 1 if len(numbers) else 0
-    if reader is None and not blocks.damage:
-        raise RecordingError("the file is empty", where=str(path))
-    if previous and reader and on_warning and not blocks.damage:
-        if blocks.rest:
-            fault = "the file does not end with a line break"
-        elif fault := "the last row is short" if reader.is_short(block) else "":
-            previous = {name: values[:-1] for name, values in previous[0].items()}, previous[1][:-1]
-        if fault:
-            on_warning(f"{path.name}: {fault}; the last row is not used")
-    if previous:
-        yield previous
-    if blocks.damage:
-        where = f"{path}: after row {first}"
-        raise DamagedRecordingError(f"truncated or corrupt: {blocks.damage}", where=where)
+        if blocks.damage:
+            what, where = f"truncated or corrupt: {blocks.damage}", f"{self._path}: after row {first}"
+            raise DamagedRecordingError(what, where=where)
 
+    def _lines(self, block: str) -> list[str]:
+        lines = block.split("\n")
+        is_plain = self._regex in ("", r"\s+")
+        return lines if is_plain else [re.sub(self._regex, self._mark, line.strip()) for line in lines]
 
-@dataclass(frozen=True, slots=True)
-class _CsvReader:
-    """Reads blocks of a CSV file.
+    def _count(self, line: str) -> int:
+        return len(line.split()) if self._mark == " " else line.count(self._mark) + 1
 
-    Attributes:
-        chosen: {column: column of the file}.
-        header: the line with the names; empty: none.
-        width: number of columns; 0: the rows may have several widths.
-        first: a line with the width of the table, because pandas refuses columns that no row of a block has.
-        options: of `pandas.read_csv`.
-    """
+    def _after_header(self, lines: list[str]) -> list[str]:
+        """Choose the columns, and return the lines after the header."""
+        import pandas as pd
 
-    chosen: dict[str, str]
-    header: str
-    first: str
-    width: int
-    options: dict[str, Any]
+        names = self._table.columns
+        if not names:
+            comment = self._table.comment or "\n"
+            start = next((n for n, line in enumerate(lines) if line.strip() and line[0] != comment), None)
+            if start is None:
+                raise RecordingError("no header", where=str(self._path))
+            self._header, lines = lines[start], lines[start + 1 :]
+            header = pd.read_csv(io.StringIO(self._header), nrows=0, **self._options)
+            names = [str(name) for name in header.columns]
+            self._width = len(names)
+        self._chosen = self._choose(names)
+        originals = [name.strip('" ') for name in self._header.split(self._mark)]
+        if equal := [name for name in self._chosen.values() if originals.count(name) > 1]:
+            what, valid = f"several columns have the name {equal[0]}", f"columns: [{', '.join(names[:40])}]"
+            raise RecordingError(what, where=str(self._path), valid=f"{valid} and skip: 1")
+        # Pandas refuses columns that no row of a block has.
+        self._header = self._header or self._mark.join(names)
+        self._options["usecols"] = [*self._chosen.values()]
+        return lines
 
-    def read(
-        self, block: str, ids: Collection[str], dropped: Counter[str]
-    ) -> tuple[dict[str, Any], NDArray[np.int64]]:
+    def _parsed(self, lines: list[str]) -> tuple[dict[str, Any], NDArray[np.int64]]:
         """Return the columns, and the numbers of their rows in the block."""
         import pandas as pd
 
-        lines, numbers, separator = block.split("\n"), None, self.options["sep"]
-        # A quoted text may contain line breaks.
-        if self.width and '"' not in block:
-            bad = {line for line in lines if line.count(separator) >= self.width and self._is_long(line)}
-            if bad or self.header in block:
-                comment = self.options["comment"]
-                lines = [
-                    line for line in lines if line.strip() and not (comment and line.startswith(comment))
-                ]
-                good = np.array([line not in bad and line != self.header for line in lines], bool)
-                dropped["repeated header, or more fields than the header"] += int(np.count_nonzero(~good))
-                numbers = np.flatnonzero(good)
-                block = "\n".join(lines[number] for number in numbers.tolist())
-        data = (self.first + block).encode()
-        frame = pd.read_csv(io.BytesIO(data), **self.options)
+        numbers, width, mark = None, self._width - 1, self._mark
+        # A quoted text may contain separators and line breaks.
+        # A separator may follow the last field.
+        long = {line for line in lines if line.count(mark) > width}
+        long = {line for line in long if self._count(line.rstrip(f"{mark} ")) > self._width}
+        if self._width and (long or self._header in lines) and not any('"' in line for line in lines):
+            comment = self._table.comment or "\n"
+            lines = [line for line in lines if line.strip() and line[0] != comment]
+            good = np.array([line not in long and line != self._header for line in lines], bool)
+            reason = "a repeated header, or more fields than the header (columns: all names; skip: 1)"
+            self._dropped[reason] += int(np.count_nonzero(~good))
+            numbers = np.flatnonzero(good)
+            lines = [lines[number] for number in numbers.tolist()]
+        data = "\n".join([self._header, *lines]).encode()
+        frame = pd.read_csv(io.BytesIO(data), **self._options)
         # `1e2` may be a hexadecimal id, and float64 merges large ids.
-        columns = {self.chosen[name] for name in ids if name in self.chosen}
-        if texts := {column: str for column in columns if frame[column].dtype.kind == "f"}:
-            frame = pd.read_csv(io.BytesIO(data), **self.options, dtype=texts)
+        ids = {column for name, column in self._chosen.items() if name in self._ids}
+        if texts := {column: str for column in ids if frame[column].dtype.kind == "f"}:
+            frame = pd.read_csv(io.BytesIO(data), **self._options, dtype=texts)
             frame[[*texts]] = frame[[*texts]].replace(r"\.0+$", "", regex=True)
-        arrays = {name: frame[column].to_numpy() for name, column in self.chosen.items()}
+        arrays = {name: frame[column].to_numpy() for name, column in self._chosen.items()}
         return arrays, np.arange(len(frame)) if numbers is None else numbers
-
-    def _is_long(self, line: str) -> bool:
-        separator = self.options["sep"]
-        return len(_fields(line.rstrip(f"{separator} "), separator)) > self.width
-
-    def is_short(self, block: str) -> bool:
-        """Return whether the last line of a block has less fields than the header and the line before."""
-        separator = self.options["sep"]
-        widths = [len(_fields(line, separator)) for line in block.rstrip().rsplit("\n", 2)[-2:]]
-        return bool(self.width) and widths[-1:] < [self.width] and widths[-1:] < widths[:1]
-
-
-def _csv_reader(table: TableFormat, path: Path, block: str, choose: ChooseColumns) -> tuple[_CsvReader, str]:
-    """Read the header; return the reader and the text after the header."""
-    separator, lines = table.separator, block.split("\n")[table.skip :]
-    header, width, line = table.columns, 0, ""
-    if not header:
-        marks = (table.comment or "\n",)
-        first = next((n for n, line in enumerate(lines) if line.strip() and not line.startswith(marks)), None)
-        if first is None:
-            raise RecordingError("no header", where=str(path))
-        line, lines = lines[first], lines[first + 1 :]
-        header = [name or f"Unnamed: {n}" for n, name in enumerate(_fields(line, separator))]
-        # A separator may follow the last field. Lists of any length may follow the header.
-        rows = [row.rstrip(f"{separator} ") for row in lines[:20] if row.strip()]
-        shortest = min([len(_fields(row, separator)) for row in rows], default=0)
-        if shortest == len(header) + 1:
-            what, valid = (
-                f"the rows have {shortest} columns, the header {len(header)}",
-                "columns: all names, and skip: 1",
-            )
-            raise RecordingError(what, where=str(path), valid=valid)
-        width = len(header) if shortest <= len(header) else 0
-    # Equal names become `r` and `r.1`.
-    names = [f"{name}.{header[:n].count(name)}".removesuffix(".0") for n, name in enumerate(header)]
-    chosen = choose(names)
-    if equal := [name for name in chosen.values() if header.count(name) > 1]:
-        what = f"{header.count(equal[0])} columns have the name {equal[0]}"
-        raise RecordingError(what, where=str(path), valid=f"columns: [{', '.join(names[:40])}] and skip: 1")
-    mark = separator if len(separator) == 1 else " " if separator == r"\s+" else ""
-    options = {
-        "header": 0 if mark else None, "index_col": False, "skipinitialspace": True, "names": names, "sep": separator,
-        "usecols": [*chosen.values()], "decimal": table.decimal, "comment": table.comment or None,
-        "engine": "c" if mark else "python",
-    }  # fmt: skip
-    widest = mark.join("x" * len(names)) + "\n" if mark else ""
-    return _CsvReader(chosen, line, widest, width, options), "\n".join(lines)
-
-
-def _fields(line: str, separator: str) -> list[str]:
-    if len(separator) > 1:
-        return re.split(separator, line.strip())
-    return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
