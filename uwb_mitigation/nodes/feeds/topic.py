@@ -21,9 +21,9 @@ from uwb_mitigation.recordings.mapping.conversion import (
     measurement,
     samples_of,
 )
-from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, Mapping
+from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TOPIC, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows
-from uwb_mitigation.recordings.mapping.tables import LOG_TIME, TOPIC, UNREADABLE, Chunk
+from uwb_mitigation.recordings.mapping.tables import LOG_TIME, UNREADABLE, Chunk
 from uwb_mitigation.types.measurement import (
     LINEAR_MAGNITUDES,
     Cir,

@@ -157,9 +157,8 @@ def _parts(values: ColumnDict) -> NDArray[np.int64] | None:
     stamps = values["stamp"]
     if len(stamps) == 0 or stamps.max() >= FIRST_DATE_NS:
         return None
-    pair = (
-        pd.DataFrame({name: values[name] for name in ("tag", "anchor")}).groupby(["tag", "anchor"]).ngroup()
-    )
+    frame = pd.DataFrame({name: values[name] for name in ("tag", "anchor")})
+    pair = frame.groupby(["tag", "anchor"]).ngroup()
     order = np.argsort(pair.to_numpy(), kind="stable")
     limit, same = -round(MIN_RESTART_S * NS_PER_S), np.diff(pair.to_numpy()[order]) == 0
     restarts = np.zeros(len(stamps), np.int64)
@@ -191,36 +190,27 @@ def check_stamps(values: ColumnDict, name: str, stamp: FieldRule, *, moving: boo
     middle, duration_s = float(np.median(intervals_s)), float(intervals_s.sum())
     is_slow = moving and middle > MAX_INTERVAL_S
     if is_slow or len(intervals_s) / duration_s > MAX_RATE_HZ:
-        hint = (
-            _unit_of_time(middle, stamp) + "; for slow recordings without motion set moving: false" * is_slow
-        )
-        what, valid = (
-            f"the ranges are {middle:.3g} s apart, in {duration_s:.3g} s",
-            f"0.001 to {MAX_INTERVAL_S:g} s",
-        )
-        raise RecordingError(what, where=name, valid=f"{valid}; probably set {hint}")
+        what = f"the ranges are {middle:.3g} s apart, in {duration_s:.3g} s"
+        valid = f"0.001 to {MAX_INTERVAL_S:g} s; probably set {_unit_of_time(middle, stamp)} of the stamps"
+        valid += "; for slow recordings without motion set moving: false" if is_slow else ""
+        raise RecordingError(what, where=name, valid=valid)
 
 
 def _unit_of_time(interval_s: float, rule: FieldRule) -> str:
     """Return the line of a mapping that makes an interval most plausible."""
     now_ns = TIME.get(rule.unit or "s", NS_PER_S) * rule.scale
-    units = {f"unit: {unit} of the stamps": factor for unit, factor in TIME.items() if unit != "iso8601"}
-    units |= {f"scale: {s} ({name}) of the stamps": s * NS_PER_S for name, s in _TIMES_S.items()}
-    distances = {
-        line: abs(np.log(interval_s * ns / now_ns / 0.1)) for line, ns in units.items() if ns != now_ns
-    }
-    return min(distances, key=distances.__getitem__)
+    units = {f"unit: {unit}": factor for unit, factor in TIME.items() if unit != "iso8601"}
+    units |= {f"scale: {s} ({name})": s * NS_PER_S for name, s in _TIMES_S.items()}
+    misfits = {line: abs(np.log(interval_s * ns / now_ns * 10)) for line, ns in units.items() if ns != now_ns}
+    return min(misfits, key=misfits.__getitem__)
 
 
 def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> None:
     """Raise RecordingError for wrong units of lengths or of the first-path index, or for differences of ranges."""
     import pandas as pd
 
-    ranges, true, negative = (
-        np.abs(values["range"]),
-        values["true range"],
-        float((values["range"] < 0).mean()),
-    )
+    ranges, true = np.abs(values["range"]), values["true range"]
+    negative = float((values["range"] < 0).mean())
     if len(ranges) >= 20 and negative > MAX_NEGATIVE:
         valid = "ranges: differences of ranges (TDoA) are not used; if the sign is wrong, set scale: -1"
         raise RecordingError(f"{negative:.0%} of the ranges are negative", where=name, valid=valid)
@@ -260,9 +250,8 @@ def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> Non
 
 def _unit_of_length(factor: float, unit: str) -> tuple[str, float]:
     """Return the unit that explains a factor of lengths in `unit` best, and the logarithm of the rest of the factor."""
-    misfits = {
-        other: abs(np.log(factor * metres / LENGTHS[unit or "m"])) for other, metres in LENGTHS.items()
-    }
+    ratio = factor / LENGTHS[unit or "m"]
+    misfits = {other: abs(np.log(ratio * metres)) for other, metres in LENGTHS.items()}
     return min(misfits.items(), key=lambda item: item[1])
 
 
@@ -297,16 +286,10 @@ def anchor_warnings(
     ranged = np.unique(values["anchor"]).tolist()
     if not positions:
         return
-    wrong = []
-    for anchor in ranged:
-        difference = median(np.abs(differences_m[values["anchor"] == anchor]))
-        if difference > MAX_DIFFERENCE_M:
-            wrong.append(f"{format_id(anchor)} by {difference:.2f} m")
-    if wrong:
-        yield (
-            f"true ranges and distances from positions differ for anchor {_listed(wrong)}: "
-            "wrong anchor positions or ids, lever arm or frame?"
-        )
+    differences = {anchor: median(np.abs(differences_m[values["anchor"] == anchor])) for anchor in ranged}
+    if wrong := [f"{format_id(a)} by {d:.2f} m" for a, d in differences.items() if d > MAX_DIFFERENCE_M]:
+        what = f"true ranges and distances from positions differ for anchor {_listed(wrong)}"
+        yield f"{what}: wrong anchor positions or ids, lever arm or frame?"
     if missing := [format_id(anchor) for anchor in ranged if anchor not in positions]:
         swapped = set(np.unique(values["tag"]).tolist()) & set(positions)
         hint = "are tag and anchor exchanged?" if swapped else "compare the ids"
@@ -334,21 +317,19 @@ def value_warnings(values: ColumnDict, *, errors_measured: bool) -> Iterator[str
             yield f"{count} {name} are above {limit:.0f} m"
     medians = pd.Series(ranges).groupby(values["anchor"]).median()
     for anchor, ratio in (medians / medians.median())[lambda ratios: ratios > MAX_RATIO].items():
-        yield (
-            f"the median range of anchor {format_id(anchor)} is {ratio:.0f} times that of the others: if its unit "
-            f"differs, set units: {{{anchor}: cm}} of range"
-        )
+        what = f"the median range of anchor {format_id(anchor)} is {ratio:.0f} times that of the others"
+        yield f"{what}: if its unit differs, set units: {{{anchor}: cm}} of range"
     if (middle := median(np.abs(errors))) > MAX_ERROR_M:
         yield f"the median error is {middle:.0f} m: do range and truth have the same unit?"
-    if errors_measured and len(errors) >= 20:
-        # Errors of UWB have a tail of late first paths, which are positive.
-        low, middle, high = np.percentile(errors, (5, 50, 95))
-        if middle - low > 2 * max(high - middle, 0.0) and low < -0.3 and middle < 0:
-            yield (
-                f"most errors are negative (median {middle:.2f} m, 5 % below {low:.2f} m): probably the error column is "
-                "true - measured (set scale: -1), if not many ranges are too short; estimated from the distribution"
-            )
-    if negative := int(np.count_nonzero(values["range"] < 0)):
+    # Errors of UWB have a tail of late first paths, which are positive.
+    low, middle, high = np.percentile(errors, (5, 50, 95)) if len(errors) >= 20 else (0.0, 0.0, 0.0)
+    if errors_measured and middle - low > 2 * max(high - middle, 0.0) and low < -0.3 and middle < 0:
+        what = f"most errors are negative (median {middle:.2f} m, 5 % below {low:.2f} m)"
+        hint = (
+            "probably the error column is true - measured (set scale: -1), if not many ranges are too short"
+        )
+        yield f"{what}: {hint}; estimated from the distribution"
+    if negative := int(np.count_nonzero(ranges < 0)):
         yield f"{negative} ranges are negative"
     level = median(values["rx_power"])
     if np.isfinite(level) and not -140 < level < -20:

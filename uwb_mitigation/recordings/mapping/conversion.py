@@ -6,7 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -15,28 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.mapping import (
-    LENGTHS,
-    SCALES,
-    TIME,
-    FieldRule,
-    RowFilter,
-    TableFormat,
-)
-from uwb_mitigation.recordings.mapping.tables import (
-    CHUNK_ROWS,
-    LOG_TIME,
-    TOPIC,
-    UNREADABLE,
-    Chunk,
-    read_chunks,
-)
+from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter, TableFormat
+from uwb_mitigation.recordings.mapping.tables import LOG_TIME, UNREADABLE, Chunk, TableFile
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.types.stamps import NS_PER_S
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
 
+MAX_ROWS = 100_000
 UNKNOWN_ID = (1 << 64) - 1
 UNKNOWN_STAMP = np.iinfo(np.int64).min
 """Id and stamp of a row without one."""
@@ -53,6 +40,10 @@ _HINTS = (
 MAX_STAMP_S = 4.6e9
 """Stamps are within the years 1824 to 2115, so that differences fit into 64 bits."""
 
+_VALID_IDS = (
+    "a whole number such as 3 or 0x1f; hexadecimal without 0x: `hex: true`; `pattern` takes a number from a text, `names: true` "
+    "numbers texts"
+)
 NO_CIR = Cir(np.zeros(0, np.int16))
 _TIME_OF_DAY = r"\d{1,2}:\d\d:\d\d(\.\d+)?"
 _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
@@ -96,24 +87,14 @@ def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> Range
         return float(columns[name][row])
 
     count = number("sequence")
-    return RangeMeasurement(
-        int(columns["stamp"][row]),
-        int(columns["tag"][row]),
-        int(columns["anchor"][row]),
-        (int(count) if math.isfinite(count) else sequence) & 0xFFFFFFFF,
-        0,
-        number("range"),
-        Cir(
-            cir.samples,
-            cir.encoding,
-            first_path_index=number("first_path_index"),
-            scale=cir.scale,
-            preamble_count=_integer(number("preamble_count"), 65535),
-            rx_power_dbm=number("rx_power"),
-            first_path_power_dbm=number("first_path_power"),
-            channel=_integer(number("channel"), 255),
-        ),
-    )
+    counter = (int(count) if math.isfinite(count) else sequence) & 0xFFFFFFFF
+    fields: dict[str, Any] = {
+        "first_path_index": number("first_path_index"), "preamble_count": _integer(number("preamble_count"), 65535),
+        "rx_power_dbm": number("rx_power"), "first_path_power_dbm": number("first_path_power"),
+        "channel": _integer(number("channel"), 255),
+    }  # fmt: skip
+    stamp, tag, anchor = (int(columns[name][row]) for name in ("stamp", "tag", "anchor"))
+    return RangeMeasurement(stamp, tag, anchor, counter, 0, number("range"), replace(cir, **fields))
 
 
 def _integer(value: float, limit: int) -> int:
@@ -147,8 +128,8 @@ class Converter:
         """Return the columns of the table that contain ids."""
         return {column for name in self.ids if (value := self.values.get(name)) for column in value.columns}
 
-    def convert(self, chunk: Chunk, file: str = "") -> ColumnDict:
-        """Return the values of all rows of a chunk; `file`: its path for `file_name`.
+    def convert(self, chunk: Chunk) -> ColumnDict:
+        """Return the values of all rows of a chunk.
 
         Raises:
             RecordingError: an id or a number cannot be read; `where` names the row.
@@ -157,29 +138,21 @@ class Converter:
         try:
             for name, value in self.values.items():
                 if name == "stamp":
-                    columns[name] = read_stamps(value, chunk, file)
+                    columns[name] = read_stamps(value, chunk)
                 elif name in self.ids:
-                    ids = value or FieldRule(constant=1)
-                    columns[name] = _read_ids(ids, chunk, name, file, self.names)
+                    columns[name] = _read_ids(value or FieldRule(constant=1), chunk, name, self.names)
                 elif name in ("label", "configuration"):
-                    columns[name] = _read_texts(value, chunk, name, file)
+                    columns[name] = _read_texts(value, chunk, name)
                 else:
-                    columns[name] = read_numbers(value, chunk, name, file)
-                if value and value.units:
-                    columns[name] = columns[name] * _factors(value, columns["anchor"])
+                    columns[name] = read_numbers(value, chunk, name)
+                for anchor, unit in (value.units if value else {}).items():
+                    factor = SCALES[unit] / SCALES[value.unit or "m"] if value else 1.0
+                    columns[name] = columns[name] * np.where(columns["anchor"] == anchor, factor, 1.0)
         except UNREADABLE as error:
             raise RecordingError(f"{name} cannot be read: {error!s:.200}", where=str(chunk.path)) from error
         if "cir_power" in columns:
             _add_levels(columns)
         return columns
-
-
-def _factors(value: FieldRule, anchors: NDArray[np.uint64]) -> NDArray[np.float64]:
-    """Return the factors of values whose anchors have other units, (n,)."""
-    factors = np.ones(len(anchors))
-    for anchor, unit in value.units.items():
-        factors[anchors == anchor] = LENGTHS[unit] / LENGTHS[value.unit or "m"]
-    return factors
 
 
 def _add_levels(columns: ColumnDict) -> None:
@@ -193,10 +166,9 @@ def _add_levels(columns: ColumnDict) -> None:
         columns[name] = np.where(np.isfinite(level), level, columns[name])
 
 
-def _read_texts(value: FieldRule | None, chunk: Chunk, name: str, file: str) -> NDArray[Any]:
+def _read_texts(value: FieldRule | None, chunk: Chunk, name: str) -> NDArray[Any]:
     """Return a value as texts (n,), after `pattern` and `values`; empty: unknown."""
-    raw = None if value is None else _raw(value, chunk, file)
-    if value is None or raw is None:
+    if value is None or (raw := _raw(value, chunk)) is None:
         return np.broadcast_to(np.array([""], object), chunk.count)
     texts: dict[Any, str] = {}
     for row, cell in enumerate(cells := raw.tolist()):
@@ -205,31 +177,35 @@ def _read_texts(value: FieldRule | None, chunk: Chunk, name: str, file: str) -> 
     return np.array([texts[cell] for cell in cells], object)
 
 
-def _text(value: FieldRule, cell: Any, name: str, where: str) -> str:
-    # None and NaN are missing values.
+def _cell_text(cell: Any) -> str:
+    # None and NaN are missing values. Tables read integers in a column with missing values as floats.
     if cell is None or cell != cell:
         return ""
-    text = str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
-    if value.pattern and text.lower() not in _MISSING:
-        match = re.search(value.pattern, text)
-        if match is None and not value.optional:
-            what = f"{name} = {text!r:.60} does not match {value.pattern!r}"
-            raise RecordingError(what, where=where, valid="optional: true makes such values unknown")
-        text = (match[1] if match else None) or ""
+    return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell).strip()
+
+
+def _text(value: FieldRule, cell: Any, name: str, where: str) -> str:
+    text = _cell_text(cell)
+    for pattern in filter(None, (value.file_name or value.topic_name, value.pattern)):
+        if text.lower() not in _MISSING:
+            match = re.search(pattern, text)
+            if match is None and not value.optional:
+                what = f"{name} = {text!r:.60} does not match {pattern!r}"
+                raise RecordingError(what, where=where, valid="optional: true makes it unknown")
+            text = (match[1] if match else None) or ""
     return value.values.get(text, text)
 
 
-def read_numbers(value: FieldRule | None, chunk: Chunk, name: str, file: str = "") -> NDArray[np.float64]:
+def read_numbers(value: FieldRule | None, chunk: Chunk, name: str) -> NDArray[np.float64]:
     """Return a value in SI units, float64 (n,); NaN: unknown.
 
     Raises:
         RecordingError: a text is not a number; `where` names its row.
     """
-    raw = None if value is None else _raw(value, chunk, file)
-    if value is None or raw is None:
+    if value is None or (raw := _raw(value, chunk)) is None:
         return np.broadcast_to(np.nan, chunk.count)
-    if value.pattern or value.values:
-        raw = _read_texts(value, chunk, name, file)
+    if value.is_text:
+        raw = _read_texts(value, chunk, name)
     numbers = _floats(raw, chunk, name, value.column)
     with np.errstate(over="ignore", invalid="ignore"):
         numbers = numbers * SCALES.get(value.unit, 1.0) * value.scale + value.offset
@@ -248,49 +224,43 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
     texts = pd.Series([str(item).strip() for item in raw.tolist()], dtype=object)
     numbers = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
     for row in np.flatnonzero(np.isnan(numbers) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
-        hints = (hint for form, hint in _HINTS if re.match(form, texts[row]))
-        valid = next(hints, f"a number in column {column}")
+        hints = [hint for form, hint in _HINTS if re.match(form, texts[row])]
+        valid = [*hints, f"a number in column {column}"][0]
         raise RecordingError(
             f"{name} = {texts[row]!r:.40} is not a number", where=chunk.where(row), valid=valid
         )
     return numbers
 
 
-def _raw(value: FieldRule, chunk: Chunk, file: str) -> NDArray[Any] | None:
+def _raw(value: FieldRule, chunk: Chunk) -> NDArray[Any] | None:
     """Return the unconverted values of the rows; None: the column is optional and missing."""
-    if rule := value.file_name or value.topic_name:
-        texts = [file] * chunk.count if value.file_name else chunk.columns.get(TOPIC, [""] * chunk.count)
-        matches = {text: re.search(rule, text) for text in set(texts)}
-        if missing := [text for text, match in matches.items() if match is None]:
-            raise RecordingError(f"{missing[0]!r} does not match {rule!r}", where=str(chunk.path))
-        return np.array([matches[text][1] for text in texts], object)  # type: ignore[index]
     if value.rate_hz:
         return np.asarray((chunk.before + chunk.rows) / value.rate_hz)
     if value.constant is not None:
         return np.full(chunk.count, value.constant)
-    needed = list(value.sum) or [value.column]
-    if missing := [name for name in needed if name not in chunk.columns]:
+    names = list(value.sum) or [value.source]
+    if missing := [name for name in names if name not in chunk.columns]:
         if value.optional:
             return None
         raise RecordingError(f"no column {missing[0]}", where=str(chunk.path))
-    arrays = {name: np.asarray(chunk.columns[name]) for name in needed}
-    for name, array in arrays.items():
+    arrays = [np.asarray(chunk.columns[name]) for name in names]
+    for name, array in zip(names, arrays, strict=True):
         if array.ndim > 1 or (array.dtype == object and len(array) and np.ndim(array[0])):
             raise RecordingError(f"column {name} contains lists", where=str(chunk.path), valid=f"{name}[]")
-    if value.sum:
-        terms = [factor * _floats(arrays[name], chunk, name, name) for name, factor in value.sum.items()]
-        return np.asarray(np.sum(terms, axis=0))
-    return np.asarray(arrays[value.column])
+    if not value.sum:
+        return arrays[0]
+    factors = zip(value.sum.items(), arrays, strict=True)
+    terms = [factor * _floats(array, chunk, name, name) for (name, factor), array in factors]
+    return np.asarray(np.sum(terms, axis=0))
 
 
-def read_stamps(value: FieldRule | None, chunk: Chunk, file: str) -> NDArray[np.int64]:
+def read_stamps(value: FieldRule | None, chunk: Chunk) -> NDArray[np.int64]:
     """Return stamps in ns, int64 (n,); `UNKNOWN_STAMP`: unknown.
 
     Raises:
         RecordingError: a text is not a date or number; or most stamps are impossible, so that the unit is wrong.
     """
-    raw = None if value is None else _raw(value, chunk, file)
-    if value is None or raw is None:
+    if value is None or (raw := _raw(value, chunk)) is None:
         if LOG_TIME in chunk.columns:
             return np.asarray(chunk.columns[LOG_TIME], np.int64)
         raise RecordingError("no stamp", where=str(chunk.path), valid="fields.stamp: a column, or rate_hz")
@@ -319,10 +289,8 @@ def read_stamps(value: FieldRule | None, chunk: Chunk, file: str) -> NDArray[np.
         first = raw[np.flatnonzero(is_known & ~possible)[0]]
         dates_s = [(unit, abs(float(first) * TIME[unit] / 1e9)) for unit in ("s", "ms", "us", "ns")]
         unit = next((f"unit: {unit}" for unit, date_s in dates_s if 9e8 < date_s < MAX_STAMP_S), "")
-        what = f"stamp = {first} is outside of the years 1824 to 2115"
-        raise RecordingError(
-            what, where=str(chunk.path), valid=unit or "seconds since 1970: unit, scale, offset"
-        )
+        what, valid = f"stamp = {first} is outside of the years 1824 to 2115", unit or "seconds since 1970"
+        raise RecordingError(what, where=str(chunk.path), valid=valid)
     possible &= np.abs(stamps / 1e9 + value.offset) < MAX_STAMP_S
     offset = round(min(max(value.offset, -MAX_STAMP_S), MAX_STAMP_S) * 1e9)
     return np.where(possible, stamps + offset, UNKNOWN_STAMP)
@@ -349,21 +317,18 @@ def _dates(raw: NDArray[Any], unit: str, chunk: Chunk) -> tuple[NDArray[np.int64
     return times.dt.tz_convert(None).to_numpy("datetime64[ns]").astype(np.int64), is_known
 
 
-def _read_ids(
-    value: FieldRule, chunk: Chunk, name: str, file: str, names: dict[str, int]
-) -> NDArray[np.uint64]:
+def _read_ids(value: FieldRule, chunk: Chunk, name: str, names: dict[str, int]) -> NDArray[np.uint64]:
     """Return ids, uint64 (n,); `UNKNOWN_ID`: unknown; `names` numbers the texts of `names: true`."""
-    raw = _raw(value, chunk, file)
+    raw = _raw(value, chunk)
     if raw is None:
-        raise RecordingError(f"no column {value.column} for the {name}", where=str(chunk.path))
+        raise RecordingError(f"no column {value.source} for the {name}", where=str(chunk.path))
     if raw.dtype.kind in "iu" and value.is_plain_id and (len(raw) == 0 or raw.min() >= 0):
         return np.asarray(raw, np.uint64)
     numbers: dict[Any, int] = {}
     for row, item in enumerate(items := raw.tolist()):
         if item in numbers:
             continue
-        where = chunk.where(row)
-        text = _text(value, item, name, where)
+        text = _text(value, item, name, chunk.where(row))
         if text.lower() in _MISSING:
             numbers[item] = UNKNOWN_ID
             continue
@@ -376,9 +341,8 @@ def _read_ids(
             if not 0 <= numbers[item] < UNKNOWN_ID:
                 raise ValueError(text)
         except ValueError as error:
-            valid = "a whole number such as 3 or 0x1f; hexadecimal without 0x: `hex: true`; `pattern` takes a number from "
-            valid += "a text, `names: true` numbers texts"
-            raise RecordingError(f"{name} = {item!r:.40} is not an id", where=where, valid=valid) from error
+            what, where = f"{name} = {item!r:.40} is not an id", chunk.where(row)
+            raise RecordingError(what, where=where, valid=_VALID_IDS) from error
     return np.array([numbers[item] for item in items], np.uint64)
 
 
@@ -431,22 +395,17 @@ def filter_rows(
     mask = np.ones(chunk.count, bool)
     for rule in rules:
         raw = np.asarray(chunk.columns[rule.column])
-        bad = np.zeros(chunk.count, bool)
+        bad, cells = np.zeros(chunk.count, bool), [_cell_text(cell) for cell in raw.tolist()]
         for values, is_bad in ((rule.equals, True), (rule.differs, False)):
             if values is not None:
-                listed = values if isinstance(values, list) else [values]
-                texts = [f"{value:g}" if isinstance(value, float) else value for value in listed]
-                same = np.isin(raw.astype(str), texts)
-                if raw.dtype.kind in "iuf":
-                    same |= np.isin(raw, [value for value in listed if isinstance(value, float)])
-                bad |= same == is_bad
+                texts = {_cell_text(value) for value in (values if isinstance(values, list) else [values])}
+                bad |= np.array([(cell in texts) == is_bad for cell in cells], bool)
         if rule.matches is not None:
-            expression = re.compile(rule.matches)
-            bad |= np.array([bool(expression.search(str(cell))) for cell in raw.tolist()], bool)
+            bad |= np.array([re.search(rule.matches, cell) is not None for cell in cells], bool)
         if rule.below is not None or rule.above is not None:
             numbers = _floats(raw, chunk, rule.column, rule.column)
-            bad |= numbers < (-np.inf if rule.below is None else rule.below)
-            bad |= numbers > (np.inf if rule.above is None else rule.above)
+            below, above = (math.nan if limit is None else limit for limit in (rule.below, rule.above))
+            bad |= (numbers < below) | (numbers > above)
         mask &= ~count_bad(bad & mask, dropped, f"{prefix}{rule}")
     return mask
 
@@ -461,7 +420,7 @@ def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDA
 def read_csv(
     path: Path, ids: Sequence[str], numbers: Mapping[str, tuple[float, float]], optional: Sequence[str] = ()
 ) -> ColumnDict:
-    """Read a CSV file of at most `CHUNK_ROWS` rows; `.xz` is decompressed.
+    """Read a CSV file of at most `MAX_ROWS` rows; `.xz` is decompressed.
 
     Args:
         path: the file.
@@ -474,9 +433,10 @@ def read_csv(
     """
     values = {name: FieldRule(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
     converter = Converter(values, ids=ids)
-    chunks = list(islice(read_chunks(TableFormat(format="csv"), path, converter.columns, ids), 2))
-    if len(chunks) != 1 or not 0 < chunks[0].count <= CHUNK_ROWS:
-        raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {CHUNK_ROWS} rows")
+    file = TableFile(TableFormat(format="csv"), path, converter.columns, ids)
+    chunks = list(islice(file.chunks(), 2))
+    if len(chunks) != 1 or not 0 < chunks[0].count <= MAX_ROWS:
+        raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {MAX_ROWS} rows")
     columns = converter.convert(chunks[0])
     for name, (low, high) in [*((name, (0, UNKNOWN_ID - 1)) for name in ids), *numbers.items()]:
         bad = ~((columns[name] >= low) & (columns[name] <= high))

@@ -7,6 +7,7 @@ import math
 import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from collections.abc import Mapping as Columns
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,32 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, format_id
-from uwb_mitigation.recordings.mapping import checks
+from uwb_mitigation.recordings.mapping import checks, conversion
 from uwb_mitigation.recordings.mapping.checks import median
 from uwb_mitigation.recordings.mapping.cirs import CirFile, join_by_row, join_by_time
-from uwb_mitigation.recordings.mapping.conversion import (
-    NO_CIR,
-    UNKNOWN_ID,
-    UNKNOWN_STAMP,
-    ColumnDict,
-    Converter,
-    concat,
-    count_bad,
-    filter_rows,
-    measurement,
-    take,
-)
-from uwb_mitigation.recordings.mapping.mapping import (
-    CirSource,
-    FieldRule,
-    Mapping,
-    Poses,
-    TableFormat,
-    TrueRanges,
-    axes,
-    series,
-)
-from uwb_mitigation.recordings.mapping.tables import find_files, read_chunks
+from uwb_mitigation.recordings.mapping.conversion import NO_CIR, UNKNOWN_ID, ColumnDict, Converter, take
+from uwb_mitigation.recordings.mapping.mapping import CirSource, FieldRule, Mapping, TableFormat, axes, series
+from uwb_mitigation.recordings.mapping.tables import TableFile, find_files
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Record, Truth
 from uwb_mitigation.types.source import Source
@@ -50,6 +31,8 @@ MAX_RANGES = 20_000_000
 MAX_STAMP_NS = 2**31 * NS_PER_S
 """Stamps of ROS are from 1970 to 2038."""
 
+_Rules = Columns[str, FieldRule | None]
+_Mask = NDArray[np.bool_]
 _TAG, _ANCHOR, _POSE = (tuple(axes(name, None)) for name in ("tag", "anchor", "pose"))
 
 
@@ -102,8 +85,7 @@ class MappedRecording(Source):
         if not stamp.rate_hz and not mapping.topics:
             checks.check_stamps(self.values, self.name, stamp, moving=mapping.moving)
         self._drop(checks.invalid_rows(self.values))
-        if mapping.cir and mapping.cir.files:
-            self._add_other_cirs(mapping.cir)
+        self._add_other_cirs()
         del self.values["row"]
         if stamp.rate_hz:
             self._separate_placements(stamp.rate_hz)
@@ -144,7 +126,7 @@ class MappedRecording(Source):
             has_truth = label or math.isfinite(true_m)
             truth = Truth(true_m, label, values["configuration"][row]) if has_truth else None
             position = tuple(positions[row].tolist()) if has_position[row] else None
-            yield Record(measurement(values, row, self.cir(row), row), truth, position)
+            yield Record(conversion.measurement(values, row, self.cir(row), row), truth, position)
         if self._damage:
             raise self._damage
 
@@ -156,45 +138,50 @@ class MappedRecording(Source):
         self,
         table: TableFormat,
         paths: Sequence[Path],
-        values: dict[str, FieldRule | None],
+        values: _Rules,
         what: str = "",
         cir: CirSource | None = None,
     ) -> ColumnDict:
         """Return the rows of files that no rule drops: `values`, `cir`, `row`, `file`; `what` names them in counts."""
         medians = {f"{what}{rule}": rule for rule in table.drop if rule.from_median is not None}
-        values = values | {name: FieldRule(column=rule.column) for name, rule in medians.items()}
+        values = {**values, **{name: FieldRule(column=rule.column) for name, rule in medians.items()}}
         converter, tables, before = Converter(values, self.names), list[ColumnDict](), 0
         dropped = Counter[str]()
         columns = converter.columns | dict.fromkeys(series(cir.column) if cir else (), False)
         for number, path in enumerate(paths):
             name = Path(os.path.relpath(path, self._folder)).as_posix()
             try:
-                for chunk in read_chunks(
-                    table, path, columns, converter.id_columns, before, dropped, self.warnings.append
-                ):
+                arguments = columns, converter.id_columns, name, dropped, self.warnings.append
+                for chunk in TableFile(table, path, *arguments).chunks(before):
                     before += chunk.count
                     if before > MAX_RANGES:
                         raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
-                    chunk = chunk.take(filter_rows(table.drop, chunk, self.dropped, what))
-                    table_rows = converter.convert(chunk, name)
-                    table_rows["cir"] = (
-                        self._cirs.add(cir, chunk) if cir else np.broadcast_to(-1, chunk.count)
-                    )
-                    tables.append(
-                        table_rows | {"row": chunk.rows, "file": np.full(chunk.count, number, np.int32)}
-                    )
+                    chunk = chunk.take(conversion.filter_rows(table.drop, chunk, self.dropped, what))
+                    cirs = self._cirs.add(cir, chunk) if cir else np.broadcast_to(-1, chunk.count)
+                    places = {"cir": cirs, "row": chunk.rows, "file": np.full(chunk.count, number, np.int32)}
+                    tables.append(converter.convert(chunk) | places)
             except DamagedRecordingError as error:
                 self._damage = error
                 self.warnings.append(f"{error}: only the rows before are used")
         self.dropped.update({f"{what}{reason}": count for reason, count in dropped.items()})
         if not tables:
             raise self._damage or RecordingError("no rows", where=str(paths[0]))
-        rows = concat(tables)
+        rows = conversion.concat(tables)
         mask = np.ones(len(rows["row"]), bool)
         for name, rule in medians.items():
-            numbers = rows.pop(name)
-            mask &= ~count_bad(np.abs(numbers - median(numbers)) > rule.from_median, self.dropped, name)
+            far = np.abs(rows[name] - median(rows.pop(name))) > rule.from_median
+            mask &= ~conversion.count_bad(far, self.dropped, name)
         return take(rows, mask)
+
+    def _read_complete(
+        self, table: TableFormat, paths: Sequence[Path], rules: _Rules, what: str
+    ) -> ColumnDict:
+        """Return the rows of files in which all values are known, in the order of their stamps."""
+        rows = self._read(table, paths, rules, what)
+        for name in rules:
+            unknown = {"stamp": conversion.UNKNOWN_STAMP, "anchor": UNKNOWN_ID, "tag": UNKNOWN_ID}.get(name)
+            rows = take(rows, rows[name] != unknown if unknown else np.isfinite(rows[name]))
+        return take(rows, np.argsort(rows["stamp"], kind="stable")) if "stamp" in rules else rows
 
     def _files_of(self, table: TableFormat, file: Path, *, optional: bool = False) -> list[Path]:
         """Return the files of a table in the folder of the ranges; topics are in the same bag."""
@@ -204,11 +191,20 @@ class MappedRecording(Source):
             return find_files(table, file.parent, file)
         return []
 
-    def _drop(self, rules: dict[str, NDArray[np.bool_]]) -> None:
+    def _by_files(self, table: TableFormat, optional: bool = False) -> Iterator[tuple[list[Path], _Mask]]:
+        """Yield files of a table, and which ranges they belong to."""
+        groups = defaultdict[tuple[Path, ...], list[int]](list)
+        for number, file in enumerate(self._files):
+            groups[tuple(self._files_of(table, file, optional=optional))].append(number)
+        for paths, numbers in groups.items():
+            if paths:
+                yield list(paths), np.isin(self.values["file"], numbers)
+
+    def _drop(self, rules: dict[str, _Mask]) -> None:
         """Drop and count the ranges to which a rule applies."""
         mask = np.ones(len(self), bool)
         for what, bad in rules.items():
-            mask &= ~count_bad(bad & mask, self.dropped, what)
+            mask &= ~conversion.count_bad(bad & mask, self.dropped, what)
         if not mask.any():
             where, valid = str(self._files[0]), f"dropped: {dict(self.dropped) or 'none'}"
             raise self._damage or RecordingError("no ranges", where=where, valid=valid)
@@ -222,23 +218,22 @@ class MappedRecording(Source):
                 raise RecordingError(what, where=self.name, valid=valid)
             self.warnings.append(what)
 
-    def _add_other_cirs(self, source: CirSource) -> None:
+    def _add_other_cirs(self) -> None:
         """Join the CIRs of other files, by row or by time and ids."""
-        join = source.join
-        keys: dict[str, FieldRule | None] = {"first_path_index": source.first_path_index}
+        if (source := self._mapping.cir) is None or not source.files:
+            return
+        join, keys = source.join, {"first_path_index": source.first_path_index}
         if join:
             keys |= {"stamp": join.stamp, "tag": join.tag, "anchor": join.anchor}
         self.values |= {name: self.values[name].copy() for name in ("cir", "first_path_index")}
-        for number, file in enumerate(self._files):
-            if paths := self._files_of(source, file, optional=source.optional):
-                rows = np.flatnonzero(self.values["file"] == number)
-                cirs = self._read(source, paths, keys, "CIR ", source)
-                if join:
-                    text, is_warning = join_by_time(self.values, rows, cirs, join)
-                    name = f"{file.parent.name}/{paths[0].name}: " if len(self._files) > 1 else ""
-                    (self.warnings if is_warning else self.notes).append(f"{name}{text}")
-                else:
-                    join_by_row(self.values, rows, cirs, str(file))
+        for paths, mask in self._by_files(source, source.optional):
+            rows, cirs = np.flatnonzero(mask), self._read(source, paths, keys, "CIR ", source)
+            if join:
+                text, is_warning = join_by_time(self.values, rows, cirs, join)
+                name = f"{paths[0].parent.name}/{paths[0].name}: " if len(self._files) > 1 else ""
+                (self.warnings if is_warning else self.notes).append(f"{name}{text}")
+            else:
+                join_by_row(self.values, rows, cirs, str(paths[0]))
 
     def _separate_placements(self, rate_hz: float) -> None:
         """Put the ranges of each placement one after the other, with pauses between placements."""
@@ -259,130 +254,101 @@ class MappedRecording(Source):
 
     def _anchor_positions(self) -> dict[int, NDArray[np.float64]]:
         """Return the positions from the ranges or from another file, and set `anchors`."""
-        rows, sd = self.values, 0.02
-        for source in self._mapping.anchors:
+        import pandas as pd
+
+        rows, sources, sd = self.values, self._mapping.anchors, 0.02
+        for source in sources:
             sd = source.sd
             if not source.files:
                 break
-            optional = source.optional or len(self._mapping.anchors) > 1
-            if paths := self._files_of(source, self._files[0], optional=optional):
-                rows = self._read(
-                    source, paths[:1], {"anchor": source.id} | axes("anchor", source.position), "anchor "
-                )
+            if paths := self._files_of(source, self._files[0], optional=source.optional or len(sources) > 1):
+                rules = {"anchor": source.id} | axes("anchor", source.position)
+                rows = self._read_complete(source, paths[:1], rules, "anchor ")
                 break
-        position, where = _stacked(rows, _ANCHOR), str(self._files[0])
-        good = np.isfinite(position).all(axis=1) & (rows["anchor"] != UNKNOWN_ID)
-        ids, first, index = np.unique(rows["anchor"][good], return_index=True, return_inverse=True)
-        position = position[good]
-        differs = np.abs(position - position[first][index]).max(axis=1, initial=0.0) > 1e-3
-        if differs.any():
-            what = f"anchor {format_id(int(ids[index[differs][0]]))} has two positions"
-            valid = "one for each anchor; are tag and anchor exchanged?"
-            raise RecordingError(what, where=where, valid=valid)
-        if len(ids) > MAX_ANCHORS:
-            self.warnings.append(f"{len(ids)} anchors, of which none is written: at most {MAX_ANCHORS}")
-        elif len(ids) and self._mapping.anchors:
-            names = {number: text for text, number in self.names.items()}
-            self.anchors = AnchorMap(
-                [
-                    Anchor(key, (x, y, z), sd, names.get(key, "")[:100])
-                    for key, (x, y, z) in zip(ids.tolist(), position[first].tolist(), strict=True)
-                ],
-                where,
-            )
-        return dict(zip(ids.tolist(), position[first], strict=True))
+        else:
+            if sources:
+                self.notes.append(f"no anchors: no file {source.files!r} in {self._files[0].parent}")
+        names, where = {number: text for text, number in self.names.items()}, str(self._files[0])
+        columns = {name: rows[name] for name in ("anchor", *_ANCHOR)}
+        by_anchor = pd.DataFrame(columns).dropna().groupby("anchor")
+        moved = (by_anchor.max() - by_anchor.min()).max(axis=1)
+        positions = dict(zip(moved.index.tolist(), by_anchor.first().to_numpy(), strict=True))
+        if differs := moved.index[moved > 1e-3].tolist():
+            what, valid = f"anchor {format_id(differs[0])} has two", "one; are tag and anchor exchanged?"
+            raise RecordingError(f"{what} positions", where=where, valid=valid)
+        if len(positions) > MAX_ANCHORS:
+            self.warnings.append(f"{len(positions)} anchors, of which none is written: at most {MAX_ANCHORS}")
+        elif positions and sources:
+            named = [(key, (*xyz.tolist(),), names.get(key, "")[:100]) for key, xyz in positions.items()]
+            anchors = [Anchor(key, xyz, sd, name) for key, xyz, name in named]
+            self.anchors = AnchorMap(anchors, where)
+        return positions
 
     def _add_truth(self, positions: dict[int, NDArray[np.float64]]) -> None:
         values, truth = self.values, self._mapping.truth
-        if truth.poses:
-            self._add_poses(truth.poses)
-        if truth.ranges:
-            self._add_true_ranges(truth.ranges)
+        self._add_poses()
+        self._add_true_ranges()
         anchors = np.full((len(self), 3), np.nan)
         for key, position in positions.items():
             anchors[values["anchor"] == key] = position
         with np.errstate(over="ignore"):
             distance = np.linalg.norm(_stacked(values, _TAG) - anchors, axis=1)
         distance[np.isinf(distance)] = np.nan
+        if truth.range_from_positions and not positions:
+            raise RecordingError("range_from_positions needs the positions of the anchors", where=self.name)
         if truth.range_from_positions:
-            if not positions:
-                raise RecordingError(
-                    "range_from_positions needs the positions of the anchors", where=self.name
-                )
             values["true range"] = distance
         if truth.error and not truth.range:
             values["true range"] = values["range"] - values["error"]
         elif truth.error:
-            same, opposite = (
-                median(np.abs(values["range"] - sign * values["error"] - values["true range"]))
-                for sign in (1, -1)
-            )
+            signed = (values["range"] - sign * values["error"] - values["true range"] for sign in (1, -1))
+            same, opposite = (median(np.abs(difference)) for difference in signed)
             if 2 * opposite < same:
-                raise RecordingError(
-                    "the error is true - measured", where=self.name, valid="truth.error: scale: -1"
-                )
+                valid = "truth.error: scale: -1"
+                raise RecordingError("the error is true - measured", where=self.name, valid=valid)
         self.warnings += checks.anchor_warnings(values, positions, distance - values["true range"])
 
-    def _add_true_ranges(self, source: TrueRanges) -> None:
+    def _add_true_ranges(self) -> None:
         """Interpolate the true ranges of all pairs in another file."""
-        import pandas as pd
-
-        values, pair = self.values, ["tag", "anchor"]
-        true = np.full(len(self), np.nan)
-        targets = (
-            pd.DataFrame({name: values[name] for name in (*pair, "file")}).groupby([*pair, "file"]).indices
-        )
-        rules: dict[str, FieldRule | None] = {
-            "tag": source.tag,
-            "anchor": source.anchor,
-            "true": source.range,
-        }
+        if (source := self._mapping.truth.ranges) is None:
+            return
+        values, true = self.values, np.full(len(self), np.nan)
+        rules = {"tag": source.tag, "anchor": source.anchor, "range": source.range}
         rules["stamp"] = source.stamp or FieldRule(constant=0)
-        for number, file in enumerate(self._files):
-            paths = self._files_of(source, file)
-            rows = self._read(source, paths, rules, "true range ")
-            rows = take(rows, np.isfinite(rows["true"]) & (rows["stamp"] != UNKNOWN_STAMP))
-            rows = take(rows, np.argsort(rows["stamp"], kind="stable"))
-            for key, at in pd.DataFrame({name: rows[name] for name in pair}).groupby(pair).indices.items():
-                path = TruePath(rows["stamp"][at], rows["true"][at][:, np.newaxis])
-                if not source.stamp and np.ptp(rows["true"][at]) > 0:
-                    what = f"tag {format_id(key[0])} and anchor {format_id(key[1])} have several true ranges"
+        for paths, mask in self._by_files(source):
+            rows = self._read_complete(source, paths, rules, "true range ")
+            for tag, anchor in set(zip(rows["tag"].tolist(), rows["anchor"].tolist(), strict=True)):
+                at = (rows["tag"] == tag) & (rows["anchor"] == anchor)
+                to = mask & (values["tag"] == tag) & (values["anchor"] == anchor)
+                if not source.stamp and np.ptp(rows["range"][at]) > 0:
+                    what = f"tag {format_id(tag)} and anchor {format_id(anchor)} have several true ranges"
                     raise RecordingError(what, where=str(paths[0]), valid="truth.ranges.stamp: their times")
-                to = targets.get((*key, number), np.zeros(0, np.int64))
-                stamps = values["stamp"][to] if source.stamp else np.zeros(len(to), np.int64)
+                stamps = values["stamp"][to] if source.stamp else np.zeros(to.sum(), np.int64)
+                path = TruePath(rows["stamp"][at], rows["range"][at][:, np.newaxis])
                 true[to] = path.position_at(stamps)[:, 0]
         values["true range"] = true
         self.notes.append(f"true ranges joined: {np.isfinite(true).sum()} of {len(true)}")
 
-    def _add_poses(self, poses: Poses) -> None:
+    def _add_poses(self) -> None:
         """Interpolate the true positions of the antennas of all tags."""
         from scipy.spatial.transform import Rotation
 
-        values, files_by_poses = self.values, defaultdict[tuple[Path, ...], list[int]](list)
+        if (poses := self._mapping.truth.poses) is None:
+            return
+        values, turns = self.values, {f"turn {n}": value for n, value in enumerate(poses.orientation or ())}
         values |= {name: values[name].copy() for name in _TAG}
-        for number, file in enumerate(self._files):
-            files_by_poses[tuple(self._files_of(poses, file))].append(number)
-        turns: dict[str, FieldRule | None] = {
-            f"turn {n}": value for n, value in enumerate(poses.orientation or ())
-        }
-        for paths, numbers in files_by_poses.items():
-            rows = self._read(
-                poses, paths, {"stamp": poses.stamp} | axes("pose", poses.position) | turns, "pose "
-            )
-            position = _stacked(rows, _POSE)
-            good = np.isfinite(position).all(axis=1) & (rows["stamp"] != UNKNOWN_STAMP)
+        rules = {"stamp": poses.stamp, **axes("pose", poses.position), **turns}
+        for paths, mask in self._by_files(poses):
+            rows = self._read_complete(poses, paths, rules, "pose ")
             if turns:
-                turn = _stacked(rows, tuple(turns))
-                good &= np.isfinite(turn).all(axis=1) & (np.linalg.norm(turn, axis=1) > 0.5)
-            order = np.flatnonzero(good)[np.argsort(rows["stamp"][good], kind="stable")]
-            in_files = np.isin(values["file"], numbers)
-            for tag in np.unique(values["tag"][in_files]).tolist():
+                rows = take(rows, np.linalg.norm(_stacked(rows, tuple(turns)), axis=1) > 0.5)
+            for tag in np.unique(values["tag"][mask]).tolist():
                 arm = poses.lever_arm
                 offset = np.array(arm.get(tag, (0.0, 0.0, 0.0)) if isinstance(arm, dict) else arm)
-                offset = Rotation.from_quat(turn[order]).apply(offset) if turns else offset
-                path = TruePath(rows["stamp"][order], position[order] + offset)
+                offset = Rotation.from_quat(_stacked(rows, tuple(turns))).apply(offset) if turns else offset
+                path = TruePath(rows["stamp"], _stacked(rows, _POSE) + offset)
                 self.truth = path if len(self.truth) == 0 else self.truth
-                selected = np.flatnonzero(in_files & (values["tag"] == tag))
+                selected = mask & (values["tag"] == tag)
                 for name, coordinate in zip(_TAG, path.position_at(values["stamp"][selected]).T, strict=True):
                     values[name][selected] = coordinate
 
@@ -404,9 +370,8 @@ class MappedRecording(Source):
         self.truth = TruePath(self.truth.stamp_ns + shift_ns, self.truth.position)
         if self.motion:
             self.motion = replace(self.motion, stamp_ns=self.motion.stamp_ns + shift_ns)
-        self.warnings.append(
-            f"{shift_ns / 1e9:+.0f} s were added to all stamps, because those of ROS are from 1970 to 2038"
-        )
+        what = "were added to all stamps, because those of ROS are from 1970 to 2038"
+        self.warnings.append(f"{shift_ns / 1e9:+.0f} s {what}")
 
     def _read_motion(self) -> Odometry | None:
         """Read speeds, and integrate the poses from them."""
@@ -414,12 +379,10 @@ class MappedRecording(Source):
         if source is None:
             return None
         speeds = {"forward": source.forward, "left": source.left, "yaw_rate": source.yaw_rate}
-        paths = self._files_of(source, self._files[0])
-        rows = self._read(source, paths, {"stamp": source.stamp, **speeds}, "odometry ")
-        twist = _stacked(rows, tuple(speeds))
-        good = np.isfinite(twist).all(axis=1) & (rows["stamp"] != UNKNOWN_STAMP)
-        stamp, first = np.unique(rows["stamp"][good], return_index=True)
-        twist = twist[good][first]
+        rules = {"stamp": source.stamp, **speeds}
+        rows = self._read_complete(source, self._files_of(source, self._files[0]), rules, "odometry ")
+        stamp, first = np.unique(rows["stamp"], return_index=True)
+        twist = _stacked(rows, tuple(speeds))[first]
         step = np.diff(stamp, prepend=stamp[:1]) / 1e9
         yaw = np.cumsum(twist[:, 2] * step)
         middle = yaw - twist[:, 2] * step / 2

@@ -37,6 +37,9 @@ LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 SCALES = LENGTHS | {"samples": 1.0, "10.6": 1 / 64, "dBm": 1.0}
 """SI units per unit that is not of time; 10.6 is the fixed-point first-path index of the DW1000."""
 
+FILE, TOPIC = "@file", "@topic"
+"""Columns with the path of the file below the recording, and with the topic of a message."""
+
 LIST_INDEX = "#"
 """Column with the index of an element in the innermost list of a message."""
 
@@ -132,9 +135,19 @@ class FieldRule(_Strict):
         return self
 
     @property
+    def source(self) -> str:
+        """Return the column of a chunk with the value."""
+        return FILE if self.file_name else TOPIC if self.topic_name else self.column
+
+    @property
+    def is_text(self) -> bool:
+        """Return whether the value is a part of a text, or replaced."""
+        return bool(self.pattern or self.values or self.file_name or self.topic_name)
+
+    @property
     def is_plain_id(self) -> bool:
         """Return whether integers are ids without a conversion."""
-        return not (self.pattern or self.values or self.hex or self.names or self.offset) and self.scale == 1
+        return not (self.is_text or self.hex or self.names or self.offset) and self.scale == 1
 
     @property
     def columns(self) -> tuple[str, ...]:

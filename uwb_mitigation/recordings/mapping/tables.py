@@ -7,8 +7,7 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,15 +24,9 @@ from uwb_mitigation.errors import (
     did_you_mean,
 )
 from uwb_mitigation.files import read_bounded
-from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, VARIABLE, TableFormat
+from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
-from uwb_mitigation.recordings.mapping.text_files import (
-    ChooseColumns,
-    CsvRows,
-    OnWarning,
-    Rows,
-    TextBlocks,
-)
+from uwb_mitigation.recordings.text_files import CsvRows, OnWarning, Rows, TextBlocks
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 """Largest number of rows, and of values in columns, of a chunk."""
@@ -46,9 +39,6 @@ MAX_DOCUMENT_ROWS, MAX_YAML_BYTES = 20_000_000, 1 << 20
 
 LOG_TIME = "@stamp"
 """Column with the time at which a message was recorded, ns."""
-
-TOPIC = "@topic"
-"""Column with the topic of a message."""
 
 _SUFFIXES = {
     ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".log": "lines", ".jsonl": "lines", ".json": "json", ".mat": "matlab",
@@ -133,234 +123,190 @@ def find_files(table: TableFormat, root: Path, ranges: Path | None = None) -> li
     return paths
 
 
-def read_chunks(
-    table: TableFormat,
-    path: Path,
-    columns: Mapping[str, bool],
-    ids: Collection[str] = (),
-    before: int = 0,
-    dropped: Counter[str] | None = None,
-    on_warning: OnWarning | None = None,
-) -> Iterator[Chunk]:
-    """Yield the rows of a file, only the given columns and those of the rules to drop rows.
+@dataclass(slots=True)
+class TableFile:
+    """A file of a table.
 
-    Args:
+    Attributes:
         table: format of the file.
         path: the file.
-        columns: {name: whether it is left out if it is missing}.
+        columns: {name of a needed column: whether it is left out if it is missing}.
         ids: columns that contain ids.
-        before: number of rows in the files before.
-        dropped: counts damaged rows, by reason; None: not counted.
+        file: its path in the recording.
+        dropped: counts damaged rows, by reason.
         on_warning: called if the last row of a text file is cut, and not yielded; None: it is yielded.
-
-    Raises:
-        RecordingError: the file cannot be read, or a column is missing; the message names similar columns.
-        DamagedRecordingError: the file is truncated, after yielding the rows before.
     """
-    kind = ("" if path.is_dir() else table.format) or _kind_of(path)
-    kind = "lines" if kind != "messages" and (table.pattern or table.text) else kind
-    dropped = Counter() if dropped is None else dropped
-    if (groups := re.search(table.file_name, path.as_posix())) is None:
-        raise RecordingError(f"the path does not match {table.file_name!r}", where=str(path))
-    constants = groups.groupdict()
-    needed = {**columns, **{rule.column: False for rule in table.drop}}
-    needed = {name: optional for name, optional in needed.items() if name not in constants}
-    choose = partial(_choose, table, needed, path)
-    try:
-        if kind in ("messages", "lines", "json", "yaml"):
-            rows = _messages(kind, table, path, needed, dropped, on_warning)
-        elif kind == "csv":
-            rows = iter(CsvRows(table, path, choose, ids, dropped, on_warning))
-        elif kind:
-            rows = _arrays(table, path, choose)
-        else:
-            valid = f"{', '.join(sorted({*_SUFFIXES.values()}))}; others as CSV, such as with pandas.DataFrame.to_csv"
-            raise RecordingError(f"unknown format {path.suffix}", where=str(path), valid=valid)
-        for values, numbers in rows:
-            values |= {name: np.full(len(numbers), text, object) for name, text in constants.items()}
-            if table.unpivot:
-                values, repeats = _unpivot(table, values, len(numbers))
-                numbers = np.repeat(numbers, repeats)
-            yield Chunk(values, len(numbers), path, numbers, before)
-    except UwbMitigationError:
-        raise
-    except Exception as error:
-        # For damaged files the libraries raise many other types, such as BadZipFile or ZeroDivisionError.
-        raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
 
+    table: TableFormat
+    path: Path
+    columns: Mapping[str, bool]
+    ids: Collection[str] = ()
+    file: str = ""
+    dropped: Counter[str] = field(default_factory=Counter)
+    on_warning: OnWarning | None = None
 
-def _choose(
-    table: TableFormat, columns: Mapping[str, bool], path: Path, names: Sequence[str]
-) -> dict[str, str]:
-    """Return the columns that exist, also with other case; raise RecordingError if a required one is missing."""
-    folded = {name.strip().lower(): name for name in names}
-    chosen = {name: name if name in names else folded.get(name.lower(), "") for name in columns}
-    groups = [name for rule in table.unpivot.values() for name in re.compile(rule).groupindex]
-    for name in (*table.unpivot, *groups, *([VARIABLE] if table.unpivot else ())):
-        chosen.pop(name, None)
-    for rule in table.unpivot.values():
-        if not (matches := [name for name in names if re.fullmatch(rule, name)]):
-            raise RecordingError(
-                f"no column matches unpivot {rule!r}", where=str(path), valid=", ".join(names[:40])
-            )
-        chosen |= dict(zip(matches, matches, strict=True))
-    for name, column in chosen.items():
-        if not column and name not in names and not columns[name]:
-            valid = f"columns: {', '.join(names[:40])}"
-            if len(names) == 1 and (mark := next((mark for mark in ";\t|," if mark in names[0]), "")):
-                valid = f"there is one column {names[0]!r:.60}; set separator: {mark!r}"
-            suggestion = did_you_mean(name, names)
-            raise RecordingError(f"no column {name}", where=str(path), valid=valid, suggestion=suggestion)
-    return {name: column for name, column in chosen.items() if column in names}
+    def chunks(self, before: int = 0) -> Iterator[Chunk]:
+        """Yield the rows, only the needed columns and those of the rules to drop rows.
 
+        Args:
+            before: number of rows in the files before.
 
-def _unpivot(table: TableFormat, columns: Mapping[str, Any], count: int) -> tuple[dict[str, Any], int]:
-    """Return one row for each column that matches, as `pandas.melt`, and the number of rows for each row.
-
-    The columns of a matrix are numbered from 1.
-    """
-    melted: dict[str, dict[str, Any]] = {}
-    sources = set()
-    for target, rule in table.unpivot.items():
-        for name, values in columns.items():
-            if match := re.fullmatch(rule, name):
-                sources.add(name)
-                groups = match.groupdict()
-                keys = ["_".join(groups.values()) if groups else match[1] if match.re.groups == 1 else name]
-                if is_matrix := np.ndim(values) == 2:
-                    keys = [str(number + 1) for number in range(values.shape[1])]
-                for key, column in zip(keys, values.T if is_matrix else [values], strict=True):
-                    cells = {name: np.full(count, text, object) for name, text in groups.items()}
-                    melted.setdefault(key, cells)[target] = column
-    rows = {
-        name: np.repeat(values, len(melted), axis=0)
-        for name, values in columns.items()
-        if name not in sources
-    }
-    unknown = np.full(count, np.nan)
-    for target in dict.fromkeys(name for cells in melted.values() for name in cells):
-        rows[target] = np.stack([cells.get(target, unknown) for cells in melted.values()], axis=1).reshape(-1)
-    return rows | {VARIABLE: np.tile(np.array(list(melted), object), count)}, len(melted)
-
-
-def _arrays(table: TableFormat, path: Path, choose: ChooseColumns) -> Rows:
-    """Read a MATLAB or HDF5 file in slices."""
-    with contextlib.ExitStack() as stack:
-        arrays = _load(table, path, stack)
-        chosen = choose([str(name) for name in arrays if not str(name).startswith("__")])
-        # Slices of large files are read later, other values are arrays of one row at least.
-        columns = {name: arrays[column] for name, column in chosen.items()}
-        columns = {
-            n: array if getattr(array, "ndim", 0) else np.atleast_1d(array) for n, array in columns.items()
-        }
-        lengths = {name: len(array) for name, array in columns.items()}
-        if len(set(lengths.values())) > 1:
-            raise RecordingError("columns of different length", where=str(path), valid=str(lengths))
-        width = max([int(np.prod(array.shape[1:])) for array in columns.values()], default=1)
-        rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(width, 1)))
-        for first in range(0, count := max(lengths.values(), default=0), rows):
-            values = {name: np.asarray(array[first : first + rows]) for name, array in columns.items()}
-            yield values, np.arange(first, min(first + rows, count))
-
-
-def _load(table: TableFormat, path: Path, stack: contextlib.ExitStack) -> Mapping[str, Any]:
-    """Return {name: array with one entry a row}: the variables of a file, or the fields of its variable `group`."""
-    is_matlab, content = (table.format or _kind_of(path)) == "matlab", None
-    if is_matlab and path.stat().st_size > MAX_ARRAY_BYTES:
-        raise RecordingError(f"more than {MAX_ARRAY_BYTES >> 30} GiB", where=str(path), valid="CSV, HDF5")
-    if is_matlab:
-        from scipy.io import loadmat
-
-        # Version 7.3 is HDF5.
-        with contextlib.suppress(NotImplementedError):
-            content = loadmat(path, simplify_cells=True)
-    if is_hdf5 := content is None:
+        Raises:
+            RecordingError: the file cannot be read, or a column is missing; the message names similar columns.
+            DamagedRecordingError: the file is truncated, after yielding the rows before.
+        """
+        table, path = self.table, self.path
+        kind = ("" if path.is_dir() else table.format) or _kind_of(path)
+        kind = "lines" if kind != "messages" and (table.pattern or table.text) else kind
+        if (groups := re.search(table.file_name, self.file)) is None:
+            raise RecordingError(f"{self.file!r} does not match {table.file_name!r}", where=str(path))
+        constants = {FILE: self.file, **groups.groupdict()}
+        needed = {**self.columns, **{rule.column: False for rule in table.drop}}
+        self.columns = {name: optional for name, optional in needed.items() if name not in constants}
         try:
-            import h5py
-        except ImportError as error:
-            raise MissingDependencyError("h5py is not installed", valid="pip install h5py") from error
-        content = stack.enter_context(h5py.File(path, "r"))
-    if table.group:
-        if table.group not in content:
-            valid = ", ".join(map(str, content))
-            raise RecordingError(f"no variable {table.group}", where=str(path), valid=valid)
-        content = content[table.group]
-    if is_hdf5 and is_matlab:
+            if kind in ("messages", "lines", "json", "yaml"):
+                rows = self._messages(kind)
+            elif kind == "csv":
+                rows = iter(CsvRows(table, path, self._choose, self.ids, self.dropped, self.on_warning))
+            elif kind:
+                rows = self._arrays(is_matlab=kind == "matlab")
+            else:
+                valid = (
+                    f"{', '.join(sorted({*_SUFFIXES.values()}))}; others as CSV, such as with pandas.to_csv"
+                )
+                raise RecordingError(f"unknown format {path.suffix}", where=str(path), valid=valid)
+            for values, numbers in rows:
+                values |= {name: np.full(len(numbers), text, object) for name, text in constants.items()}
+                if table.unpivot:
+                    values, repeats = _unpivot(table, values, len(numbers))
+                    numbers = np.repeat(numbers, repeats)
+                yield Chunk(values, len(numbers), path, numbers, before)
+        except UwbMitigationError:
+            raise
+        except Exception as error:
+            # For damaged files the libraries raise many other types, such as BadZipFile or ZeroDivisionError.
+            raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
+
+    def _choose(self, names: Sequence[str]) -> dict[str, str]:
+        """Return {column: column of the file, also with other case}; raise RecordingError if a required one is missing."""
+        table, where = self.table, str(self.path)
+        folded = {name.strip().lower(): name for name in names}
+        chosen = {name: name if name in names else folded.get(name.lower(), "") for name in self.columns}
+        groups = [name for rule in table.unpivot.values() for name in re.compile(rule).groupindex]
+        for name in (*table.unpivot, *groups, *([VARIABLE] if table.unpivot else ())):
+            chosen.pop(name, None)
+        for rule in table.unpivot.values():
+            if not (matches := [name for name in names if re.fullmatch(rule, name)]):
+                what, valid = f"no column matches unpivot {rule!r}", ", ".join(names[:40])
+                raise RecordingError(what, where=where, valid=valid)
+            chosen |= dict(zip(matches, matches, strict=True))
+        for name, column in chosen.items():
+            if not column and name not in names and not self.columns[name]:
+                valid, suggestion = f"columns: {', '.join(names[:40])}", did_you_mean(name, names)
+                if len(names) == 1 and (mark := next((mark for mark in ";\t|," if mark in names[0]), "")):
+                    valid = f"there is one column {names[0]!r:.60}; set separator: {mark!r}"
+                raise RecordingError(f"no column {name}", where=where, valid=valid, suggestion=suggestion)
+        return {name: column for name, column in chosen.items() if column in names}
+
+    def _arrays(self, *, is_matlab: bool) -> Rows:
+        """Read a MATLAB or HDF5 file in slices."""
+        with contextlib.ExitStack() as stack:
+            arrays = self._load(stack, is_matlab=is_matlab)
+            chosen = self._choose([str(name) for name in arrays if not str(name).startswith("__")])
+            # Slices of large files are read later, other values are arrays of one row at least.
+            columns = {name: arrays[column] for name, column in chosen.items()}
+            columns |= {
+                n: np.atleast_1d(array) for n, array in columns.items() if not getattr(array, "ndim", 0)
+            }
+            lengths = {name: len(array) for name, array in columns.items()}
+            if len(set(lengths.values())) > 1:
+                raise RecordingError("columns of different length", where=str(self.path), valid=str(lengths))
+            width = max([int(np.prod(array.shape[1:])) for array in columns.values()], default=1)
+            rows = max(1, min(CHUNK_ROWS, CHUNK_VALUES // max(width, 1)))
+            for first in range(0, count := max(lengths.values(), default=0), rows):
+                values = {name: np.asarray(array[first : first + rows]) for name, array in columns.items()}
+                yield values, np.arange(first, min(first + rows, count))
+
+    def _load(self, stack: contextlib.ExitStack, *, is_matlab: bool) -> Mapping[str, Any]:
+        """Return {name: array with one entry a row}: the variables of a file, or the fields of its variable `group`."""
+        table, where, content = self.table, str(self.path), None
+        if is_matlab:
+            from scipy.io import loadmat
+
+            if self.path.stat().st_size > MAX_ARRAY_BYTES:
+                raise RecordingError(f"more than {MAX_ARRAY_BYTES >> 30} GiB", where=where, valid="CSV, HDF5")
+            # Version 7.3 is HDF5.
+            with contextlib.suppress(NotImplementedError):
+                content = loadmat(self.path, simplify_cells=True)
+        if is_hdf5 := content is None:
+            try:
+                import h5py
+            except ImportError as error:
+                raise MissingDependencyError("h5py is not installed", valid="pip install h5py") from error
+            content = stack.enter_context(h5py.File(self.path, "r"))
+        if table.group:
+            if table.group not in content:
+                valid = ", ".join(map(str, content))
+                raise RecordingError(f"no variable {table.group}", where=where, valid=valid)
+            content = content[table.group]
         # MATLAB writes the transposed array.
-        is_array = hasattr(content, "dtype")
-        content = (
-            content[()].T
-            if is_array
-            else {n: np.squeeze(item[()].T) for n, item in content.items() if hasattr(item, "dtype")}
-        )
-    if isinstance(content, Mapping):
-        return content
-    if np.ndim(content) > 1 and not table.columns:
-        return {"": content}
-    import pandas as pd
+        if is_hdf5 and is_matlab and hasattr(content, "dtype"):
+            content = content[()].T
+        elif is_hdf5 and is_matlab:
+            content = {n: np.squeeze(item[()].T) for n, item in content.items() if hasattr(item, "dtype")}
+        if isinstance(content, Mapping):
+            return content
+        if np.ndim(content) > 1 and not table.columns:
+            return {"": content}
+        import pandas as pd
 
-    # The fields of a structure, or the columns of a matrix.
-    frame = pd.DataFrame(
-        content if isinstance(content, list) else np.asarray(content), columns=table.columns or None
-    )
-    return {str(name): column.to_numpy() for name, column in frame.items()}
+        # The fields of a structure, or the columns of a matrix.
+        content = content if isinstance(content, list) else np.asarray(content)
+        frame = pd.DataFrame(content, columns=table.columns or None)
+        return {str(name): column.to_numpy() for name, column in frame.items()}
 
-
-def _messages(
-    kind: str,
-    table: TableFormat,
-    path: Path,
-    columns: Mapping[str, bool],
-    dropped: Counter[str],
-    on_warning: OnWarning | None,
-) -> Rows:
-    """Read the messages of a bag, the lines of a log, or the objects of a document."""
-    messages: Iterator[tuple[dict[str, Any], Any]]
-    if kind == "messages":
-        messages = _bag(path, table)
-    elif kind == "lines":
-        messages = _lines(path, on_warning)
-    elif kind == "json":
-        messages = iter([({}, json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError)))])
-    else:
-        document = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
-        messages = iter([({}, _entries(document[table.group] if table.group else document))])
-        table = table.model_copy(update={"group": "[]"})
-    reader, first, reason, limit = (
-        MessageRows(table, columns),
-        0,
-        "",
-        MAX_ROWS if kind == "messages" else MAX_DOCUMENT_ROWS,
-    )
-    damage: DamagedRecordingError | None = None
-    while damage is None:
-        rows, count = defaultdict[str, list[Any]](list), 0
-        try:
-            for count, (constants, message) in enumerate(islice(messages, 1000), 1):
-                values, problem = dict[str, list[Any]](), ""
-                try:
-                    values = reader.rows(message, limit)
-                except RecordingError as error:
-                    where, problem = ": ".join([str(path), *constants.values()][:2]), f" ({error.what})"
-                    if kind != "lines":
-                        raise RecordingError(error.what, where=where, valid=error.valid) from error
-                repeats = len(values.get(LIST_INDEX, ()))
-                if kind == "lines" and not repeats and message.strip():
-                    reason = reason or f"lines without a range, such as {message.strip()!r:.60}{problem}"
-                    dropped[reason] += 1
-                for name, cells in [
-                    *values.items(),
-                    *((name, [cell] * repeats) for name, cell in constants.items()),
-                ]:
-                    rows[name] += cells
-        except DamagedRecordingError as error:
-            damage = error
-        if not count:
-            break
-        yield rows, np.arange(first, first + len(rows[LIST_INDEX]))
-        first += len(rows[LIST_INDEX])
-    if damage:
-        raise damage
+    def _messages(self, kind: str) -> Rows:
+        """Read the messages of a bag, the lines of a log, or the objects of a document."""
+        table, path, limit = self.table, self.path, MAX_DOCUMENT_ROWS
+        messages: Iterator[tuple[dict[str, Any], Any]]
+        if kind == "messages":
+            messages, limit = _bag(path, table), MAX_ROWS
+        elif kind == "lines":
+            messages = _lines(path, self.on_warning)
+        elif kind == "json":
+            messages = iter([({}, json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError)))])
+        else:
+            document = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
+            messages = iter([({}, _entries(document[table.group] if table.group else document))])
+            table = table.model_copy(update={"group": "[]"})
+        reader, first, reason = MessageRows(table, self.columns), 0, ""
+        damage: DamagedRecordingError | None = None
+        while damage is None:
+            rows, last = defaultdict[str, list[Any]](list), None
+            try:
+                for last in islice(messages, 1000):
+                    (constants, message), values, problem = last, dict[str, list[Any]](), ""
+                    try:
+                        values = reader.rows(message, limit)
+                    except RecordingError as error:
+                        where, problem = ": ".join([str(path), *constants.values()][:2]), f" ({error.what})"
+                        if kind != "lines":
+                            raise RecordingError(error.what, where=where, valid=error.valid) from error
+                    repeats = len(values.get(LIST_INDEX, ()))
+                    if kind == "lines" and not repeats and message.strip():
+                        reason = reason or f"lines without a range, such as {message.strip()!r:.60}{problem}"
+                        self.dropped[reason] += 1
+                    values |= {name: [cell] * repeats for name, cell in constants.items()}
+                    for name, cells in values.items():
+                        rows[name] += cells
+            except DamagedRecordingError as error:
+                damage = error
+            if last is None:
+                break
+            yield rows, np.arange(first, first + len(rows[LIST_INDEX]))
+            first += len(rows[LIST_INDEX])
+        if damage:
+            raise damage
 
 
 def _bag(path: Path, table: TableFormat) -> Iterator[tuple[dict[str, Any], Any]]:
@@ -386,11 +332,32 @@ def _entries(document: Any) -> list[dict[str, Any]]:
     for key, value in document.items() if isinstance(document, dict) else enumerate(document):
         # Such as a text `[1.0, 2.0]`, or a list `- position: ...` and `- orientation: ...`.
         value = yaml.safe_load(value) if isinstance(value, str) and value.startswith("[") else value
-        items = value if isinstance(value, list) else [value]
-        fields = {str(number): item for number, item in enumerate(items)}
-        entries.append(
-            {"key": str(key)}
-            | fields
-            | {k: v for item in items if isinstance(item, dict) for k, v in item.items()}
-        )
+        entry = {"key": str(key)}
+        for number, item in enumerate(value if isinstance(value, list) else [value]):
+            entry |= item if isinstance(item, dict) else {str(number): item}
+        entries.append(entry)
     return entries
+
+
+def _unpivot(table: TableFormat, columns: Mapping[str, Any], count: int) -> tuple[dict[str, Any], int]:
+    """Return one row for each column that matches, as `pandas.melt`, and the number of rows for each row.
+
+    The columns of a matrix are numbered from 1.
+    """
+    melted: dict[str, dict[str, Any]] = {}
+    rows = dict(columns)
+    for target, rule in table.unpivot.items():
+        for name in columns:
+            if match := re.fullmatch(rule, name):
+                groups, values = match.groupdict(), rows.pop(name)
+                keys = ["_".join(groups.values()) if groups else match[1] if match.re.groups == 1 else name]
+                if is_matrix := np.ndim(values) == 2:
+                    keys = [str(number + 1) for number in range(values.shape[1])]
+                for key, column in zip(keys, values.T if is_matrix else [values], strict=True):
+                    cells = {group: np.full(count, text, object) for group, text in groups.items()}
+                    melted.setdefault(key, cells)[target] = column
+    rows = {name: np.repeat(values, len(melted), axis=0) for name, values in rows.items()}
+    unknown = np.full(count, np.nan)
+    for target in dict.fromkeys(name for cells in melted.values() for name in cells):
+        rows[target] = np.stack([cells.get(target, unknown) for cells in melted.values()], axis=1).reshape(-1)
+    return rows | {VARIABLE: np.tile(np.array(list(melted), object), count)}, len(melted)

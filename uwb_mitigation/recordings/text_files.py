@@ -10,6 +10,7 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -133,46 +134,43 @@ class CsvRows:
     ) -> None:  # fmt: skip
         self._table, self._path, self._choose, self._ids = table, path, choose, set(ids)
         self._dropped, self._on_warning = dropped, on_warning
-        regex = table.separator if len(table.separator) > 1 else ""
-        self._regex, self._mark = regex, " " if regex == r"\s+" else "\t" if regex else table.separator
+        # The fields are separated by one mark, by white space, or by an expression that is replaced by tabs.
+        self._regex = table.separator if len(table.separator) > 1 and table.separator != r"\s+" else ""
+        self._mark = "\t" if self._regex else " " if table.separator == r"\s+" else table.separator
         self._chosen, self._header, self._width = dict[str, str](), "", 0
         self._options: dict[str, Any] = {
-            "sep": regex if regex == r"\s+" else self._mark, "decimal": table.decimal, "comment": table.comment or None,
-            "index_col": False, "skipinitialspace": True,
+            "sep": r"\s+" if self._mark == " " else self._mark, "decimal": table.decimal, "index_col": False,
+            "comment": table.comment or None, "skipinitialspace": True,
         }  # fmt: skip
 
     def __iter__(self) -> Rows:
         blocks, first = TextBlocks(self._path, '"', keep_rest=self._on_warning is None), 0
         previous: Any = None
         for block in blocks:
-            lines = self._lines(block)
+            lines = block.split("\n")
+            if self._regex:
+                lines = [re.sub(self._regex, self._mark, line.strip()) for line in lines]
             if not self._chosen:
                 lines = self._after_header(lines[self._table.skip :])
             if previous:
                 yield previous
             columns, numbers = self._parsed(lines)
-            previous = columns, first + numbers
-            first += int(numbers[-1]) + 1 if len(numbers) else 0
+            previous, first = (columns, first + numbers), first + int(numbers.max(initial=-1)) + 1
         if not self._chosen and not blocks.damage:
             raise RecordingError("the file is empty", where=str(self._path))
         if previous and self._on_warning and not blocks.damage:
+            fault = "the file does not end with a line break" if blocks.rest else ""
             widths = [self._count(line) for line in lines if line.strip()][-2:]
-            is_short = widths[-1:] < [self._width] and widths[-1:] < widths[:1]
-            if is_short:
-                previous = {name: values[:-1] for name, values in previous[0].items()}, previous[1][:-1]
-            if is_short or blocks.rest:
-                fault = "the last row is short" if is_short else "the file does not end with a line break"
+            if not fault and widths[-1:] < [self._width] and widths[-1:] < widths[:1]:
+                fault = "the last row is short"
+                previous = {name: values[:-1] for name, values in columns.items()}, previous[1][:-1]
+            if fault:
                 self._on_warning(f"{self._path.name}: {fault}; the last row is not used")
         if previous:
             yield previous
         if blocks.damage:
             what, where = f"truncated or corrupt: {blocks.damage}", f"{self._path}: after row {first}"
             raise DamagedRecordingError(what, where=where)
-
-    def _lines(self, block: str) -> list[str]:
-        lines = block.split("\n")
-        is_plain = self._regex in ("", r"\s+")
-        return lines if is_plain else [re.sub(self._regex, self._mark, line.strip()) for line in lines]
 
     def _count(self, line: str) -> int:
         return len(line.split()) if self._mark == " " else line.count(self._mark) + 1
@@ -181,13 +179,10 @@ class CsvRows:
         """Choose the columns, and return the lines after the header."""
         import pandas as pd
 
-        names = self._table.columns
+        names, comment = self._table.columns, self._table.comment or "\n"
         if not names:
-            comment = self._table.comment or "\n"
-            start = next((n for n, line in enumerate(lines) if line.strip() and line[0] != comment), None)
-            if start is None:
-                raise RecordingError("no header", where=str(self._path))
-            self._header, lines = lines[start], lines[start + 1 :]
+            lines = list(dropwhile(lambda line: not line.strip() or line.startswith(comment), lines))
+            self._header, lines = lines[0] if lines else "", lines[1:]
             header = pd.read_csv(io.StringIO(self._header), nrows=0, **self._options)
             names = [str(name) for name in header.columns]
             self._width = len(names)
@@ -205,18 +200,18 @@ class CsvRows:
         """Return the columns, and the numbers of their rows in the block."""
         import pandas as pd
 
-        numbers, width, mark = None, self._width - 1, self._mark
-        # A quoted text may contain separators and line breaks.
         # A separator may follow the last field.
-        long = {line for line in lines if line.count(mark) > width}
-        long = {line for line in long if self._count(line.rstrip(f"{mark} ")) > self._width}
-        if self._width and (long or self._header in lines) and not any('"' in line for line in lines):
-            comment = self._table.comment or "\n"
-            lines = [line for line in lines if line.strip() and line[0] != comment]
-            good = np.array([line not in long and line != self._header for line in lines], bool)
+        long = {line for line in lines if self._width and line.count(self._mark) >= self._width}
+        long = {line for line in long if self._count(line.rstrip(f"{self._mark} ")) > self._width}
+        numbers = None
+        # A quoted text may contain separators and line breaks.
+        if (long or (self._width and self._header in lines)) and not any('"' in line for line in lines):
+            lines = [
+                line for line in lines if line.strip() and not line.startswith(self._table.comment or "\n")
+            ]
+            numbers = np.flatnonzero([line not in long and line != self._header for line in lines])
             reason = "a repeated header, or more fields than the header (columns: all names; skip: 1)"
-            self._dropped[reason] += int(np.count_nonzero(~good))
-            numbers = np.flatnonzero(good)
+            self._dropped[reason] += len(lines) - len(numbers)
             lines = [lines[number] for number in numbers.tolist()]
         data = "\n".join([self._header, *lines]).encode()
         frame = pd.read_csv(io.BytesIO(data), **self._options)
