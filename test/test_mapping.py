@@ -329,7 +329,7 @@ def test_every_shipped_mapping_is_valid_and_names_its_source():
     for name in names:
         if name != "util":
             assert load_mapping(name).source.startswith("https://"), name
-    with pytest.raises(ParameterError, match="UTIL cannot be imported: .*time differences of arrival"):
+    with pytest.raises(ParameterError, match=r"UTIL cannot be imported: .*time differences of arrival"):
         load_mapping("util")
 
 
@@ -462,7 +462,7 @@ def test_ghent_university(tmp_path: Path):
         "2,2.707,2.545,-79.895,751,-82.755,101,los,3edvl,1_hw,-0.0852,3edvl1_hw\n",
     )
     source = open_mapped(tmp_path, "ghent_university")
-    first, second = source
+    first, _ = source
     assert first.truth is not None
     assert first.truth.configuration == "hwhw"
     assert first.truth.label == "NLOS"
@@ -684,7 +684,7 @@ def test_single_impossible_values_are_dropped_and_counted(tmp_path: Path):
 
 
 def test_the_median_of_a_rule_is_that_of_all_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("uwb_mitigation.recordings.mapping.tables.CHUNK_ROWS", 2)
+    monkeypatch.setattr("uwb_mitigation.recordings.text_files.BLOCK_CHARS", 8)
     write(tmp_path / "a.csv", "t,a,r,z\n0,1,2,5\n1,1,3,5\n")
     write(tmp_path / "b.csv", "t,a,r,z\n2,1,4,1\n3,1,5,1\n4,1,6,1.2\n5,1,7,0.9\n6,1,8,\n")
     source = read(PLAIN | {"drop": [{"column": "z", "from_median": 0.5}]}, tmp_path)
@@ -730,7 +730,7 @@ def test_a_truncated_compressed_file_gives_what_is_before_the_damage(
 ):
     import lzma
 
-    monkeypatch.setattr("uwb_mitigation.recordings.mapping.tables.CHUNK_ROWS", 1000)
+    monkeypatch.setattr("uwb_mitigation.recordings.text_files.BLOCK_CHARS", 10_000)
     rows = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3:.15f}\n" for n in range(20_000))
     data = lzma.compress(rows.encode())
     (tmp_path / "x.csv.xz").write_bytes(data[: len(data) - 1000])

@@ -1,0 +1,498 @@
+"""Files as people have them: damaged, in other encodings and units, logs, several clocks; and public data sets."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+from test_mapping import PLAIN, ranges_of, read, with_fields, write
+
+from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
+from uwb_mitigation.recordings import text_files
+from uwb_mitigation.recordings.formats import open_mapped
+from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+from uwb_mitigation.recordings.mapping.mapping import TableFormat
+from uwb_mitigation.recordings.mapping.messages import MessageRows
+
+HEADER = "t,a,r,true\n"
+TRUE = {"truth": {"range": "true"}}
+
+
+def rows(count: int = 80, start: float = 0.0, step: float = 0.1, factors: Any = None) -> str:
+    """Return ranges of four anchors with errors of 0.1 m; `factors`: {anchor: of another unit}."""
+    lines = []
+    for n in range(count):
+        anchor, true = n % 4 + 1, n % 4 + 3 + np.sin(n / 9)
+        measured = (true + 0.1) * (factors or {}).get(anchor, 1)
+        lines.append(f"{start + n * step:.6f},{anchor},{measured:.5f},{true:.5f}\n")
+    return "".join(lines)
+
+
+def of(content: str | bytes, path: Path, /, **document: Any) -> MappedRecording:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return read(PLAIN | document, path)
+
+
+def values_of(source: MappedRecording) -> list[tuple[float, int, int, float]]:
+    measurements = [record.measurement for record in source]
+    return [(m.stamp_ns / 1e9, m.tag_id, m.anchor_id, round(m.range_m, 6)) for m in measurements]
+
+
+# Text files ------------------------------------------------------------------------------------------------------
+
+
+def test_rows_before_the_damage_of_a_packed_file_are_used(tmp_path: Path):
+    text = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3:.9f}\n" for n in range(40_000))
+    packed = gzip.compress(text.encode())
+    source = of(packed[: len(packed) * 2 // 3], tmp_path / "x.csv.gz", moving=False)
+    assert 20_000 < len(source) < 30_000
+    found = []
+    with pytest.raises(DamagedRecordingError, match=f"after row {len(source)}: truncated"):
+        found.extend(record.measurement.range_m for record in source)
+    assert found == pytest.approx([np.sin(n) + 3 for n in range(len(source))], abs=1e-8)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "cp1252"])
+def test_other_encodings_and_line_breaks_are_read(encoding: str, tmp_path: Path):
+    text = "t;a;r;Gerät\r\n0,0;1;2,5;Küche\r\n0,1;2;2,6;Büro\r\n"
+    document = {"separator": ";", "decimal": ",", "truth": {"label": "Gerät"}}
+    source = of(text.encode(encoding), tmp_path / "x.csv", **document)
+    assert values_of(source) == [(0.0, 1, 1, 2.5), (0.1, 1, 2, 2.6)]
+    assert source.values["label"].tolist() == ["Küche", "Büro"]
+
+
+def test_repeated_headers_and_merged_rows_are_dropped_and_keep_the_row_numbers(tmp_path: Path):
+    write(tmp_path / "cirs.csv", "c\n" + "".join(f"{n} {n}\n" for n in range(6)))
+    text = "t,a,r\n0,1,2.0\n0.1,1,2.10.2,1,2.2\nt,a,r\n0.3,1,2.3\n0.4,1,2.4\n"
+    source = of(text, tmp_path / "x.csv", cir={"files": "cirs.csv", "column": "c"})
+    assert ranges_of(source) == [2.0, 2.3, 2.4]
+    assert [record.measurement.cir.samples.tolist() for record in source] == [[0, 0], [3, 3], [4, 4]]
+    ((reason, count),) = source.dropped.items()
+    assert (reason[:17], count) == ("a repeated header", 2)
+
+
+def test_rows_that_are_all_longer_than_the_header_are_refused(tmp_path: Path):
+    # Such as those of R, which writes no name of the column with the row numbers.
+    with pytest.raises(RecordingError, match=r"columns: all names; skip: 1"):
+        of("t,a,r\n1,0.1,7,2.5\n2,0.2,7,2.6\n", tmp_path / "x.csv")
+    named = {"columns": ["number", "t", "a", "r"], "skip": 1}
+    assert values_of(of("t,a,r\n1,0.1,7,2.5\n", tmp_path / "y.csv", **named)) == [(0.1, 1, 7, 2.5)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,a,r,r\n0,1,2,3\n", r"several columns have the name r \(columns: \[t, a, r, r.1\] and skip: 1"),
+        ("t,a,r\n0,1,2\n# note\n1,1,2\n", "row 2: .* set comment: '#'"),
+        ('t,a,r\n0,1,2\n1,1,"2\n2,1,3\n', "a closing quote or a line break is missing after '1,1"),
+        ("t,a,r\n0,1,2.5 m\n", r"set pattern: '\(\[-\\d.\]\+\)'"),
+        ("t,a,r\n31/12/2023 10:00:00,1,2\n", "set unit: '%d/%m/%Y %H:%M:%S', in the order of the file"),
+        ("t,a,r\n10:00:00.5,1,2\n", "set unit: iso8601"),
+        ("t,a,r\n0,10,2\n1,11,2\n2,1e2,2\n", "row 3: anchor = '1e2' is not an id .*`hex: true`"),
+        ("t,a,r\n" + "5,1,2\n5,1,3\n" * 9, r"all stamps are equal \(stamp: another column, or {rate_hz"),
+    ],
+)
+def test_error_names_the_line_of_the_mapping_that_is_missing(text: str, message: str, tmp_path: Path):
+    with pytest.raises(RecordingError, match=message):
+        of(text, tmp_path / "x.csv")
+
+
+def test_names_of_columns_comments_and_hexadecimal_ids_are_set(tmp_path: Path):
+    text = "# log\nt,a,r,r\n0,10,2,3\n# note\n1,1e2,2,4\n"
+    document = with_fields(anchor={"column": "a", "hex": True}, range="r2")
+    document |= {"columns": ["t", "a", "r", "r2"], "skip": 2, "comment": "#"}
+    assert values_of(of(text, tmp_path / "x.csv", **document)) == [(0.0, 1, 16, 3.0), (1.0, 1, 0x1E2, 4.0)]
+
+
+def test_large_ids_are_exact_in_a_column_with_missing_ids(tmp_path: Path):
+    source = of("t,a,r\n0,9007199254740993,2\n1,,2\n2,7,3\n", tmp_path / "x.csv")
+    assert [anchor for _, _, anchor, _ in values_of(source)] == [9007199254740993, 7]
+
+
+def test_decompression_bomb_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(text_files, "MIN_BOMB_CHARS", 1 << 22)
+    with pytest.raises(RecordingError, match="expands to more than 500 times its size"):
+        of(gzip.compress(b"t,a,r\n" + b"\n" * 20_000_000), tmp_path / "x.csv.gz")
+
+
+def test_other_formats_are_refused_with_a_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(RecordingError, match=r"unknown format .xlsx .*others as CSV"):
+        of(b"PK", tmp_path / "x.xlsx")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(MissingDependencyError, match=r"h5py is not installed .*pip install h5py"):
+        of(b"", tmp_path / "x.h5")
+
+
+# Values ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000), ("cm", 100)])
+@pytest.mark.parametrize("truth", [TRUE, {}])
+def test_unit_of_one_anchor_is_found_and_can_be_set(
+    unit: str, factor: float, truth: dict[str, Any], tmp_path: Path
+):
+    text = HEADER + rows(factors={3: factor})
+    with pytest.raises(RecordingError, match=rf"anchor 3 is .*set units: {{3: {unit}}} of range"):
+        of(text, tmp_path / "x.csv", **truth)
+    fields = with_fields(range={"column": "r", "units": {3: unit}})
+    source = of(text, tmp_path / "x.csv", **fields | TRUE)
+    assert source.errors_m == pytest.approx(np.full(80, 0.1), abs=1e-4)
+
+
+def test_a_large_offset_of_all_anchors_is_no_unit_of_one(tmp_path: Path):
+    text = HEADER + "".join(
+        f"{n},{n % 4},{[1.5, 3, 5, 8][n % 4] + 154.0},{[1.5, 3, 5, 8][n % 4]}\n" for n in range(80)
+    )
+    assert len(of(text, tmp_path / "x.csv", **TRUE)) == 80
+
+
+def test_numbers_that_mean_no_measurement_are_dropped(tmp_path: Path):
+    lines = (HEADER + rows()).splitlines(keepends=True)
+    for n, number in ((5, "0"), (9, "0.00"), (17, "655.35")):
+        lines[n] = ",".join([*lines[n].split(",")[:2], number, lines[n].split(",")[3]])
+    source = of("".join(lines), tmp_path / "x.csv", **TRUE)
+    what = "which means no measurement"
+    assert source.dropped == {f"range is 0, {what}": 2, f"range is 655.35, {what}": 1}
+    assert source.errors_m == pytest.approx(np.full(77, 0.1), abs=1e-4)
+    # A tag next to an anchor measures zero.
+    near = "t,a,r\n" + "".join(f"{n},1,{abs(n - 20) / 100}\n" for n in range(80))
+    assert not of(near, tmp_path / "y.csv").dropped
+
+
+def test_differences_of_ranges_are_refused(tmp_path: Path):
+    text = "t,a,r\n" + "".join(f"{n / 10},{n % 4},{2 * np.sin(n):.3f}\n" for n in range(60))
+    with pytest.raises(RecordingError, match=r"of the ranges are negative .*\(TDoA\)"):
+        of(text, tmp_path / "x.csv")
+
+
+def test_outliers_are_reported_by_an_import(tmp_path: Path):
+    write(tmp_path / "map.yaml", yaml.safe_dump(PLAIN | TRUE))
+    write(tmp_path / "x.csv", HEADER + rows() + "9,1,812.5,4\n")
+    done = run("data", "import", "x.csv", "--map", "map.yaml", "-o", "x.mcap", folder=tmp_path)
+    assert "warning: 1 ranges are above 100 m" in done.stderr
+    assert "warning: 1 errors are above 5 m" in done.stderr
+
+
+def test_true_ranges_of_another_file_are_interpolated(tmp_path: Path):
+    true = "".join(f"{n / 5},{anchor},{anchor * 1000 + n}\n" for n in range(50) for anchor in (1, 2, 3))
+    write(tmp_path / "true.csv", f"time,id,mm\n{true}")
+    ranges = {"files": "true.csv", "stamp": "time", "anchor": "id", "range": {"column": "mm", "unit": "mm"}}
+    text = "t,a,r\n0.1,1,1.2\n0.1,2,2.2\n0.1,4,4.2\n99,1,1.2\n"
+    source = of(text, tmp_path / "x.csv", truth={"ranges": ranges})
+    assert source.values["true range"] == pytest.approx([1.0005, 2.0005, np.nan, np.nan], nan_ok=True)
+    assert source.notes == ["true ranges joined: 2 of 4"]
+    del ranges["stamp"]
+    with pytest.raises(RecordingError, match=r"have several true ranges \(truth.ranges.stamp"):
+        read(PLAIN | {"truth": {"ranges": ranges}}, tmp_path / "x.csv")
+
+
+def test_registers_without_receive_power_give_the_first_path_level(tmp_path: Path):
+    text = "t,a,r,f1,f2,f3,n\n0,1,2,4889,13876,10464,1024\n"
+    document = with_fields(preamble_count="n") | {"registers": {"amplitudes": ["f1", "f2", "f3"]}}
+    cir = next(iter(of(text, tmp_path / "x.csv", **document))).measurement.cir
+    assert np.isnan(cir.rx_power_dbm)
+    assert cir.first_path_power_dbm == pytest.approx(10 * np.log10(325939393 / 1024**2) - 121.74, abs=0.01)
+
+
+def test_a_name_has_one_number_as_tag_and_anchor(tmp_path: Path):
+    names = {"tag": {"column": "from", "names": True}, "anchor": {"column": "a", "names": True}}
+    source = of("t,from,a,r\n0,A,B,2\n1,B,A,3\n", tmp_path / "x.csv", **with_fields(**names))
+    assert [ids[1:3] for ids in values_of(source)] == [(1, 2), (2, 1)]
+
+
+def test_missing_file_of_anchors_is_named(tmp_path: Path):
+    anchors = {"files": "site/anchors.csv", "id": "a", "position": ["x", 0, 0]}
+    with pytest.raises(
+        RecordingError, match=r"no file 'site/anchors.csv' \(relative to the folder of the ranges"
+    ):
+        of(HEADER + rows(), tmp_path / "x.csv", anchors=anchors)
+    source = of(HEADER + rows(), tmp_path / "x.csv", anchors=anchors | {"optional": True})
+    assert source.notes == [f"no anchors: no file 'site/anchors.csv' in {tmp_path}"]
+
+
+# Stamps ----------------------------------------------------------------------------------------------------------
+
+
+def test_two_boots_in_a_file_are_two_parts(tmp_path: Path):
+    text = HEADER + rows(40) + rows(40, start=0.05)
+    source = of(text, tmp_path / "x.csv", **TRUE)
+    assert source.warnings == [
+        "the clock starts again at row 41 of x.csv: 2 parts, with pauses of 5 s between them"
+    ]
+    stamps = source.values["stamp"] / 1e9
+    assert stamps == pytest.approx([*np.arange(40) / 10, *(8.9 + np.arange(40) / 10)])
+    assert source.errors_m == pytest.approx(np.full(80, 0.1), abs=1e-4)
+    write(tmp_path / "poses.csv", "t,x\n0,0\n9,0\n")
+    poses = {"files": "poses.csv", "stamp": "t", "position": ["x", 0, 0]}
+    with pytest.raises(RecordingError, match=r"the clock starts again .*one recording for each part"):
+        read(PLAIN | {"truth": {"poses": poses}}, tmp_path / "x.csv")
+
+
+def test_two_boots_in_two_files_are_two_parts(tmp_path: Path):
+    write(tmp_path / "run1.csv", HEADER + rows(40))
+    write(tmp_path / "run2.csv", HEADER + rows(40, start=0.05))
+    source = read(PLAIN, tmp_path)
+    assert "starts again at row 1 of run2.csv" in source.warnings[0]
+    assert (np.diff(source.values["stamp"]) > 4e9).sum() == 1
+
+
+@pytest.mark.parametrize("order", ["by anchor", "shuffled", "files"])
+def test_unsorted_rows_of_one_clock_are_sorted(order: str, tmp_path: Path):
+    lines = rows(80).splitlines(keepends=True)
+    if order == "shuffled":
+        lines = np.random.default_rng(1).permutation(lines).tolist()
+    by_anchor = {anchor: [line for line in lines if f",{anchor}," in line] for anchor in range(1, 5)}
+    if order == "by anchor":
+        lines = [line for group in by_anchor.values() for line in group]
+    for anchor, group in by_anchor.items():
+        write(tmp_path / f"files/{anchor}.csv", HEADER + "".join(group))
+    write(tmp_path / "one/x.csv", HEADER + "".join(lines))
+    source = read(PLAIN, tmp_path / ("files" if order == "files" else "one"))
+    assert not any("starts again" in warning for warning in source.warnings)
+    assert source.values["stamp"] / 1e9 == pytest.approx(np.arange(80) / 10)
+
+
+@pytest.mark.parametrize("lowest", [0, -(2**31)])
+def test_stamps_of_a_32_bit_counter_are_continued(lowest: int, tmp_path: Path):
+    counts = [2**32 - 2_000_000 + lowest + n * 100_000 for n in range(60)]
+    stamps = [(count - lowest) % 2**32 + lowest for count in counts]
+    text = "t,a,r\n" + "".join(f"{stamp},{n % 4},{n % 4 + 3}\n" for n, stamp in enumerate(stamps))
+    source = of(text, tmp_path / "x.csv", **with_fields(stamp={"column": "t", "unit": "us"}))
+    assert np.diff(source.values["stamp"]).tolist() == [100_000_000] * 59
+    assert source.warnings == ["the stamps overflow or pass midnight; they were continued"]
+
+
+@pytest.mark.parametrize(
+    ("unit", "texts", "stamps"),
+    [
+        ("iso8601", ("23:59:59.5", "00:00:00.1"), (86_399.5, 86_400.1)),
+        ("iso8601", ("2024-01-02 03:04:05,5", "2024-01-02 03:04:06"), (1_704_164_645.5, 1_704_164_646.0)),
+        ("%d/%m/%Y %H:%M:%S", ("02/01/2024 03:04:05", "02/01/2024 03:04:06"), (1_704_164_645, 1_704_164_646)),
+        ("%m/%d/%Y %H:%M:%S", ("01/02/2024 03:04:05", "01/02/2024 03:04:06"), (1_704_164_645, 1_704_164_646)),
+        ("%H.%M.%S", ("00.00.01", "00.00.02"), (1, 2)),
+    ],
+)
+def test_dates_and_times_of_other_forms(unit: str, texts: Any, stamps: Any, tmp_path: Path):
+    text = "t,a,r\n" + "".join(f'"{cell}",1,2.{n}\n' for n, cell in enumerate(texts))
+    source = of(text, tmp_path / "x.csv", **with_fields(stamp={"column": "t", "unit": unit}))
+    assert [stamp for stamp, *_ in values_of(source)] == pytest.approx(list(stamps))
+
+
+def test_unit_of_stamps_that_is_already_set_is_not_proposed(tmp_path: Path):
+    text = "t,a,r\n" + "".join(f"{17 * 10**14 + n * 100_000},1,2\n" for n in range(20))
+    with pytest.raises(RecordingError, match=r"outside of the years 1824 to 2115 \(unit: us\)"):
+        of(text, tmp_path / "x.csv", **with_fields(stamp={"column": "t", "unit": "ms"}))
+
+
+def test_repeated_rows_are_dropped_unless_the_clock_is_coarse(tmp_path: Path):
+    text = rows(40)
+    for repeated in (text + text, "".join(line * 2 for line in text.splitlines(keepends=True))):
+        source = of(HEADER + repeated, tmp_path / "x.csv", **TRUE)
+        assert (len(source), source.dropped, source.warnings) == (40, {"repeated row": 40}, [])
+    coarse = "t,a,r\n" + "".join(f"{n // 10},1,{3 + n % 3 / 100}\n" for n in range(60))
+    source = of(coarse, tmp_path / "x.csv")
+    assert len(source) == 60
+    assert source.warnings == ["54 ranges repeat the stamp of another range of the same pair"]
+
+
+# Logs ------------------------------------------------------------------------------------------------------------
+
+LOG = """boot v1.2
+[12] Range: 2.31 m  from: 1D  RX power: -78.2 dBm
+[112] Range: 2.35 m  from: 1E  RX power: -79 dBm
+timeout
+[212] Range: 2.33 m  from: 1D
+"""
+LINE = {
+    "pattern": r"\[(?P<t>\d+)\] Range: (?P<r>[\d.]+) m +from: (?P<a>\w+)(?: +RX power: (?P<l>\S+))?",
+    "fields": {
+        "stamp": {"column": "t", "unit": "ms"}, "anchor": {"column": "a", "hex": True}, "range": "r", "rx_power": "l",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["x.log", "x.txt"])
+def test_lines_of_a_log_are_rows(name: str, tmp_path: Path):
+    source = of(LOG, tmp_path / name, **LINE)
+    assert values_of(source) == [(0.012, 1, 0x1D, 2.31), (0.112, 1, 0x1E, 2.35), (0.212, 1, 0x1D, 2.33)]
+    assert source.values["rx_power"] == pytest.approx([-78.2, -79, np.nan], nan_ok=True)
+    assert source.dropped == {"lines without a range, such as 'boot v1.2'": 2}
+    with pytest.raises(RecordingError, match=r"no ranges .*lines without a range, such as 'hello'"):
+        of("hello\nworld\n", tmp_path / name, **LINE)
+
+
+def test_a_line_may_contain_several_ranges():
+    table = TableFormat(pattern=r"addr=(?P<a>0x\w+), .*?distance\[cm\]=(?P<r>\d+)")
+    reader = MessageRows(table, {"a": False, "r": False})
+    line = "[addr=0x0001, status=OK, distance[cm]=23]; [addr=0x0002, status=OK, distance[cm]=45]"
+    assert reader.rows(line) == {"#": [0, 0], "a": ["0x0001", "0x0002"], "r": ["23", "45"]}
+    assert reader.rows("SESSION_STATUS") == {"#": [], "a": [], "r": []}
+
+
+def test_json_lines_and_documents_are_read(tmp_path: Path):
+    lines = 'ready\n{"t": 0, "a": 1, "r": 2.5}\n{"t": 1, "a": 2, "r": 2.6}\n'
+    source = of(lines, tmp_path / "x.jsonl", text="json")
+    assert values_of(source) == [(0.0, 1, 1, 2.5), (1.0, 1, 2, 2.6)]
+    assert source.dropped == {"lines without a range, such as 'ready' (not JSON: 'ready')": 1}
+    document = json.dumps(
+        {"runs": {"one": [{"t": 0, "a": 1, "r": 2.5}], "two": [{"t": 1, "a": 2, "r": 2.6}]}}
+    )
+    assert values_of(of(document, tmp_path / "x.json", group="runs[][]")) == values_of(source)
+
+
+def test_rows_of_other_messages_are_dropped_by_an_expression_or_unknown(tmp_path: Path):
+    text = "t,m\n0,boot\n1,Range 2.5 from 3\n2,Range 2.6 from 3\n"
+    fields = {
+        "stamp": "t", "anchor": {"column": "m", "pattern": r"from (\d+)"},
+        "range": {"column": "m", "pattern": r"Range ([\d.]+)"},
+    }  # fmt: skip
+    rule = {"column": "m", "matches": "^(?!Range)"}
+    source = of(text, tmp_path / "x.csv", fields=fields, drop=[rule])
+    assert (ranges_of(source), source.dropped) == ([2.5, 2.6], {"m matches ^(?!Range)": 1})
+    with pytest.raises(RecordingError, match=r"anchor = 'boot' does not match .*optional: true"):
+        of(text, tmp_path / "x.csv", fields=fields)
+    optional = {name: field | {"optional": True} for name, field in fields.items() if name != "stamp"}
+    assert ranges_of(of(text, tmp_path / "x.csv", fields=fields | optional)) == [2.5, 2.6]
+
+
+# Public data sets ------------------------------------------------------------------------------------------------
+
+
+def test_murp(tmp_path: Path):
+    pairs = [f"{i}_{j}" for i in range(1, 7) for j in range(1, 7)]
+    header = [
+        "t",
+        "x",
+        *pairs,
+        *(f"{pair}_t" for pair in pairs),
+        *(f"{pair}_err" for pair in pairs),
+        "r",
+        "r_t",
+    ]
+    for base, target in ((1, 2), (2, 1)):
+        lines = [",".join(header)]
+        for n in range(3):
+            measured = [str(2 + base + n / 100) if pair in ("1_2", "6_3") else "" for pair in pairs]
+            lines.append(",".join([str(n / 25), "0", *measured, *["1.9"] * 36, *["0.1"] * 36, "2", "2"]))
+        write(tmp_path / f"01/01_base-{base}_targ-{target}_win-0_step-0.csv", "\n".join(lines))
+        write(tmp_path / f"01/01_base-{base}_targ-{target}_win-1_step-1.csv", "filtered")
+    source = open_mapped(tmp_path / "01", "murp")
+    assert values_of(source)[:4] == [
+        (0.0, 11, 22, 3.0),
+        (0.0, 16, 23, 3.0),
+        (0.0, 21, 12, 4.0),
+        (0.0, 26, 13, 4.0),
+    ]
+    assert set(source.values["true range"]) == {1.9}
+    assert len(source) == 12
+
+
+def log_a_tec(position: tuple[float, float, float], anchor: int, channel: int) -> dict[str, Any]:
+    place = (float(anchor), 2.0, 1.0)
+    distance = float(np.linalg.norm(np.subtract(place, position)))
+    numbers = np.random.default_rng(anchor).integers(-200, 200, (1016, 2)).tolist()
+    names = (
+        "tag_id",
+        "anchor_id",
+        "x_tag",
+        "y_tag",
+        "z_tag",
+        "x_anchor",
+        "y_anchor",
+        "z_anchor",
+        "nlos",
+        "range",
+    )
+    values = ("0B16", f"DECA{anchor}", *position, *place, anchor % 2, round(distance + 0.1, 2))
+    names += (
+        "fp_index",
+        "rss",
+        "rss_fp",
+        "fp_point1",
+        "fp_point2",
+        "fp_point3",
+        "stdev_noise",
+        "cir_power",
+        "max_noise",
+    )
+    values += (745, -78.5, -80.1, 1, 2, 3, 4, 5, 6)
+    names += (
+        "rxpacc",
+        "channel_number",
+        "frame_length",
+        "preamble_length",
+        "bitrate",
+        "prfr",
+        "preamble_code",
+        "cir",
+    )
+    return dict(
+        zip(
+            names,
+            (*values, 1010, channel, 10, 1024, 110, 64, 9, [str(complex(*pair)) for pair in numbers]),
+            strict=True,
+        )
+    )
+
+
+def test_log_a_tec(tmp_path: Path):
+    positions = [(0.5, 1.0, 1.2), (1.5, 1.0, 1.2), (2.5, 1.0, 1.2)]
+    document: dict[str, Any] = {"path": [], "measurements": {}}
+    for position in positions:
+        name, channels = "_".join(f"{axis:.2f}" for axis in position), (1, 5)
+        cells = {a: {f"ch{c}": [log_a_tec(position, a, c)] * 2 for c in channels} for a in (1, 2)}
+        document["measurements"][name] = {f"A{anchor}": cells[anchor] for anchor in cells}
+        for anchor, channel in ((1, 1), (2, 5)):
+            row = log_a_tec(position, anchor, channel)
+            line = ",".join([*(str(value) for name, value in row.items() if name != "cir"), *row["cir"]])
+            names = ",".join(row).upper() + "..."
+            write(tmp_path / f"raw/data/{name}/ch{channel}_A{anchor}.csv", f"v1.1\n{names}\n{line}")
+    write(tmp_path / "environment0/data.json", json.dumps(document))
+    for path, mapping, count in (("environment0", "log_a_tec", 24), ("raw", "log_a_tec_raw", 6)):
+        source = open_mapped(tmp_path / path, mapping)
+        first = next(iter(source))
+        assert (len(source), sorted(source.anchors.index)) == (count, [1, 2])
+        assert source.notes == ["3 placements, with pauses of 5 s between them"]
+        assert source.errors_m == pytest.approx(np.full(count, 0.1), abs=0.006)
+        assert (first.tag_position, first.truth and first.truth.label) == (positions[0], "NLOS")
+        assert (first.truth and first.truth.configuration) == "placement 1"
+        cir, expected = first.measurement.cir, log_a_tec(positions[0], 1, 1)["cir"]
+        assert [complex(*pair) for pair in cir.samples.reshape(-1, 2)] == [complex(text) for text in expected]
+        assert (cir.first_path_index, cir.preamble_count, cir.rx_power_dbm, cir.channel) == (
+            745,
+            1010,
+            -78.5,
+            1,
+        )
+
+
+def test_ewine_localization(tmp_path: Path):
+    numbers = ",".join(str(float(n**3)) for n in range(1016))
+    lines = [
+        f"1.0,2.0,{3 + n},4.0,{np.hypot(2 + n, 2) + 0.1:.3f},{n % 2},7,9,745,-78,-80,1,2,3,4,5,6,1010,4,39,1024,110,64,17,{numbers}"
+        for n in range(3)
+    ]
+    source = open_mapped(write(tmp_path / "tag_room0.csv", "\n".join(lines)), "ewine_localization")
+    assert source.errors_m == pytest.approx(np.full(3, 0.1), abs=0.001)
+    first = next(iter(source)).measurement
+    assert (first.anchor_id, len(first.cir), first.cir.first_path_index, first.cir.channel) == (
+        0,
+        1016,
+        745,
+        4,
+    )
+    assert source.anchors.position.tolist() == [[1.0, 2.0, 0.0]]
+
+
+def test_util_is_refused_with_a_reason(tmp_path: Path):
+    done = run("data", "import", tmp_path, "--map", "util", "-o", "x.mcap", folder=tmp_path)
+    assert done.returncode != 0
+    assert "UTIL cannot be imported: it contains time differences of arrival (TDoA)" in done.stderr
