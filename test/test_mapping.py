@@ -644,8 +644,8 @@ def test_unsorted_and_repeated_stamps_and_nan_are_reported(tmp_path: Path):
     assert ranges_of(source) == [2.0, 2.1, 9.0, 3.0, -1.0]
     assert source.dropped == {"range is not a number": 1}
     assert [warning.split(" ", 1)[1] for warning in source.warnings] == [
-        "stamps are earlier than the one before; the ranges were sorted",
         "ranges repeat the stamp of another range of the same pair",
+        "stamps are earlier than the one before; the ranges were sorted",
         "ranges are negative",
     ]
     assert any("sorted" in kind for kind in source.skipped)

@@ -100,10 +100,10 @@ def test_stamps_are_kept_unless_ros_cannot_represent_them(tmp_path: Path):
     [
         (100, "s", "100 s apart.*unit: ms"),
         (0.1, "ms", "0.0001 s apart.*unit: s of the stamps"),
-        (0.0001, "s", r"scale: 3600 \(hours\)"),
+        (0.0001, "s", r"unit: s, scale: 3600 \(hours\)"),
         (100_000, "s", "unit: us"),
         (100_000, "ms", "unit: us"),
-        (1 / 864_000, "s", r"scale: 86400 \(days\)"),
+        (1 / 864_000, "s", r"unit: s, scale: 86400 \(days\)"),
     ],
 )
 def test_implausible_rate_is_an_error(step: float, unit: str, message: str, tmp_path: Path):

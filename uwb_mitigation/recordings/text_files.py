@@ -10,6 +10,7 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.recordings.mapping.mapping import TableFormat
 
 BLOCK_CHARS, MAX_ROW_CHARS = 1 << 22, 1 << 26
 """Size of a block, and largest size of a row."""
@@ -112,6 +112,17 @@ def _encoding(head: bytes) -> str:
     return "utf-8-sig"
 
 
+@dataclass(frozen=True, slots=True)
+class CsvFormat:
+    """Format of a CSV file; the attributes are those of `TableFormat`."""
+
+    separator: str
+    decimal: str
+    comment: str
+    skip: int
+    columns: Sequence[str]
+
+
 class CsvRows:
     """The rows of a CSV file.
 
@@ -129,7 +140,7 @@ class CsvRows:
     """
 
     def __init__(
-        self, table: TableFormat, path: Path, choose: ChooseColumns, ids: Collection[str],
+        self, table: CsvFormat, path: Path, choose: ChooseColumns, ids: Collection[str],
         dropped: Counter[str], on_warning: OnWarning | None,
     ) -> None:  # fmt: skip
         self._table, self._path, self._choose, self._ids = table, path, choose, set(ids)
@@ -179,7 +190,7 @@ class CsvRows:
         """Choose the columns, and return the lines after the header."""
         import pandas as pd
 
-        names, comment = self._table.columns, self._table.comment or "\n"
+        names, comment = [*self._table.columns], self._table.comment or "\n"
         if not names:
             lines = list(dropwhile(lambda line: not line.strip() or line.startswith(comment), lines))
             self._header, lines = lines[0] if lines else "", lines[1:]

@@ -69,14 +69,14 @@ def unknown_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     }
 
 
-def invalid_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
-    """Return {reason: rows} that repeat another row, or with a number that means that there is no range."""
-    rules = {"repeated row": _repeated(values)[1]}
+def no_measurements(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+    """Return {reason: rows} with a number that means that there is no range."""
+    rules = {}
     for number in _NO_RANGE_M:
         same = np.abs(values["range"] - number) < 1e-6
         near = np.abs(values["range"] - number) < max(0.05, 0.2 * number)
         is_true = np.abs(values["true range"] - number) < 1.0
-        if np.array_equal(same, near) and not (same & is_true).any():
+        if same.any() and np.array_equal(same, near) and not (same & is_true).any():
             rules[f"range is {number:g}, which means no measurement"] = same
     return rules
 
@@ -86,7 +86,7 @@ def impossible_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     return {f"{name} is above {MAX_POSSIBLE:g}": np.abs(values[name]) > MAX_POSSIBLE for name in _LIMITED}
 
 
-def _repeated(values: ColumnDict) -> tuple[int, NDArray[np.bool_]]:
+def repeated_rows(values: ColumnDict) -> tuple[int, NDArray[np.bool_]]:
     """Return the number of ranges with the stamp of another range of the pair, and which of them are equal rows.
 
     Rows with a coarse clock may be equal: if some of the pair's ranges with the same stamp differ, none is returned.
@@ -134,7 +134,7 @@ def _without_overflow(values: ColumnDict, rule: FieldRule) -> NDArray[np.int64] 
     is_date = rule.unit == "iso8601" or "%" in rule.unit
     period = _DAY_S * NS_PER_S if is_date else round((TIME[rule.unit or "s"] * rule.scale) * 2**32)
     stamps, has_overflow = values["stamp"].copy(), False
-    for number in np.unique(values["file"]):
+    for number in range(int(values["file"].max()) + 1):
         rows = np.flatnonzero(values["file"] == number)
         one = (stamps[rows] - round(rule.offset * NS_PER_S)) / period
         back, forward = np.diff(one) < -0.96, np.diff(one) > 0.96
@@ -171,7 +171,7 @@ def _parts(values: ColumnDict) -> NDArray[np.int64] | None:
     of_file: NDArray[np.int64] = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < limit)
     part = of_file if of_file[-1] == count else of_pair
     # A copy of the rows is no second part.
-    is_copy = _repeated(values)[1]
+    is_copy = repeated_rows(values)[1]
     return None if is_copy[part > 0].mean() > 0.9 else part
 
 
@@ -181,8 +181,9 @@ def _parts(values: ColumnDict) -> NDArray[np.int64] | None:
 def check_stamps(values: ColumnDict, name: str, stamp: FieldRule, *, moving: bool) -> None:
     """Raise RecordingError for equal stamps, or an implausible rate, which shows a wrong unit of stamps."""
     # Several ranges may have the same stamp.
-    intervals_s = np.diff(np.unique(values["stamp"])) / 1e9
-    if not len(intervals_s) and _repeated(values)[0]:
+    intervals_s = np.diff(np.sort(values["stamp"], kind="stable")) / 1e9
+    intervals_s = intervals_s[intervals_s > 0]
+    if not len(intervals_s) and repeated_rows(values)[0]:
         valid = "stamp: another column, or {rate_hz: ranges per second}"
         raise RecordingError("all stamps are equal", where=name, valid=valid)
     if len(intervals_s) < 10:
@@ -200,7 +201,7 @@ def _unit_of_time(interval_s: float, rule: FieldRule) -> str:
     """Return the line of a mapping that makes an interval most plausible."""
     now_ns = TIME.get(rule.unit or "s", NS_PER_S) * rule.scale
     units = {f"unit: {unit}": factor for unit, factor in TIME.items() if unit != "iso8601"}
-    units |= {f"scale: {s} ({name})": s * NS_PER_S for name, s in _TIMES_S.items()}
+    units |= {f"unit: s, scale: {s} ({name})": s * NS_PER_S for name, s in _TIMES_S.items()}
     misfits = {line: abs(np.log(interval_s * ns / now_ns * 10)) for line, ns in units.items() if ns != now_ns}
     return min(misfits, key=misfits.__getitem__)
 
@@ -240,7 +241,8 @@ def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> Non
             valid = f"{low:g} to {high:g}; probably set unit: {alternative if middle > high else si}"
             raise RecordingError(what, where=name, valid=valid)
     factor = _scale(ranges, true)
-    for quantity, ratio, now in (("range", factor, unit), ("truth.range", 1 / factor, true_unit)):
+    inverse = 1 / factor if factor else np.nan
+    for quantity, ratio, now in (("range", factor, unit), ("truth.range", inverse, true_unit)):
         fitting, misfit = _unit_of_length(ratio, now)
         if misfit < _MAX_MISFIT and fitting != (now or "m"):
             what = f"the ranges are {factor:.3g} times the true ranges"
@@ -250,8 +252,10 @@ def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> Non
 
 def _unit_of_length(factor: float, unit: str) -> tuple[str, float]:
     """Return the unit that explains a factor of lengths in `unit` best, and the logarithm of the rest of the factor."""
-    ratio = factor / LENGTHS[unit or "m"]
-    misfits = {other: abs(np.log(ratio * metres)) for other, metres in LENGTHS.items()}
+    now_m = LENGTHS[unit or "m"]
+    misfits = {
+        other: abs(np.log(factor * m / now_m)) if factor > 0 else np.inf for other, m in LENGTHS.items()
+    }
     return min(misfits.items(), key=lambda item: item[1])
 
 
@@ -283,9 +287,9 @@ def anchor_warnings(
         positions: {anchor: position}.
         differences_m: distances of positions minus true ranges, (n,); NaN: unknown.
     """
-    ranged = np.unique(values["anchor"]).tolist()
     if not positions:
         return
+    ranged = np.unique(values["anchor"]).tolist()
     differences = {anchor: median(np.abs(differences_m[values["anchor"] == anchor])) for anchor in ranged}
     if wrong := [f"{format_id(a)} by {d:.2f} m" for a, d in differences.items() if d > MAX_DIFFERENCE_M]:
         what = f"true ranges and distances from positions differ for anchor {_listed(wrong)}"
@@ -307,8 +311,6 @@ def value_warnings(values: ColumnDict, *, errors_measured: bool) -> Iterator[str
     """Yield warnings of implausible values; `errors_measured`: the recording has errors, but no true ranges."""
     import pandas as pd
 
-    if repeated := _repeated(values)[0]:
-        yield f"{repeated} ranges repeat the stamp of another range of the same pair"
     ranges, errors = values["range"], values["range"] - values["true range"]
     errors = errors[np.isfinite(errors)]
     for name, numbers, limit in (("ranges", ranges, _LARGE_M), ("errors", np.abs(errors), _LARGE_ERROR_M)):

@@ -40,10 +40,7 @@ _HINTS = (
 MAX_STAMP_S = 4.6e9
 """Stamps are within the years 1824 to 2115, so that differences fit into 64 bits."""
 
-_VALID_IDS = (
-    "a whole number such as 3 or 0x1f; hexadecimal without 0x: `hex: true`; `pattern` takes a number from a text, `names: true` "
-    "numbers texts"
-)
+_VALID_IDS = "a whole number such as 3 or 0x1f; otherwise set `hex: true`, `pattern` or `names: true`"
 NO_CIR = Cir(np.zeros(0, np.int16))
 _TIME_OF_DAY = r"\d{1,2}:\d\d:\d\d(\.\d+)?"
 _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
@@ -303,9 +300,9 @@ def _dates(raw: NDArray[Any], unit: str, chunk: Chunk) -> tuple[NDArray[np.int64
     # Python's logging writes a comma.
     texts = pd.Series([str(cell).strip().replace(",", ".") for cell in raw.tolist()], dtype=object)
     if unit == "iso8601":
-        times = pd.to_datetime(texts, utc=True, errors="coerce", format="ISO8601")
+        times = pd.to_datetime(texts, utc=True, errors="coerce", format="ISO8601").dt.as_unit("ns")
         of_day = pd.to_timedelta(texts.where(texts.str.fullmatch(_TIME_OF_DAY)), errors="coerce")
-        times = times.fillna(pd.Timestamp(0, tz="UTC") + of_day)
+        times = times.fillna((pd.Timestamp(0, tz="UTC") + of_day).dt.as_unit("ns"))
     else:
         times = pd.to_datetime(texts, utc=True, errors="coerce", format=unit)
         if not re.search("%[YyGcx]", unit):

@@ -84,7 +84,10 @@ class MappedRecording(Source):
             self._continue_clocks(stamp)
         if not stamp.rate_hz and not mapping.topics:
             checks.check_stamps(self.values, self.name, stamp, moving=mapping.moving)
-        self._drop(checks.invalid_rows(self.values))
+        count, repeated = checks.repeated_rows(self.values)
+        if count and not repeated.any():
+            self.warnings.append(f"{count} ranges repeat the stamp of another range of the same pair")
+        self._drop({"repeated row": repeated, **checks.no_measurements(self.values)})
         self._add_other_cirs()
         del self.values["row"]
         if stamp.rate_hz:

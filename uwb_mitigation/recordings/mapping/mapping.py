@@ -11,15 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    WrapValidator,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, WrapValidator, model_validator
 
 from uwb_mitigation.errors import ParameterError, did_you_mean
 from uwb_mitigation.files import read_bounded
@@ -48,7 +40,7 @@ VARIABLE = "variable"
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True)
+    model_config = {"frozen": True}
 
     @model_validator(mode="before")
     @classmethod

@@ -16,17 +16,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import (
-    DamagedRecordingError,
-    MissingDependencyError,
-    RecordingError,
-    UwbMitigationError,
-    did_you_mean,
-)
+from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError, did_you_mean
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
-from uwb_mitigation.recordings.text_files import CsvRows, OnWarning, Rows, TextBlocks
+from uwb_mitigation.recordings.text_files import CsvFormat, CsvRows, OnWarning, Rows, TextBlocks
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 """Largest number of rows, and of values in columns, of a chunk."""
@@ -167,7 +161,8 @@ class TableFile:
             if kind in ("messages", "lines", "json", "yaml"):
                 rows = self._messages(kind)
             elif kind == "csv":
-                rows = iter(CsvRows(table, path, self._choose, self.ids, self.dropped, self.on_warning))
+                csv = CsvFormat(table.separator, table.decimal, table.comment, table.skip, table.columns)
+                rows = iter(CsvRows(csv, path, self._choose, self.ids, self.dropped, self.on_warning))
             elif kind:
                 rows = self._arrays(is_matlab=kind == "matlab")
             else:
@@ -181,7 +176,7 @@ class TableFile:
                     values, repeats = _unpivot(table, values, len(numbers))
                     numbers = np.repeat(numbers, repeats)
                 yield Chunk(values, len(numbers), path, numbers, before)
-        except UwbMitigationError:
+        except (RecordingError, MissingDependencyError):
             raise
         except Exception as error:
             # For damaged files the libraries raise many other types, such as BadZipFile or ZeroDivisionError.
