@@ -154,6 +154,12 @@ def test_a_large_offset_of_all_anchors_is_no_unit_of_one(tmp_path: Path):
     assert len(of(text, tmp_path / "x.csv", **TRUE)) == 80
 
 
+def test_an_anchor_next_to_the_tag_with_a_large_error_has_no_other_unit(tmp_path: Path):
+    pairs = [(0.04, 1.6), (6.0, 6.1), (8.0, 8.1), (9.0, 9.1)]
+    text = HEADER + "".join(f"{n},{n % 4},{pairs[n % 4][1]},{pairs[n % 4][0]}\n" for n in range(80))
+    assert len(of(text, tmp_path / "x.csv", **TRUE)) == 80
+
+
 def test_numbers_that_mean_no_measurement_are_dropped(tmp_path: Path):
     lines = (HEADER + rows()).splitlines(keepends=True)
     for n, number in ((5, "0"), (9, "0.00"), (17, "655.35")):

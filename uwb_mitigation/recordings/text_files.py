@@ -202,8 +202,10 @@ class CsvRows:
         if equal := [name for name in self._chosen.values() if originals.count(name) > 1]:
             what, valid = f"several columns have the name {equal[0]}", f"columns: [{', '.join(names[:40])}]"
             raise RecordingError(what, where=str(self._path), valid=f"{valid} and skip: 1")
-        # Pandas refuses columns that no row of a block has.
-        self._header = self._header or self._mark.join(names)
+        if self._table.columns:
+            # Pandas refuses columns that no row of a block has.
+            self._header = self._mark.join("x" * len(names))
+            self._options |= {"names": names, "header": 0}
         self._options["usecols"] = [*self._chosen.values()]
         return lines
 

@@ -217,17 +217,20 @@ def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> Non
         raise RecordingError(f"{negative:.0%} of the ranges are negative", where=name, valid=valid)
     by_anchor, wrong = pd.Series(ranges).groupby(values["anchor"]), dict[int, str]()
     medians, rows_of = by_anchor.median(), by_anchor.indices
-    typical = medians.median()
+    is_plausible = medians.between(MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M)
+    typical = medians[is_plausible].median()
     for anchor, middle in medians.items():
         factor = _scale(ranges[rows_of[anchor]], true[rows_of[anchor]])
-        fitting, misfit = _unit_of_length(factor if np.isfinite(factor) else middle / typical, unit)
-        # An offset may also explain the factor, but not if it is that of one anchor.
-        is_other = fitting != (unit or "m") and misfit < _MAX_MISFIT and not 0.4 < middle / typical < 2.5
-        if (is_other and np.isfinite(factor)) or middle > MAX_PLAUSIBLE_M or 0 < middle < MIN_PLAUSIBLE_M:
+        if np.isnan(factor) and not is_plausible[anchor]:
+            factor = middle / typical
+        fitting, misfit = _unit_of_length(factor, unit)
+        # An offset may also explain the factor, but not the difference from other anchors.
+        differs = middle > 2.5 * typical if factor > 1 else middle < 0.4 * typical
+        if differs and fitting != (unit or "m") and (misfit < _MAX_MISFIT or not is_plausible[anchor]):
             wrong[anchor] = fitting
     if 0 < len(wrong) < len(medians):
         anchor = next(iter(wrong))
-        what = f"the median range of anchor {format_id(anchor)} is {medians[anchor]:,.4g} m, of all {typical:,.4g} m"
+        what = f"the median range of anchor {format_id(anchor)} is {medians[anchor]:,.4g} m, others {typical:,.4g} m"
         lines = ", ".join(f"{anchor}: {fitting}" for anchor, fitting in wrong.items())
         raise RecordingError(what, where=name, valid=f"probably set units: {{{lines}}} of range")
     for column, low, high, si, alternative in (

@@ -49,9 +49,8 @@ class CirFile:
             try:
                 samples, encoding, scale = samples_of(values, source.samples)
             except UNREADABLE as error:
-                raise RecordingError(
-                    f"not a CIR: {error}", where=chunk.where(row), valid=source.samples
-                ) from error
+                what, where = f"not a CIR: {error}", chunk.where(row)
+                raise RecordingError(what, where=where, valid=source.samples) from error
             if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
                 raise RecordingError("a CIR in dB", where=chunk.where(row), valid=LINEAR_MAGNITUDES)
             if len(samples):
@@ -95,10 +94,8 @@ def join_by_time(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, join:
     sources = pd.DataFrame({name: cirs[name] for name in (*keys, "cir", "first_path_index")})
     sources = sources[sources["cir"] >= 0].assign(cir_stamp=sources["stamp"])
     targets, sources = (frame.sort_values("stamp", kind="stable") for frame in (targets, sources))
-    tolerance = {"direction": "nearest", "tolerance": round(join.tolerance_s * 1e9)}
-    pairs = pd.merge_asof(targets, sources, on="stamp", by=["tag", "anchor"], **tolerance).dropna(
-        subset="cir"
-    )
+    limits: Any = {"direction": "nearest", "tolerance": round(join.tolerance_s * 1e9)}
+    pairs = pd.merge_asof(targets, sources, on="stamp", by=["tag", "anchor"], **limits).dropna(subset="cir")
     # A CIR belongs to one range only.
     distance = (pairs["cir_stamp"] - pairs["stamp"]).abs()
     pairs = pairs.loc[distance.sort_values(kind="stable").index].drop_duplicates("cir")
@@ -133,8 +130,6 @@ def _summary(ranges: Any, cirs: Any, attached: int, join: Join) -> tuple[str, bo
     delay_s, count = float(medians[best]), int(counts[starts[best]])
     text += f"; typical delay {delay_s:+.2f} s"
     if count > 1.1 * min(attached, _MAX_SEARCHED) + 1:
-        return (
-            f"{text}; cir.join.stamp with offset: {join.stamp.offset - delay_s:.3f} would attach more",
-            True,
-        )
+        hint = f"cir.join.stamp with offset: {join.stamp.offset - delay_s:.3f} would attach more"
+        return f"{text}; {hint}", True
     return text, attached < len(cirs) / 2

@@ -152,8 +152,9 @@ def _value(*units: str) -> WrapValidator:
         if isinstance(value, str | int | float):
             value = {"column" if isinstance(value, str) else "constant": value}
         rule = validate(value)
-        if rule.unit and rule.unit not in units and not ("%" in rule.unit and "iso8601" in units):
-            raise ValueError(f"unit {rule.unit!r}; valid: {', '.join(units) or 'none'}")
+        is_format = "%" in rule.unit and "iso8601" in units
+        if (rule.unit and rule.unit not in units and not is_format) or (rule.units and "m" not in units):
+            raise ValueError(f"unit {rule.unit or rule.units!r}; valid: {', '.join(units) or 'none'}")
         return rule
 
     return WrapValidator(read)
@@ -205,7 +206,7 @@ class TableFormat(_Strict):
         files: glob, below the folder that is imported, or next to the file of the ranges; or {pattern: glob}, of which
             the first is used whose regular expression is found in the path of the recording.
         separator, decimal: of CSV; the separator may be a regular expression, such as `\\s+`.
-        columns: names of the columns of files without header; `CIR{0..1015}` stands for 1016 columns.
+        columns: names of the columns of files without header; `CIR{0..1015}` means 1016 columns.
         skip, comment: number of lines before the table or its header, and character with which comments start.
         pattern: regular expression for lines of a log, or for the texts of messages: each match is a row, and its named
             groups `(?P<name>...)` are the columns.

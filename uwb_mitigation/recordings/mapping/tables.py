@@ -239,11 +239,7 @@ class TableFile:
             except ImportError as error:
                 raise MissingDependencyError("h5py is not installed", valid="pip install h5py") from error
             content = stack.enter_context(h5py.File(self.path, "r"))
-        if table.group:
-            if table.group not in content:
-                valid = ", ".join(map(str, content))
-                raise RecordingError(f"no variable {table.group}", where=where, valid=valid)
-            content = content[table.group]
+        content = self._group(content)
         # MATLAB writes the transposed array.
         if is_hdf5 and is_matlab and hasattr(content, "dtype"):
             content = content[()].T
@@ -260,6 +256,12 @@ class TableFile:
         frame = pd.DataFrame(content, columns=table.columns or None)
         return {str(name): column.to_numpy() for name, column in frame.items()}
 
+    def _group(self, content: Any) -> Any:
+        if (group := self.table.group) and group not in content:
+            valid = ", ".join(map(str, content))
+            raise RecordingError(f"no variable {group}", where=str(self.path), valid=valid)
+        return content[group] if group else content
+
     def _messages(self, kind: str) -> Rows:
         """Read the messages of a bag, the lines of a log, or the objects of a document."""
         table, path, limit = self.table, self.path, MAX_DOCUMENT_ROWS
@@ -272,7 +274,7 @@ class TableFile:
             messages = iter([({}, json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError)))])
         else:
             document = yaml.safe_load(read_bounded(path, MAX_YAML_BYTES, RecordingError))
-            messages = iter([({}, _entries(document[table.group] if table.group else document))])
+            messages = iter([({}, _entries(self._group(document)))])
             table = table.model_copy(update={"group": "[]"})
         reader, first, reason = MessageRows(table, self.columns), 0, ""
         damage: DamagedRecordingError | None = None
