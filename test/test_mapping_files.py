@@ -124,8 +124,9 @@ def test_decompression_bomb_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_other_formats_are_refused_with_a_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    with pytest.raises(RecordingError, match=r"unknown format .xlsx .*others as CSV"):
-        of(b"PK", tmp_path / "x.xlsx")
+    for name, valid in (("x.xlsx", "others as CSV"), ("x.log", "lines with `pattern` or `text`")):
+        with pytest.raises(RecordingError, match=rf"unknown format .* {valid}"):
+            of(b"PK", tmp_path / name)
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingDependencyError, match=r"h5py is not installed .*pip install h5py"):
         of(b"", tmp_path / "x.h5")

@@ -151,7 +151,8 @@ class TableFile:
         """
         table, path = self.table, self.path
         kind = ("" if path.is_dir() else table.format) or _kind_of(path)
-        kind = "lines" if kind != "messages" and (table.pattern or table.text) else kind
+        is_log = kind != "messages" and (table.pattern or table.text)
+        kind = "lines" if is_log else kind.replace("lines", "")
         if (groups := re.search(table.file_name, self.file)) is None:
             raise RecordingError(f"{self.file!r} does not match {table.file_name!r}", where=str(path))
         constants = {FILE: self.file, **groups.groupdict()}
@@ -167,7 +168,7 @@ class TableFile:
                 rows = self._arrays(is_matlab=kind == "matlab")
             else:
                 valid = (
-                    f"{', '.join(sorted({*_SUFFIXES.values()}))}; others as CSV, such as with pandas.to_csv"
+                    "csv, hdf5, json, matlab, messages, yaml; lines with `pattern` or `text`; save others as CSV"
                 )
                 raise RecordingError(f"unknown format {path.suffix}", where=str(path), valid=valid)
             for values, numbers in rows:
