@@ -234,6 +234,18 @@ def test_standard_messages():
     ) == [(1, 2, 3.0)]
 
 
+def test_lines_of_text_are_read_with_a_pattern():
+    fields = {
+        "anchor": {"column": "a", "hex": True},
+        "range": {"column": "r", "unit": "cm", "units": {30: "m"}},
+    }
+    document = {"name": "lines", "type": "std_msgs/msg/String", "topics": ["/log"], "fields": fields}
+    convert = Convert(Mapping.model_validate(document | {"pattern": r"from (?P<a>\w+): (?P<r>[\d.]+)"}))
+    assert convert.take(String(data="from 1D: 250; from 1E: 3.5")) == [(1, 29, 2.5), (1, 30, 3.5)]
+    assert len(convert.take(String(data="boot"))) == 2
+    assert not convert.ranges.counts
+
+
 def test_hostile_texts_are_counted():
     convert = Convert("string_json")
     for text in (

@@ -167,9 +167,7 @@ class TableFile:
             elif kind:
                 rows = self._arrays(is_matlab=kind == "matlab")
             else:
-                valid = (
-                    "csv, hdf5, json, matlab, messages, yaml; lines with `pattern` or `text`; save others as CSV"
-                )
+                valid = "csv, hdf5, json, matlab, messages, yaml; lines with `pattern` or `text`; save others as CSV"
                 raise RecordingError(f"unknown format {path.suffix}", where=str(path), valid=valid)
             for values, numbers in rows:
                 values |= {name: np.full(len(numbers), text, object) for name, text in constants.items()}
