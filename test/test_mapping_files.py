@@ -15,8 +15,8 @@ from command_line import run
 from test_mapping import PLAIN, ranges_of, read, with_fields, write
 
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
-from uwb_mitigation.recordings import text_files
 from uwb_mitigation.recordings.formats import open_mapped
+from uwb_mitigation.recordings.mapping import text_files
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import TableFormat
 from uwb_mitigation.recordings.mapping.messages import MessageRows
@@ -163,7 +163,7 @@ def test_an_anchor_next_to_the_tag_with_a_large_error_has_no_other_unit(tmp_path
 
 def test_numbers_that_mean_no_measurement_are_dropped(tmp_path: Path):
     lines = (HEADER + rows()).splitlines(keepends=True)
-    for n, number in ((5, "0"), (9, "0.00"), (17, "655.35")):
+    for n, number in ((5, "0"), (9, "0.00"), (17, "655.34998")):
         lines[n] = ",".join([*lines[n].split(",")[:2], number, lines[n].split(",")[3]])
     source = of("".join(lines), tmp_path / "x.csv", **TRUE)
     what = "which means no measurement"

@@ -246,6 +246,13 @@ def test_lines_of_text_are_read_with_a_pattern():
     assert not convert.ranges.counts
 
 
+def test_ranges_without_an_id_are_counted():
+    document = {"name": "x", "type": "std_msgs/msg/String", "topics": ["/log"], "text": "json"}
+    convert = Convert(Mapping.model_validate(document | {"fields": {"anchor": "a", "range": "r"}}))
+    assert convert.take(String(data='{"a": null, "r": 2.5}')) == []
+    assert convert.ranges.counts == {"tag or anchor is unknown": 1}
+
+
 def test_hostile_texts_are_counted():
     convert = Convert("string_json")
     for text in (

@@ -14,9 +14,11 @@ from rclpy.subscription import Subscription
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
+from uwb_mitigation.recordings.mapping.checks import unknown_rows
 from uwb_mitigation.recordings.mapping.conversion import (
     NO_CIR,
     Converter,
+    count_bad,
     filter_rows,
     measurement,
     samples_of,
@@ -144,13 +146,9 @@ class TopicFeed:
         values = self._converter.convert(chunk)
         # Radios without a synchronised clock send a zero stamp.
         values["stamp"][values["stamp"] <= 0] = now_ns
-        measurements = []
-        for row in range(chunk.count):
-            if np.isfinite(values["range"][row]):
-                measurements.append(measurement(values, row, self._cir(chunk, row), self._ranges + row))
-            else:
-                self.counts["range is not a number"] += 1
-        return measurements
+        unknown = [count_bad(bad, self.counts, reason) for reason, bad in unknown_rows(values).items()]
+        rows_used = np.flatnonzero(~np.any(unknown, axis=0)).tolist()
+        return [measurement(values, row, self._cir(chunk, row), self._ranges + row) for row in rows_used]
 
     def _cir(self, chunk: Chunk, row: int) -> Cir:
         source = self._mapping.cir

@@ -73,7 +73,7 @@ def no_measurements(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     """Return {reason: rows} with a number that means that there is no range."""
     rules = {}
     for number in _NO_RANGE_M:
-        same = np.abs(values["range"] - number) < 1e-6
+        same = np.abs(values["range"] - number) < 1e-4
         near = np.abs(values["range"] - number) < max(0.05, 0.2 * number)
         is_true = np.abs(values["true range"] - number) < 1.0
         if same.any() and np.array_equal(same, near) and not (same & is_true).any():
@@ -256,9 +256,8 @@ def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> Non
 def _unit_of_length(factor: float, unit: str) -> tuple[str, float]:
     """Return the unit that explains a factor of lengths in `unit` best, and the logarithm of the rest of the factor."""
     now_m = LENGTHS[unit or "m"]
-    misfits = {
-        other: abs(np.log(factor * m / now_m)) if factor > 0 else np.inf for other, m in LENGTHS.items()
-    }
+    ratio = factor / now_m if factor > 0 else np.inf
+    misfits = {other: float(abs(np.log(ratio * m))) for other, m in LENGTHS.items()}
     return min(misfits.items(), key=lambda item: item[1])
 
 
@@ -330,10 +329,8 @@ def value_warnings(values: ColumnDict, *, errors_measured: bool) -> Iterator[str
     low, middle, high = np.percentile(errors, (5, 50, 95)) if len(errors) >= 20 else (0.0, 0.0, 0.0)
     if errors_measured and middle - low > 2 * max(high - middle, 0.0) and low < -0.3 and middle < 0:
         what = f"most errors are negative (median {middle:.2f} m, 5 % below {low:.2f} m)"
-        hint = (
-            "probably the error column is true - measured (set scale: -1), if not many ranges are too short"
-        )
-        yield f"{what}: {hint}; estimated from the distribution"
+        hint = "probably the error column is true - measured (set scale: -1)"
+        yield f"{what}: {hint}, if not many ranges are too short; estimated from the distribution"
     if negative := int(np.count_nonzero(ranges < 0)):
         yield f"{negative} ranges are negative"
     level = median(values["rx_power"])

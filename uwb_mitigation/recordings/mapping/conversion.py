@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections import Counter
@@ -211,21 +212,19 @@ def read_numbers(value: FieldRule | None, chunk: Chunk, name: str) -> NDArray[np
 
 
 def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[np.float64]:
-    with np.errstate(all="ignore"):
-        try:
-            return raw.astype(np.float64)
-        except (ValueError, TypeError):
-            pass
+    with np.errstate(all="ignore"), contextlib.suppress(ValueError, TypeError):
+        return raw.astype(np.float64)
     import pandas as pd
 
     texts = pd.Series([str(item).strip() for item in raw.tolist()], dtype=object)
     numbers = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
     for row in np.flatnonzero(np.isnan(numbers) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
         hints = [hint for form, hint in _HINTS if re.match(form, texts[row])]
-        valid = [*hints, f"a number in column {column}"][0]
-        raise RecordingError(
-            f"{name} = {texts[row]!r:.40} is not a number", where=chunk.where(row), valid=valid
+        what, valid = (
+            f"{name} = {texts[row]!r:.40} is not a number",
+            [*hints, f"a number in column {column}"][0],
         )
+        raise RecordingError(what, where=chunk.where(row), valid=valid)
     return numbers
 
 

@@ -32,6 +32,7 @@ MAX_STAMP_NS = 2**31 * NS_PER_S
 """Stamps of ROS are from 1970 to 2038."""
 
 _Rules = Columns[str, FieldRule | None]
+_Paths = Sequence[Path]
 _Mask = NDArray[np.bool_]
 _TAG, _ANCHOR, _POSE = (tuple(axes(name, None)) for name in ("tag", "anchor", "pose"))
 
@@ -138,12 +139,7 @@ class MappedRecording(Source):
         self._cirs.close()
 
     def _read(
-        self,
-        table: TableFormat,
-        paths: Sequence[Path],
-        values: _Rules,
-        what: str = "",
-        cir: CirSource | None = None,
+        self, table: TableFormat, paths: _Paths, values: _Rules, what: str = "", cir: CirSource | None = None
     ) -> ColumnDict:
         """Return the rows of files that no rule drops: `values`, `cir`, `row`, `file`; `what` names them in counts."""
         medians = {f"{what}{rule}": rule for rule in table.drop if rule.from_median is not None}
@@ -176,9 +172,7 @@ class MappedRecording(Source):
             mask &= ~conversion.count_bad(far, self.dropped, name)
         return take(rows, mask)
 
-    def _read_complete(
-        self, table: TableFormat, paths: Sequence[Path], rules: _Rules, what: str
-    ) -> ColumnDict:
+    def _read_complete(self, table: TableFormat, paths: _Paths, rules: _Rules, what: str) -> ColumnDict:
         """Return the rows of files in which all values are known, in the order of their stamps."""
         rows = self._read(table, paths, rules, what)
         for name in rules:

@@ -30,11 +30,9 @@ class MessageRows:
     def __init__(self, table: TableFormat, columns: Mapping[str, bool]) -> None:
         self._table, self._columns = table, columns
         self._pattern = re.compile(table.pattern) if table.pattern else None
-        self._paths = {
-            column: [step for step in re.split(r"\.|(\[\])", f"{table.group}.{column}") if step]
-            for column in columns
-            if column != LIST_INDEX
-        }
+        paths = {column: f"{table.group}.{column}" for column in columns if column != LIST_INDEX}
+        steps = {column: re.split(r"\.|(\[\])", path) for column, path in paths.items()}
+        self._paths = {column: [*filter(None, path)] for column, path in steps.items()}
 
     def rows(self, message: Any, limit: int = MAX_ROWS) -> dict[str, list[Any]]:
         """Return {column: list} of the rows of a message; all have the same length.
@@ -46,11 +44,7 @@ class MessageRows:
         Raises:
             RecordingError: a field is missing, or a text is not in the format of the mapping.
         """
-        if self._table.text or self._pattern:
-            text = message if isinstance(message, str) else _step(message, "data", "data")
-            items = self._parsed(text)
-        else:
-            items = [message]
+        items = self._parsed(message) if self._table.text or self._pattern else [message]
         rows: dict[str, list[Any]] = {name: [] for name in (LIST_INDEX, *self._paths)}
         for item in items:
             values: dict[str, tuple[Any, int]] = {}
@@ -64,8 +58,9 @@ class MessageRows:
             _append_rows(rows, values, 0, limit)
         return rows
 
-    def _parsed(self, text: Any) -> list[Any]:
+    def _parsed(self, message: Any) -> list[Any]:
         """Return the matches of the pattern, or the JSON object or pairs of a text."""
+        text = message if isinstance(message, str) else _step(message, "data", "data")
         if not isinstance(text, str) or len(text) > MAX_TEXT:
             raise RecordingError("data is not a text", valid="a field of type string")
         if self._pattern:
@@ -90,11 +85,8 @@ def _append_rows(
         for name, (value, _) in values.items():
             rows[name].append(value)
     for number in range(min(map(len, lists), default=0)):
-        element = {
-            name: (value[number], depth - 1) if depth else (value, 0)
-            for name, (value, depth) in values.items()
-        }
-        _append_rows(rows, element, number, limit)
+        items = ((name, value[number] if depth else value, depth) for name, (value, depth) in values.items())
+        _append_rows(rows, {name: (item, max(depth - 1, 0)) for name, item, depth in items}, number, limit)
 
 
 def _items(text: str) -> Any:
@@ -127,13 +119,10 @@ def _step(value: Any, name: str, column: str) -> Any:
     else:
         if not name.startswith("_") and hasattr(value, name):
             return getattr(value, name)
-        fields = [
-            str(field).lstrip("_")
-            for field in getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
-            if field != "__msgtype__"
-        ]
-    raise RecordingError(
+        names = getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
+        fields = [str(field).lstrip("_") for field in names if field != "__msgtype__"]
+    what, valid = (
         f"no field {name} for column {column}",
-        valid=f"the message has {', '.join(fields[:30]) or 'no fields'}",
-        suggestion=did_you_mean(name, fields),
+        f"the message has {', '.join(fields[:30]) or 'no fields'}",
     )
+    raise RecordingError(what, valid=valid, suggestion=did_you_mean(name, fields))

@@ -8,7 +8,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import compress, islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError,
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
-from uwb_mitigation.recordings.text_files import CsvFormat, CsvRows, OnWarning, Rows, TextBlocks
+from uwb_mitigation.recordings.mapping.text_files import CsvRows, OnWarning, Rows, TextBlocks
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 """Largest number of rows, and of values in columns, of a chunk."""
@@ -69,12 +69,11 @@ class Chunk:
         """Return the chosen rows."""
         if mask.all():
             return self
-        chosen = np.flatnonzero(mask).tolist()
-        columns = {
-            name: values[mask] if isinstance(values, np.ndarray) else [values[row] for row in chosen]
+        columns: dict[str, Any] = {
+            name: values[mask] if isinstance(values, np.ndarray) else list(compress(values, mask))
             for name, values in self.columns.items()
         }
-        return Chunk(columns, len(chosen), self.path, self.rows[mask], self.before)
+        return Chunk(columns, int(mask.sum()), self.path, self.rows[mask], self.before)
 
 
 def _kind_of(path: Path) -> str:
@@ -162,8 +161,7 @@ class TableFile:
             if kind in ("messages", "lines", "json", "yaml"):
                 rows = self._messages(kind)
             elif kind == "csv":
-                csv = CsvFormat(table.separator, table.decimal, table.comment, table.skip, table.columns)
-                rows = iter(CsvRows(csv, path, self._choose, self.ids, self.dropped, self.on_warning))
+                rows = iter(CsvRows(table, path, self._choose, self.ids, self.dropped, self.on_warning))
             elif kind:
                 rows = self._arrays(is_matlab=kind == "matlab")
             else:
@@ -209,9 +207,8 @@ class TableFile:
             chosen = self._choose([str(name) for name in arrays if not str(name).startswith("__")])
             # Slices of large files are read later, other values are arrays of one row at least.
             columns = {name: arrays[column] for name, column in chosen.items()}
-            columns |= {
-                n: np.atleast_1d(array) for n, array in columns.items() if not getattr(array, "ndim", 0)
-            }
+            single = {name: array for name, array in columns.items() if not getattr(array, "ndim", 0)}
+            columns |= {name: np.atleast_1d(array) for name, array in single.items()}
             lengths = {name: len(array) for name, array in columns.items()}
             if len(set(lengths.values())) > 1:
                 raise RecordingError("columns of different length", where=str(self.path), valid=str(lengths))

@@ -10,7 +10,6 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+from uwb_mitigation.recordings.mapping.mapping import TableFormat
 
 BLOCK_CHARS, MAX_ROW_CHARS = 1 << 22, 1 << 26
 """Size of a block, and largest size of a row."""
@@ -112,17 +112,6 @@ def _encoding(head: bytes) -> str:
     return "utf-8-sig"
 
 
-@dataclass(frozen=True, slots=True)
-class CsvFormat:
-    """Format of a CSV file; the attributes are those of `TableFormat`."""
-
-    separator: str
-    decimal: str
-    comment: str
-    skip: int
-    columns: Sequence[str]
-
-
 class CsvRows:
     """The rows of a CSV file.
 
@@ -140,7 +129,7 @@ class CsvRows:
     """
 
     def __init__(
-        self, table: CsvFormat, path: Path, choose: ChooseColumns, ids: Collection[str],
+        self, table: TableFormat, path: Path, choose: ChooseColumns, ids: Collection[str],
         dropped: Counter[str], on_warning: OnWarning | None,
     ) -> None:  # fmt: skip
         self._table, self._path, self._choose, self._ids = table, path, choose, set(ids)
@@ -219,9 +208,8 @@ class CsvRows:
         numbers = None
         # A quoted text may contain separators and line breaks.
         if (long or (self._width and self._header in lines)) and not any('"' in line for line in lines):
-            lines = [
-                line for line in lines if line.strip() and not line.startswith(self._table.comment or "\n")
-            ]
+            comment = self._table.comment or "\n"
+            lines = [line for line in lines if line.strip() and not line.startswith(comment)]
             numbers = np.flatnonzero([line not in long and line != self._header for line in lines])
             reason = "a repeated header, or more fields than the header (columns: all names; skip: 1)"
             self._dropped[reason] += len(lines) - len(numbers)
