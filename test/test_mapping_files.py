@@ -136,10 +136,8 @@ def test_other_formats_are_refused_with_a_way(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000), ("cm", 100)])
-@pytest.mark.parametrize("truth", [TRUE, {}])
-def test_unit_of_one_anchor_is_found_and_can_be_set(
-    unit: str, factor: float, truth: dict[str, Any], tmp_path: Path
-):
+@pytest.mark.parametrize("truth", [TRUE, {}], ids=["with truth", "without truth"])
+def test_unit_of_one_anchor_is_found_and_can_be_set(unit: str, factor: float, truth: Any, tmp_path: Path):
     text = HEADER + rows(factors={3: factor})
     with pytest.raises(RecordingError, match=rf"anchor 3 is .*set units: {{3: {unit}}} of range"):
         of(text, tmp_path / "x.csv", **truth)
@@ -148,15 +146,15 @@ def test_unit_of_one_anchor_is_found_and_can_be_set(
     assert source.errors_m == pytest.approx(np.full(80, 0.1), abs=1e-4)
 
 
-def test_a_large_offset_of_all_anchors_is_no_unit_of_one(tmp_path: Path):
-    text = HEADER + "".join(
-        f"{n},{n % 4},{[1.5, 3, 5, 8][n % 4] + 154.0},{[1.5, 3, 5, 8][n % 4]}\n" for n in range(80)
-    )
-    assert len(of(text, tmp_path / "x.csv", **TRUE)) == 80
-
-
-def test_an_anchor_next_to_the_tag_with_a_large_error_has_no_other_unit(tmp_path: Path):
-    pairs = [(0.04, 1.6), (6.0, 6.1), (8.0, 8.1), (9.0, 9.1)]
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [(true, true + 154.0) for true in (1.5, 3, 5, 8)],
+        [(0.04, 1.6), (6.0, 6.1), (8.0, 8.1), (9.0, 9.1)],
+    ],
+    ids=["a large offset of all anchors", "one anchor next to the tag with a large error"],
+)
+def test_large_errors_are_no_unit_of_one_anchor(pairs: list[tuple[float, float]], tmp_path: Path):
     text = HEADER + "".join(f"{n},{n % 4},{pairs[n % 4][1]},{pairs[n % 4][0]}\n" for n in range(80))
     assert len(of(text, tmp_path / "x.csv", **TRUE)) == 80
 
@@ -217,9 +215,8 @@ def test_a_name_has_one_number_as_tag_and_anchor(tmp_path: Path):
 
 def test_missing_file_of_anchors_is_named(tmp_path: Path):
     anchors = {"files": "site/anchors.csv", "id": "a", "position": ["x", 0, 0]}
-    with pytest.raises(
-        RecordingError, match=r"no file 'site/anchors.csv' \(relative to the folder of the ranges"
-    ):
+    message = r"no file 'site/anchors.csv' \(relative to the folder of the ranges"
+    with pytest.raises(RecordingError, match=message):
         of(HEADER + rows(), tmp_path / "x.csv", anchors=anchors)
     source = of(HEADER + rows(), tmp_path / "x.csv", anchors=anchors | {"optional": True})
     assert source.notes == [f"no anchors: no file 'site/anchors.csv' in {tmp_path}"]
@@ -231,9 +228,8 @@ def test_missing_file_of_anchors_is_named(tmp_path: Path):
 def test_two_boots_in_a_file_are_two_parts(tmp_path: Path):
     text = HEADER + rows(40) + rows(40, start=0.05)
     source = of(text, tmp_path / "x.csv", **TRUE)
-    assert source.warnings == [
-        "the clock starts again at row 41 of x.csv: 2 parts, with pauses of 5 s between them"
-    ]
+    what = "the clock starts again at row 41 of x.csv: 2 parts, with pauses of 5 s between them"
+    assert source.warnings == [what]
     stamps = source.values["stamp"] / 1e9
     assert stamps == pytest.approx([*np.arange(40) / 10, *(8.9 + np.arange(40) / 10)])
     assert source.errors_m == pytest.approx(np.full(80, 0.1), abs=1e-4)
@@ -349,10 +345,10 @@ def test_json_lines_and_documents_are_read(tmp_path: Path):
     source = of(lines, tmp_path / "x.jsonl", text="json")
     assert values_of(source) == [(0.0, 1, 1, 2.5), (1.0, 1, 2, 2.6)]
     assert source.dropped == {"lines without a range, such as 'ready' (not JSON: 'ready')": 1}
-    document = json.dumps(
-        {"runs": {"one": [{"t": 0, "a": 1, "r": 2.5}], "two": [{"t": 1, "a": 2, "r": 2.6}]}}
+    runs = {"one": [{"t": 0, "a": 1, "r": 2.5}], "two": [{"t": 1, "a": 2, "r": 2.6}]}
+    assert values_of(of(json.dumps({"runs": runs}), tmp_path / "x.json", group="runs[][]")) == values_of(
+        source
     )
-    assert values_of(of(document, tmp_path / "x.json", group="runs[][]")) == values_of(source)
 
 
 def test_rows_of_other_messages_are_dropped_by_an_expression_or_unknown(tmp_path: Path):
@@ -389,79 +385,51 @@ def test_murp(tmp_path: Path):
         for n in range(3):
             measured = [str(2 + base + n / 100) if pair in ("1_2", "6_3") else "" for pair in pairs]
             lines.append(",".join([str(n / 25), "0", *measured, *["1.9"] * 36, *["0.1"] * 36, "2", "2"]))
-        write(tmp_path / f"01/01_base-{base}_targ-{target}_win-0_step-0.csv", "\n".join(lines))
-        write(tmp_path / f"01/01_base-{base}_targ-{target}_win-1_step-1.csv", "filtered")
+        for name, content in (("win-0_step-0", "\n".join(lines)), ("win-1_step-1", "filtered")):
+            write(tmp_path / f"01/01_base-{base}_targ-{target}_{name}.csv", content)
     source = open_mapped(tmp_path / "01", "murp")
-    assert values_of(source)[:4] == [
-        (0.0, 11, 22, 3.0),
-        (0.0, 16, 23, 3.0),
-        (0.0, 21, 12, 4.0),
-        (0.0, 26, 13, 4.0),
-    ]
-    assert set(source.values["true range"]) == {1.9}
-    assert len(source) == 12
+    expected = [(0.0, 11, 22, 3.0), (0.0, 16, 23, 3.0), (0.0, 21, 12, 4.0), (0.0, 26, 13, 4.0)]
+    assert (len(source), values_of(source)[:4], set(source.values["true range"])) == (12, expected, {1.9})
 
 
 def log_a_tec(position: tuple[float, float, float], anchor: int, channel: int) -> dict[str, Any]:
     place = (float(anchor), 2.0, 1.0)
-    distance = float(np.linalg.norm(np.subtract(place, position)))
-    numbers = np.random.default_rng(anchor).integers(-200, 200, (1016, 2)).tolist()
+    measured = round(float(np.linalg.norm(np.subtract(place, position))) + 0.1, 2)
     names = (
-        "tag_id",
-        "anchor_id",
-        "x_tag",
-        "y_tag",
-        "z_tag",
-        "x_anchor",
-        "y_anchor",
-        "z_anchor",
-        "nlos",
-        "range",
+        "tag_id anchor_id x_tag y_tag z_tag x_anchor y_anchor z_anchor nlos range fp_index rss rss_fp fp_point1 fp_point2 "
+        "fp_point3 stdev_noise cir_power max_noise rxpacc channel_number frame_length preamble_length bitrate prfr preamble_code"
     )
-    values = ("0B16", f"DECA{anchor}", *position, *place, anchor % 2, round(distance + 0.1, 2))
-    names += (
-        "fp_index",
-        "rss",
-        "rss_fp",
-        "fp_point1",
-        "fp_point2",
-        "fp_point3",
-        "stdev_noise",
-        "cir_power",
-        "max_noise",
-    )
-    values += (745, -78.5, -80.1, 1, 2, 3, 4, 5, 6)
-    names += (
-        "rxpacc",
-        "channel_number",
-        "frame_length",
-        "preamble_length",
-        "bitrate",
-        "prfr",
-        "preamble_code",
-        "cir",
-    )
-    return dict(
-        zip(
-            names,
-            (*values, 1010, channel, 10, 1024, 110, 64, 9, [str(complex(*pair)) for pair in numbers]),
-            strict=True,
-        )
-    )
+    values = [
+        "0B16",
+        f"DECA{anchor}",
+        *position,
+        *place,
+        anchor % 2,
+        measured,
+        745,
+        -78.5,
+        -80.1,
+        *range(6),
+        1010,
+        channel,
+    ]
+    numbers = np.random.default_rng(anchor).integers(-200, 200, (1016, 2)).tolist()
+    row = dict(zip(names.split(), [*values, 10, 1024, 110, 64, 9], strict=True))
+    return row | {"cir": [str(complex(*pair)) for pair in numbers]}
 
 
 def test_log_a_tec(tmp_path: Path):
     positions = [(0.5, 1.0, 1.2), (1.5, 1.0, 1.2), (2.5, 1.0, 1.2)]
     document: dict[str, Any] = {"path": [], "measurements": {}}
     for position in positions:
-        name, channels = "_".join(f"{axis:.2f}" for axis in position), (1, 5)
-        cells = {a: {f"ch{c}": [log_a_tec(position, a, c)] * 2 for c in channels} for a in (1, 2)}
-        document["measurements"][name] = {f"A{anchor}": cells[anchor] for anchor in cells}
+        name = "_".join(f"{axis:.2f}" for axis in position)
+        cells = {f"A{a}": {f"ch{c}": [log_a_tec(position, a, c)] * 2 for c in (1, 5)} for a in (1, 2)}
+        document["measurements"][name] = cells
         for anchor, channel in ((1, 1), (2, 5)):
             row = log_a_tec(position, anchor, channel)
             line = ",".join([*(str(value) for name, value in row.items() if name != "cir"), *row["cir"]])
-            names = ",".join(row).upper() + "..."
-            write(tmp_path / f"raw/data/{name}/ch{channel}_A{anchor}.csv", f"v1.1\n{names}\n{line}")
+            content = f"v1.1\n{','.join(row).upper()}...\n{line}"
+            write(tmp_path / f"raw/data/{name}/ch{channel}_A{anchor}.csv", content)
     write(tmp_path / "environment0/data.json", json.dumps(document))
     for path, mapping, count in (("environment0", "log_a_tec", 24), ("raw", "log_a_tec_raw", 6)):
         source = open_mapped(tmp_path / path, mapping)
@@ -473,29 +441,20 @@ def test_log_a_tec(tmp_path: Path):
         assert (first.truth and first.truth.configuration) == "placement 1"
         cir, expected = first.measurement.cir, log_a_tec(positions[0], 1, 1)["cir"]
         assert [complex(*pair) for pair in cir.samples.reshape(-1, 2)] == [complex(text) for text in expected]
-        assert (cir.first_path_index, cir.preamble_count, cir.rx_power_dbm, cir.channel) == (
-            745,
-            1010,
-            -78.5,
-            1,
-        )
+        diagnostics = cir.first_path_index, cir.preamble_count, cir.rx_power_dbm, cir.channel
+        assert diagnostics == (745, 1010, -78.5, 1)
 
 
 def test_ewine_localization(tmp_path: Path):
-    numbers = ",".join(str(float(n**3)) for n in range(1016))
-    lines = [
-        f"1.0,2.0,{3 + n},4.0,{np.hypot(2 + n, 2) + 0.1:.3f},{n % 2},7,9,745,-78,-80,1,2,3,4,5,6,1010,4,39,1024,110,64,17,{numbers}"
-        for n in range(3)
-    ]
+    samples = ",".join(str(float(n**3)) for n in range(1016))
+    levels = "7,9,745,-78,-80,1,2,3,4,5,6,1010,4,39,1024,110,64,17"
+    measured = [np.hypot(2 + n, 2) + 0.1 for n in range(3)]
+    lines = [f"1.0,2.0,{3 + n},4.0,{measured[n]:.3f},{n % 2},{levels},{samples}" for n in range(3)]
     source = open_mapped(write(tmp_path / "tag_room0.csv", "\n".join(lines)), "ewine_localization")
     assert source.errors_m == pytest.approx(np.full(3, 0.1), abs=0.001)
     first = next(iter(source)).measurement
-    assert (first.anchor_id, len(first.cir), first.cir.first_path_index, first.cir.channel) == (
-        0,
-        1016,
-        745,
-        4,
-    )
+    assert (first.anchor_id, len(first.cir)) == (0, 1016)
+    assert (first.cir.first_path_index, first.cir.channel) == (745, 4)
     assert source.anchors.position.tolist() == [[1.0, 2.0, 0.0]]
 
 
