@@ -78,9 +78,8 @@ def _sqlite_messages(path: Path, topics: Collection[str]) -> Iterator[_Message]:
         with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
             # Otherwise SQLite refuses a file that is shorter than its header claims.
             database.execute("PRAGMA writable_schema=ON")
-            names = {
-                key: (name, kind) for key, name, kind in database.execute("SELECT id, name, type FROM topics")
-            }
+            rows = database.execute("SELECT id, name, type FROM topics")
+            names = {key: (name, kind) for key, name, kind in rows}
             _check_topics(path, topics, dict(names.values()))
             tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master")}
             query = "SELECT topic_type, encoded_message_definition FROM message_definitions"

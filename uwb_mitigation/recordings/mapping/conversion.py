@@ -70,12 +70,9 @@ def take(columns: ColumnDict, rows: NDArray[Any]) -> ColumnDict:
     if rows.dtype == bool and rows.all():
         return columns
     count = int(np.count_nonzero(rows)) if rows.dtype == bool else len(rows)
-    return {
-        name: np.broadcast_to(columns.pop(name)[:1], count)
-        if columns[name].strides == (0,)
-        else columns.pop(name)[rows]
-        for name in list(columns)
-    }
+    constant = [name for name, column in columns.items() if column.strides == (0,)]
+    taken = {name: np.broadcast_to(columns.pop(name)[:1], count) for name in constant}
+    return taken | {name: columns.pop(name)[rows] for name in list(columns)}
 
 
 def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
@@ -220,10 +217,8 @@ def _floats(raw: NDArray[Any], chunk: Chunk, name: str, column: str) -> NDArray[
     numbers = np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
     for row in np.flatnonzero(np.isnan(numbers) & ~texts.str.lower().isin(_MISSING))[:1].tolist():
         hints = [hint for form, hint in _HINTS if re.match(form, texts[row])]
-        what, valid = (
-            f"{name} = {texts[row]!r:.40} is not a number",
-            [*hints, f"a number in column {column}"][0],
-        )
+        what = f"{name} = {texts[row]!r:.40} is not a number"
+        valid = [*hints, f"a number in column {column}"][0]
         raise RecordingError(what, where=chunk.where(row), valid=valid)
     return numbers
 

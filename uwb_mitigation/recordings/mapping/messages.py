@@ -15,6 +15,7 @@ MAX_ROWS = 4096
 """Largest number of ranges in one message."""
 
 MAX_TEXT = 1 << 20
+_Columns = dict[str, list[Any]]
 _COMMAND = re.compile(r"^\s*AT\+\w+[=:]")
 _PAIRS = re.compile(r"(\w+)\s*[:=]\s*(\([^()]*\)|\[[^\[\]]*\]|[^,\s()\[\]]+)")
 
@@ -34,7 +35,7 @@ class MessageRows:
         steps = {column: re.split(r"\.|(\[\])", path) for column, path in paths.items()}
         self._paths = {column: [*filter(None, path)] for column, path in steps.items()}
 
-    def rows(self, message: Any, limit: int = MAX_ROWS) -> dict[str, list[Any]]:
+    def rows(self, message: Any, limit: int = MAX_ROWS) -> _Columns:
         """Return {column: list} of the rows of a message; all have the same length.
 
         Args:
@@ -45,7 +46,7 @@ class MessageRows:
             RecordingError: a field is missing, or a text is not in the format of the mapping.
         """
         items = self._parsed(message) if self._table.text or self._pattern else [message]
-        rows: dict[str, list[Any]] = {name: [] for name in (LIST_INDEX, *self._paths)}
+        rows: _Columns = {name: [] for name in (LIST_INDEX, *self._paths)}
         for item in items:
             values: dict[str, tuple[Any, int]] = {}
             for column, path in self._paths.items():
@@ -73,9 +74,7 @@ class MessageRows:
         return [{name: _items(value) for name, value in _PAIRS.findall(_COMMAND.sub("", text))}]
 
 
-def _append_rows(
-    rows: dict[str, list[Any]], values: dict[str, tuple[Any, int]], index: int, limit: int
-) -> None:
+def _append_rows(rows: _Columns, values: dict[str, tuple[Any, int]], index: int, limit: int) -> None:
     """Append one row for each element of the innermost lists; `values`: (value, depth of its lists)."""
     lists = [value for value, depth in values.values() if depth]
     if not lists:
@@ -121,8 +120,6 @@ def _step(value: Any, name: str, column: str) -> Any:
             return getattr(value, name)
         names = getattr(value, "__slots__", ()) or vars(type(value)).get("__dataclass_fields__", ())
         fields = [str(field).lstrip("_") for field in names if field != "__msgtype__"]
-    what, valid = (
-        f"no field {name} for column {column}",
-        f"the message has {', '.join(fields[:30]) or 'no fields'}",
-    )
+    what = f"no field {name} for column {column}"
+    valid = f"the message has {', '.join(fields[:30]) or 'no fields'}"
     raise RecordingError(what, valid=valid, suggestion=did_you_mean(name, fields))
