@@ -191,12 +191,12 @@ def test_true_ranges_of_another_file_are_interpolated(tmp_path: Path):
     write(tmp_path / "true.csv", f"time,id,mm\n{true}")
     ranges = {"files": "true.csv", "stamp": "time", "anchor": "id", "range": {"column": "mm", "unit": "mm"}}
     text = "t,a,r\n0.1,1,1.2\n0.1,2,2.2\n0.1,4,4.2\n99,1,1.2\n"
-    source = of(text, tmp_path / "x.csv", truth={"ranges": ranges})
+    source = of(text, tmp_path / "x.csv", truth={"range": ranges})
     assert source.values["true range"] == pytest.approx([1.0005, 2.0005, np.nan, np.nan], nan_ok=True)
     assert source.notes == ["true ranges joined: 2 of 4"]
     del ranges["stamp"]
-    with pytest.raises(RecordingError, match=r"have several true ranges \(truth.ranges.stamp"):
-        read(PLAIN | {"truth": {"ranges": ranges}}, tmp_path / "x.csv")
+    with pytest.raises(RecordingError, match=r"have several true ranges \(truth.range.stamp"):
+        read(PLAIN | {"truth": {"range": ranges}}, tmp_path / "x.csv")
 
 
 def test_registers_without_receive_power_give_the_first_path_level(tmp_path: Path):

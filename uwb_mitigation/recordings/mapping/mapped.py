@@ -319,7 +319,7 @@ class MappedRecording(Source):
                 to = mask & (values["tag"] == tag) & (values["anchor"] == anchor)
                 if not source.stamp and np.ptp(rows["range"][at]) > 0:
                     what = f"tag {format_id(tag)} and anchor {format_id(anchor)} have several true ranges"
-                    raise RecordingError(what, where=str(paths[0]), valid="truth.ranges.stamp: their times")
+                    raise RecordingError(what, where=str(paths[0]), valid="truth.range.stamp: their times")
                 stamps = values["stamp"][to] if source.stamp else np.zeros(to.sum(), np.int64)
                 path = TruePath(rows["stamp"][at], rows["range"][at][:, np.newaxis])
                 true[to] = path.position_at(stamps)[:, 0]

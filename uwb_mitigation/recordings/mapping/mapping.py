@@ -331,7 +331,10 @@ class TrueRanges(TableFormat):
 
 
 class TruthSource(_Strict):
-    """Ground truth: true range, error (measured - true), label (LOS, NLOS, other), name of the placement, positions."""
+    """Ground truth: true range, error (measured - true), label (LOS, NLOS, other), name of the placement, positions.
+
+    A `range` with `files` is that of another table, and is in `ranges`.
+    """
 
     range: Length | None = None
     ranges: TrueRanges | None = None
@@ -341,6 +344,13 @@ class TruthSource(_Strict):
     tag_position: Point | None = None
     poses: Poses | None = None
     range_from_positions: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _separate_table(cls, value: Any) -> Any:
+        source = value.get("range") if isinstance(value, dict) else None
+        is_table = isinstance(source, dict) and "files" in source
+        return {**value, "range": None, "ranges": source} if is_table else value
 
 
 class AnchorSource(TableFormat):
