@@ -170,6 +170,9 @@ def test_numbers_that_mean_no_measurement_are_dropped(tmp_path: Path):
     # A tag next to an anchor measures zero.
     near = "t,a,r\n" + "".join(f"{n},1,{abs(n - 20) / 100}\n" for n in range(80))
     assert not of(near, tmp_path / "y.csv").dropped
+    zeros = "".join(f"{n + 0.5},2,0,{n % 2 * 4}\n" for n in range(80))
+    mixed = HEADER + "".join(f"{line},0.1\n" for line in near.splitlines()[1:]) + zeros
+    assert of(mixed, tmp_path / "z.csv", **TRUE).dropped == {f"range is 0, {what}": 40}
 
 
 def test_differences_of_ranges_are_refused(tmp_path: Path):

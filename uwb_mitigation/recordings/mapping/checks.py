@@ -75,9 +75,11 @@ def no_measurements(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     for number in _NO_RANGE_M:
         same = np.abs(values["range"] - number) < 1e-4
         near = np.abs(values["range"] - number) < max(0.05, 0.2 * number)
-        is_true = np.abs(values["true range"] - number) < 1.0
-        if same.any() and np.array_equal(same, near) and not (same & is_true).any():
-            rules[f"range is {number:g}, which means no measurement"] = same
+        error = np.abs(values["true range"] - number)
+        is_alone = np.array_equal(same, near) and not (same & (error < 1.0)).any()
+        bad = same if is_alone else same & (error > max(1.0, 0.2 * number))
+        if bad.any():
+            rules[f"range is {number:g}, which means no measurement"] = bad
     return rules
 
 
