@@ -1,4 +1,4 @@
-"""The experimental model for STS windows of a DW3000: simulated receiver, window lengths, and never chosen by default."""
+"""The experimental model for STS windows of a DW3000: simulated receiver, window lengths, and its automatic choice."""
 
 from __future__ import annotations
 
@@ -80,18 +80,18 @@ def test_short_windows_and_other_sources_pass_through(received) -> None:
         assert all(each.range_m == each.range_raw_m for each in results)
 
 
-def test_it_is_used_only_if_it_is_named(received, tmp_path: Path) -> None:
+def test_it_is_chosen_for_a_recording_of_the_sts_and_marked_as_experimental(received, tmp_path: Path) -> None:
     ranges = windows(received[0][:5], 16)
     recording = tmp_path / "sts.mcap"
     with BagWriter(recording, {"source": "a test", "simulated": "true"}) as bag:
         for each in ranges:
             bag.write(Record(each))
-    chosen = [load_bundle(default_model_path(scaling)) for scaling in (None, *Scaling)]
-    for bundle in (*chosen, bundle_for(None, recording)):
-        assert bundle.model_id != MODEL.model_id
-        assert {each.status for each in Mitigation(bundle).correct(ranges)} == {Status.OUT_OF_DISTRIBUTION}
-    assert "experimental, no real recording was available" in MODEL.card.origin
-    assert MODEL.card.source == "DW3000 STS"
+    assert bundle_for(None, recording).model_id == MODEL.model_id
+    assert MODEL.card.label == "dw3000_sts (experimental)"
+    for scaling in Scaling:
+        other = Mitigation(load_bundle(default_model_path(scaling)))
+        assert {each.status for each in other.correct(ranges)} == {Status.OUT_OF_DISTRIBUTION}
+        assert "experimental" not in other.bundle.card.label
 
 
 def test_firmware_of_a_dw1000_gets_no_model_for_a_dw3000(tmp_path: Path) -> None:

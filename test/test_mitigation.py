@@ -76,7 +76,7 @@ def test_correction_is_linear_bias_plus_network_in_float32(mitigation):
     subject = measurement(3.1)
     _, window = window_of(subject.cir, Preprocessing(157))
     powers = np.array([-82.0]), np.array([-88.0])
-    (predicted,) = LINE.predict_m(*powers) + mitigation._session.predict_m(window[None])
+    (predicted,) = LINE.predict_m(*powers) + mitigation._backends[0]._session.predict_m(window[None])
     result = mitigation.correct([subject])[0]
     assert result.status is Status.OK
     assert result.correction_m == float(predicted)
@@ -163,6 +163,6 @@ class NotANumberSession:
 @pytest.mark.parametrize("session", [FailingSession(), NotANumberSession()])
 def test_failing_network_passes_the_range_through(tmp_path, session):
     subject = Mitigation(bundle(tmp_path, Remnet(samples=157)))
-    subject._session = session
+    subject._backends[0]._session = session
     results = subject.correct([measurement(3.0)] * 2)
     assert [(result.status, result.range_m) for result in results] == [(Status.MODEL_ERROR, 3.0)] * 2

@@ -30,7 +30,6 @@ from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes.support.diagnostics import (
     DROPPED,
     MIN_LOS,
-    NO_PREAMBLE_COUNT,
     NO_RANGES,
     NO_SEQUENCE_NUMBER,
     NO_USABLE_CIR,
@@ -207,13 +206,6 @@ def warnings(health: MitigatorHealth) -> list[str]:
 )
 def test_many_ranges_of_a_bad_status_cause_a_warning(statuses: dict[Status, int], expected: list[str]):
     assert warnings(health(statuses)) == expected
-
-
-def test_ranges_without_a_preamble_count_cause_their_own_warning():
-    lacking = health({Status.OK: 79, Status.BAD_CIR: 21})
-    lacking.without_preamble_count = 21
-    assert warnings(lacking) == [NO_PREAMBLE_COUNT.text]
-    assert warnings(lacking) == []
 
 
 def test_slow_correction_and_no_data_cause_a_warning():

@@ -40,7 +40,7 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
 ):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
-    ros.start("mitigator", "offsets:=0.5")
+    mitigator = ros.start("mitigator", "offsets:=0.5")
     ports = ",".join(str(tmp_path / f"uci{number}") for number in range(3))
     capture = tmp_path / "capture.txt"
     options = ("radio.window:=16", "radio.anchors:=[2, 3]", f"capture:={capture}")
@@ -49,24 +49,25 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert {len(message.cir.samples) for message in raw} == {32}
     assert all(abs(message.range - 3.0) < 0.2 for message in raw)
 
-    node.wait_for_output("only with model:=dw3000_sts")
-    assert node.output.count("model:=dw3000_sts") == 1
     status = ros.diagnosis("driver", lambda status: "ranging" in status.message)
     assert diagnostic_values(status)["radio 0: CIR taps"] == "16"
 
+    assert {(m.cir.radio, m.cir.segment) for m in raw} == {(Cir.DW3000, Cir.STS)}
+    ros.spin_until(lambda: len(corrected) > 20)
+    experimental = load_bundle(shipped_model_path("dw3000_sts")).model_id
+    assert {(m.model_id, m.status) for m in corrected} == {(experimental, RangeCorrected.OK)}
+    assert all(0 < abs(m.range - (m.range_raw - 0.5)) < 0.1 for m in corrected)
+    reason = "model dw3000_sts (experimental), id "
+    mitigator.wait_for_output(reason)
+    assert mitigator.output.count(reason) == 1
+    status = ros.diagnosis("mitigator", lambda status: any(reason in v.value for v in status.values))
+    assert any("DW3000 STS" in v.key and "tag-anchor 1-2, 1-3" in v.value for v in status.values)
+
+    assert ros.set_parameter("mitigator", "model", "universal").successful
     status = ros.diagnosis("mitigator", lambda status: "DW3000 STS" in status.message)
     assert "trained for DW1000 IPATOV" in status.message
-    ros.spin_until(lambda: len(corrected) > 20)
-    assert {m.status for m in corrected} == {RangeCorrected.OUT_OF_DISTRIBUTION}
-    assert all(m.range == pytest.approx(m.range_raw - 0.5) for m in corrected)
-    assert {(m.cir.radio, m.cir.segment) for m in raw} == {(Cir.DW3000, Cir.STS)}
-
-    assert ros.set_parameter("mitigator", "model", "dw3000_sts").successful
-    experimental = load_bundle(shipped_model_path("dw3000_sts")).model_id
-    ros.spin_until(lambda: sum(m.model_id == experimental for m in corrected) > 20)
-    named = [m for m in corrected if m.model_id == experimental]
-    assert {m.status for m in named} == {RangeCorrected.OK}
-    assert all(0 < abs(m.range - (m.range_raw - 0.5)) < 0.1 for m in named)
+    ros.spin_until(lambda: corrected[-1].status == RangeCorrected.OUT_OF_DISTRIBUTION)
+    assert corrected[-1].range == pytest.approx(corrected[-1].range_raw - 0.5)
 
     boards.unplug(1)
     ros.diagnosis("driver", lambda status: "uci1" in status.message)

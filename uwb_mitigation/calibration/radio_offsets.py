@@ -181,7 +181,6 @@ def estimate_offset(
         DatasetError: no placement is in LOS, or there are no true ranges.
     """
     groups: dict[tuple[int, int, str], list[_Sample]] = {}
-    preprocessing = Preprocessing(mitigation.bundle.preprocessing.samples, Scaling.MAX)
     without_truth, has_cirs = 0, False
     stream = iter(records)
     while batch := list(islice(stream, _BATCH)):
@@ -202,7 +201,8 @@ def estimate_offset(
                 continue
             placement = "" if truth is None else truth.configuration
             predicted_m = _predicted_m(mitigation, measured, result)
-            gap_db = _power_gap_db(measured, preprocessing)
+            model = mitigation.bundles[mitigation.choose(measured.cir.kind).model]
+            gap_db = _power_gap_db(measured, Preprocessing(model.preprocessing.samples, Scaling.MAX))
             is_los = _is_los(gap_db, None if truth is None or len(measured.cir) else truth.label)
             offset_m = measured.range_m - predicted_m - true_m
             has_cirs |= len(measured.cir) > 0
@@ -211,7 +211,8 @@ def estimate_offset(
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
     pairs = sorted({(tag, anchor) for tag, anchor, _ in groups})
     _check_pairs(pairs, without_truth, has_one_distance=distance_m is not None)
-    limit_m = MAX_EXCESS_M if mitigation.bundle.linear_bias == LinearBiasModel(0.0) else MAX_ERROR_M
+    includes_offset = any(bundle.linear_bias != LinearBiasModel(0.0) for bundle in mitigation.bundles)
+    limit_m = MAX_ERROR_M if includes_offset else MAX_EXCESS_M
     placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
     return _combined(placements, mitigation.bundle.model_id, common, has_cirs)
 
@@ -232,7 +233,7 @@ def _check_pairs(pairs: list[tuple[int, int]], without_truth: int, *, has_one_di
 def _predicted_m(mitigation: Mitigation, measured: RangeMeasurement, result: CorrectedRange) -> float:
     """Return the error that the model predicts; NaN: it predicts none."""
     cir = measured.cir
-    is_foreign = not mitigation.bundle.card.fits(cir.radio, cir.segment, len(cir) > 0)
+    is_foreign = not mitigation.choose(cir.kind).is_trained
     if is_foreign or (len(cir) == 0 and result.status is Status.NO_CIR):
         # Without a CIR, or with that of another radio, the whole error is the offset.
         return 0.0

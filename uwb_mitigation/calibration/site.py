@@ -20,7 +20,7 @@ from uwb_mitigation.calibration.solution import (
     solve_without_truth,
     usable_ranges,
 )
-from uwb_mitigation.errors import DatasetError, ModelError, format_id
+from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, format_id
 from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
@@ -225,7 +225,10 @@ def calibrate(
 
     Raises:
         DatasetError: the drives do not determine the calibration, or an anchor position is wrong.
+        ParameterError: several models, as `load_model()` returns.
     """
+    if not isinstance(model, Bundle):
+        raise ParameterError("several models", valid='one to start from, such as load_model("universal")')
     site = read_site(recordings, anchors, model.card)
     height = None if height_m is None else Height(height_m)
     return calibrate_site(site, model, solve_without_truth(site, model, height=height, area=None), seed=0)

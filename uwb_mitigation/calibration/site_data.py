@@ -200,7 +200,7 @@ class _RangeTable:
             self.last_stamp_ns = max(stamp_ns, self.last_stamp_ns or stamp_ns)
             cir = measured.cir
             powers = cir.rx_power_dbm, cir.first_path_power_dbm
-            is_usable = fault == 0 and self._card.fits(cir.radio, cir.segment, len(cir) > 0)
+            is_usable = fault == 0 and self._card.is_trained_for(cir.kind)
             self._rows.append(
                 (measured.tag_id, stamp_ns, row, measured.range_m, *powers, height_m, is_usable)
             )

@@ -64,11 +64,10 @@ def offset_of(source: Source) -> float | None:
     """Return the offset of the boards (m) from LOS ranges with truth; None if it is unknown."""
     from uwb_mitigation.calibration.radio_offsets import estimate_offset
     from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.mitigation.model.bundle import load_bundle
-    from uwb_mitigation.mitigation.model.shipped import default_model_path
+    from uwb_mitigation.mitigation.model.shipped import load_model
 
     try:
-        return estimate_offset(Mitigation(load_bundle(default_model_path())), source).offset_m
+        return estimate_offset(Mitigation(load_model()), source).offset_m
     except DatasetError:
         return None
 

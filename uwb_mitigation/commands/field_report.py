@@ -103,19 +103,15 @@ def _ask(port: str) -> None:
 
 
 def _correct(observation: Observation) -> None:
-    """Correct the ranges with the shipped model if it was trained for the radio."""
+    """Correct the ranges with the shipped models if one was trained for the radio."""
     from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.mitigation.model.bundle import load_bundle
-    from uwb_mitigation.mitigation.model.shipped import model_path
+    from uwb_mitigation.mitigation.model.shipped import load_model
 
-    bundle = load_bundle(model_path(None))
-    cirs = [measured.cir for measured in observation.ranges]
-    sources = {cir.source for cir in cirs}
-    observation.model = (
-        f"{bundle.name}: trained for {bundle.card.source}, ranges of {', '.join(sorted(sources))}"
-    )
-    if all(bundle.card.fits(cir.radio, cir.segment, len(cir) > 0) for cir in cirs):
-        observation.corrected = Mitigation(bundle).correct(observation.ranges)
+    mitigation = Mitigation(load_model())
+    choices = {mitigation.choose(measured.cir.kind) for measured in observation.ranges}
+    observation.model = "; ".join(sorted(map(str, choices)))
+    if all(choice.is_trained for choice in choices):
+        observation.corrected = mitigation.correct(observation.ranges)
 
 
 def _write(folder: Path, source: str, observation: Observation, checks: list[Check]) -> None:

@@ -57,14 +57,7 @@ def train(
             "stop_s, configuration, label); may be given several times.",
         ),
     ] = None,
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE|NAME",
-            help="With --from-bag: bundle to start from, or the name of a shipped one. Default: `universal`, or "
-            "`universal_amplitude` for CIRs without preamble counts.",
-        ),
-    ] = None,
+    model: ModelOption = None,
     recipe_name: Annotated[
         Literal["auto", "constant", "line", "line+network", "network"],
         typer.Option("--recipe", help="With --data: kind of model; auto: selected by cross-validation."),

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.bundles import ModelOption, show_models
+from uwb_mitigation.commands.support.checks import OffsetsOption
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.calibration.survey import SurveyResult
     from uwb_mitigation.commands.offline.track import HoldoutErrors, TagTracks
+    from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap
@@ -127,12 +130,14 @@ def track(
     ] = None,
     stamp_offset: OffsetOption = 0.0,
     acceleration: AccelerationOption = 0.8,
+    model: ModelOption = None,
+    offsets: OffsetsOption = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Estimate the tracks of a recording's tags: filtered and smoothed.
 
-    It uses the corrected ranges of the bag (`uwb-mitigation process`), or raw ranges if there are none. If the
+    It uses the corrected ranges of the bag (`uwb-mitigation process`). If there are none, it corrects the raw ranges. If the
     bag contains the truth, a table shows the errors of both and of least squares on raw ranges. A second table,
     which needs no truth, shows the residuals of raw and corrected ranges. Anchor positions are written to OUT.anchors.yaml.
 
@@ -145,10 +150,18 @@ def track(
     from uwb_mitigation.commands.offline.track import held_out, track_tag, tum_file, write_tracks
     from uwb_mitigation.commands.offline.track import tum as tum_text
     from uwb_mitigation.files import write_atomically
+    from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
+    from uwb_mitigation.types.offsets import NO_OFFSETS
 
-    config, recorded = _read(bag, anchors, height, height_sd, height_topic, area, stamp_offset, acceleration)
+    mitigation = Mitigation(load_model(model), offsets or NO_OFFSETS)
+    options = height, height_sd, height_topic, area, stamp_offset, acceleration
+    config, recorded = _read(bag, anchors, *options, mitigation)
+    if not mitigation.used and (model or offsets):
+        raise ParameterError("--model or --offsets", where=str(bag), valid="a bag without corrected ranges")
+    show_models(mitigation.used)
     config = replace(config, robot=_robot_of(bag, odometry, imu, lever_arm, recorded))
     several = len(recorded.tags) > 1
     tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
@@ -245,12 +258,14 @@ def _read(
     area: str | None,
     stamp_offset: float,
     acceleration: float,
+    mitigation: Mitigation | None = None,
 ) -> tuple[EstimatorConfig, RecordedRanges]:
     from uwb_mitigation.positioning.geometry import Area, Height
     from uwb_mitigation.positioning.noise_model import NoiseModel
     from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.recordings.bag.pose_paths import read_heights
+    from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
     from uwb_mitigation.types.anchors import anchors_path, load_anchors
 
@@ -265,7 +280,8 @@ def _read(
     anchor_map = (None if anchors else recorded_anchors(bag)) or load_anchors(anchors or anchors_path(bag))
     with console.progress() as bar:
         bar.add_task("reading", total=None)
-        recorded = read_ranges(bag, anchor_map, stamp_offset)
+        corrected = () if mitigation is None else mitigation.correct_records(open_recording(bag))
+        recorded = read_ranges(bag, anchor_map, stamp_offset, corrected)
     for identity, count in recorded.unknown_anchors.items():
         warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +12,7 @@ import typer
 from rich.markup import escape
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 from uwb_mitigation.commands.support.checks import OffsetsOption
 from uwb_mitigation.commands.support.console import JsonOption, show_table
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
@@ -55,18 +56,21 @@ def process(
     """
     from uwb_mitigation.commands.offline import parallel
     from uwb_mitigation.commands.offline.process import Job
+    from uwb_mitigation.mitigation.model.bundle import Bundle
+    from uwb_mitigation.mitigation.model.shipped import AUTO, load_model
     from uwb_mitigation.types.offsets import read_offsets
 
     if workers is not None and workers < 1:
         raise ParameterError(f"jobs = {workers}", valid="1 or more")
     bags = parallel.plan(sources, output)
     # Load the model first: an invalid model would give the same error for every bag.
-    bundle = bundle_for(model, bags[0].source)
+    bundle = load_model(model)
+    # Absolute paths, since a worker of a cluster has another working directory.
+    path = bundle.path.absolute() if isinstance(bundle, Bundle) else AUTO
     radio_offsets = read_offsets(offsets or "")
     jobs = []
     for planned in bags:
-        # Absolute paths, since a worker of a cluster has another working directory.
-        source, place, path = planned.source.absolute(), planned.output.absolute(), bundle.path.absolute()
+        source, place = planned.source.absolute(), planned.output.absolute()
         jobs.append(Job(source, place, path, force, radio_offsets))
         if not planned.alone:
             _make_folder(place.parent)
@@ -79,9 +83,10 @@ def process(
     else:
         outcomes = _follow(jobs, parallel.run_locally(jobs, workers or parallel.num_cores()))
     seconds = outcomes[0].seconds if len(jobs) == 1 else time.perf_counter() - started
-    result = _result(outcomes, seconds, bundle.model_id)
+    result = _result(outcomes, seconds, bundle.model_id if isinstance(bundle, Bundle) else None)
     if any(outcome.written for outcome in outcomes):
         _show(result)
+        show_models(sum((outcome.models for outcome in outcomes), Counter()))
     console.write_json(json, result)
     _raise_failures(outcomes)
 
@@ -114,7 +119,7 @@ def _follow(jobs: list[Job], outcomes: Iterable[Outcome]) -> list[Outcome]:
     return [by_job[job] for job in jobs]
 
 
-def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str, Any]:
+def _result(outcomes: list[Outcome], seconds: float, model_id: int | None) -> dict[str, Any]:
     ranges = sum(outcome.ranges for outcome in outcomes)
     return {
         "ranges": ranges,
@@ -129,8 +134,10 @@ def _result(outcomes: list[Outcome], seconds: float, model_id: int) -> dict[str,
 
 def _row(outcome: Outcome) -> dict[str, Any]:
     ok, error = outcome.statuses["OK"], outcome.error
-    names = ("messages", "ranges", "replaced", "seconds", "statuses", "skipped", "mismatches", "error")
+    names = ("messages", "ranges", "replaced", "seconds", "statuses", "skipped", "error")
     return {name: getattr(outcome, name) for name in names} | {
+        "models": {str(choice): count for choice, count in outcome.models.items() if choice.fits},
+        "mismatches": {str(choice): count for choice, count in outcome.models.items() if not choice.fits},
         "bag": outcome.job.source.name,
         "source": str(outcome.job.source),
         "output": str(outcome.job.output) if outcome.written else None,
@@ -153,7 +160,7 @@ def _show(result: dict[str, Any]) -> None:
         "replaced": "replaced:d",
     }
     show_table(
-        f"Corrected by model {result['model_id']:08x}",
+        "Corrected bags",
         columns,
         result["bags"],
         max_rows=len(result["bags"]),
@@ -163,8 +170,6 @@ def _show(result: dict[str, Any]) -> None:
     for row in result["bags"]:
         for kind, count in row["skipped"].items():
             console.warn(f"{row['source']}: {count} x {kind}")
-        for reason, count in row["mismatches"].items():
-            console.warn(f"{row['source']}: {count} ranges are not corrected: {reason}")
 
 
 def _raise_failures(outcomes: list[Outcome]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support.bundles import ModelOption
 
 if TYPE_CHECKING:
     from uwb_mitigation.mitigation.correction import Corrector
@@ -94,7 +94,7 @@ def view(
         if path is None:
             continue
         feed = SceneUpdater(Scene(), lock)
-        player = BagPlayer(path, feed, partial(_backend, model, path), namespace)
+        player = BagPlayer(path, feed, partial(_backend, model), namespace)
         if anchor_map is not None:
             feed.anchors(anchor_map)
         if player.corrects:
@@ -130,7 +130,8 @@ def view(
             time.sleep(3600.0)
 
 
-def _backend(model: Path | None, bag: Path) -> Corrector:
+def _backend(model: Path | None) -> Corrector:
     from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.shipped import load_model
 
-    return Mitigation(bundle_for(model, bag))
+    return Mitigation(load_model(model))

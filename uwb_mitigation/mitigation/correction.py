@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
+from uwb_mitigation.mitigation.model.choice import Choice, choose_model
 from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
 from uwb_mitigation.types.measurement import (
+    CirKind,
     CorrectedBy,
     CorrectedColumns,
     CorrectedRange,
@@ -31,6 +34,9 @@ MAX_RANGE_M = 1e6
 
 BATCH = 256
 """Number of records that `Corrector.correct_records` reads ahead."""
+
+MAX_KINDS = 1000
+"""Number of kinds of CIRs whose models are kept."""
 
 _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
@@ -83,20 +89,71 @@ class CorrectionRule:
         return correction, variance
 
 
-class Corrector(ABC):
-    """Corrects ranges with a bundle: `Mitigation` with ONNX Runtime, `FirmwareMitigation` with the firmware's C.
+class Backend(Protocol):
+    """Corrects ranges of a radio and a segment for which its model was trained."""
+
+    def correct(self, ranges: RangeColumns, offset_m: NDArray[np.float32]) -> CorrectedColumns:
+        """Return n corrected ranges; `offset_m`: offsets of their radios, m, float32 (n,)."""
+
+
+class Corrector:
+    """Corrects ranges: `Mitigation` with ONNX Runtime, `FirmwareMitigation` with the firmware's C. Not thread-safe.
+
+    Args:
+        model: the model, or several, of which `choose_model` selects one for each range.
+        offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, or a
+            file written by `uwb-mitigation offset` or `calibrate`.
 
     Attributes:
-        bundle: the model.
+        bundles: the models.
         offsets: offsets of the radios; may be changed between two calls.
+        used: number of corrected ranges by choice of the model.
+
+    Raises:
+        ModelError: the backend rejects a model.
+        ParameterError: the offset is not finite, too large, or no such file exists.
     """
 
-    bundle: Bundle
-    offsets: Offsets
+    _backend: Callable[[Bundle], Backend]
 
-    @abstractmethod
+    def __init__(
+        self, model: Bundle | Sequence[Bundle], offsets: Offsets | float | str | Path = NO_OFFSETS
+    ) -> None:
+        self.bundles = (model,) if isinstance(model, Bundle) else tuple(model)
+        self.offsets = offsets if isinstance(offsets, Offsets) else read_offsets(str(offsets))
+        self._backends = [self._backend(bundle) for bundle in self.bundles]
+        self.used: Counter[Choice] = Counter()
+        # Bounded, because a stream may contain CIRs of any length.
+        self.choose = lru_cache(MAX_KINDS)(partial(choose_model, self.bundles))
+
+    @property
+    def bundle(self) -> Bundle:
+        """The model, or the first one."""
+        return self.bundles[0]
+
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """Return the corrected ranges; never raises because of the content of a measurement."""
+        offset_m = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
+        kinds = ranges.kinds()
+        if len(kinds) == 1:
+            return self._correct_kind(kinds[0][0], ranges, offset_m)
+        # All rows are replaced.
+        result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
+        for kind, rows in kinds:
+            part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
+            for name in ("range_m", "correction_m", "variance_m2", "status", "model_id"):
+                getattr(result, name)[rows] = getattr(part, name)
+        return result
+
+    def _correct_kind(
+        self, kind: CirKind, ranges: RangeColumns, offset_m: NDArray[np.float32]
+    ) -> CorrectedColumns:
+        choice = self.choose(kind)
+        self.used[choice] += len(ranges)
+        if choice.is_trained:
+            return self._backends[choice.model].correct(ranges, offset_m)
+        status = np.full(len(ranges), _OUT_OF_DISTRIBUTION if kind.samples else _NO_CIR, np.uint8)
+        return pass_through(self.bundles[choice.model], ranges, offset_m, status)
 
     @overload
     def correct(self, measurements: RangeMeasurement) -> CorrectedRange: ...
@@ -116,8 +173,14 @@ class Corrector(ABC):
         results: list[CorrectedRange | None] = [None] * len(measurements)
         for indices, ranges in RangeColumns.grouped(measurements):
             corrected = self.correct_columns(ranges)
-            columns = (corrected.range_m, corrected.correction_m, corrected.variance_m2, corrected.status)
-            for index, range_m, correction_m, variance_m2, status in zip(
+            columns = (
+                corrected.range_m,
+                corrected.correction_m,
+                corrected.variance_m2,
+                corrected.status,
+                corrected.model_id,
+            )
+            for index, range_m, correction_m, variance_m2, status, model_id in zip(
                 indices, *(column.tolist() for column in columns), strict=True
             ):
                 results[index] = CorrectedRange(
@@ -127,7 +190,7 @@ class Corrector(ABC):
                     variance_m2,
                     _STATUSES[status],
                     corrected.origin,
-                    corrected.model_id,
+                    model_id,
                 )
         return [result for result in results if result is not None]
 
@@ -197,64 +260,22 @@ def pass_through(
     )
     if not ranges.samples.shape[1]:
         variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
-    return CorrectedColumns(range_m, offset_m, variance, status, CorrectedBy.HOST, bundle.model_id)
+    model_id = np.array([bundle.model_id] * len(ranges), np.uint32)
+    return CorrectedColumns(range_m, offset_m, variance, status, CorrectedBy.HOST, model_id)
 
 
-def pass_other_radio(
-    bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32]
-) -> CorrectedColumns | None:
-    """Return the raw ranges minus the offsets if the bundle was trained for another radio or segment, otherwise None.
+class OnnxBackend:
+    """Runs a model with ONNX Runtime."""
 
-    Args:
-        bundle: the model.
-        ranges: n measured ranges.
-        offset_m: offset of the radios of each range, m, float32 (n,).
-    """
-    has_cir = ranges.samples.shape[1] > 0
-    if bundle.card.fits(ranges.radio, ranges.segment, has_cir):
-        return None
-    status = _OUT_OF_DISTRIBUTION if has_cir else _NO_CIR
-    return pass_through(bundle, ranges, offset_m, np.full(len(ranges), status, np.uint8))
-
-
-class Mitigation(Corrector):
-    """Corrects ranges with one bundle, by ONNX Runtime. Not thread-safe.
-
-    Predicted error = linear bias + network (or a missed direct path, see `early_path`), correction = offset of the radios + predicted error, and corrected = range -
-    correction, each one float32 operation, so that a microcontroller computes the same bits. The bundle uses the range
-    minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
-    through with a status that gives the reason and a larger variance:
-
-    NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: the bundle was
-    trained for another radio or segment, the range minus offset or the corrected range is negative or not finite, the
-    predicted error is outside the bundle's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
-
-    The further a measurement is outside the bundle's training data (`Card.ood_bands`), the more its correction shrinks
-    from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
-
-    Args:
-        bundle: the model.
-        offsets: offsets of the radios, in addition to the bundle's prediction: one offset in m for all, `Offsets`, or a
-            file written by `uwb-mitigation offset` or `calibrate`.
-
-    Raises:
-        ModelError: ONNX Runtime rejects the bundle's network.
-        ParameterError: the offset is not finite, too large, or no such file exists.
-    """
-
-    def __init__(self, bundle: Bundle, offsets: Offsets | float | str | Path = NO_OFFSETS) -> None:
+    def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
-        self.offsets = offsets if isinstance(offsets, Offsets) else read_offsets(str(offsets))
         self._session = Session(bundle)
         self._rule = CorrectionRule(bundle.card)
 
-    def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
-        """See `Corrector`."""
+    def correct(self, ranges: RangeColumns, offset_m: NDArray[np.float32]) -> CorrectedColumns:
+        """See `Backend`."""
         linear_bias, n = self.bundle.linear_bias, len(ranges)
-        offset = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
-        if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
-            return passed
-        range_m = _subtract_offset(ranges.range_m, offset)
+        range_m = _subtract_offset(ranges.range_m, offset_m)
         valid = _is_valid_range(range_m)
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         predicted = linear_bias.predict_m(*powers)
@@ -286,9 +307,9 @@ class Mitigation(Corrector):
         accepted = self._rule.accepts(predicted, score)
         rows = _row_index(accepted)
         excess, variance = self._rule.apply(predicted[rows], score[rows])
-        correction = offset[rows] + excess
+        correction = offset_m[rows] + excess
         corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
-        if np.minimum.reduce(corrected_m, initial=0.0) < 0.0:
+        if np.count_nonzero(corrected_m < 0.0):
             kept = corrected_m >= 0.0
             accepted[accepted] = kept
             rows = accepted
@@ -296,11 +317,11 @@ class Mitigation(Corrector):
                 values[kept] for values in (corrected_m, correction, variance)
             )
         if rows is _ALL_ROWS:
-            model_id = self.bundle.model_id
+            model_id = np.array([self.bundle.model_id] * n, np.uint32)
             return CorrectedColumns(corrected_m, correction, variance, status, CorrectedBy.HOST, model_id)
         rejected = (status == _OK) & ~accepted
         status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
-        corrected = pass_through(self.bundle, ranges, offset, status)
+        corrected = pass_through(self.bundle, ranges, offset_m, status)
         corrected.range_m[rows], corrected.correction_m[rows], corrected.variance_m2[rows] = (
             corrected_m,
             correction,
@@ -328,6 +349,25 @@ class Mitigation(Corrector):
                 if (np.float32(range_m[index]) - bias_m[index]) - error_m >= MIN_RANGE_M:
                     network_m[index] = error_m
         return network_m
+
+
+class Mitigation(Corrector):
+    """Corrects ranges by ONNX Runtime.
+
+    Predicted error = linear bias + network (or a missed direct path, see `early_path`), correction = offset of the radios + predicted error, and corrected = range -
+    correction, each one float32 operation, so that a microcontroller computes the same bits. The model uses the range
+    minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
+    through with a status that gives the reason and a larger variance:
+
+    NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: no model was
+    trained for this radio or segment, the range minus offset or the corrected range is negative or not finite, the
+    predicted error is outside the model's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
+
+    The further a measurement is outside the model's training data (`Card.ood_bands`), the more its correction shrinks
+    from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
+    """
+
+    _backend = OnnxBackend
 
 
 def _row_index(mask: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:

@@ -128,25 +128,25 @@ class Preprocessing:
                 windows.append(window)
                 scales.append(scale)
                 symbols.append(PREAMBLE_DIVISOR * count)
-        if windows and not _are_usable(np.array(windows), total, is_complex):
+        if not windows:
+            return np.array(faults, np.uint8), np.empty((0, self.samples), np.float32)
+        stacked = np.array(windows)
+        if not _are_usable(stacked, total, is_complex):
             usable = [row for row, fault in enumerate(faults) if not fault]
             for row, window in zip(usable, windows, strict=True):
                 faults[row] = _content_fault(window, total, is_complex)
             rows = [number for number, row in enumerate(usable) if not faults[row]]
-            windows, scales, symbols = (
-                [values[row] for row in rows] for values in (windows, scales, symbols)
-            )
-        if not windows:
-            return np.array(faults, np.uint8), np.empty((0, self.samples), np.float32)
+            stacked = stacked[rows]
+            scales, symbols = ([values[row] for row in rows] for values in (scales, symbols))
 
         if is_complex:
-            power = np.array(windows, np.int32)
+            power = stacked.astype(np.int32)
             np.multiply(power, power, out=power)
             inputs = (power[:, 0::2] + power[:, 1::2]).astype(np.float32)
             np.sqrt(inputs, out=inputs)
         else:
-            inputs = np.array(windows, np.float32)
-        if any(scale != 1.0 for scale in scales):
+            inputs = stacked.astype(np.float32)
+        if scales.count(1.0) < len(scales):
             np.multiply(inputs, np.array(scales, np.float32)[:, None], out=inputs)
         if self.scaling is Scaling.MAX:
             np.divide(inputs, inputs.max(axis=1, keepdims=True), out=inputs)

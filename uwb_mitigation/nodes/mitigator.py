@@ -7,6 +7,7 @@ import threading
 import time
 from array import array
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from itertools import chain
 from typing import Any
 
@@ -17,11 +18,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
 from uwb_mitigation.mitigation.correction import Corrector, Mitigation
-from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.mitigation.model.choice import choose_model
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.model.shipped import model_path
+from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Scaling
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
@@ -30,6 +32,7 @@ from uwb_mitigation.nodes.support.parameter_tables import MITIGATOR
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     Cir,
+    CirKind,
     Encoding,
     RadioType,
     RangeMeasurement,
@@ -47,38 +50,37 @@ if importlib.util.find_spec("onnxruntime") is None:
 BATCH = 16
 """Maximum batch size: correcting queued ranges in a batch takes half the time of single ranges."""
 
-_PASSED_THROUGH = (Status.OUT_OF_DISTRIBUTION, Status.NO_CIR)
-
 
 def load_corrector(model: str, backend: str = "onnxruntime") -> Corrector:
-    """Return the bundle of the parameter `model`, ready to correct by `backend`.
+    """Return the model or models of the parameter `model`, ready to correct by `backend`.
 
     Raises:
-        ModelError: the bundle is missing, corrupt, or refused by the backend.
+        ModelError: a model is missing, corrupt, or refused by the backend.
         MissingDependencyError: `firmware` without a C compiler.
     """
-    bundle = load_bundle(model_path(model))
+    bundles = load_model(model)
     if backend == "firmware":
         # Import on demand: it compiles C code.
         from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
 
-        corrector: Corrector = FirmwareMitigation(bundle)
+        corrector: Corrector = FirmwareMitigation(bundles)
     else:
-        corrector = Mitigation(bundle)
+        corrector = Mitigation(bundles)
     _warm_up(corrector)
     return corrector
 
 
 def _warm_up(corrector: Corrector) -> None:
     """Correct single ranges and a batch, because the first calls of ONNX Runtime and NumPy are slow."""
-    card = corrector.bundle.card
-    samples = np.zeros(2 * 2 * card.preprocessing.samples, np.int16)
-    samples[2 * WINDOW_LEAD] = 10_000
-    cir = Cir(samples, first_path_index=WINDOW_LEAD, preamble_count=128, rx_power_dbm=-80.0,
-              first_path_power_dbm=-81.0, radio=card.radios[0], segment=card.segments[0])  # fmt: skip
-    measurement = RangeMeasurement(0, 1, 1, 0, 0, 5.0, cir)
-    for count in (1, 1, BATCH):
-        corrector.correct([measurement] * count)
+    for card in (bundle.card for bundle in corrector.bundles):
+        samples = np.zeros(2 * 2 * card.preprocessing.samples, np.int16)
+        samples[2 * WINDOW_LEAD] = 10_000
+        preamble_count = 128 if card.preprocessing.scaling is Scaling.PREAMBLE else 0
+        cir = Cir(samples, first_path_index=WINDOW_LEAD, preamble_count=preamble_count, rx_power_dbm=-80.0,
+                  first_path_power_dbm=-81.0, radio=card.radios[0], segment=card.segments[0])  # fmt: skip
+        measurement = RangeMeasurement(0, 1, 1, 0, 0, 5.0, cir)
+        for count in (1, 1, BATCH):
+            corrector.correct([measurement] * count)
 
 
 class Mitigator(ManagedNode):
@@ -102,6 +104,8 @@ class Mitigator(ManagedNode):
         self._sensor_ranges: endpoints.SensorRanges | None = None
         self._mitigation: Corrector | None = None
         self._prepared: tuple[str, Corrector] | None = None
+        self._shipped: tuple[Bundle, ...] = ()
+        self._advised = ""
         self._offsets = NO_OFFSETS
         self._prepared_offsets: Offsets | None = None
         # A driver in the same process calls `correct` from its own thread; transitions run in the executor's.
@@ -145,29 +149,26 @@ class Mitigator(ManagedNode):
             mitigation, publisher = self._mitigation, self._corrected
             if mitigation is None or publisher is None:
                 return
-            offsets = mitigation.offsets  # `_swap` may replace them after the lock is released.
             results = mitigation.correct(measurements)
             for measurement, corrected in zip(measurements, results, strict=True):
                 publisher.publish(encode_corrected(measurement, corrected))
                 if self._sensor_ranges is not None:
                     m = measurement
                     self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
-        now_ns = self.now_ns()
-        self.health.add_time(time.perf_counter_ns() - began_ns)
-        needs_count = mitigation.bundle.preprocessing.scaling is Scaling.PREAMBLE
-        for measurement, corrected in zip(measurements, results, strict=True):
-            self.health.statuses[corrected.status] += 1
-            if needs_count and corrected.status is Status.BAD_CIR and measurement.cir.preamble_count <= 0:
-                self.health.without_preamble_count += 1
-            cir = measurement.cir
-            if corrected.status in _PASSED_THROUGH and not mitigation.bundle.card.fits(
-                cir.radio, cir.segment, len(cir) > 0
-            ):
-                self.health.other_source = cir.source
-            if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
-                (offset_m,) = offsets.lookup([measurement.tag_id], [measurement.anchor_id])
-                self.health.los_m.append(corrected.correction_m - float(offset_m))
-            self._meter.add(now_ns - measurement.stamp_ns)
+            now_ns = self.now_ns()
+            self.health.add_time(time.perf_counter_ns() - began_ns)
+            for measurement, corrected in zip(measurements, results, strict=True):
+                choice = mitigation.choose(measurement.cir.kind)
+                if self.health.add(choice, measurement, corrected.status) and len(mitigation.bundles) > 1:
+                    first = f"tag {format_id(measurement.tag_id)}, anchor {format_id(measurement.anchor_id)}"
+                    if choice.fits:
+                        self.get_logger().info(f"ranges of {choice} (first: {first})")
+                    else:
+                        self.get_logger().warning(f"ranges are not corrected: {choice} (first: {first})")
+                if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
+                    (offset_m,) = mitigation.offsets.lookup([measurement.tag_id], [measurement.anchor_id])
+                    self.health.los_m.append(corrected.correction_m - float(offset_m))
+                self._meter.add(now_ns - measurement.stamp_ns)
 
     def subscription_count(self) -> int:
         """Return the number of subscribers of the corrected ranges."""
@@ -181,22 +182,34 @@ class Mitigator(ManagedNode):
     def describe(self) -> diagnostics.Description:
         warnings, entries, failed = self.health.period()
         level, text = diagnostics.OK, "correcting"
+        if (mitigation := self._mitigation) is not None:
+            bundles, rejected = mitigation.bundles, self.health.rejected
+            if diagnostics.ALL_REJECTED.text in warnings and len(bundles) == 1 and rejected is not None:
+                warnings.append(self._advice(bundles[0], rejected))
+            entries |= {
+                "model": ", ".join(bundle.card.label for bundle in bundles),
+                "model id": ", ".join(diagnostics.model_id(bundle.model_id) for bundle in bundles),
+                "offsets": str(mitigation.offsets),
+            }
+            for choice, pairs in list(self.health.pairs.items()):
+                ids = ", ".join(f"{format_id(tag)}-{format_id(anchor)}" for tag, anchor in sorted(pairs))
+                entries[choice.kind] = f"{choice.reason}; tag-anchor {ids}"
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings)
         if failed:
             level, text = diagnostics.ERROR, "the model fails on some ranges"
-        entries |= self._meter.entries()
-        untrained_source, self.health.other_source = self.health.other_source, ""
-        if untrained_source and (mitigation := self._mitigation) is not None and not failed:
-            reason = mitigation.bundle.card.mismatch(untrained_source)
-            level, text = diagnostics.WARN, f"ranges are not corrected: {reason}"
-        if (mitigation := self._mitigation) is not None:
-            entries |= {
-                "model": mitigation.bundle.name,
-                "model id": diagnostics.model_id(mitigation.bundle.model_id),
-                "offsets": str(mitigation.offsets),
-            }
-        return "host", level, text, entries
+        return "host", level, text, entries | self._meter.entries()
+
+    def _advice(self, bundle: Bundle, rejected: CirKind) -> str:
+        """Return, and log once, which shipped model fits ranges that the named one rejects."""
+        if not self._shipped:
+            with suppress(UwbMitigationError):
+                self._shipped = load_model()
+        advice = f"the model is {bundle.name}; with model:=auto: {choose_model(self._shipped, rejected)}"
+        if advice != self._advised:
+            self.get_logger().warning(f"every range is rejected: {advice}")
+        self._advised = advice
+        return advice
 
     def _publisher_count(self) -> int:
         return self._raw.get_publisher_count() if self._raw is not None else 0
@@ -245,15 +258,16 @@ class Mitigator(ManagedNode):
         mitigation.offsets = self._offsets
         with self._lock:
             self._mitigation = mitigation
-        bundle = mitigation.bundle
+            self.health.reset_model()
         self._reset_offset_check(mitigation)
+        bundle, labels = mitigation.bundle, [each.card.label for each in mitigation.bundles]
+        model = f"{bundle.name}, id {diagnostics.model_id(bundle.model_id)}; {bundle.card.origin}"
+        if len(labels) > 1:
+            model = f"auto: the first of {', '.join(labels)} that fits"
         limits = "; it may increase errors of other boards and at other sites"
         if bundle.linear_bias == LinearBiasModel(0.0):
             limits = f"; offsets of these radios: {self._offsets}"
-        self.get_logger().info(
-            f"correcting with model {bundle.name}, id {diagnostics.model_id(bundle.model_id)}; "
-            f"{bundle.card.origin}{limits}"
-        )
+        self.get_logger().info(f"correcting with model {model}{limits}")
 
     def _reset_offset_check(self, mitigation: Corrector) -> None:
         # A linear bias model includes the offset of the boards of its training, unless another offset is set.

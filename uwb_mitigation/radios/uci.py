@@ -25,7 +25,6 @@ from uwb_mitigation.radios.port import (
     StreamPort,
 )
 from uwb_mitigation.radios.settings import PREFIX, Role, ValueReader, read_addresses, read_ports
-from uwb_mitigation.types.measurement import Segment
 
 BAUD = 115_200
 DEFAULT_CHANNEL = 9
@@ -36,9 +35,6 @@ REOPEN_NS = 10 * 10**9
 
 SHUTDOWN_NS = 10**9
 """Maximum duration of the commands that end the sessions and restore the calibration of a board."""
-
-EXPERIMENTAL_MODEL = "dw3000_sts"
-"""Name of the shipped model for CIRs of the STS segment."""
 
 _MIN_RANGES, _CIR_SHARE = 20, 0.5
 
@@ -141,7 +137,6 @@ class UciPort(StreamPort):
         self._number, self._capture = number, capture
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
-        self._model_logged = False
 
     def apply(self, settings: UciPortSettings) -> None:
         """Start the board again with other settings.
@@ -182,8 +177,6 @@ class UciPort(StreamPort):
                 values |= {"CIR taps": session.window[0], "CIR taps before the first path": session.window[1]}
             if session.position_unit.name:
                 values["unit of the first-path positions"] = session.position_unit.name
-            if self._model_logged:
-                values["correction"] = f"set model:={EXPERIMENTAL_MODEL} at the mitigator (experimental)"
             values |= {name.replace("_", " "): count for name, count in session.totals().items()}
             values |= {"openings": self.openings}
             self.monitor.period_s = max(PERIOD_S, 3 * s.effective_interval_ms / 1e3)
@@ -242,12 +235,6 @@ class UciPort(StreamPort):
             raise LinkError(session.state, where=str(self._address))
         if not (session.settings.role is Role.TAG or session.settings.report):
             return messages
-        is_sts = any(len(measured.cir) and measured.cir.segment is Segment.STS for measured in measurements)
-        if is_sts and not self._model_logged:
-            # The default model passes these ranges through.
-            self._model_logged = True
-            text = "the mitigator corrects CIRs of DW3000 STS only with"
-            messages.append(PortMessage(logging.INFO, f"{text} model:={EXPERIMENTAL_MODEL} (experimental)"))
         return messages + measurements
 
     def _outgoing(self) -> bytes:

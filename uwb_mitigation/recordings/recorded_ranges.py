@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.measurement import CorrectedRange, Record
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, measurement_key
 from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_CORRECTED_TYPE, RANGE_RAW
 from uwb_mitigation.types.tracks import Ranges, TruePath
@@ -24,7 +26,7 @@ class TagRecording:
 
     Attributes:
         raw: ranges as measured, with unknown variances.
-        ranges: corrected ranges with their variances, if the bag contains any; otherwise the raw ranges.
+        ranges: corrected ranges with their variances, if there are any; otherwise the raw ranges.
         corrected: whether `ranges` are corrected.
         truth: true positions; empty: unknown.
     """
@@ -55,13 +57,20 @@ _Row = tuple[int, int, float, float, float]
 _DTYPE = np.dtype([("s", "i8"), ("a", "i8"), ("r", "f8"), ("v", "f8"), ("p", "f8")])
 
 
-def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> RecordedRanges:
+def read_ranges(
+    path: Path,
+    anchors: AnchorMap,
+    stamp_offset_s: float = 0.0,
+    corrected: Iterable[tuple[Record, CorrectedRange]] = (),
+) -> RecordedRanges:
     """Read all ranges of a bag.
 
     Args:
         path: the bag.
         anchors: the map; ranges of other anchors are skipped.
         stamp_offset_s: added to the stamps of the ranges (not of the truth): -0.2 if they are late by 0.2 s.
+        corrected: corrected ranges of a bag that contains none; of a tag whose ranges they do not change, the raw ranges
+            are used. Not read if the bag contains corrected ranges.
 
     Raises:
         RecordingError: the bag cannot be read, or has no range of an anchor in the map.
@@ -75,9 +84,15 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
             check_channel(message.channel, RANGE_CIR_TYPE if is_raw else RANGE_CORRECTED_TYPE, path)
             checked.add(id(message.channel))
         try:
-            table.add_raw(message.data) if is_raw else table.add_corrected(message.data)
+            if is_raw:
+                table.add_raw(message.data)
+            else:
+                table.add_corrected(*decode_corrected(message.data))
         except RecordingError as error:
             table.skipped[error.what] += 1
+    if not (has_corrected := RANGE_CORRECTED in bag.topics):
+        for record, result in corrected:
+            table.add_corrected(measurement_key(record.measurement), result)
     if not table.raw and not table.corrected:
         map_ids = ", ".join(map(str, sorted(anchors.index)))
         recorded_ids = ", ".join(map(str, sorted(table.unknown_anchors))) or "none"
@@ -91,9 +106,10 @@ def read_ranges(path: Path, anchors: AnchorMap, stamp_offset_s: float = 0.0) -> 
     tags = []
     for tag in sorted(table.raw.keys() | table.corrected.keys()):
         raw = _columns(tag, table.raw.get(tag, []))
-        is_corrected = tag in table.corrected
-        ranges = _columns(tag, table.corrected[tag]) if is_corrected else raw
-        tags.append(TagRecording(tag, raw, ranges, is_corrected, truths.get(tag, no_truth)))
+        ranges = _columns(tag, table.corrected[tag]) if tag in table.corrected else raw
+        if not has_corrected and np.array_equal(ranges.range_m, raw.range_m):
+            ranges = raw
+        tags.append(TagRecording(tag, raw, ranges, ranges is not raw, truths.get(tag, no_truth)))
     return RecordedRanges(tags, table.unknown_anchors, table.skipped + bag.warnings)
 
 
@@ -114,8 +130,7 @@ class _RangeTable:
         if not self._add(self.raw, key, measured.range_m, math.nan, power):
             self._count(key)
 
-    def add_corrected(self, data: bytes) -> None:
-        key, corrected = decode_corrected(data)
+    def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         power = self._powers.get(key, math.nan)
         if key not in self._powers:
             # A bag without raw ranges: corrected ranges contain the measured ones.

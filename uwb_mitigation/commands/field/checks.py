@@ -238,6 +238,9 @@ def _model(o: Observation) -> Iterator[Check]:
         remedy = "ranges are published without correction; offsets work"
         yield Check("model", o.model, "trained for this radio", Verdict.WARNING, remedy)
         return
+    verdict = Verdict.WARNING if "experimental" in o.model else Verdict.PASS
+    remedy = "compare corrected ranges with known distances before use"
+    yield Check("model", o.model, "not experimental", verdict, remedy)
     residual_m = abs(float(np.median([corrected.range_m for corrected in o.corrected])) - o.distance_m)
     remedy = "calibrate the offset of the pair"
     yield _judge("error of the median corrected range", residual_m, 0.15, 0.3, "m", remedy)

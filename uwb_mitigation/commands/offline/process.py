@@ -22,11 +22,12 @@ from uwb_mitigation.errors import (
     missing_dependency,
 )
 from uwb_mitigation.mitigation.correction import Mitigation
-from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.choice import Choice
+from uwb_mitigation.mitigation.model.shipped import AUTO, load_model
 from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors, write_anchors
 from uwb_mitigation.recordings.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.recordings.bag.writer import METADATA_RECORD, BagWriter
-from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment, Status
+from uwb_mitigation.types.measurement import RangeMeasurement, Status
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.ros import schemas
 from uwb_mitigation.types.ros.codec import RangeBatch, decode_range, encode_corrected
@@ -46,14 +47,14 @@ class Job:
     Attributes:
         source: an MCAP file or rosbag2 folder.
         output: an MCAP file if it ends in `.mcap`, otherwise a rosbag2 folder.
-        model: the bundle.
+        model: path of the bundle; `auto`: the shipped one that fits each range.
         force: replace an existing `output`.
         offsets: offsets of the radios.
     """
 
     source: Path
     output: Path
-    model: Path
+    model: Path | str = AUTO
     force: bool = False
     offsets: Offsets = NO_OFFSETS
 
@@ -69,7 +70,7 @@ class Outcome:
         statuses: corrected ranges by status, {name: count}.
         replaced: corrected ranges of the input, which are not copied.
         skipped: warnings, {kind: count}.
-        mismatches: why ranges were passed through for their radio or segment, {reason: count}.
+        models: ranges by model, {choice: count}.
         seconds: wall time of reading, correcting and writing.
         error: why the output is missing or (damaged input) incomplete; None = success.
         written: whether there is an output.
@@ -81,7 +82,7 @@ class Outcome:
     statuses: Counter[str] = field(default_factory=Counter)
     replaced: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
-    mismatches: Counter[str] = field(default_factory=Counter)
+    models: Counter[Choice] = field(default_factory=Counter)
     seconds: float = 0.0
     error: UwbMitigationError | None = None
     written: bool = False
@@ -113,14 +114,14 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         ParameterError: the output exists, or its folder does not.
         ModelError: the model cannot be used.
     """
-    mitigation = Mitigation(load_bundle(job.model), job.offsets)
-    # The model is loaded once per process and takes as long as thousands of ranges: do not count it in the bag's time.
+    mitigation = Mitigation(load_model(job.model), job.offsets)
+    # Loading the models takes as long as thousands of ranges: do not count it in the bag's time.
     schemas.typestore()
     started = time.perf_counter()
     bag = BagReader(job.source)
     metadata = bag.metadata.get(METADATA_RECORD, {})
     origin = {
-        "source": f"{job.source.name}, corrected by model {mitigation.bundle.model_id:08x}",
+        "source": f"{job.source.name}, corrected by model {' or '.join(f'{b.model_id:08x}' for b in mitigation.bundles)}",
         "simulated": metadata.get("simulated", "unknown"),
     }
     with BagWriter(job.output, origin, force=job.force) as out:
@@ -161,7 +162,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         statuses=corrector.statuses,
         replaced=corrector.replaced,
         skipped=corrector.skipped + bag.warnings,
-        mismatches=corrector.mismatches,
+        models=mitigation.used,
         seconds=seconds,
         error=damage,
         written=True,
@@ -180,7 +181,6 @@ class _Corrector:
         self._corrected = out.corrected_channel()
         self.statuses: Counter[str] = Counter()
         self.skipped: Counter[str] = Counter()
-        self.mismatches: Counter[str] = Counter()
         self.replaced = 0
 
     def write(self, batch: list[RawMessage]) -> None:
@@ -214,11 +214,9 @@ class _Corrector:
             except RecordingError:
                 self._correct_singly(messages, indices, encoded)
                 continue
-            ranges = batch.columns
-            corrected = self._mitigation.correct_columns(ranges)
+            corrected = self._mitigation.correct_columns(batch.columns)
             for status, count in zip(*np.unique(corrected.status, return_counts=True), strict=True):
                 self.statuses[Status(status).name] += int(count)
-            self._count_mismatches(ranges.radio, ranges.segment, ranges.samples.shape[1] > 0, len(ranges))
             for index, message in zip(indices, batch.encode_corrected(corrected), strict=True):
                 encoded[index] = message
         return encoded
@@ -235,12 +233,3 @@ class _Corrector:
         for (index, measurement), result in zip(decoded.items(), corrected, strict=True):
             encoded[index] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
-            cir = measurement.cir
-            self._count_mismatches(cir.radio, cir.segment, len(cir) > 0, 1)
-
-    def _count_mismatches(self, radio: RadioType, segment: Segment, has_cir: bool, count: int) -> None:
-        card = self._mitigation.bundle.card
-        if not card.fits(radio, segment, has_cir):
-            self.mismatches[card.mismatch(f"{radio.name} {segment.name if has_cir else 'without CIR'}")] += (
-                count
-            )

@@ -1,7 +1,9 @@
-"""Default model of a command."""
+"""The option `--model`, and the model of a command that uses only one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,6 +15,7 @@ from uwb_mitigation.errors import UwbMitigationError
 
 if TYPE_CHECKING:
     from uwb_mitigation.mitigation.model.bundle import Bundle
+    from uwb_mitigation.mitigation.model.choice import Choice
 
 MAX_RECORDS_READ = 1000
 
@@ -20,36 +23,41 @@ ModelOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE|NAME",
-        help="Bundle, or the name of a shipped one. Default: `universal`, or `universal_amplitude` if the "
-        "first CIR of the recording has no preamble count.",
+        help="Bundle, or the name of a shipped one. Default: `auto`, the shipped model that fits the radio and the CIR.",
         show_default=False,
     ),
 ]
 
 
+def show_models(models: Mapping[Choice, int]) -> None:
+    """Print the number of ranges of each model; warn about ranges that no model fits."""
+    for choice, count in models.items():
+        if choice.fits:
+            console.print_line(f"{count} ranges of {choice}")
+        else:
+            console.warn(f"{count} ranges are not corrected: {choice}")
+
+
 def bundle_for(named: Path | None, recording: Path) -> Bundle:
-    """Return the named bundle, or the shipped one (logged unless `universal`) that can read a recording's CIRs.
+    """Return the named bundle, or the one for the first CIR of a recording (logged unless it is the default).
 
     Raises:
         ModelError: the bundle cannot be loaded.
     """
-    from uwb_mitigation.mitigation.model.shipped import AMPLITUDE, load_model
-
-    if named is None and _lacks_counts(recording):
-        console.err.print(f"the CIRs have no preamble count: using the model {AMPLITUDE}", style="yellow")
-        named = Path(AMPLITUDE)
-    return load_model(named)
-
-
-def _lacks_counts(recording: Path) -> bool:
-    """Return whether the first CIR has no preamble count; False if it is damaged. The command reports read errors."""
+    from uwb_mitigation.mitigation.model.bundle import Bundle
+    from uwb_mitigation.mitigation.model.choice import choose_model
+    from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.recordings.formats import open_recording
 
-    try:
-        with open_recording(recording) as source:
-            for record in islice(source, MAX_RECORDS_READ):
-                if len(record.measurement.cir.samples):
-                    return record.measurement.cir.preamble_count <= 0
-    except UwbMitigationError:
-        pass
-    return False
+    models = load_model(named)
+    if isinstance(models, Bundle):
+        return models
+    # The command reports the errors of reading.
+    with suppress(UwbMitigationError), open_recording(recording) as source:
+        for record in islice(source, MAX_RECORDS_READ):
+            if len(record.measurement.cir):
+                choice = choose_model(models, record.measurement.cir.kind)
+                if choice.model:
+                    console.warn(str(choice))
+                return models[choice.model]
+    return models[0]

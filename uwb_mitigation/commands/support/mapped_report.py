@@ -112,7 +112,6 @@ def missing(source: MappedRecording) -> list[str]:
             f"{no_cir}: only constants and linear models correct them (networks: status NO_CIR)",
         ),
         (with_cir and unknown("first_path_index"), "no first-path index: networks need it (status BAD_CIR)"),
-        (with_cir and unknown("preamble_count"), "no preamble count: use the model `universal_amplitude`"),
         (unknown("rx_power"), "no receive level: no linear model"),
         (unknown("first_path_power"), "no first-path level: no linear model of the power gap"),
         (not len(source.errors_m), "no true range: `evaluate`, `train` and `offset` cannot use it"),

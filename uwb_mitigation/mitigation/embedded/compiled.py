@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
-from uwb_mitigation.mitigation.correction import Corrector, pass_other_radio, pass_through
+from uwb_mitigation.mitigation.correction import Corrector, pass_through
 from uwb_mitigation.mitigation.embedded.compiling import (
     WARNINGS,
     Signatures,
@@ -27,7 +27,6 @@ from uwb_mitigation.mitigation.embedded.compiling import (
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.types.measurement import Cir, CorrectedColumns, RangeColumns, Status
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 
 _OPTIONS = ("-std=c99", "-O3", "-fPIC", *WARNINGS)
 
@@ -142,43 +141,45 @@ def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
     return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
 
 
-class FirmwareMitigation(Corrector):
-    """Corrects ranges with one bundle in the firmware; bit-identical to `Mitigation`.
+class FirmwareBackend:
+    """Runs a model in the firmware."""
 
-    Raises:
-        MissingDependencyError: no C compiler is installed, or the firmware's sources are not installed.
-        ModelError: the firmware cannot run the bundle's network.
-        UwbMitigationError: the sources do not compile.
-    """
-
-    def __init__(self, bundle: Bundle, offsets: Offsets = NO_OFFSETS) -> None:
+    def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
-        self.offsets = offsets
         # The loaded library no longer needs its file.
         with tempfile.TemporaryDirectory(prefix="uwb_firmware_backend_") as name:
             folder = Path(name)
             export_bundle(bundle, folder)
             self._firmware = CompiledFirmware(folder, folder)
 
-    def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
-        """See `Corrector`."""
-        offset = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
-        if (passed := pass_other_radio(self.bundle, ranges, offset)) is not None:
-            return passed
+    def correct(self, ranges: RangeColumns, offset_m: NDArray[np.float32]) -> CorrectedColumns:
+        """See `Backend`."""
         *values, status = zip(
             *(
-                self._firmware.correct(float(ranges.range_m[row]), _cir(ranges, row), float(offset[row]))
+                self._firmware.correct(float(ranges.range_m[row]), _cir(ranges, row), float(offset_m[row]))
                 for row in range(len(ranges))
             ),
             strict=True,
         )
-        corrected = pass_through(self.bundle, ranges, offset, np.array(status, np.uint8))
+        corrected = pass_through(self.bundle, ranges, offset_m, np.array(status, np.uint8))
         is_corrected = corrected.status == Status.OK
         for column, computed in zip(
             (corrected.range_m, corrected.correction_m, corrected.variance_m2), values, strict=True
         ):
             column[is_corrected] = np.array(computed, np.float32)[is_corrected]
         return corrected
+
+
+class FirmwareMitigation(Corrector):
+    """Corrects ranges in the firmware; bit-identical to `Mitigation`.
+
+    Raises:
+        MissingDependencyError: no C compiler is installed, or the firmware's sources are not installed.
+        ModelError: the firmware cannot run the network of a model.
+        UwbMitigationError: the sources do not compile.
+    """
+
+    _backend = FirmwareBackend
 
 
 def _cir(ranges: RangeColumns, row: int) -> Cir:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, overload
 
 from uwb_mitigation.errors import ModelError, did_you_mean
 
@@ -14,23 +14,42 @@ if TYPE_CHECKING:
     from uwb_mitigation.mitigation.model.bundle import Bundle
     from uwb_mitigation.mitigation.preprocessing import Scaling
 
+AUTO = "auto"
+"""Name of the choice of a model for each range, see `choose_model`."""
+
 DEFAULT, AMPLITUDE = "universal", "universal_amplitude"
 """Models for unknown sites and boards, with and without preamble counts."""
 
-SHIPPED = (DEFAULT, AMPLITUDE, "evk1000_apartment", "dw3000_sts")
-"""All models; an example of a surveyed site and an experimental one for the DW3000 are used only if they are named."""
+AUTOMATIC = (DEFAULT, AMPLITUDE, "dw3000_sts")
+"""Models that are chosen automatically; of two that fit, the first."""
+
+SHIPPED = (*AUTOMATIC, "evk1000_apartment")
+"""All models; the last one, an example of a surveyed site, is used only if it is named."""
 
 _SHARE = Path("share", "uwb_mitigation")
 
 
-def load_model(named: str | Path | None = None) -> Bundle:
-    """Load a model: a file, or the name of a shipped one (`SHIPPED`); `universal` for None.
+@overload
+def load_model(named: Literal["auto"] | None = None) -> tuple[Bundle, ...]: ...  # type: ignore[overload-overlap]
+
+
+@overload
+def load_model(named: str | Path) -> Bundle: ...
+
+
+def load_model(named: str | Path | None = None) -> Bundle | tuple[Bundle, ...]:
+    """Load a model: a file, or the name of a shipped one (`SHIPPED`).
+
+    For `auto` or None, load the shipped models from which `Mitigation` chooses one for each range. All are loaded, so that
+    no live range waits for one (7 ms each) and a damaged file is reported at once.
 
     Raises:
         ModelError: there is no such model or file, or it is damaged.
     """
     from uwb_mitigation.mitigation.model.bundle import load_bundle
 
+    if not named or str(named) in (AUTO, "."):
+        return tuple(load_bundle(shipped_model_path(name)) for name in AUTOMATIC)
     return load_bundle(model_path(named))
 
 

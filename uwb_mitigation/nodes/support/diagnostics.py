@@ -13,7 +13,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.mitigation.model.choice import Choice
+from uwb_mitigation.types.measurement import CirKind, RangeMeasurement, Status
 from uwb_mitigation.types.stamps import NS_PER_S
 
 OK = DiagnosticStatus.OK
@@ -105,14 +106,10 @@ OUT_OF_DISTRIBUTION = Threshold(
     "many ranges are out of distribution: the model was trained on other data",
 )
 NO_USABLE_CIR = Threshold("share of ranges NO_CIR or BAD_CIR", 0.2, "many ranges have no usable CIR")
-NO_PREAMBLE_COUNT = Threshold(
-    "share of ranges without the preamble count that the model needs",
-    0.2,
-    "many CIRs have no preamble count, and this model needs it: set model to universal_amplitude",
-)
 DROPPED = Threshold("share of ranges dropped", 0.0, "ranges were dropped: the queue was too short")
 SLOW = Threshold("p99 of the processing time, ms", 20.0, "correction is slow: the processor is overloaded")
 NO_RANGES = Threshold("s without a range", 5.0, "no ranges received")
+ALL_REJECTED = Threshold("s in which every range was rejected", 5.0, "every range is rejected")
 OFFSET = Threshold(
     "absolute median predicted error of LOS ranges, m",
     0.15,
@@ -122,6 +119,9 @@ OFFSET = Threshold(
 
 MAX_LOS, MIN_LOS = 1000, 200
 """Maximum and minimum number of latest LOS ranges whose median is compared with OFFSET."""
+
+MAX_PAIRS = 20
+"""Maximum number of pairs of radios that are listed for each model."""
 
 
 class MitigatorHealth:
@@ -136,8 +136,9 @@ class MitigatorHealth:
         lost: ranges that the middleware reports as lost, because the publisher's queue was too short.
         loss_counter: counts the lost ranges and those dropped by the subscription's queue.
         malformed: messages that could not be decoded.
-        without_preamble_count: ranges whose CIR lacks the preamble count that the model needs, in this period.
-        other_source: radio and segment of a CIR that the model was not trained for, in this period.
+        pairs: first pairs of radios (tag, anchor) of each choice of a model, since the model was set.
+        misfit: why no model, or not the named one, can correct a CIR of this period; empty: none.
+        rejected: the last CIR whose range was not corrected, since the model was set.
         los_m: predicted errors of the latest LOS ranges without the offsets of the radios.
         excludes_offset: whether the predicted errors do not contain the radios' offset, so that the median of `los_m`
             is near 0.
@@ -150,13 +151,15 @@ class MitigatorHealth:
         self.lost = 0
         self.loss_counter = LossCounter(publishers)
         self.malformed = 0
-        self.without_preamble_count = 0
-        self.other_source = ""
+        self.pairs: dict[Choice, set[tuple[int, int]]] = {}
+        self.misfit = ""
+        self.rejected: CirKind | None = None
         self.los_m: deque[float] = deque(maxlen=MAX_LOS)
         self.excludes_offset = False
         self._processing_ns: deque[int] = deque(maxlen=MAX_LATENCIES)
         self._now_s = now_s
         self._last_s = now_s()
+        self._rejected_since_s = math.inf
         self._previous: tuple[Counter[Status], int] = (Counter(), 0)
 
     @property
@@ -168,6 +171,26 @@ class MitigatorHealth:
         """Add the processing time of a range or of a batch."""
         self._processing_ns.append(processing_ns)
         self._last_s = self._now_s()
+
+    def add(self, choice: Choice, measurement: RangeMeasurement, status: Status) -> bool:
+        """Count a range; return whether it is the first one with this choice of a model."""
+        self.statuses[status] += 1
+        if status is Status.OK:
+            self._rejected_since_s = math.inf
+        else:
+            self._rejected_since_s = min(self._rejected_since_s, self._last_s)
+            if len(measurement.cir):
+                self.rejected = measurement.cir.kind
+                self.misfit = self.misfit if choice.fits else str(choice)
+        is_first = choice not in self.pairs
+        pairs = self.pairs.setdefault(choice, set())
+        if len(pairs) < MAX_PAIRS:
+            pairs.add((measurement.tag_id, measurement.anchor_id))
+        return is_first
+
+    def reset_model(self) -> None:
+        """Forget the ranges of the previous model."""
+        self.pairs, self.misfit, self.rejected, self._rejected_since_s = {}, "", None, math.inf
 
     def period(self) -> tuple[list[str], dict[str, object], bool]:
         """Begin a new period.
@@ -183,16 +206,14 @@ class MitigatorHealth:
         los_m = self.los_m.copy()
         median_m = statistics.median(los_m) if los_m else math.nan
         total = max(statuses.total(), 1)
-        without_preamble_count, self.without_preamble_count = self.without_preamble_count / total, 0
         out_of_distribution = statuses[Status.OUT_OF_DISTRIBUTION] / total
         values = {
             OUT_OF_DISTRIBUTION: out_of_distribution,
-            NO_USABLE_CIR: (statuses[Status.NO_CIR] + statuses[Status.BAD_CIR]) / total
-            - without_preamble_count,
-            NO_PREAMBLE_COUNT: without_preamble_count,
+            NO_USABLE_CIR: (statuses[Status.NO_CIR] + statuses[Status.BAD_CIR]) / total,
             DROPPED: dropped / max(statuses.total() + dropped, 1),
             SLOW: float(np.percentile(processing_ns, 99)) / 1e6 if processing_ns else 0.0,
             NO_RANGES: self._now_s() - self._last_s,
+            ALL_REJECTED: self._last_s - self._rejected_since_s,
             OFFSET: abs(median_m) if self.excludes_offset and len(los_m) >= MIN_LOS else 0.0,
         }
         entries: dict[str, object] = {f"ranges {status.name}": self.statuses[status] for status in Status}
@@ -206,6 +227,9 @@ class MitigatorHealth:
             entries["line of sight: median predicted error m"] = f"{median_m:.3f}"
         entries |= percentiles("processing", processing_ns)
         warnings = [threshold.text for threshold, value in values.items() if value > threshold.limit]
+        if self.misfit:
+            warnings.insert(0, f"ranges are not corrected: {self.misfit}")
+            self.misfit = ""
         return warnings, entries, statuses[Status.MODEL_ERROR] > 0
 
 

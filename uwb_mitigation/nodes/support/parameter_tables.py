@@ -191,9 +191,9 @@ DRIVER = (
 )  # fmt: skip
 
 MITIGATOR = (
-    Parameter("model", "", "Model bundle to correct with: a file, or the name of a shipped one (universal, universal_amplitude, "
-              "evk1000_apartment, dw3000_sts); empty: universal. An invalid bundle is refused, and the previous one "
-              "stays in use.", live=True),
+    Parameter("model", "auto", "Model to correct with: auto, for each range the first of universal, universal_amplitude and "
+              "dw3000_sts (experimental) that fits its radio and CIR; the name of one of these or evk1000_apartment; or a "
+              "file. An invalid model is refused, and the previous one stays in use.", live=True),
     Parameter("offsets", "", "Offset of ranges due to antenna delays, subtracted before the model: a number in "
               "metres, or a file written by `uwb-mitigation offset` or `calibrate`; empty: 0. Invalid "
               "offsets are refused, and "

@@ -1,0 +1,280 @@
+"""The model is chosen by the data: the rule, `process`, `track` and the live nodes without an option."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import ros_harness
+from bag_material import imported
+from command_line import succeed
+from compilers import NEEDS_CC
+from model_material import Recorded, bundle, measurement
+from ros_harness import diagnostic_values
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from benchmarks.paper.simulated import SimulatedDeepUwb
+from uwb_mitigation.calibration.site import calibrate
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
+from uwb_mitigation.mitigation.model.choice import choose_model
+from uwb_mitigation.mitigation.model.shipped import load_model
+from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.recordings.bag.reader import BagReader
+from uwb_mitigation.recordings.mcap import McapRecording
+from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status
+from uwb_mitigation.types.ros.codec import decode_corrected
+from uwb_mitigation.types.ros.topics import RANGE_CORRECTED
+
+AUTO = load_model()
+NAMES = {bundle.model_id: bundle.name for bundle in AUTO}
+NAN = float("nan")
+STS = {"radio": RadioType.DW3000, "segment": Segment.STS}
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "reason"),
+    [
+        ({}, "universal", "DW1000 IPATOV (assumed) with preamble count and levels: model universal, id "),
+        ({"radio": RadioType.DW1000, "segment": Segment.IPATOV}, "universal", "DW1000 IPATOV with"),
+        ({"preamble_count": 0}, "universal_amplitude", "without preamble count: model universal_amplitude"),
+        ({"rx_power_dbm": NAN}, "universal_amplitude", "without levels"),
+        ({"preamble_count": 0, "first_path_power_dbm": NAN}, "universal_amplitude", "preamble count and levels"),
+        (STS, "dw3000_sts", "DW3000 STS with preamble count and levels: model dw3000_sts (experimental)"),
+        (STS | {"samples": np.ones(24, np.int16)}, "", "dw3000_sts needs a CIR of 13 samples"),
+        ({"samples": np.ones(312, np.int16)}, "", "universal needs a CIR of 157 samples"),
+        ({"samples": np.zeros(0, np.int16)}, "", "of UNKNOWN without CIR, and no model in use fits: universal needs"),
+        ({"radio": RadioType.QM35, "segment": Segment.STS}, "", "dw3000_sts was trained for DW3000 STS"),
+    ],
+)  # fmt: skip
+def test_the_first_model_that_fits_the_data_is_chosen(changes: dict, name: str, reason: str) -> None:
+    choice = choose_model(AUTO, measurement(**changes).cir.kind)
+    assert choice.fits == bool(name)
+    assert not name or AUTO[choice.model].name == name
+    assert reason in str(choice)
+
+
+def test_models_of_a_site_need_what_their_line_and_their_network_need(tmp_path: Path) -> None:
+    line, network = ([bundle(tmp_path, needs_cir=needs_cir)] for needs_cir in (False, True))
+    for changes, fits in (({"samples": np.zeros(0, np.int16)}, True), ({"rx_power_dbm": NAN}, False)):
+        assert choose_model(line, measurement(**changes).cir.kind).fits == fits
+        assert not choose_model(network, measurement(**changes).cir.kind).fits
+
+
+def sts(each: RangeMeasurement) -> RangeMeasurement:
+    """Return the range with the window of a UCI board, between other radios."""
+    start = int(each.cir.first_path_index) - WINDOW_LEAD
+    first = 2 * (start - each.cir.start_index)
+    cir = Cir(
+        each.cir.samples[first : first + 32], 0, start, each.cir.first_path_index, preamble_count=64, **STS
+    )
+    return replace(each, tag_id=202, anchor_id=each.anchor_id + 10, cir=cir)
+
+
+def mixed(count: int) -> list[RangeMeasurement]:
+    """Return ranges of a DW1000, in turn with those of a DW3000."""
+    source = SimulatedSource(count=count, rate_hz=40.0)
+    return [
+        sts(record.measurement) if number % 2 else record.measurement for number, record in enumerate(source)
+    ]
+
+
+def without(each: RangeMeasurement, **changes: object) -> RangeMeasurement:
+    return replace(each, cir=replace(each.cir, **changes))
+
+
+BACKENDS = [Mitigation, pytest.param(FirmwareMitigation, marks=NEEDS_CC)]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_mixed_batch_is_corrected_like_single_ranges_by_the_named_models(backend: type) -> None:
+    ranges = mixed(60)
+    ranges[::5] = [without(each, preamble_count=0) for each in ranges[::5]]
+    ranges[::7] = [without(each, rx_power_dbm=NAN) for each in ranges[::7]]
+    ranges[::11] = [without(each, samples=np.zeros(0, np.int16)) for each in ranges[::11]]
+    named = {each.model_id: Mitigation(each, 0.22) for each in AUTO}
+    auto = backend(AUTO, 0.22)
+    results = auto.correct(ranges)
+    assert {result.model_id for result in results} == set(named)
+    assert results == [auto.correct(each) for each in ranges]
+    assert results == [
+        named[result.model_id].correct(each) for each, result in zip(ranges, results, strict=True)
+    ]
+    assert sum(auto.used.values()) == 2 * len(ranges)
+
+
+def test_arrays_with_and_without_levels_use_two_models() -> None:
+    (each,) = (record.measurement for record in islice(SimulatedSource(count=1), 1))
+    cir = each.cir.samples.reshape(-1, 2).astype(float) @ [1, 1j]
+    levels = {
+        "preamble_count": each.cir.preamble_count,
+        "first_path_power_dbm": each.cir.first_path_power_dbm,
+    }
+    fields = levels | {"rx_power_dbm": [each.cir.rx_power_dbm, NAN]}
+    first_path = each.cir.first_path_index - each.cir.start_index
+    result = Mitigation(AUTO).correct_arrays(each.range_m, np.stack([cir, cir]), first_path, **fields)
+    assert [NAMES[model_id] for model_id in result.model_id] == ["universal", "universal_amplitude"]
+    assert result.status.tolist() == [Status.OK, Status.OK]
+
+
+def test_calibrate_starts_from_one_model() -> None:
+    with pytest.raises(ParameterError, match="load_model"):
+        calibrate([], SimulatedSource().anchors, AUTO)
+
+
+def corrected_in(path: Path) -> dict[tuple[int, int], tuple[float, float, int, int]]:
+    messages = BagReader(path).messages((RANGE_CORRECTED,))
+    found = [decode_corrected(message.data) for message in messages]
+    return {
+        (key.stamp_ns, key.anchor_id): (each.range_m, each.variance_m2, each.status, each.model_id)
+        for key, each in found
+    }
+
+
+@pytest.fixture
+def mixed_bag(tmp_path: Path) -> Path:
+    recording = Recorded(map(Record, mixed(160)))
+    recording.name = "two radios"
+    return imported(recording, tmp_path / "mixed.mcap")
+
+
+def test_process_uses_two_models_for_a_mixed_recording(mixed_bag: Path, tmp_path: Path) -> None:
+    done = succeed("process mixed.mcap -o out.mcap --json out.json", folder=tmp_path)
+    assert re.search(
+        r"ranges of DW3000 STS without levels: model dw3000_sts \(experimental\), id", done.stdout
+    )
+    (row,) = json.loads((tmp_path / "out.json").read_text())["bags"]
+    assert len(row["models"]) == 2
+    assert not row["mismatches"]
+    results = corrected_in(tmp_path / "out.mcap")
+    ok = Counter(NAMES[model_id] for *_, status, model_id in results.values() if status == Status.OK)
+    assert ok.keys() == {"universal", "dw3000_sts"}
+    assert ok.total() > 0.95 * len(results)
+
+
+def test_track_corrects_a_recording_of_raw_ranges_as_process_does(tmp_path: Path) -> None:
+    succeed("data simulate --like drive --ranges 400 -o raw.mcap", folder=tmp_path)
+    succeed("process raw.mcap --offsets 0.22 -o done.mcap", folder=tmp_path)
+    options = "--anchors raw.anchors.yaml --height 0"
+    succeed(f"track done.mcap {options} -o a.mcap --json a.json", folder=tmp_path)
+    done = succeed(f"track raw.mcap {options} --offsets 0.22 -o b.mcap --json b.json", folder=tmp_path)
+    assert "DW1000 IPATOV with preamble count and levels: model universal, id" in done.stdout
+    first, second = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    assert first == second
+    assert first["live"]["horizontal_rmse_m"] != first["raw_live"]["horizontal_rmse_m"]
+
+
+@pytest.fixture
+def deepuwb(tmp_path: Path) -> Path:
+    """Import a pickle of the published format, with simulated ranges, as the guide does."""
+    records = list(SimulatedDeepUwb(seed=3, ranges=300, exchanges=4))
+    rows = [
+        (
+            record.measurement.cir.samples * record.measurement.cir.scale,
+            record.measurement.range_m - record.truth.range_m,
+            number * 5 // len(records),
+            "0000000000" if record.truth.label == "LOS" else "1000000000",
+        )
+        for number, record in enumerate(records)
+        if record.truth
+    ]
+    with pd.option_context("mode.string_storage", "python"):
+        frame = pd.DataFrame(rows, columns=["CIR", "Error", "Room", "Obstacles"])
+        frame.to_pickle(tmp_path / "deepuwb.pkl", protocol=4)
+    succeed("data import deepuwb.pkl -o deepuwb.mcap", folder=tmp_path)
+    return tmp_path / "deepuwb.mcap"
+
+
+def replayed(ros: ros_harness.Ros, bag: Path, count: int) -> tuple[dict, ros_harness.Process]:
+    """Replay a bag through driver and mitigator without an option; return the corrected ranges."""
+    received = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    mitigator = ros.start("mitigator")
+    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=20.0", *ros_harness.PAUSED)
+    mitigator.wait_for_output("correcting with model")
+    ros.play()
+    ros.spin_until(lambda: len(received) == count)
+    stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in received]
+    results = [(each.range, each.variance, each.status, each.model_id) for each in received]
+    keys = [(stamp, each.anchor_id) for stamp, each in zip(stamps, received, strict=True)]
+    return dict(zip(keys, results, strict=True)), mitigator
+
+
+def values(results: dict) -> list[tuple]:
+    """Return results without stamps, which a replay changes."""
+    return [results[key] for key in sorted(results)]
+
+
+@pytest.mark.ros
+def test_deepuwb_is_corrected_live_and_offline_without_an_option(ros: ros_harness.Ros, deepuwb: Path):
+    done = succeed("process deepuwb.mcap -o out.mcap", folder=deepuwb.parent)
+    assert "without preamble count and levels: model universal_amplitude" in done.stdout
+    offline = values(corrected_in(deepuwb.parent / "out.mcap"))
+    assert sum(status == Status.OK for *_, status, _ in offline) >= 0.95 * len(offline) > 280
+    live, mitigator = replayed(ros, deepuwb, len(offline))
+    assert values(live) == offline
+    assert mitigator.output.count("DW1000 IPATOV (assumed) without preamble count and levels: model") == 1
+
+
+@pytest.mark.ros
+def test_demo_corrects_deepuwb(deepuwb: Path):
+    command = [sys.executable, "-m", "uwb_mitigation.commands.entry", "demo", "--recording", str(deepuwb)]
+    environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
+    run = subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
+    assert run.returncode == 0, run.stdout + run.stderr
+    ((received, ok),) = re.findall(r"(\d+) ranges received, \d+ corrected \((\d+) OK", run.stdout)
+    assert int(ok) >= 0.95 * int(received) > 280
+
+
+@pytest.mark.ros
+def test_a_mixed_recording_uses_two_models_at_the_same_time(ros: ros_harness.Ros, mixed_bag: Path):
+    succeed("process mixed.mcap -o out.mcap", folder=mixed_bag.parent)
+    offline = values(corrected_in(mixed_bag.parent / "out.mcap"))
+    live, mitigator = replayed(ros, mixed_bag, len(offline))
+    assert values(live) == offline
+    for text in ("levels: model universal, id", "DW3000 STS without levels: model dw3000_sts (experimental)"):
+        mitigator.wait_for_output(text)
+    entries = diagnostic_values(ros.diagnosis("mitigator", lambda status: len(status.values) > 5))
+    assert re.search(
+        "model dw3000_sts .experimental., id .*; tag-anchor 202-1", entries["DW3000 STS without levels"]
+    )
+    assert re.search(
+        "model universal, id .*; tag-anchor 101-", entries["DW1000 IPATOV with preamble count and levels"]
+    )
+
+
+@pytest.mark.ros
+def test_ranges_without_a_model_are_reported_once(ros: ros_harness.Ros, tmp_path: Path):
+    other = [without(each, radio=RadioType.QM35, segment=Segment.STS) for each in mixed(60)]
+    recording = Recorded(map(Record, other))
+    recording.name = "another radio"
+    bag = imported(recording, tmp_path / "other.mcap")
+    live, mitigator = replayed(ros, bag, len(list(McapRecording(bag))))
+    assert {status for *_, status, _ in live.values()} == {Status.OUT_OF_DISTRIBUTION}
+    mitigator.wait_for_output("no model in use fits")
+    status = ros.diagnosis("mitigator", lambda status: "no model in use fits" in status.message)
+    assert "QM35 STS" in status.message
+    assert mitigator.output.count("no model in use fits") == 2  # with and without levels
+
+
+@pytest.mark.ros
+def test_a_named_model_that_rejects_every_range_names_the_one_that_fits(ros: ros_harness.Ros, deepuwb: Path):
+    mitigator = ros.start("mitigator", "model:=universal")
+    ros.start("driver", "source:=mcap", f"path:={deepuwb}", "rate:=0.2")
+    mitigator.wait_for_output("with model:=auto: DW1000 IPATOV (assumed) without preamble count and levels")
+    status = ros.diagnosis("mitigator", lambda status: "model universal_amplitude, id" in status.message)
+    assert "the model is universal" in status.message
+    assert mitigator.output.count("every range is rejected") == 1
+    assert ros.set_parameter("mitigator", "model", "auto").successful
+    ros.diagnosis("mitigator", lambda status: status.message == "correcting")
