@@ -98,8 +98,8 @@ def test_good_uci_boards_pass_and_the_file_names_nobody(
 @pytest.mark.parametrize(
     ("faults", "names"),
     [
-        ({"offset_m": 0.5}, {"error of the median range"}),
-        ({"empty_cir": True}, {"share of ranges with CIR"}),
+        ({"offset_m": 0.5}, {"error of the median range", "error of the median corrected range"}),
+        ({"empty_cir": True}, {"share of ranges with CIR", "share of ranges without correction"}),
         ({"clock_ppm": 60.0}, {"clock error"}),
     ],
 )

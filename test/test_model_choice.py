@@ -28,7 +28,7 @@ from uwb_mitigation.calibration.site import calibrate
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
-from uwb_mitigation.mitigation.model.choice import choose_model
+from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.recordings.bag.reader import BagReader
@@ -60,7 +60,7 @@ STS = {"radio": RadioType.DW3000, "segment": Segment.STS}
     ],
 )  # fmt: skip
 def test_the_first_model_that_fits_the_data_is_chosen(changes: dict, name: str, reason: str) -> None:
-    choice = choose_model(AUTO, measurement(**changes).cir.kind)
+    choice = choose_model(AUTO, CirKind.of(measurement(**changes).cir))
     assert choice.fits == bool(name)
     assert not name or AUTO[choice.model].name == name
     assert reason in str(choice)
@@ -69,8 +69,8 @@ def test_the_first_model_that_fits_the_data_is_chosen(changes: dict, name: str, 
 def test_models_of_a_site_need_what_their_line_and_their_network_need(tmp_path: Path) -> None:
     line, network = ([bundle(tmp_path, needs_cir=needs_cir)] for needs_cir in (False, True))
     for changes, fits in (({"samples": np.zeros(0, np.int16)}, True), ({"rx_power_dbm": NAN}, False)):
-        assert choose_model(line, measurement(**changes).cir.kind).fits == fits
-        assert not choose_model(network, measurement(**changes).cir.kind).fits
+        assert choose_model(line, CirKind.of(measurement(**changes).cir)).fits == fits
+        assert not choose_model(network, CirKind.of(measurement(**changes).cir)).fits
 
 
 def sts(each: RangeMeasurement) -> RangeMeasurement:

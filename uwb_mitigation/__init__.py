@@ -2,7 +2,7 @@
 
     from uwb_mitigation import Mitigation, load_model, open_recording
 
-    mitigation = Mitigation(load_model("universal"), offsets=0.22)
+    mitigation = Mitigation(load_model(), offsets=0.22)
     for record in open_recording("drive.mcap"):
         print(mitigation.correct(record.measurement).range_m)
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
+from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.mitigation.model.graph import float_model
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
@@ -201,7 +202,7 @@ def estimate_offset(
                 continue
             placement = "" if truth is None else truth.configuration
             predicted_m = _predicted_m(mitigation, measured, result)
-            model = mitigation.bundles[mitigation.choose(measured.cir.kind).model]
+            model = mitigation.bundles[mitigation.choose(CirKind.of(measured.cir)).model]
             gap_db = _power_gap_db(measured, Preprocessing(model.preprocessing.samples, Scaling.MAX))
             is_los = _is_los(gap_db, None if truth is None or len(measured.cir) else truth.label)
             offset_m = measured.range_m - predicted_m - true_m
@@ -233,7 +234,7 @@ def _check_pairs(pairs: list[tuple[int, int]], without_truth: int, *, has_one_di
 def _predicted_m(mitigation: Mitigation, measured: RangeMeasurement, result: CorrectedRange) -> float:
     """Return the error that the model predicts; NaN: it predicts none."""
     cir = measured.cir
-    is_foreign = not mitigation.choose(cir.kind).is_trained
+    is_foreign = not mitigation.choose(CirKind.of(cir)).is_trained
     if is_foreign or (len(cir) == 0 and result.status is Status.NO_CIR):
         # Without a CIR, or with that of another radio, the whole error is the offset.
         return 0.0

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.mitigation.correction import MAX_RANGE_M
 from uwb_mitigation.mitigation.model.bundle import ModelCard
+from uwb_mitigation.mitigation.model.choice import CirKind, is_trained_for
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.training.data.dataset import CirSources, Dataset
 from uwb_mitigation.types.anchors import AnchorMap
@@ -200,7 +201,7 @@ class _RangeTable:
             self.last_stamp_ns = max(stamp_ns, self.last_stamp_ns or stamp_ns)
             cir = measured.cir
             powers = cir.rx_power_dbm, cir.first_path_power_dbm
-            is_usable = fault == 0 and self._card.is_trained_for(cir.kind)
+            is_usable = fault == 0 and is_trained_for(self._card, CirKind.of(cir))
             self._rows.append(
                 (measured.tag_id, stamp_ns, row, measured.range_m, *powers, height_m, is_usable)
             )

@@ -105,10 +105,11 @@ def _ask(port: str) -> None:
 def _correct(observation: Observation) -> None:
     """Correct the ranges with the shipped models if one was trained for the radio."""
     from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.choice import CirKind
     from uwb_mitigation.mitigation.model.shipped import load_model
 
     mitigation = Mitigation(load_model())
-    choices = {mitigation.choose(measured.cir.kind) for measured in observation.ranges}
+    choices = {mitigation.choose(CirKind.of(measured.cir)) for measured in observation.ranges}
     observation.model = "; ".join(sorted(map(str, choices)))
     if all(choice.is_trained for choice in choices):
         observation.corrected = mitigation.correct(observation.ranges)

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
-from uwb_mitigation.mitigation.model.choice import Choice, choose_model
+from uwb_mitigation.mitigation.model.choice import Choice, CirKind, choose_model, kinds_of
 from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
 from uwb_mitigation.types.measurement import (
-    CirKind,
     CorrectedBy,
     CorrectedColumns,
     CorrectedRange,
@@ -38,6 +37,7 @@ BATCH = 256
 MAX_KINDS = 1000
 """Number of kinds of CIRs whose models are kept."""
 
+_COLUMNS = ("range_m", "correction_m", "variance_m2", "status", "model_id")
 _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
 _INFINITE_VARIANCE = np.float32(np.inf)
@@ -105,7 +105,7 @@ class Corrector:
             file written by `uwb-mitigation offset` or `calibrate`.
 
     Attributes:
-        bundles: the models.
+        bundles: the models. bundle: the first one.
         offsets: offsets of the radios; may be changed between two calls.
         used: number of corrected ranges by choice of the model.
 
@@ -121,27 +121,23 @@ class Corrector:
     ) -> None:
         self.bundles = (model,) if isinstance(model, Bundle) else tuple(model)
         self.offsets = offsets if isinstance(offsets, Offsets) else read_offsets(str(offsets))
+        self.bundle = self.bundles[0]
         self._backends = [self._backend(bundle) for bundle in self.bundles]
         self.used: Counter[Choice] = Counter()
         # Bounded, because a stream may contain CIRs of any length.
         self.choose = lru_cache(MAX_KINDS)(partial(choose_model, self.bundles))
 
-    @property
-    def bundle(self) -> Bundle:
-        """The model, or the first one."""
-        return self.bundles[0]
-
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """Return the corrected ranges; never raises because of the content of a measurement."""
         offset_m = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
-        kinds = ranges.kinds()
+        kinds = kinds_of(ranges)
         if len(kinds) == 1:
             return self._correct_kind(kinds[0][0], ranges, offset_m)
         # All rows are replaced.
         result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
         for kind, rows in kinds:
             part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
-            for name in ("range_m", "correction_m", "variance_m2", "status", "model_id"):
+            for name in _COLUMNS:
                 getattr(result, name)[rows] = getattr(part, name)
         return result
 
@@ -173,15 +169,9 @@ class Corrector:
         results: list[CorrectedRange | None] = [None] * len(measurements)
         for indices, ranges in RangeColumns.grouped(measurements):
             corrected = self.correct_columns(ranges)
-            columns = (
-                corrected.range_m,
-                corrected.correction_m,
-                corrected.variance_m2,
-                corrected.status,
-                corrected.model_id,
-            )
+            columns = [getattr(corrected, name).tolist() for name in _COLUMNS]
             for index, range_m, correction_m, variance_m2, status, model_id in zip(
-                indices, *(column.tolist() for column in columns), strict=True
+                indices, *columns, strict=True
             ):
                 results[index] = CorrectedRange(
                     range_m,

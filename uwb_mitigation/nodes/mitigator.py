@@ -21,7 +21,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
 from uwb_mitigation.mitigation.correction import Corrector, Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.mitigation.model.choice import choose_model
+from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Scaling
@@ -32,7 +32,6 @@ from uwb_mitigation.nodes.support.parameter_tables import MITIGATOR
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     Cir,
-    CirKind,
     Encoding,
     RadioType,
     RangeMeasurement,
@@ -158,7 +157,7 @@ class Mitigator(ManagedNode):
             now_ns = self.now_ns()
             self.health.add_time(time.perf_counter_ns() - began_ns)
             for measurement, corrected in zip(measurements, results, strict=True):
-                choice = mitigation.choose(measurement.cir.kind)
+                choice = mitigation.choose(CirKind.of(measurement.cir))
                 if self.health.add(choice, measurement, corrected.status) and len(mitigation.bundles) > 1:
                     first = f"tag {format_id(measurement.tag_id)}, anchor {format_id(measurement.anchor_id)}"
                     if choice.fits:

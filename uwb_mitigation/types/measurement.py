@@ -10,7 +10,7 @@ import enum
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,34 +76,6 @@ class CorrectedBy(enum.IntEnum):
     DEVICE = 1
 
 
-class CirKind(NamedTuple):
-    """Properties of a CIR that decide which model can correct its range; the fields are those of `Cir`.
-
-    `samples`: their number in time; 0: no CIR. `has_levels`: both levels are known.
-    """
-
-    radio: RadioType
-    segment: Segment
-    samples: int
-    has_preamble_count: bool
-    has_levels: bool
-
-    @property
-    def source(self) -> tuple[RadioType, Segment]:
-        """Radio and segment; recordings of earlier versions and of other programs contain only the DW1000's preamble."""
-        is_unknown = self.radio is RadioType.UNKNOWN and self.segment is Segment.UNKNOWN
-        return (RadioType.DW1000, Segment.IPATOV) if is_unknown else (self.radio, self.segment)
-
-    def __str__(self) -> str:
-        if not self.samples:
-            return f"{self.radio.name} without CIR"
-        radio, segment = self.source
-        text = f"{radio.name} {segment.name}" + (" (assumed)" if radio is not self.radio else "")
-        known = {"preamble count": self.has_preamble_count, "levels": self.has_levels}
-        missing = [name for name, is_known in known.items() if not is_known]
-        return f"{text} {'without' if missing else 'with'} {' and '.join(missing or known)}"
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Cir:
     """A channel impulse response from the radio's accumulator.
@@ -143,12 +115,6 @@ class Cir:
     def __len__(self) -> int:
         """The number of samples in time (a complex sample counts once)."""
         return len(self.samples) // (2 if self.encoding == Encoding.COMPLEX_INT16 else 1)
-
-    @property
-    def kind(self) -> CirKind:
-        """Properties that decide which model can correct the range."""
-        has_levels = math.isfinite(self.power_gap_db)
-        return CirKind(self.radio, self.segment, len(self), self.preamble_count > 0, has_levels)
 
     @property
     def power_gap_db(self) -> float:
@@ -367,20 +333,6 @@ class RangeColumns:
             for name in self.__slots__
         }
         return RangeColumns(**columns)
-
-    def kinds(self) -> list[tuple[CirKind, NDArray[np.bool_]]]:
-        """Return the kinds of the CIRs, and the rows of each."""
-        samples = self.samples.shape[1] // (2 if self.encoding == Encoding.COMPLEX_INT16 else 1)
-        counts, rx, first_path = self.preamble_count, self.rx_power_dbm, self.first_path_power_dbm
-        # A loop over Python numbers: for a live range, a batch of one, it is faster than operations on arrays.
-        known = [
-            (count > 0, math.isfinite(a - b))
-            for count, a, b in zip(counts.tolist(), rx.tolist(), first_path.tolist(), strict=True)
-        ]
-        return [
-            (CirKind(self.radio, self.segment, samples, *each), np.array([row == each for row in known]))
-            for each in dict.fromkeys(known)
-        ]
 
     def __len__(self) -> int:
         """The number of exchanges."""

@@ -45,7 +45,7 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
         ModelError: the bundle cannot be loaded.
     """
     from uwb_mitigation.mitigation.model.bundle import Bundle
-    from uwb_mitigation.mitigation.model.choice import choose_model
+    from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
     from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.recordings.formats import open_recording
 
@@ -56,7 +56,7 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
     with suppress(UwbMitigationError), open_recording(recording) as source:
         for record in islice(source, MAX_RECORDS_READ):
             if len(record.measurement.cir):
-                choice = choose_model(models, record.measurement.cir.kind)
+                choice = choose_model(models, CirKind.of(record.measurement.cir))
                 if choice.model:
                     console.warn(str(choice))
                 return models[choice.model]

@@ -25,7 +25,7 @@ from uwb_mitigation.mitigation.model.architecture import Architecture, Mlp, Remn
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import Band, OodBands
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.types.measurement import CirKind, RadioType, Segment
+from uwb_mitigation.types.measurement import RadioType, Segment
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -78,25 +78,6 @@ class ModelCard:
     early_path: bool = False
     radios: tuple[RadioType, ...] = (RadioType.DW1000,)
     segments: tuple[Segment, ...] = (Segment.IPATOV,)
-
-    def is_trained_for(self, kind: CirKind) -> bool:
-        """Return whether the network was trained for the radio and the segment of CIRs."""
-        radio, segment = kind.source
-        return radio in self.radios and (segment in self.segments or not kind.samples)
-
-    def misfit(self, kind: CirKind) -> str:
-        """Return why the model cannot correct ranges with CIRs of a kind; empty: it can."""
-        samples, needs_levels = self.preprocessing.samples, self.linear_bias.needs_power
-        requirements = [(self.is_trained_for(kind), f"was trained for {self.source}")]
-        if self.needs_cir:
-            needs_count = self.preprocessing.scaling is Scaling.PREAMBLE
-            needs_levels |= self.ood_bands is not None and self.ood_bands.needs_levels
-            requirements += [
-                (kind.samples >= samples, f"needs a CIR of {samples} samples"),
-                (kind.has_preamble_count or not needs_count, "needs the preamble count"),
-            ]
-        requirements.append((kind.has_levels or not needs_levels, "needs the levels"))
-        return next((text for is_met, text in requirements if not is_met), "")
 
     @property
     def source(self) -> str:

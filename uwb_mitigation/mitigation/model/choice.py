@@ -2,11 +2,84 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.types.measurement import CirKind
+import numpy as np
+from numpy.typing import NDArray
+
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard
+from uwb_mitigation.mitigation.preprocessing import Scaling
+from uwb_mitigation.types.measurement import Cir, Encoding, RadioType, RangeColumns, Segment
+
+
+class CirKind(NamedTuple):
+    """Properties of a CIR that decide which model can correct its range; the fields are those of `Cir`.
+
+    `samples`: their number in time; 0: no CIR. `has_levels`: both levels are known.
+    """
+
+    radio: RadioType
+    segment: Segment
+    samples: int
+    has_preamble_count: bool
+    has_levels: bool
+
+    @classmethod
+    def of(cls, cir: Cir) -> CirKind:
+        """Return the kind of a CIR."""
+        return cls(cir.radio, cir.segment, len(cir), cir.preamble_count > 0, math.isfinite(cir.power_gap_db))
+
+    @property
+    def source(self) -> tuple[RadioType, Segment]:
+        """Radio and segment; recordings of earlier versions and of other programs contain only the DW1000's preamble."""
+        is_unknown = self.radio is RadioType.UNKNOWN and self.segment is Segment.UNKNOWN
+        return (RadioType.DW1000, Segment.IPATOV) if is_unknown else (self.radio, self.segment)
+
+    def __str__(self) -> str:
+        if not self.samples:
+            return f"{self.radio.name} without CIR"
+        radio, segment = self.source
+        text = f"{radio.name} {segment.name}" + (" (assumed)" if radio is not self.radio else "")
+        known = {"preamble count": self.has_preamble_count, "levels": self.has_levels}
+        missing = [name for name, is_known in known.items() if not is_known]
+        return f"{text} {'without' if missing else 'with'} {' and '.join(missing or known)}"
+
+
+def kinds_of(ranges: RangeColumns) -> list[tuple[CirKind, NDArray[np.bool_]]]:
+    """Return the kinds of the CIRs of n ranges, and the rows of each, bool (n,)."""
+    samples = ranges.samples.shape[1] // (2 if ranges.encoding == Encoding.COMPLEX_INT16 else 1)
+    counts, rx, first_path = ranges.preamble_count, ranges.rx_power_dbm, ranges.first_path_power_dbm
+    # A loop over Python numbers: for a live range, a batch of one, it is faster than operations on arrays.
+    known = [
+        (count > 0, math.isfinite(a - b))
+        for count, a, b in zip(counts.tolist(), rx.tolist(), first_path.tolist(), strict=True)
+    ]
+    return [
+        (CirKind(ranges.radio, ranges.segment, samples, *each), np.array([row == each for row in known]))
+        for each in dict.fromkeys(known)
+    ]
+
+
+def is_trained_for(card: ModelCard, kind: CirKind) -> bool:
+    """Return whether a network was trained for the radio and the segment of CIRs."""
+    radio, segment = kind.source
+    return radio in card.radios and (segment in card.segments or not kind.samples)
+
+
+def misfit(card: ModelCard, kind: CirKind) -> str:
+    """Return why a model cannot correct ranges with CIRs of a kind; empty: it can."""
+    samples, needs_levels = card.preprocessing.samples, card.linear_bias.needs_power
+    if not is_trained_for(card, kind):
+        return f"was trained for {card.source}"
+    if card.needs_cir:
+        needs_levels |= card.ood_bands is not None and card.ood_bands.needs_levels
+        if kind.samples < samples:
+            return f"needs a CIR of {samples} samples"
+        if card.preprocessing.scaling is Scaling.PREAMBLE and not kind.has_preamble_count:
+            return "needs the preamble count"
+    return "" if kind.has_levels or not needs_levels else "needs the levels"
 
 
 class Choice(NamedTuple):
@@ -39,8 +112,8 @@ def choose_model(models: Sequence[Bundle], kind: CirKind) -> Choice:
     recordings, after lost messages and restarts. If one frame of a radio lacks its levels, this frame is corrected
     without them, and the next one with them again.
     """
-    misfits = [bundle.card.misfit(kind) for bundle in models]
-    trained = [index for index, bundle in enumerate(models) if bundle.card.is_trained_for(kind)]
+    misfits = [misfit(bundle.card, kind) for bundle in models]
+    trained = [index for index, bundle in enumerate(models) if is_trained_for(bundle.card, kind)]
     if "" in misfits:
         model = misfits.index("")
         reason = f"model {models[model].card.label}, id {models[model].model_id:08x}"

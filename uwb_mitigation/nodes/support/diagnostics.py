@@ -13,8 +13,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from uwb_mitigation.mitigation.model.choice import Choice
-from uwb_mitigation.types.measurement import CirKind, RangeMeasurement, Status
+from uwb_mitigation.mitigation.model.choice import Choice, CirKind
+from uwb_mitigation.types.measurement import RangeMeasurement, Status
 from uwb_mitigation.types.stamps import NS_PER_S
 
 OK = DiagnosticStatus.OK
@@ -180,7 +180,7 @@ class MitigatorHealth:
         else:
             self._rejected_since_s = min(self._rejected_since_s, self._last_s)
             if len(measurement.cir):
-                self.rejected = measurement.cir.kind
+                self.rejected = CirKind.of(measurement.cir)
                 self.misfit = self.misfit if choice.fits else str(choice)
         is_first = choice not in self.pairs
         pairs = self.pairs.setdefault(choice, set())
