@@ -34,7 +34,7 @@ from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status
+from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status, Truth
 from uwb_mitigation.types.ros.codec import decode_corrected
 from uwb_mitigation.types.ros.topics import RANGE_CORRECTED
 
@@ -145,12 +145,12 @@ def corrected_in(path: Path) -> dict[tuple[int, int], tuple[float, float, int, i
 
 @pytest.fixture
 def mixed_bag(tmp_path: Path) -> Path:
-    recording = Recorded(map(Record, mixed(160)))
+    recording = Recorded(Record(each, Truth(each.range_m, "LOS", "here")) for each in mixed(160))
     recording.name = "two radios"
     return imported(recording, tmp_path / "mixed.mcap")
 
 
-def test_process_uses_two_models_for_a_mixed_recording(mixed_bag: Path, tmp_path: Path) -> None:
+def test_process_and_evaluate_use_two_models_for_a_mixed_recording(mixed_bag: Path, tmp_path: Path) -> None:
     done = succeed("process mixed.mcap -o out.mcap --json out.json", folder=tmp_path)
     assert re.search(
         r"ranges of DW3000 STS without levels: model dw3000_sts \(experimental\), id", done.stdout
@@ -159,6 +159,9 @@ def test_process_uses_two_models_for_a_mixed_recording(mixed_bag: Path, tmp_path
     assert len(row["models"]) == 2
     assert not row["mismatches"]
     results = corrected_in(tmp_path / "out.mcap")
+    done = succeed("evaluate --data mixed.mcap --json evaluated.json", folder=tmp_path)
+    assert done.stdout.count("ranges of ") == 2
+    assert json.loads((tmp_path / "evaluated.json").read_text())["statuses"]["OK"] == row["ok"]
     ok = Counter(NAMES[model_id] for *_, status, model_id in results.values() if status == Status.OK)
     assert ok.keys() == {"universal", "dw3000_sts"}
     assert ok.total() > 0.95 * len(results)
@@ -245,13 +248,10 @@ def test_a_mixed_recording_uses_two_models_at_the_same_time(ros: ros_harness.Ros
     assert values(live) == offline
     for text in ("levels: model universal, id", "DW3000 STS without levels: model dw3000_sts (experimental)"):
         mitigator.wait_for_output(text)
-    entries = diagnostic_values(ros.diagnosis("mitigator", lambda status: len(status.values) > 5))
-    assert re.search(
-        "model dw3000_sts .experimental., id .*; tag-anchor 202-1", entries["DW3000 STS without levels"]
-    )
-    assert re.search(
-        "model universal, id .*; tag-anchor 101-", entries["DW1000 IPATOV with preamble count and levels"]
-    )
+    status = ros.diagnosis("mitigator", lambda status: "models by radio" in diagnostic_values(status))
+    uses = diagnostic_values(status)["models by radio"]
+    assert re.search(r"with preamble count and levels: model universal, id \w+ \(tag-anchor 101-1,", uses)
+    assert re.search(r"DW3000 STS .* model dw3000_sts \(experimental\), id \w+ \(tag-anchor 202-1", uses)
 
 
 @pytest.mark.ros

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from array import array
 from collections.abc import Iterator
@@ -61,7 +62,10 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     mitigator.wait_for_output(reason)
     assert mitigator.output.count(reason) == 1
     status = ros.diagnosis("mitigator", lambda status: any(reason in v.value for v in status.values))
-    assert any("DW3000 STS" in v.key and "tag-anchor 1-2, 1-3" in v.value for v in status.values)
+    assert re.fullmatch(
+        r"DW3000 STS .*: model dw3000_sts .* \(tag-anchor 1-2, 1-3\)",
+        diagnostic_values(status)["models by radio"],
+    )
 
     assert ros.set_parameter("mitigator", "model", "universal").successful
     status = ros.diagnosis("mitigator", lambda status: "DW3000 STS" in status.message)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from uwb_mitigation.commands.support import console, model_tables
-from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for, show_models
 from uwb_mitigation.commands.support.checks import OffsetsOption, ScalingName, check_output, needs_torch
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError
@@ -221,14 +221,17 @@ def evaluate(
     if unused := _options_given(context, _CROSS_VALIDATION_OPTIONS):
         raise ParameterError(f"{unused} without --cross-validate", valid="only with --cross-validate")
     from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.training.evaluation import accuracy
     from uwb_mitigation.types.offsets import read_offsets
 
-    mitigation = Mitigation(bundle_for(model, data), read_offsets(offsets or ""))
+    mitigation = Mitigation(load_model(model), read_offsets(offsets or ""))
     with open_recording(data) as source, console.reading() as on_record:
         result = accuracy.evaluate_accuracy(mitigation, source, on_record)
     model_tables.show_accuracy(result)
+    if len(mitigation.used) > 1:
+        show_models(mitigation.used)
     console.write_json(json, result.as_json())
 
 

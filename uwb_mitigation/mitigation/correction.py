@@ -132,10 +132,10 @@ class Corrector:
         offset_m = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
         kinds = kinds_of(ranges)
         if len(kinds) == 1:
-            return self._correct_kind(kinds[0][0], ranges, offset_m)
+            return self._correct_kind(next(iter(kinds)), ranges, offset_m)
         # All rows are replaced.
         result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
-        for kind, rows in kinds:
+        for kind, rows in kinds.items():
             part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
             for name in _COLUMNS:
                 getattr(result, name)[rows] = getattr(part, name)

@@ -190,9 +190,11 @@ class Mitigator(ManagedNode):
                 "model id": ", ".join(diagnostics.model_id(bundle.model_id) for bundle in bundles),
                 "offsets": str(mitigation.offsets),
             }
-            for choice, pairs in list(self.health.pairs.items()):
-                ids = ", ".join(f"{format_id(tag)}-{format_id(anchor)}" for tag, anchor in sorted(pairs))
-                entries[choice.kind] = f"{choice.reason}; tag-anchor {ids}"
+            if pairs := list(self.health.pairs.items()):
+                entries["models by radio"] = "; ".join(
+                    f"{choice} (tag-anchor {', '.join(f'{format_id(t)}-{format_id(a)}' for t, a in sorted(ids))})"
+                    for choice, ids in pairs
+                )
         if warnings:
             level, text = diagnostics.WARN, "; ".join(warnings)
         if failed:

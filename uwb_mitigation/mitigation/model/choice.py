@@ -6,9 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.types.measurement import Cir, Encoding, RadioType, RangeColumns, Segment
@@ -47,19 +44,17 @@ class CirKind(NamedTuple):
         return f"{text} {'without' if missing else 'with'} {' and '.join(missing or known)}"
 
 
-def kinds_of(ranges: RangeColumns) -> list[tuple[CirKind, NDArray[np.bool_]]]:
-    """Return the kinds of the CIRs of n ranges, and the rows of each, bool (n,)."""
+def kinds_of(ranges: RangeColumns) -> dict[CirKind, list[int]]:
+    """Return the kinds of the CIRs of ranges, and the rows of each."""
     samples = ranges.samples.shape[1] // (2 if ranges.encoding == Encoding.COMPLEX_INT16 else 1)
-    counts, rx, first_path = ranges.preamble_count, ranges.rx_power_dbm, ranges.first_path_power_dbm
+    levels = ranges.rx_power_dbm.tolist(), ranges.first_path_power_dbm.tolist()
+    rows: dict[tuple[bool, bool], list[int]] = {}
     # A loop over Python numbers: for a live range, a batch of one, it is faster than operations on arrays.
-    known = [
-        (count > 0, math.isfinite(a - b))
-        for count, a, b in zip(counts.tolist(), rx.tolist(), first_path.tolist(), strict=True)
-    ]
-    return [
-        (CirKind(ranges.radio, ranges.segment, samples, *each), np.array([row == each for row in known]))
-        for each in dict.fromkeys(known)
-    ]
+    for row, (count, rx, first_path) in enumerate(zip(ranges.preamble_count.tolist(), *levels, strict=True)):
+        rows.setdefault((count > 0, math.isfinite(rx - first_path)), []).append(row)
+    return {
+        CirKind(ranges.radio, ranges.segment, samples, *known): indices for known, indices in rows.items()
+    }
 
 
 def is_trained_for(card: ModelCard, kind: CirKind) -> bool:

@@ -1,4 +1,4 @@
-"""Evaluate a bundle on a labelled recording with the same code as for live measurements."""
+"""Evaluate models on a labelled recording with the same code as for live measurements."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BATCH = 256
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Accuracy of one model on one recording.
+    """Accuracy of a model, or of several, on one recording.
 
     Attributes:
         n: number of measurements with a true range and a valid range.
@@ -28,8 +28,8 @@ class Accuracy:
             `interval95_sigmas` reported standard deviations.
         by_label, by_configuration: {name: (n, MAE before, MAE after)}.
         statuses: {status: number of measurements}; unless the status is OK, the corrected range is the raw range.
-        model_id: id of the model.
-        trained_on: configurations that are also in the training data according to the card. If not empty, the
+        model_id: id of the model of most ranges.
+        trained_on: configurations that are also in its training data according to the card. If not empty, the
             result is optimistic.
     """
 
@@ -64,7 +64,7 @@ def evaluate_accuracy(
     Raises:
         DatasetError: no measurement can be compared.
     """
-    raw, corrected, variance, labels, configurations = [], [], [], [], []
+    raw, corrected, variance, labels, configurations, model_ids = [], [], [], [], [], []
     statuses: Counter[str] = Counter()
     stream = iter(records)
     read = 0
@@ -79,6 +79,7 @@ def evaluate_accuracy(
             variance.append(result.variance_m2)
             labels.append(record.truth.label)
             configurations.append(record.truth.configuration)
+            model_ids.append(result.model_id)
             statuses[result.status.name] += 1
         read += len(batch)
         for _ in batch:
@@ -86,9 +87,10 @@ def evaluate_accuracy(
     if not raw:
         raise DatasetError(f"none of {read} measurements has a valid range and a true one")
     raw_m, corrected_m, variances = np.array(raw), np.array(corrected), np.array(variance)
-    card = mitigation.bundle.card
+    cards = {bundle.model_id: bundle.card for bundle in mitigation.bundles}
+    model_id = max(cards, key=model_ids.count)
     # This part of the card is for people and may contain any JSON value.
-    training_configurations = card.training.get("configurations")
+    training_configurations = cards[model_id].training.get("configurations")
     trained_on = {
         name
         for name in set(configurations)
@@ -99,10 +101,12 @@ def evaluate_accuracy(
         raw=ErrorStatistics.of(raw_m),
         corrected=ErrorStatistics.of(corrected_m),
         coverage68=coverage(corrected_m, variances, 1.0),
-        coverage95=coverage(corrected_m, variances, card.interval95_sigmas),
+        coverage95=coverage(
+            corrected_m, variances, np.array([cards[each].interval95_sigmas for each in model_ids])
+        ),
         by_label=mae_by_group(np.array(labels), raw_m, corrected_m),
         by_configuration=mae_by_group(np.array(configurations), raw_m, corrected_m),
         statuses=dict(statuses.most_common()),
-        model_id=mitigation.bundle.model_id,
+        model_id=model_id,
         trained_on=tuple(sorted(trained_on)),
     )

@@ -64,7 +64,9 @@ def mae_by_group(
 
 
 def coverage(
-    error_m: NDArray[np.floating], variance_m2: NDArray[np.floating] | float, sigmas: float
+    error_m: NDArray[np.floating],
+    variance_m2: NDArray[np.floating] | float,
+    sigmas: NDArray[np.floating] | float,
 ) -> float:
     """Return the share of errors within `sigmas` standard deviations of zero."""
     return float(np.mean(np.abs(error_m) <= sigmas * np.sqrt(variance_m2)))
