@@ -5,17 +5,13 @@ from __future__ import annotations
 import secrets
 import time
 import webbrowser
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption
-
-if TYPE_CHECKING:
-    from uwb_mitigation.mitigation.correction import Corrector
 
 
 def view(
@@ -77,6 +73,8 @@ def view(
     """
     from threading import Lock
 
+    from uwb_mitigation.mitigation.correction import Mitigation
+    from uwb_mitigation.mitigation.model.shipped import load_model
     from uwb_mitigation.positioning.geometry import Height
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
@@ -94,7 +92,7 @@ def view(
         if path is None:
             continue
         feed = SceneUpdater(Scene(), lock)
-        player = BagPlayer(path, feed, partial(_backend, model), namespace)
+        player = BagPlayer(path, feed, lambda: Mitigation(load_model(model)), namespace)
         if anchor_map is not None:
             feed.anchors(anchor_map)
         if player.corrects:
@@ -128,10 +126,3 @@ def view(
             webbrowser.open(server.url)
         while True:
             time.sleep(3600.0)
-
-
-def _backend(model: Path | None) -> Corrector:
-    from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.mitigation.model.shipped import load_model
-
-    return Mitigation(load_model(model))

@@ -53,11 +53,10 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
     if isinstance(models, Bundle):
         return models
     # The command reports the errors of reading.
-    with suppress(UwbMitigationError), open_recording(recording) as source:
-        for record in islice(source, MAX_RECORDS_READ):
-            if len(record.measurement.cir):
-                choice = choose_model(models, CirKind.of(record.measurement.cir))
-                if choice.model:
-                    console.warn(str(choice))
-                return models[choice.model]
+    with suppress(UwbMitigationError, StopIteration), open_recording(recording) as source:
+        cirs = (record.measurement.cir for record in islice(source, MAX_RECORDS_READ))
+        choice = choose_model(models, CirKind.of(next(cir for cir in cirs if len(cir))))
+        if choice.model:
+            console.warn(str(choice))
+        return models[choice.model]
     return models[0]
