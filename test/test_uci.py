@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from benchmarks import uci
 from benchmarks.equipment.uci_board import FIRST_PATH, UciBoardModel, UciFaults, _Session, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, RecordingError
+from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.radios.fira import codes, messages
 from uwb_mitigation.radios.fira.capture import FIRST_LINE, CaptureWriter, UciCapture
 from uwb_mitigation.radios.fira.cir import PositionUnit, read_cir
@@ -462,7 +463,7 @@ def test_ranges_without_diagnostics_are_published_without_delay():
         run.step(run.board.range_packet(handle, sequence, 3.0), 18)
     assert len(run.measured_ranges) == 100
     assert run.measured_ranges[-1].stamp_ns == run.now_ns
-    assert run.measured_ranges[-1].cir.source == "DW3000 without CIR"
+    assert str(CirKind.of(run.measured_ranges[-1].cir)) == "DW3000 without CIR"
 
 
 @given(st.binary(max_size=600), st.integers(1, 40))

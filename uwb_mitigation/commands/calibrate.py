@@ -136,7 +136,8 @@ def calibrate(
     anchor_map = (None if anchors else recorded_anchors(bags[0])) or load_anchors(
         anchors or anchors_path(bags[0])
     )
-    source = bundle_for(None, bags[0])
+    # For CIRs of another radio, a line in the levels is compared with offsets only.
+    source = bundle_for(None, bags[0], may_be_experimental=False)
     try:
         site = _gather(bags, anchor_map, source, stamp_offset, height_topic, height_sd)
         with console.stage_bars() as on_progress:

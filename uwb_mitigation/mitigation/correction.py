@@ -97,21 +97,9 @@ class Backend(Protocol):
 
 
 class Corrector:
-    """Corrects ranges: `Mitigation` with ONNX Runtime, `FirmwareMitigation` with the firmware's C. Not thread-safe.
+    """Corrects ranges: `Mitigation` with ONNX Runtime, `FirmwareMitigation` with the firmware's C.
 
-    Args:
-        model: the model, or several, of which `choose_model` selects one for each range.
-        offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, or a
-            file written by `uwb-mitigation offset` or `calibrate`.
-
-    Attributes:
-        bundles: the models. bundle: the first one.
-        offsets: offsets of the radios; may be changed between two calls.
-        used: number of corrected ranges by choice of the model.
-
-    Raises:
-        ModelError: the backend rejects a model.
-        ParameterError: the offset is not finite, too large, or no such file exists.
+    Arguments, attributes and errors are those of `Mitigation`.
     """
 
     _backend: Callable[[Bundle], Backend]
@@ -342,7 +330,7 @@ class OnnxBackend:
 
 
 class Mitigation(Corrector):
-    """Corrects ranges by ONNX Runtime.
+    """Corrects ranges by ONNX Runtime. Not thread-safe.
 
     Predicted error = linear bias + network (or a missed direct path, see `early_path`), correction = offset of the radios + predicted error, and corrected = range -
     correction, each one float32 operation, so that a microcontroller computes the same bits. The model uses the range
@@ -355,6 +343,20 @@ class Mitigation(Corrector):
 
     The further a measurement is outside the model's training data (`Card.ood_bands`), the more its correction shrinks
     from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
+
+    Args:
+        model: the model, or several, of which `choose_model` selects one for each range.
+        offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, or a
+            file written by `uwb-mitigation offset` or `calibrate`.
+
+    Attributes:
+        bundles: the models. bundle: the first one.
+        offsets: offsets of the radios; may be changed between two calls.
+        used: number of corrected ranges by choice of the model. choose: returns the `Choice` for a `CirKind`.
+
+    Raises:
+        ModelError: the backend rejects a model.
+        ParameterError: the offset is not finite, too large, or no such file exists.
     """
 
     _backend = OnnxBackend

@@ -38,7 +38,7 @@ def show_models(models: Mapping[Choice, int]) -> None:
             console.warn(f"{count} ranges are not corrected: {choice}")
 
 
-def bundle_for(named: Path | None, recording: Path) -> Bundle:
+def bundle_for(named: Path | None, recording: Path, *, may_be_experimental: bool = True) -> Bundle:
     """Return the named bundle, or the one for the first CIR of a recording (logged unless it is the default).
 
     Raises:
@@ -52,6 +52,7 @@ def bundle_for(named: Path | None, recording: Path) -> Bundle:
     models = load_model(named)
     if isinstance(models, Bundle):
         return models
+    models = tuple(each for each in models if may_be_experimental or each.card.label == each.name)
     # The command reports the errors of reading.
     with suppress(UwbMitigationError, StopIteration), open_recording(recording) as source:
         cirs = (record.measurement.cir for record in islice(source, MAX_RECORDS_READ))
