@@ -26,6 +26,7 @@ from uwb_mitigation.mitigation.model.bundle import (
     save_bundle,
     session_options,
 )
+from uwb_mitigation.mitigation.model.choice import CirKind, is_trained_for
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
@@ -76,9 +77,13 @@ def test_radios_of_a_card_read_back(tmp_path):
     other = replace(card(SHAPE, quantised=False), **sources)
     model = load_bundle(save_bundle(tmp_path / "sts.onnx", graph.float_model(weights), other).path)
     assert (model.card.radios, model.card.segments) == tuple(sources.values())
-    assert model.card.fits(RadioType.QM35, Segment.STS, True)
-    assert not model.card.fits(RadioType.DW3000, Segment.IPATOV, True)
-    assert not model.card.fits(RadioType.UNKNOWN, Segment.UNKNOWN, True)
+    sources = (
+        (RadioType.QM35, Segment.STS),
+        (RadioType.DW3000, Segment.IPATOV),
+        (RadioType.UNKNOWN, Segment.UNKNOWN),
+    )
+    kinds = [CirKind(*source, 157, has_preamble_count=True, has_levels=True) for source in sources]
+    assert [is_trained_for(model.card, kind) for kind in kinds] == [True, False, False]
 
 
 def test_float32_numbers_read_back_to_the_bit(tmp_path):
