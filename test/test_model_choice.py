@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -200,11 +201,15 @@ def deepuwb(tmp_path: Path) -> Path:
     return tmp_path / "deepuwb.mcap"
 
 
-def replayed(ros: ros_harness.Ros, bag: Path, count: int) -> tuple[dict, ros_harness.Process]:
-    """Replay a bag through driver and mitigator without an option; return the corrected ranges."""
+def replayed(
+    ros: ros_harness.Ros, bag: Path, count: int, node: str = "mitigator"
+) -> tuple[dict, ros_harness.Process]:
+    """Replay a bag through driver and mitigator, or through the pipeline, without an option; return the corrected ranges."""
     received = ros.collect(RangeCorrected, "/uwb/range_corrected")
-    mitigator = ros.start("mitigator")
-    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=20.0", *ros_harness.PAUSED)
+    source = ("source:=mcap", f"path:={bag}", "rate:=20.0", *ros_harness.PAUSED)
+    mitigator = ros.start(node, *(source if node == "pipeline" else ()))
+    if node != "pipeline":
+        ros.start("driver", *source)
     mitigator.wait_for_output("correcting with model")
     ros.play()
     ros.spin_until(lambda: len(received) == count)
@@ -220,12 +225,15 @@ def values(results: dict) -> list[tuple]:
 
 
 @pytest.mark.ros
-def test_deepuwb_is_corrected_live_and_offline_without_an_option(ros: ros_harness.Ros, deepuwb: Path):
+@pytest.mark.parametrize("node", ["mitigator", "pipeline"])
+def test_deepuwb_is_corrected_live_and_offline_without_an_option(
+    ros: ros_harness.Ros, deepuwb: Path, node: str
+):
     done = succeed("process deepuwb.mcap -o out.mcap", folder=deepuwb.parent)
     assert "without preamble count and levels: model universal_amplitude" in done.stdout
     offline = values(corrected_in(deepuwb.parent / "out.mcap"))
     assert sum(status == Status.OK for *_, status, _ in offline) >= 0.95 * len(offline) > 280
-    live, mitigator = replayed(ros, deepuwb, len(offline))
+    live, mitigator = replayed(ros, deepuwb, len(offline), node)
     assert values(live) == offline
     assert mitigator.output.count("DW1000 IPATOV (assumed) without preamble count and levels: model") == 1
 
@@ -238,6 +246,15 @@ def test_demo_corrects_deepuwb(deepuwb: Path):
     assert run.returncode == 0, run.stdout + run.stderr
     ((received, ok),) = re.findall(r"(\d+) ranges received, \d+ corrected \((\d+) OK", run.stdout)
     assert int(ok) >= 0.95 * int(received) > 280
+
+
+@pytest.mark.ros
+def test_view_states_the_models_of_raw_ranges(ros: ros_harness.Ros, mixed_bag: Path):
+    program = "from uwb_mitigation.commands.entry import command_line; command_line()"
+    shown = ros.run([sys.executable, "-c", program, "view", str(mixed_bag), "--port", "0"])
+    for model in ("universal,", "dw3000_sts (experimental),"):
+        shown.wait_for_output(f"levels: model {model}")
+    shown.send(signal.SIGKILL)
 
 
 @pytest.mark.ros

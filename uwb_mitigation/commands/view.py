@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.bundles import ModelOption
+from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 
 
 def view(
@@ -87,7 +87,7 @@ def view(
 
     lock = Lock()
     anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
-    players, scenes = [], []
+    players, scenes, threads = [], [], []
     for path in (bag, second):
         if path is None:
             continue
@@ -99,7 +99,7 @@ def view(
             console.err.print(
                 f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
             )
-        player.index(anchor_map, None if height is None else Height(height))
+        threads.append(player.index(anchor_map, None if height is None else Height(height)))
         players.append(player)
         scenes.append(feed.scene)
     first = players[0]
@@ -124,5 +124,8 @@ def view(
         first.play(True)
         if browser:
             webbrowser.open(server.url)
+        for player, thread in zip(players, threads, strict=True):
+            thread.join()
+            show_models(player.models)
         while True:
             time.sleep(3600.0)

@@ -10,7 +10,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Corrector
+from uwb_mitigation.mitigation.model.choice import Choice
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -60,6 +61,7 @@ class BagPlayer:
         is_behind: whether the messages up to the position have not been read yet.
         companion: player of another recording of the same drive, which follows this one.
         missing: messages for the page on data that the bag does not contain.
+        models: number of ranges that `index` corrected, by choice of the model.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class BagPlayer:
         self.is_behind = False
         self.timeline: Timeline | None = None
         self.companion: BagPlayer | None = None
+        self.models: Mapping[Choice, int] = {}
         no_positions = "No tag positions: they need anchors, and --height if all anchors have one height."
         self.missing = MissingData(
             "No ranges up to this time."
@@ -104,6 +107,7 @@ class BagPlayer:
                 self.timeline = timeline
 
             timeline = index_recording(recording, anchors, height, backend, publish)
+            self.models = {} if backend is None else backend.used
             with self._feed.lock:
                 self._feed.scene.heat = timeline.heat
                 self._feed.scene.is_indexed = True
