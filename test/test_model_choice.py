@@ -206,12 +206,15 @@ def replayed(
 ) -> tuple[dict, ros_harness.Process]:
     """Replay a bag through driver and mitigator, or through the pipeline, without an option; return the corrected ranges."""
     received = ros.collect(RangeCorrected, "/uwb/range_corrected")
-    source = ("source:=mcap", f"path:={bag}", "rate:=20.0", *ros_harness.PAUSED)
-    mitigator = ros.start(node, *(source if node == "pipeline" else ()))
-    if node != "pipeline":
-        ros.start("driver", *source)
+    source = ("source:=mcap", f"path:={bag}", "rate:=20.0")
+    mitigator = ros.start(node, *((*source, *ros_harness.PAUSED) if node == "pipeline" else ()))
     mitigator.wait_for_output("correcting with model")
-    ros.play()
+    if node == "pipeline":
+        ros.play()
+    else:
+        # When the mitigator answers, it has discovered the subscription of this client.
+        ros.spin_until(lambda: ros.state_of(node) == "active")
+        ros.start("driver", *source, "wait_for_subscribers:=1")
     ros.spin_until(lambda: len(received) == count)
     stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in received]
     results = [(each.range, each.variance, each.status, each.model_id) for each in received]
