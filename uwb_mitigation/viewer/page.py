@@ -261,7 +261,7 @@ class Page:
             no_data, age_s = _no_data(scene, history), scene.age_s(history)
             means = history.statistics()
             means |= {
-                "rate": 0.0 if no_data else history.rate_hz(age_s),
+                "rate": 0.0 if no_data else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if no_data else 0.0,
             }
             if timeline is not None and pair in timeline.losses:

@@ -219,7 +219,7 @@ class History:
         """Return the rate of the last `RATE_RANGES` ranges by their stamps; NaN before the second one.
 
         Args:
-            age_s: time since the last range; the rate decreases if this is several mean intervals.
+            age_s: time since the last range by stamps; the rate decreases if this is several mean intervals.
         """
         # Copy in one step: the monitor draws its table in another thread than the one that adds ranges.
         recent = list(islice(reversed(self.samples), RATE_RANGES))
@@ -363,6 +363,14 @@ class Scene:
         entry = next(reversed(self._latest.values()), None) if tag_id is None else self._latest.get(tag_id)
         latest_s, received_s = entry or (math.nan, math.nan)
         return latest_s + max(self.clock() - received_s, 0.0)
+
+    def stamp_age_s(self, pair: Pair) -> float:
+        """Return the time from the last range of a pair to that of its tag by their stamps: 0 without other ranges.
+
+        It does not depend on how fast the viewer reads them.
+        """
+        latest, (tag_latest_s, _) = self.pairs[pair].latest, self._latest.get(pair[1], (-math.inf, 0.0))
+        return 0.0 if latest is None else max(tag_latest_s - latest.time_s, 0.0)
 
     def age_s(self, entry: History | TagView | TrackView) -> float:
         """Return the time since the last data of a pair, tag or track."""
