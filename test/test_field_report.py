@@ -116,7 +116,7 @@ def test_good_evb1000s_pass_and_a_low_supply_fails(report: Report, tmp_path: Pat
         assert checks["read back: device id"]["value"] == "0xdeca0130"
         assert checks["read back: antenna delay (15.65 ps)"]["verdict"] == "pass"
         boards._boards[0].chip.set_environment(30.0, 2.6)
-        assert any(failed(report("evb1000")) == {"supply"} for _ in range(3))
+        assert "supply" in failed(report("evb1000"))
 
 
 def test_negative_distances_and_timeouts_are_named_with_their_cause(
