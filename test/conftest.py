@@ -7,7 +7,10 @@ import os
 # Set this before numpy is imported. Tests run in parallel, so more threads do not help.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import atexit
+import shutil
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +28,10 @@ if TYPE_CHECKING:
 
 # If a script starts pytest in the background, SIGINT is ignored, also by the processes of the tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# What drivers keep after a crash does not belong into the user's home.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="uwb_mitigation_test_")
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 # Use the same examples in each run, and no deadline.
 settings.register_profile(

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import uci
-from benchmarks.equipment.uci_board import FIRST_PATH, UciBoardModel, UciFaults, _Session, taps_of
+from benchmarks.equipment.uci_board import FIRST_PATH, TAPS, UciBoardModel, UciFaults, _Session, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, RecordingError
 from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.radios.fira import codes, messages
+from uwb_mitigation.radios.fira.calibration import OriginalsFile
 from uwb_mitigation.radios.fira.capture import FIRST_LINE, CaptureWriter, UciCapture
 from uwb_mitigation.radios.fira.cir import PositionUnit, read_cir
 from uwb_mitigation.radios.fira.codes import PacketType
@@ -22,7 +26,9 @@ from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher
 from uwb_mitigation.radios.fira.messages import Diagnostics
 from uwb_mitigation.radios.fira.packets import MAX_GAP_NS, PacketDecoder, encode_packets
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
+from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import Role
+from uwb_mitigation.radios.uci import UciPort, UciPortSettings
 from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment
 
 MS = 10**6
@@ -42,9 +48,11 @@ WORKING_CONFIG = bytes.fromhex(
 class Bench:
     """A session and a board model, connected in virtual time."""
 
-    def __init__(self, board: UciBoardModel | None = None, **settings: object) -> None:
+    def __init__(
+        self, board: UciBoardModel | None = None, originals: OriginalsFile | None = None, **settings: object
+    ) -> None:
         self.board = board or UciBoardModel()
-        self.session = UciSession(UciSettings(**{"window": 16, **settings}))
+        self.session = UciSession(UciSettings(**{"window": 16, **settings}), originals)
         self.now_ns = 0
         self.measured_ranges: list[RangeMeasurement] = []
         self.sent = b""
@@ -768,7 +776,7 @@ def test_boards_that_the_facts_allow_range_with_their_cir(board: type[UciBoardMo
     for measured in run.measured_ranges:
         assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 157, 5))
     rejected = {Unnamed: {0x35}, OneByOne: {0x2C, 0x32, 0x35}}.get(board, set())
-    assert run.session.rejected.keys() == rejected
+    assert run.session.ranging.rejected.keys() == rejected
 
 
 @pytest.mark.parametrize("masks", [(0x38, 0x40), (0x18, 0x20, 0x40)])
@@ -834,3 +842,116 @@ def test_sessions_that_share_a_counter_get_their_cirs():
     gaps = run.session.totals()["gaps"]
     run.step(run.board.exchange(1 + 205 % 2, 205, 3.0), 18)
     assert run.session.totals()["gaps"] > gaps
+
+
+def run_until(run: Bench, state: str) -> str:
+    for _ in range(4000):
+        run.step()
+        if state in run.session.state:
+            break
+    return run.session.state
+
+
+def test_a_rejected_parameter_is_named_when_the_start_is_refused():
+    class Incomplete(UciBoardModel):
+        """Rejects the slots per round, without which it does not range."""
+
+        def _command(self, name, payload, now_s):
+            if name == codes.SET_APP_CONFIG and b"\x1b\1" in payload:
+                return self._respond(name, bytes([0x04, 1, 0x1B, 0x04]))
+            return (
+                self._respond(name, b"\x15")
+                if name == codes.RANGE_START
+                else super()._command(name, payload, now_s)
+            )
+
+    state = run_until(Bench(Incomplete()), "RANGE_START")
+    assert "a parameter is missing (status 0x15)" in state
+    assert "it rejects SLOTS_PER_RR (0x1b): invalid parameter (status 0x04)" in state
+
+
+@pytest.mark.parametrize("line", [b"error\r\n", b"error \r\n\r\nerror\r\n", b"\r\n> unknown command\r\n"])
+def test_a_board_that_answers_with_text_is_not_called_mute(line: bytes):
+    run = Bench()
+    run.board.receive = lambda data, now_s: line if data else b""
+    state = run_until(run, "CLI image")
+    assert "answers with text" in state
+    assert line.decode().split()[0].strip(">") in state
+    assert "flash the UCI image" in state
+
+
+def test_random_bytes_are_no_text():
+    run = Bench()
+    run.board.receive = lambda data, now_s: b"\x81\x00\xff\x13" * 4 if data else b""
+    run_until(run, "CLI image")
+    assert run.session.state == "no answer to the reset: is this a board with UCI firmware?"
+
+
+class Originals(OriginalsFile):
+    """As of a process that has ended."""
+
+    def save(self, changes):
+        super().save(changes)
+        if self._path.exists():
+            self._path.write_text(self._path.read_text().replace(str(os.getpid()), "4194305"))
+
+
+@pytest.fixture
+def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UciBoardModel:
+    """Return a board with the window of a driver that was killed."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    run = Bench(originals=Originals("/dev/ttyACM0"), window=157).start()
+    assert tuple(run.board._calibration.values()) == (157, 5)
+    return run.board
+
+
+def stopped(run: Bench) -> dict[str, int]:
+    """Stop a session; return the calibration of its board."""
+    run.session.stop(run.now_ns)
+    while not run.session.stopped:
+        run.step()
+    return run.board._calibration
+
+
+@pytest.mark.parametrize("port", ["/dev/ttyACM0", "/dev/ttyACM1"])
+def test_calibration_is_restored_after_the_driver_was_killed(
+    killed: UciBoardModel, tmp_path: Path, port: str
+):
+    run = Bench(killed, originals=Originals(port), window=157).start()
+    assert stopped(run) == UciBoardModel()._calibration
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_calibration_that_another_program_has_changed_is_kept(killed: UciBoardModel):
+    killed._calibration[TAPS] = 64
+    assert stopped(Bench(killed, originals=Originals("/dev/ttyACM0"), window=157).start())[TAPS] == 64
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"format": 2, "keys": {}}', '{"format": 1, "keys": {"a": 1}}']
+)
+def test_damaged_files_of_the_calibration_are_ignored(killed: UciBoardModel, tmp_path: Path, text: str):
+    (path,) = tmp_path.rglob("*.json")
+    path.write_text(text)
+    assert Bench(killed, originals=Originals("/dev/ttyACM0"), window=157).start().session.window == (157, 5)
+
+
+@pytest.mark.parametrize(
+    ("keep", "warning"),
+    [
+        (lambda packet: packet[:60] + packet[61:], "bytes or notifications are lost between board and host"),
+        (lambda packet: packet[:-100], "bytes or notifications are lost between board and host"),
+        (lambda packet: b"", "most ranges have no CIR: the firmware may not support it"),
+    ],
+    ids=["lost byte", "lost fragment", "never sent"],
+)
+def test_ranges_without_cir_are_explained_by_damaged_notifications_first(keep, warning: str):
+    run = Bench(window=157).start()
+    (handle,) = run.board.sessions
+    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), 0, None, print, lambda: 0)
+    port.session = run.session
+    for sequence in range(1, 60):
+        port.monitor.add_range(time.monotonic())
+        run.step(run.board.range_packet(handle, sequence, 3.0), 5.0)
+        run.step(keep(run.board.diagnostics_packet(handle, sequence)), 95.0)
+    assert port.report().warning.startswith(warning)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
+from uwb_mitigation.radios.fira.calibration import OriginalsFile
 from uwb_mitigation.radios.fira.capture import CaptureWriter
 from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES, parameter_name
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
@@ -37,6 +38,7 @@ SHUTDOWN_NS = 10**9
 """Maximum duration of the commands that end the sessions and restore the calibration of a board."""
 
 _MIN_RANGES, _CIR_SHARE = 20, 0.5
+_MIN_DAMAGES, _DAMAGE_SHARE = 20, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +135,8 @@ class UciPort(StreamPort):
         unexpected = [cause.name for cause in EXCHANGE_CAUSES.values() if cause.unexpected]
         monitor = ExchangeMonitor(remedies, unexpected)
         super().__init__(settings.address, on_event, monitor, stamp_clock=stamp_clock, baud=BAUD, tick_s=0.01)
-        self.session = UciSession(settings.board)
+        self._originals = OriginalsFile(str(settings.address))
+        self.session = UciSession(settings.board, self._originals)
         self._number, self._capture = number, capture
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
@@ -175,8 +178,8 @@ class UciPort(StreamPort):
             }
             if session.window is not None:
                 values |= {"CIR taps": session.window[0], "CIR taps before the first path": session.window[1]}
-            if session.position_unit.name:
-                values["unit of the first-path positions"] = session.position_unit.name
+            if unit := session.assembly.position_unit.name:
+                values["unit of the first-path positions"] = unit
             values |= {name.replace("_", " "): count for name, count in session.totals().items()}
             values |= {"openings": self.openings}
             self.monitor.period_s = max(PERIOD_S, 3 * s.effective_interval_ms / 1e3)
@@ -188,25 +191,33 @@ class UciPort(StreamPort):
     def clock_offset_ppm(self) -> float:
         """Median carrier frequency offset of the peers; NaN = unknown."""
         with self._lock:
-            return statistics.median(self.session.clock_offsets_ppm or [math.nan])
+            return statistics.median(self.session.assembly.clock_offsets_ppm or [math.nan])
 
     def _warning(self) -> str:
         """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
         session, counts = self.session, self.session.counts
         if not counts["ranges"] and counts["unknown_session"]:
             return "the only ranges are of other addresses: are the ids swapped, or other boards in reach?"
-        is_tag = session.settings.role is Role.TAG
-        if (is_tag or session.settings.report) and (warning := self.monitor.warning(time.monotonic())):
+        totals = session.totals()
+        damages = totals["damaged"] + totals["gaps"]
+        if damages > max(_MIN_DAMAGES, _DAMAGE_SHARE * counts["ranges"]):
+            return (
+                f"bytes or notifications are lost between board and host, {damages} times in {counts['ranges']} ranges, "
+                f"of which {counts['without_cir']} have no CIR: use another cable or USB port, and stop other programs"
+            )
+        if session.settings.delivers and (warning := self.monitor.warning(time.monotonic())):
             return warning
         if counts["ranges"] >= _MIN_RANGES:
             if counts["without_cir"] > _CIR_SHARE * counts["ranges"]:
                 return "most ranges have no CIR: the firmware may not support it; ranges are not corrected"
             if counts["inconsistent_cir"] > _CIR_SHARE * counts["ranges"]:
                 return "the reported first path contradicts the samples of most CIRs; they are not used"
-            if session.position_unit.name == "contradictory":
+            if session.assembly.position_unit.name == "contradictory":
                 return "the first-path positions contradict the whole taps, which are used instead"
-        if session.rejected:
-            names = ", ".join(parameter_name(tag) for tag in sorted(session.rejected))
+        if self._originals.problem:
+            return self._originals.problem
+        if rejected := session.ranging.rejected:
+            names = ", ".join(parameter_name(tag) for tag in sorted(rejected))
             return f"ranging without the parameters that the board rejected: {names}"
         return ""
 
@@ -224,8 +235,9 @@ class UciPort(StreamPort):
         session = self.session
         measurements = session.receive(data, now_ns, stamp_ns)
         messages: list[Any] = []
-        for cause, count in session.take_failures().items():
+        for cause, count in session.assembly.failures.items():
             self.monitor.add_failures(cause, count, now_ns / 1e9)
+        session.assembly.failures.clear()
         if session.starts != self._starts:
             self._starts, self._was_connected = session.starts, True
             messages.append(PortMessage(logging.INFO, self._started_text()))
@@ -233,9 +245,7 @@ class UciPort(StreamPort):
             self._worked_ns = now_ns
         if now_ns - self._worked_ns > REOPEN_NS:
             raise LinkError(session.state, where=str(self._address))
-        if not (session.settings.role is Role.TAG or session.settings.report):
-            return messages
-        return messages + measurements
+        return messages + measurements if session.settings.delivers else messages
 
     def _outgoing(self) -> bytes:
         return self.session.outgoing()

@@ -164,7 +164,7 @@ def _open(source: str, ports: list[str], capture: Path, on_event: OnEvent) -> Se
     if source == "serial":
         return serial.open([SerialSettings(PortAddress.parse(ports[0]), mode=Mode.HOST)], on_event)
     if source == "uci":
-        boards = (UciSettings(identify=True), UciSettings(Role.ANCHOR, 2, (1,)))
+        boards = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
         return uci.open(
             [
                 UciPortSettings(PortAddress.parse(port), board, capture)
@@ -199,8 +199,7 @@ def _describe(radios: Sequence[RadioPort], o: Observation) -> None:
         o.expected_ids = (settings.address, settings.peers[0])
         o.identity = {
             "device info": session.device_info.hex() or "not answered",
-            "rejected parameters": ", ".join(f"0x{tag_id:02x}" for tag_id in sorted(session.rejected))
-            or "none",
+            "rejected parameters": "; ".join(session.ranging.rejected_texts()) or "none",
         }
         o.written = {"CIR taps": settings.window, "CIR taps before the first path": 5}
         if session.window is not None:

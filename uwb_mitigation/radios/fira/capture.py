@@ -117,7 +117,7 @@ class UciCapture(Source):
                         board, session = int(words[1]), UciSession(settings)
                         boards[board] = session
                         session.opened(now_ns)
-                        (reported.discard if _is_silent(settings) else reported.add)(board)
+                        (reported.add if settings.delivers else reported.discard)(board)
                         continue
                     seconds, board_text, direction, digits = words
                     now_ns, board, data = (
@@ -149,14 +149,10 @@ class UciCapture(Source):
             raise RecordingError(f"cannot be read: {error.strerror}", where=str(self._path)) from error
 
 
-def _is_silent(settings: UciSettings) -> bool:
-    """Return whether the ranges of a board are not published: those of an anchor whose tag publishes them."""
-    return settings.role is Role.ANCHOR and not settings.report
-
-
 def _settings(text: str) -> UciSettings:
     values = json.loads(text)
     values |= {"role": Role[values["role"]], "peers": tuple(map(int, values["peers"]))}
+    values.pop("identify", None)  # of earlier versions
     settings = UciSettings(**values)
     settings.check()
     return settings

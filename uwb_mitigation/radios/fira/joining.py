@@ -42,14 +42,13 @@ class RangeArrival:
     """A range, the time of its arrival, and the diagnostics that were joined.
 
     Attributes:
-        handle, sequence: session and number of the exchange.
+        sequence: number of the exchange.
         record: the range.
         arrived_ns, stamp_ns: time of the arrival, monotonic, and on the clock of the stamps.
         diagnostics: diagnostics of the exchange; None = they have not arrived.
         is_complete: the range does not wait for diagnostics any more.
     """
 
-    handle: int
     sequence: int
     record: RangeRecord
     arrived_ns: int
@@ -107,7 +106,7 @@ class DiagnosticsMatcher:
         self._incomplete: dict[int, tuple[int, RangeArrival, Diagnostics, int]] = {}
         self._expected_notifications, self._further = 1, 0
         self._completed: int | None = None
-        self._step = 1
+        self._step, self._is_step_known = 1, False
         self._steps = (1, 0)
         self._latest: tuple[bool, int] | None = None
         self._latest_ns = 0
@@ -204,9 +203,9 @@ class DiagnosticsMatcher:
             step, count = self._steps
             self._steps = (step, count + 1) if sequence - before == step else (sequence - before, 1)
             if self._steps[1] >= ORDER_MESSAGES and self._steps[0] > 0:
-                self._step = self._steps[0]
+                self._step, self._is_step_known = self._steps[0], True
         gap = before is not None and sequence != before + self._step and not second
-        self.counts["gaps"] += gap
+        self.counts["gaps"] += gap and self._is_step_known
         if gap or damages != self._damages:
             self._strict = STRICT_MESSAGES
         elif self._strict:

@@ -24,6 +24,9 @@ MAX_MESSAGE_BYTES = 1 << 16
 MAX_GAP_NS = 250 * 10**6
 """Maximum time between the parts of a packet, after which its header is considered damaged."""
 
+MIN_TEXT, MAX_TEXT = 4, 40
+"""Number of characters that are a text, and that are shown of it."""
+
 _HEADER_BYTES = 4
 _MORE = 0x10
 _RANGES = (PacketType.NOTIFICATION, *codes.RANGE_START)
@@ -86,12 +89,22 @@ class PacketDecoder:
         self._name: tuple[int, int, int] | None = None
         self._since_ns = 0
         self._lost = False
+        self._skipped = bytearray()
 
     def reset(self) -> None:
         """Forget incomplete packets and messages."""
         self._buffer.clear()
+        self._skipped.clear()
         self._drop_fragments()
         self._lost = False
+
+    @property
+    def text(self) -> str:
+        """The text that was received instead of messages, shortened; empty: none."""
+        received = self._skipped + (self._buffer if self._lost else b"")
+        text = received.decode("ascii", "replace").strip()
+        is_text = len(text) >= MIN_TEXT and all(mark.isprintable() or mark in "\r\n\t" for mark in text)
+        return " ".join(text.split())[:MAX_TEXT] if is_text else ""
 
     def feed(self, data: bytes, now_ns: int) -> list[Packet]:
         """Return the messages that are complete with `data`; call it with no data to end a timeout."""
@@ -142,6 +155,7 @@ class PacketDecoder:
             self._skip()
             return 0
         self._drop_fragments()
+        self._skipped.clear()
         self._lost = False
         self.counts["messages"] += 1
         if name[0] == PacketType.NOTIFICATION and name not in _NOTIFICATIONS:
@@ -163,6 +177,7 @@ class PacketDecoder:
         if not self._lost:
             self._damage()
         self._lost = True
+        self._skipped = (self._skipped + self._buffer[:1])[-4 * MAX_TEXT :]
         del self._buffer[:1]
         self.counts["skipped"] += 1
 
