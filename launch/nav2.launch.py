@@ -8,17 +8,26 @@ argument of `uwb.launch.py` is accepted. With `namespace:=robot1` all nodes and 
 /tf_static, as in Nav2's own launch files.
 """
 
+import re
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
 
+from uwb_mitigation.nodes.support import launching
+
 MAP_SERVER = "map_server"
-
-
 TF = [("/tf", "tf"), ("/tf_static", "tf_static")]
 NAMESPACE = LaunchConfiguration("namespace")
+
+
+def navigation_pushes_namespace():
+    """Return whether the installed Nav2 puts its nodes into the namespace: since Lyrical, but not in Jazzy and Kilted."""
+    file = launching.installed("nav2_bringup", "launch/navigation_launch.py")
+    text = "" if file is None else file.read_text(encoding="utf-8")
+    return re.search(r"^[^#\n]*\bPushR(os|OS)Namespace\(", text, re.MULTILINE) is not None
 
 
 def included(package, file, *actions, **arguments):
@@ -67,8 +76,8 @@ def generate_launch_description():
             included(
                 "nav2_bringup",
                 "navigation_launch.py",
-                # It puts its parameters into the namespace, but not its nodes.
-                PushRosNamespace(NAMESPACE),
+                # Every Nav2 puts its parameters into the namespace.
+                *([] if navigation_pushes_namespace() else [PushRosNamespace(NAMESPACE)]),
                 namespace=NAMESPACE,
                 params_file=LaunchConfiguration("params_file"),
             ),

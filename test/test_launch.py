@@ -317,7 +317,22 @@ def test_malformed_board_is_refused(generate, text: str):
         launch(generate, "boards.launch.py", boards=text)
 
 
-def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(generate):
+@pytest.mark.parametrize(
+    ("navigation_launch", "pushes"),
+    [
+        ("load_nodes = GroupAction([Node(package='nav2_controller')])  # PushROSNamespace(namespace)", 1),
+        ("load_nodes = GroupAction([\n    PushROSNamespace(namespace=namespace),\n    Node()])", 0),
+        ("load_nodes = GroupAction([\n    PushRosNamespace(namespace=namespace),\n    Node()])", 0),
+    ],
+    ids=["Jazzy", "Lyrical", "another spelling"],
+)
+def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(
+    generate, navigation_launch: str, pushes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file = tmp_path / "share" / "nav2_bringup" / "launch" / "navigation_launch.py"
+    file.parent.mkdir(parents=True)
+    file.write_text(navigation_launch)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path / 'absent'}:{tmp_path}")
     entities = generate("nav2.launch.py")
     groups = [entity.values[0] for entity in entities if entity.kind == "group"]
     context = {"odometry": "odom", "namespace": "robot1", "params_file": "nav2.yaml"}
@@ -326,8 +341,10 @@ def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(gen
         "share/uwb_mitigation": ["launch", "uwb.launch.py"],
         "share/nav2_bringup": ["launch", "navigation_launch.py"],
     }
-    pushed, navigation = included["share/nav2_bringup"]
-    assert (pushed.kind, pushed.values[0].perform(context)) == ("push", "robot1")
+    *pushed, navigation = included["share/nav2_bringup"]
+    assert [(action.kind, action.values[0].perform(context)) for action in pushed] == [
+        ("push", "robot1")
+    ] * pushes
     overrides = {name: value.perform(context) for name, value in navigation.launch_arguments}
     assert overrides == {"namespace": "robot1", "params_file": "nav2.yaml"}
     nodes = [entity for entity in entities if entity.kind == "node"]

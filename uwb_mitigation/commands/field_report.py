@@ -22,7 +22,7 @@ import typer
 import uwb_mitigation
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.console import JsonOption, print_line
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.commands.field.checks import Check, Observation
@@ -56,9 +56,6 @@ def field_report(
 
         uwb-mitigation field-report --source uci --port /dev/ttyACM0 --distance 3
     """
-    from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
-    from uwb_mitigation.commands.field.test import observe
-
     if not 0.1 <= distance <= 500.0:
         raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")
     if output.suffix != ".zip" or output.is_dir() or not output.absolute().parent.is_dir():
@@ -66,6 +63,13 @@ def field_report(
     if output.exists() and not force:
         raise ParameterError("the file exists", where=str(output), valid="another path, or --force")
     ports = [name.strip() for name in port.split(",") if name.strip()]
+    for name in ports:
+        if name.startswith("/") and not Path(name).exists():
+            raise LinkError("is not there", where=name, valid="connect the board")
+    # NumPy, the drivers and the statistics would delay the messages above.
+    from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
+    from uwb_mitigation.commands.field.test import observe
+
     observation = Observation(distance, seconds)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

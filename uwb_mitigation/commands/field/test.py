@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import re
 import time
 from collections import Counter
@@ -86,7 +85,7 @@ def observe(
     if not 1 <= len(ports) <= (1 if source == "serial" else 2):
         raise ParameterError(f"{len(ports)} ports", valid="the tag's, or the tag's and the anchor's")
     for port in ports:
-        if not (os.path.exists(port) if source == "spi" else PortAddress.parse(port).find()):
+        if source != "spi" and not PortAddress.parse(port).find():
             raise LinkError("is not there", where=port, valid="connect the board")
     events: SimpleQueue[object] = SimpleQueue()
     with ExitStack() as stack:

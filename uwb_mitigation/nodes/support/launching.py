@@ -157,6 +157,13 @@ def check_names(words: Sequence[str], declared: Collection[str]) -> None:
             check_name("argument", name, declared, valid="--show-args lists them")
 
 
+def installed(package: str, file: str) -> Path | None:
+    """Return the path of a file of an installed ROS package; None: it is in no prefix of AMENT_PREFIX_PATH."""
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    paths = (Path(prefix, "share", package, file) for prefix in prefixes)
+    return next(filter(Path.is_file, paths), None)
+
+
 def check_package(argument: str, package: str) -> None:
     """Check that a ROS package is installed.
 
@@ -167,8 +174,7 @@ def check_package(argument: str, package: str) -> None:
     Raises:
         ParameterError: it is not in any prefix of AMENT_PREFIX_PATH.
     """
-    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
-    if not any(Path(prefix, "share", package, "package.xml").is_file() for prefix in prefixes):
+    if installed(package, "package.xml") is None:
         name = package.replace("_", "-")
         raise ParameterError(
             f"{argument}:=true needs {package}, which is not installed",
