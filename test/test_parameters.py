@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import math
-import os
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -94,22 +94,29 @@ def test_live_parameters_survive_a_respawn(ros: Ros, tmp_path: Path, monkeypatch
     assert status
 
 
-def test_state_of_a_crashed_node_is_loaded_once_and_only_if_it_is_new_and_readable(tmp_path: Path):
+def test_state_of_a_crashed_node_is_loaded_once_and_only_if_it_is_new_and_valid(tmp_path: Path):
     path, warnings = tmp_path / "locator.state", []
     logger = SimpleNamespace(info=lambda text: None, warning=warnings.append)
-    StateFile(path, logger).save({"yaw": 1.0})
+
+    def load() -> object:
+        return StateFile(path, logger).load(30.0, lambda state: state["yaw"])
+
+    StateFile(path, logger).save(lambda: {"yaw": 1.0})
+    saved = json.loads(path.read_text())
+    assert saved == {"format": 1, "saved_s": saved["saved_s"], "state": {"yaw": 1.0}}
     respawned = StateFile(path, logger)
-    assert respawned.load(30.0) == {"yaw": 1.0}
-    respawned.save({"yaw": 2.0})
-    assert not path.exists(), "a state that leads to a crash is used once"
-    StateFile(path, logger).save({"yaw": 1.0})
-    os.utime(path, (0.0, 0.0))
-    assert StateFile(path, logger).load(30.0) is None
+    assert [respawned.load(30.0, lambda state: state["yaw"]) for _ in range(2)] == [1.0, None]
+    respawned.save(lambda: {"yaw": 2.0})
+    assert load() == 1.0, "a state that leads to a crash becomes too old"
+    path.write_text(json.dumps(saved | {"saved_s": saved["saved_s"] - 40.0}))
+    assert load() is None
     assert not warnings
-    path.write_bytes(b"\x80garbage")
-    assert StateFile(path, logger).load(30.0) is None
-    assert len(warnings) == 1
-    assert StateFile(None, logger).load(30.0) is None
+    invalid = [json.dumps(saved | change) for change in ({"format": 2}, {"state": {}}, {"saved_s": "now"})]
+    for content in (b"\x80garbage", *map(str.encode, invalid)):
+        path.write_bytes(content)
+        assert load() is None
+    assert len(warnings) == 4
+    assert StateFile(None, logger).load(30.0, dict) is None
 
 
 @pytest.mark.parametrize("value", ["reliability:=perhaps", "depth:=deep"])

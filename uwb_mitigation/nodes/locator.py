@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import math
 import time
 from collections.abc import Callable, Collection
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError, format_id
 from uwb_mitigation.nodes import markers
-from uwb_mitigation.nodes.robot_motion import HOLD_S, OdometryInput, transform_type
+from uwb_mitigation.nodes.robot_motion import HOLD_S, MotionState, OdometryInput, transform_type
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
@@ -69,7 +70,7 @@ _REPEAT_AFTER_NS = 300_000_000
 
 
 class _Outputs:
-    """The publishers of one tag, its frame, and the stamps of its last messages.
+    """The publishers of one tag, its frame, and the stamps of its last poses.
 
     `robot` is the estimator of the tag if a robot with odometry carries it.
     """
@@ -85,7 +86,7 @@ class _Outputs:
         self.frame = frame
         self.robot = tag.robot
         self.picture = markers.TagPicture(frame)
-        self.published_ns = self.smoothed_ns = self.transform_ns = -(1 << 62)
+        self.published_ns = self.smoothed_ns = -(1 << 62)
 
     def all(self) -> tuple[Publisher, ...]:
         return self.pose, self.odometry, self.smoothed
@@ -110,6 +111,8 @@ class Locator(ManagedNode):
         self._tf_type: Any = None
         self._decode: Callable[[bytes], tuple[MeasurementKey, CorrectedRange]] = decode_corrected
         self._make_estimator: Callable[[AnchorMap], MultiTagEstimator]
+        self._plain_tag = 0
+        self._transform_ns: dict[str, int] = {}
         self._outputs: dict[int, _Outputs] = {}
         self._robot: OdometryInput | None = None
         self._lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -134,9 +137,9 @@ class Locator(ManagedNode):
         area = Area.parse(self.value("area"))
         self._lever_arm = parse_lever_arm(self.value("lever_arm")) or (0.0, 0.0, 0.0)
         robot = RobotData(lever_arm=self._lever_arm) if self.value("odometry") else None
-        path_of_base = DeadReckoning()
+        path_of_base, self._plain_tag = DeadReckoning(), self.value("tag")
         self._make_estimator = lambda anchors: MultiTagEstimator(
-            EstimatorConfig(anchors, model, height, area, robot=robot), self.value("tag"), path_of_base
+            EstimatorConfig(anchors, model, height, area, robot=robot), self._plain_tag, path_of_base
         )
         self._period_ns = round(NS_PER_S / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * NS_PER_S)
@@ -185,7 +188,7 @@ class Locator(ManagedNode):
     def close(self) -> None:
         super().close()
         self._outputs, self._anchors_out, self._tf, self._estimator, self._ranges = {}, None, None, None, None
-        self._robot = None
+        self._robot, self._transform_ns = None, {}
 
     def describe(self) -> diagnostics.Description:
         estimator = self._estimator
@@ -245,19 +248,27 @@ class Locator(ManagedNode):
 
     def _use_anchors(self, anchors: AnchorMap) -> None:
         self.get_logger().info(f"{len(anchors)} anchors from {self.value('anchors')}")
-        self._estimator = self._resumed_estimator(anchors) or self._make_estimator(anchors)
+        digest = hashlib.sha256(repr(anchors.anchors).encode()).hexdigest()
 
-    def _resumed_estimator(self, anchors: AnchorMap) -> MultiTagEstimator | None:
-        """Return the estimator of a process of this node that has crashed; None: none, or with other anchors."""
-        if (state := self._state_file.load(HOLD_S)) is None:
-            return None
-        estimator, motion = state
-        if estimator.anchors.anchors != anchors.anchors:
-            return None
-        if self._robot is not None and motion is not None:
-            self._robot.resume(motion, estimator.odometry)
-        resumed: MultiTagEstimator = estimator
-        return resumed
+        def read(saved: Any) -> tuple[int, MotionState | None]:
+            if saved["anchors"] != digest:
+                raise ValueError("other anchors")
+            return int(saved["tag"]), saved["motion"] and MotionState.read(saved["motion"])
+
+        if (state := self._state_file.load(HOLD_S, read)) is not None:
+            self._plain_tag, motion = self._plain_tag or state[0], state[1]
+            if self._robot is not None and motion is not None:
+                self._robot.resume(motion)
+        self._digest, self._estimator = digest, self._make_estimator(anchors)
+
+    def _saved_state(self) -> dict[str, Any]:
+        """Return the state for a process that replaces this one: the keys of its file."""
+        motion = (
+            None
+            if self._robot is None or self._robot.state.map_to_odom is None
+            else asdict(self._robot.state)
+        )
+        return {"anchors": self._digest, "tag": self._plain_tag, "motion": motion}
 
     def _on_lost(self, info: Any) -> None:
         self._lost += info.total_count_change
@@ -293,12 +304,19 @@ class Locator(ManagedNode):
         tag, estimate = result
         outputs = self._outputs_of(tag)
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
-        if estimate is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
+        held = None
+        if estimate is None and self._robot is not None and outputs.robot is not None:
+            held = self._robot.carried_on(stamp_ns)
+        known = estimate or held
+        if known is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
             if stamp_ns < outputs.published_ns - NS_PER_S:
                 # A replay starts again.
-                outputs.transform_ns = stamp_ns - 1
+                self._transform_ns.clear()
             outputs.published_ns = stamp_ns
-            self._publish_estimate(outputs, estimate)
+            if held is None:
+                self._publish_estimate(outputs, known)
+            else:
+                self._publish_base(outputs, held)
         now_ns = time.perf_counter_ns()
         if len(self._processing_ns) < 20_000:
             self._processing_ns.append(now_ns - began_ns)
@@ -307,8 +325,8 @@ class Locator(ManagedNode):
     def _outputs_of(self, tag: TagState) -> _Outputs:
         outputs = self._outputs.get(tag.tag_id)
         if outputs is None:
-            chosen = self.value("tag")
-            plain = tag.tag_id == chosen if chosen else not self._outputs
+            self._plain_tag = self._plain_tag or tag.tag_id
+            plain = tag.tag_id == self._plain_tag
             name = tag_frame(tag.tag_id)
             # Tags of several robots share the map, so the namespace keeps their frames apart.
             frame = f"{self.get_namespace()}/{self._plain_frame if plain else name}".lstrip("/")
@@ -322,41 +340,50 @@ class Locator(ManagedNode):
     def _update_lever_arm(self, tag_id: int, frame: Callable[[], str]) -> None:
         """Set the lever arm of the robot's antenna when the frame of its ranges is known on /tf_static."""
         outputs, motion = self._outputs.get(tag_id), self._robot
-        if outputs is None or outputs.robot is None or motion is None or motion.state.lever_arm_is_set:
+        if outputs is None or outputs.robot is None or motion is None or motion.lever_arm_is_set:
             return
         if (arm := motion.lever_arm(frame())) is not None:
-            outputs.robot.lever_arm, motion.state.lever_arm_is_set = arm, True
+            outputs.robot.lever_arm, motion.lever_arm_is_set = arm, True
             self.get_logger().info(f"lever arm of the antenna: {arm[0]:.3f}, {arm[1]:.3f}, {arm[2]:.3f} m")
 
     def _publish_estimate(self, outputs: _Outputs, estimate: Estimate) -> None:
         outputs.picture.add(estimate)
-        base, robot = self._at_base(outputs, estimate), outputs.robot
-        outputs.pose.publish(encode_pose(base, self._map))
-        if self._robot is None or robot is None:
-            outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
-        else:
-            twist = BodyTwist() if robot.rejects_odometry else self._robot.twist(estimate.stamp_ns)
-            frame = self._robot.state.base_frame or "base_link"
-            outputs.odometry.publish(encode_odometry(base, self._map, frame, twist))
-        # tf warns of a repeated stamp.
-        if self._tf is None or estimate.stamp_ns <= outputs.transform_ns:
+        base = self._at_base(outputs, estimate)
+        if self._robot is not None and outputs.robot is not None:
+            if not self._robot.is_resuming(estimate.stamp_ns):
+                self._publish_base(outputs, self._robot.mixed(base))
             return
-        if self._robot is not None and robot is not None:
-            transform = self._robot.map_to_odom(base, self._tolerance_ns)
-        else:
+        outputs.pose.publish(encode_pose(base, self._map))
+        outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))
+        if self._tf is not None:
             x, y, z = estimate.position.tolist()
             transform = TransformStamped(
                 header=endpoints.header(estimate.stamp_ns, self._map),
                 child_frame_id=outputs.frame,
                 transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(w=1.0)),
             )
-        self._publish_transform(outputs, transform, estimate.stamp_ns)
+            self._publish_transform(transform, estimate.stamp_ns)
+
+    def _publish_base(self, outputs: _Outputs, base: Estimate) -> None:
+        """Publish the pose of the robot, and the transform from map to odom."""
+        motion, robot = self._robot, outputs.robot
+        assert motion is not None
+        assert robot is not None
+        outputs.pose.publish(encode_pose(base, self._map))
+        twist = BodyTwist() if robot.rejects_odometry else motion.twist(base.stamp_ns)
+        frame = motion.state.base_frame or "base_link"
+        outputs.odometry.publish(encode_odometry(base, self._map, frame, twist))
+        self._publish_transform(motion.map_to_odom(base, self._tolerance_ns), base.stamp_ns)
 
     def _publish_transform(
-        self, outputs: _Outputs, transform: TransformStamped | None, stamp_ns: int
+        self, transform: TransformStamped | None, stamp_ns: int, after_ns: int = 1
     ) -> None:
-        if self._tf is not None and transform is not None:
-            outputs.transform_ns = stamp_ns
+        """Publish a transform if its estimate is later by `after_ns` than its last one: tf warns of a repeated stamp."""
+        if self._tf is None or transform is None:
+            return
+        frame = transform.child_frame_id
+        if stamp_ns - self._transform_ns.get(frame, -(1 << 62)) >= after_ns:
+            self._transform_ns[frame] = stamp_ns
             self._tf.publish(self._tf_type(transforms=[transform]))
 
     def _at_base(self, outputs: _Outputs, estimate: Estimate) -> Estimate:
@@ -399,14 +426,16 @@ class Locator(ManagedNode):
                 smoothed = tag.smoother.estimate()
                 if smoothed is not None:
                     outputs.smoothed.publish(encode_pose(self._at_base(outputs, smoothed), self._map))
-            is_due = age_s < PREDICT_UNTIL_S and stamp_ns - outputs.transform_ns >= _REPEAT_AFTER_NS
-            if self._robot is not None and outputs.robot is not None and is_due:
+        if self._robot is not None:
+            # Also before the first range after a crash.
+            latest_ns = max((tag.latest_ns for tag in estimator.tags.values() if tag.robot), default=stamp_ns)
+            if stamp_ns - latest_ns < PREDICT_UNTIL_S * NS_PER_S:
                 last = self._robot.last_map_to_odom(stamp_ns, self._tolerance_ns)
-                self._publish_transform(outputs, last, stamp_ns)
+                self._publish_transform(last, stamp_ns, _REPEAT_AFTER_NS)
         if self._anchors_out is not None and estimator.tags and self._anchors_out.get_subscription_count():
             self._show_anchors()
         if estimator.tags:
-            self._state_file.save((estimator, None if self._robot is None else self._robot.state))
+            self._state_file.save(self._saved_state)
 
     def _show_anchors(self) -> None:
         estimator, publisher = self._estimator, self._anchors_out

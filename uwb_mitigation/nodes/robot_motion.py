@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
@@ -16,11 +16,12 @@ from sensor_msgs.msg import Imu
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
-from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
+from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning
+from uwb_mitigation.positioning.online.odometry_filter import SCALE_SD
 from uwb_mitigation.types.ros.poses import BodyTwist, yaw_of
 from uwb_mitigation.types.ros.topics import TF_STATIC, relative
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
-from uwb_mitigation.types.tracks import Estimate
+from uwb_mitigation.types.tracks import Estimate, Heading
 
 Vector = tuple[float, float, float]
 
@@ -32,35 +33,68 @@ LEVER_ARM_WAIT_S = 5.0
 
 _MAX_FRAMES = 1000
 
-_BRIDGE_STEP_NS = NS_PER_S // 5
-"""Spacing of the poses that are interpolated over a restart; shorter than the timeout of the odometry."""
+MAX_GAP_SPEED = 0.5
+"""If the odometry moved by this much faster than before and after a crash (m/s), it was reset meanwhile."""
 
-_BRIDGE_SPEED = 0.5
-"""If the odometry moved by this much faster than before and after a restart (m/s), it was reset meanwhile."""
+CONTRADICTION = 25.0
+"""The pose from before a crash is dropped if ranges contradict it by 5 standard deviations."""
+
+REPLACED_SHARE = 0.99
+"""It is dropped without a step if the estimates have this share of the mixture."""
 
 
 @dataclass(slots=True)
 class MotionState:
-    """What a respawned locator continues with.
+    """The motion with which a respawned locator continues; its file has the same keys.
 
     Attributes:
         odom_frame: frame of the odometry; empty before its first message.
         base_frame: the parameter, or else the child frame of the odometry.
-        lever_arm_is_set: it is a parameter, or was found.
         map_to_odom: x, y, z (m) and yaw (rad) of the last transform; None: there was none.
         map_to_odom_ns: stamp of its estimate.
+        variance: of the x, y and z of the base (m^2) and of its yaw (rad^2) in this estimate.
         pose: x, y (m) and yaw (rad) of the latest odometry; None: there was none.
         pose_ns, speed: its stamp, and its speed in m/s.
     """
 
     odom_frame: str
     base_frame: str
-    lever_arm_is_set: bool
     map_to_odom: tuple[float, float, float, float] | None = None
     map_to_odom_ns: int = 0
-    pose: tuple[float, float, float] | None = None
+    variance: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    pose: Vector | None = None
     pose_ns: int = 0
     speed: float = 0.0
+
+    @classmethod
+    def read(cls, saved: dict[str, Any]) -> MotionState:
+        """Return a saved state; raise KeyError, TypeError or ValueError if it has no pose, or is invalid."""
+        x, y, z, yaw, vx, vy, vz, of_yaw, *pose, speed = map(
+            float, (*saved["map_to_odom"], *saved["variance"], *saved["pose"], saved["speed"])
+        )
+        if not all(map(math.isfinite, (x, y, z, yaw, *pose, speed))) or not 0.0 < min(vx, vy, of_yaw) < 1e6:
+            raise ValueError("numbers that are not valid")
+        stamps = int(saved["map_to_odom_ns"]), int(saved["pose_ns"])
+        frames = str(saved["odom_frame"]), str(saved["base_frame"])
+        odom_x, odom_y, odom_yaw = pose
+        variance = vx, vy, vz, of_yaw
+        return cls(*frames, (x, y, z, yaw), stamps[0], variance, (odom_x, odom_y, odom_yaw), stamps[1], speed)
+
+
+class _Held(NamedTuple):
+    """The transform before a crash.
+
+    Attributes:
+        map_to_odom, variance: see `MotionState`.
+        segment, begin_ns: of the path since the crash.
+        distance_m: distance driven between the crash and the first odometry after it.
+    """
+
+    map_to_odom: tuple[float, float, float, float]
+    variance: tuple[float, float, float, float]
+    segment: int
+    begin_ns: int
+    distance_m: float
 
 
 class OdometryInput:
@@ -74,13 +108,15 @@ class OdometryInput:
         ParameterError: the frames of the robot and the map are equal.
 
     Attributes:
-        path: as given, or that of `resume`.
+        path: as given.
         state: frames, and the latest pose and transform.
+        lever_arm_is_set: it is a parameter, or was found.
     """
 
     def __init__(self, node: ManagedNode, path: DeadReckoning) -> None:
         self.path = path
-        self.state = MotionState("", node.value("base_frame"), bool(node.value("lever_arm")))
+        self.state = MotionState("", node.value("base_frame"))
+        self.lever_arm_is_set = bool(node.value("lever_arm"))
         self._map, self._log = node.value("map_frame"), node.get_logger()
         if self.state.base_frame == self._map:
             raise ParameterError(
@@ -88,7 +124,8 @@ class OdometryInput:
                 valid="the robot's frame, such as base_link",
             )
         self._uses_orientation = node.value("imu_orientation")
-        self._is_resuming = False
+        self._is_resuming, self._resumed_ns = False, 0
+        self._held: _Held | None = None
         self._antenna_frame: str | None = None
         self._static_topic = node.resolve_topic_name(relative(TF_STATIC))
         self._first_range_s = 0.0
@@ -105,7 +142,7 @@ class OdometryInput:
         if node.value("imu"):
             subscribe(Imu, node.value("imu"), self._on_imu)
         message = transform_type()
-        if not self.state.lever_arm_is_set and message is not None:
+        if not self.lever_arm_is_set and message is not None:
             qos = QoSProfile(
                 depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
             )
@@ -131,7 +168,7 @@ class OdometryInput:
     def warning(self) -> str:
         """Return a warning if the lever arm is unknown, although it should have been received."""
         waiting = self._antenna_frame is None or time.monotonic() - self._first_range_s < LEVER_ARM_WAIT_S
-        if self.state.lever_arm_is_set or waiting or not self.state.base_frame:
+        if self.lever_arm_is_set or waiting or not self.state.base_frame:
             return ""
         base, antenna = self.state.base_frame, self._antenna_frame or "the antenna (ranges without frame_id)"
         return (
@@ -145,9 +182,59 @@ class OdometryInput:
             return BodyTwist()
         return BodyTwist(*self.path.twist, *self.path.twist_variance)
 
-    def resume(self, state: MotionState, path: DeadReckoning) -> None:
-        """Continue with the state and the path of a process that has crashed."""
-        self.state, self.path, self._is_resuming = state, path, True
+    def resume(self, state: MotionState) -> None:
+        """Continue with the state of a process that has crashed."""
+        self.state, self._is_resuming = state, True
+
+    def is_resuming(self, stamp_ns: int) -> bool:
+        """Return whether an estimate after a crash is older than the odometry, which may still arrive."""
+        if not self._is_resuming:
+            return self._held is not None and stamp_ns < self._held.begin_ns
+        self._resumed_ns = self._resumed_ns or stamp_ns
+        return stamp_ns - self._resumed_ns < ODOMETRY_TIMEOUT_S * NS_PER_S
+
+    def carried_on(self, stamp_ns: int) -> Estimate | None:
+        """Return the pose of the base before a crash, moved on by the odometry; None: there was none, or it was replaced."""
+        point, pose = self.path.point_at(stamp_ns), self.path.pose_at(stamp_ns)
+        if self._held is None or point is None or pose is None or point.segment != self._held.segment:
+            return None
+        (x, y, z, yaw), variance, _, _, gap_m = self._held
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        position = np.array([x + cosine * pose[0] - sine * pose[1], y + sine * pose[0] + cosine * pose[1], z])
+        of_yaw = variance[3] + point.yaw_variance + point.drift**2 + point.turn**2
+        moved = point.position_variance + (SCALE_SD**2 + of_yaw) * (gap_m + point.distance_m) ** 2
+        covariance = np.diag([variance[0] + moved, variance[1] + moved, variance[2], 1.0, 1.0, 1.0])
+        heading = Heading(yaw + pose[2], np.array([0.0, 0.0, 0.0, of_yaw]))
+        return Estimate(stamp_ns, position, np.zeros(3), covariance, heading)
+
+    def mixed(self, base: Estimate) -> Estimate:
+        """Return an estimate of the base, mixed with `carried_on` by their variances: the transform does not step."""
+        held, new = self.carried_on(base.stamp_ns), base.heading
+        if held is None or held.heading is None:
+            return base
+        delta, of_held, of_new = base.position - held.position, held.covariance, base.covariance
+        error = float(delta[:2] @ np.linalg.solve((of_held + of_new)[:2, :2], delta[:2]))
+        turn, of_turn = 0.0, math.inf
+        if new is not None:
+            turn = math.remainder(new.yaw - held.heading.yaw, math.tau)
+            of_turn = float(new.covariance[3])
+        of_yaw = float(held.heading.covariance[3])
+        # The estimates may be right: the robot was moved, or the saved pose was wrong.
+        if not max(error, turn**2 / (of_yaw + of_turn)) <= CONTRADICTION:
+            self._held = None
+            return base
+        if new is None:
+            return held
+        share = float(np.trace(of_held[:2, :2]) / np.trace((of_held + of_new)[:2, :2]))
+        of_heading = of_yaw / (of_yaw + of_turn)
+        if min(share, of_heading) > REPLACED_SHARE:
+            self._held = None
+        # Their errors are correlated: the variance of the mixture is not smaller.
+        covariance = of_new.copy()
+        covariance[:3, :3] = share * of_new[:3, :3] + (1.0 - share) * of_held[:3, :3]
+        yaw_covariance = of_heading * new.covariance + (1.0 - of_heading) * held.heading.covariance
+        heading = Heading(held.heading.yaw + of_heading * turn, yaw_covariance)
+        return replace(base, position=held.position + share * delta, covariance=covariance, heading=heading)
 
     def last_map_to_odom(self, stamp_ns: int, tolerance_ns: int) -> TransformStamped | None:
         """Return the last transform with a new stamp, for `HOLD_S`; None: later, or no heading was known yet."""
@@ -176,7 +263,9 @@ class OdometryInput:
             cosine, sine = math.cos(yaw), math.sin(yaw)
             x, y, z = base.position.tolist()
             x, y = x - cosine * odom_x + sine * odom_y, y - sine * odom_x - cosine * odom_y
-            self.state.map_to_odom, self.state.map_to_odom_ns = (x, y, z, yaw), base.stamp_ns
+            state, (of_x, of_y, of_z) = self.state, np.diag(base.covariance)[:3].tolist()
+            state.map_to_odom, state.map_to_odom_ns = (x, y, z, yaw), base.stamp_ns
+            state.variance = of_x, of_y, of_z, float(base.heading.covariance[3])
         return self.last_map_to_odom(base.stamp_ns, tolerance_ns)
 
     def _on_odometry(self, message: Odometry) -> None:
@@ -201,26 +290,24 @@ class OdometryInput:
         velocity = (twist.linear.x, twist.linear.y, twist.angular.z)
         variance = (covariance[0], covariance[7], covariance[35])
         speed = math.hypot(twist.linear.x, twist.linear.y)
+        self.path.add(stamp_ns, pose, velocity, variance)
         if self._is_resuming:
             self._is_resuming = False
-            self._bridge(stamp_ns, pose, velocity, variance, max(speed, state.speed))
-        self.path.add(stamp_ns, pose, velocity, variance)
+            self._hold(stamp_ns, pose, max(speed, state.speed))
         state.pose, state.pose_ns, state.speed = pose, stamp_ns, speed
 
-    def _bridge(self, stamp_ns: int, pose: Vector, velocity: Vector, variance: Vector, speed: float) -> None:
-        """Interpolate the poses of the odometry over a restart of this process: they contain the motion meanwhile."""
-        before, gap_ns = self.state.pose, stamp_ns - self.state.pose_ns
-        if before is None or not 0 < gap_ns <= HOLD_S * NS_PER_S:
+    def _hold(self, stamp_ns: int, pose: Vector, speed: float) -> None:
+        """Hold the transform from before a crash, unless the odometry was reset meanwhile."""
+        state, point = self.state, self.path.point_at(stamp_ns)
+        before, last, gap_ns = state.pose, state.map_to_odom, stamp_ns - state.pose_ns
+        if before is None or last is None or point is None:
             return
-        dx, dy, dyaw = (now - then for now, then in zip(pose, before, strict=True))
+        gap_m = math.hypot(pose[0] - before[0], pose[1] - before[1])
         # Also false for NaN.
-        if not math.hypot(dx, dy) <= (speed + _BRIDGE_SPEED) * gap_ns / NS_PER_S:
-            return
-        dyaw = math.remainder(dyaw, math.tau)
-        steps = math.ceil(gap_ns / _BRIDGE_STEP_NS)
-        for weight in (step / steps for step in range(1, steps)):
-            x, y, yaw = before[0] + weight * dx, before[1] + weight * dy, before[2] + weight * dyaw
-            self.path.add(self.state.pose_ns + round(weight * gap_ns), (x, y, yaw), velocity, variance)
+        if 0 < gap_ns <= HOLD_S * NS_PER_S and gap_m <= (speed + MAX_GAP_SPEED) * gap_ns / NS_PER_S:
+            self._held = _Held(last, state.variance, point.segment, stamp_ns, gap_m)
+        else:
+            state.map_to_odom = None
 
     def _on_imu(self, message: Imu) -> None:
         # A -1 in front of the covariance marks rates that are not measured.

@@ -1,18 +1,26 @@
-"""The state of a node that continues after a crash."""
+"""The state with which a node continues after a crash, in a JSON file.
+
+The file has the keys `format` (`FORMAT`), `saved_s` (Unix time) and `state`, whose keys the node defines.
+"""
 
 from __future__ import annotations
 
-import pickle
+import json
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from uwb_mitigation.files import write_atomically
+from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.files import read_bounded, write_atomically
 
-SAVE_PERIOD_S = 1.0
+FORMAT, MAX_BYTES = 1, 1 << 16
+SAVE_PERIOD_S = 0.2
 
 TRIAL_S = 5.0
-"""A process with a loaded state saves nothing for this time: a state that leads to a crash is used once."""
+"""A process with a loaded state saves nothing for this time: a state that leads to a crash becomes too old."""
+
+State = TypeVar("State")
 
 
 class StateFile:
@@ -28,32 +36,40 @@ class StateFile:
         self._is_first_load = True
         self._next_save_s = 0.0
 
-    def load(self, max_age_s: float) -> Any:
-        """Return the state that a crashed process saved; None: none, or older. Only the first call returns one."""
+    def load(self, max_age_s: float, read: Callable[[Any], State]) -> State | None:
+        """Return the state that a crashed process saved; None: none, or older. Only the first call returns one.
+
+        Args:
+            max_age_s: of the state.
+            read: checks the state; raises KeyError, TypeError or ValueError if it is invalid.
+        """
         is_first, self._is_first_load = self._is_first_load, False
         if self._path is None or not is_first or not self._path.is_file():
             return None
         try:
-            age_s = time.time() - self._path.stat().st_mtime
-            state = pickle.loads(self._path.read_bytes())
-            self._path.unlink()
-        except Exception as error:  # Damaged files raise anything.
+            document = json.loads(read_bounded(self._path, MAX_BYTES, UwbMitigationError))
+            age_s = time.time() - document["saved_s"]
+            if document["format"] != FORMAT:
+                raise ValueError(f"format {document['format']} instead of {FORMAT}")
+            if not -SAVE_PERIOD_S <= age_s <= max_age_s:
+                return None
+            state = read(document["state"])
+        except (UwbMitigationError, KeyError, OverflowError, TypeError, ValueError) as error:
             self._logger.warning(f"the state before the crash cannot be read: {error}")
-            return None
-        if age_s > max_age_s:
             return None
         self._next_save_s = time.monotonic() + TRIAL_S
         self._logger.info(f"continuing with the state of {age_s:.1f} s ago, before the crash")
         return state
 
-    def save(self, state: Any) -> None:
-        """Save a state, at most every `SAVE_PERIOD_S`."""
+    def save(self, state: Callable[[], Any]) -> None:
+        """Save what `state` returns, at most every `SAVE_PERIOD_S`."""
         now_s = time.monotonic()
         if self._path is None or now_s < self._next_save_s:
             return
         self._next_save_s = now_s + SAVE_PERIOD_S
+        document = {"format": FORMAT, "saved_s": time.time(), "state": state()}
         try:
-            write_atomically(self._path, pickle.dumps(state))
-        except Exception as error:  # Without it, the node only starts from scratch.
+            write_atomically(self._path, json.dumps(document))
+        except UwbMitigationError as error:  # Without it, the node only starts from scratch.
             self._logger.warning(f"the state cannot be saved: {error}")
             self._path = None
