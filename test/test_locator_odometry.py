@@ -6,7 +6,9 @@ import itertools
 import json
 import math
 import signal
+from dataclasses import asdict
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -34,9 +36,12 @@ from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
+from uwb_mitigation.nodes.robot_motion import MotionState, OdometryInput
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
+from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.types.anchors import dump_anchors
 from uwb_mitigation.types.ros.poses import yaw_of
+from uwb_mitigation.types.tracks import Estimate, Heading
 
 pytestmark = pytest.mark.ros
 
@@ -413,3 +418,77 @@ def test_base_frame_that_is_the_map_is_refused(ros: Ros, anchors: Path):
     locator = start(ros, anchors, "base_frame:=map")
     locator.wait_for_output("base_frame = 'map'")
     assert locator.exit_code() is None
+
+
+class Continuation:
+    """A robot that stands at (4, 2) with yaw 0.5 in the map before a crash, at (1, 0) with yaw 0 in odom."""
+
+    def __init__(self) -> None:
+        node, self.path = MagicMock(), DeadReckoning()
+        node.value.side_effect = {"map_frame": "map", "base_frame": "base_link", "odometry": "odom"}.get
+        self.motion = OdometryInput(node, self.path)
+        self._receive = node.create_subscription.call_args_list[0].args[2]
+        yaw = 0.5
+        saved = {
+            "odom_frame": "odom",
+            "base_frame": "base_link",
+            "map_to_odom": [4.0 - math.cos(yaw), 2.0 - math.sin(yaw), 0.0, yaw],
+            "map_to_odom_ns": 0,
+            "variance": [0.01, 0.01, 0.01, 0.001],
+            "pose": [1.0, 0.0, 0.0],
+            "pose_ns": 0,
+            "speed": 0.5,
+        }
+        self.motion.resume(MotionState.read(json.loads(json.dumps(saved))))
+
+    def drive(self, x: float, seconds: float) -> None:
+        message = Odometry(header=Header(frame_id="odom", stamp=Time(sec=int(seconds))))
+        message.header.stamp.nanosec = round(seconds % 1.0 * NANOSECONDS)
+        message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
+        message.twist.twist.linear.x = 0.5
+        self._receive(message)
+
+    def estimate(self, x: float, y: float, yaw: float | None, sd: float, seconds: float) -> Estimate:
+        heading = None if yaw is None else Heading(yaw, np.array([0.0, 0.0, 0.0, sd**2]))
+        return Estimate(
+            round(seconds * NANOSECONDS), np.array([x, y, 0.0]), np.zeros(3), np.eye(6) * sd**2, heading
+        )
+
+
+def test_pose_before_a_crash_is_moved_on_and_replaced_by_the_estimates():
+    robot = Continuation()
+    robot.drive(2.0, 2.0)
+    expected = 4.0 + math.cos(0.5), 2.0 + math.sin(0.5), 0.5
+    mixed = robot.motion.mixed(robot.estimate(5.0, 2.5, None, 0.3, 2.0))
+    assert (*mixed.position[:2], mixed.heading.yaw) == pytest.approx(expected)
+    mixed = robot.motion.mixed(robot.estimate(5.0, 2.5, 0.7, 0.3, 2.0))
+    assert 0.5 < mixed.heading.yaw < 0.51, "the new heading is uncertain"
+    for step in range(1, 400):
+        robot.drive(2.0 + 0.1 * step, 2.0 + 0.2 * step)
+    mixed = robot.motion.mixed(robot.estimate(39.0, 21.0, 0.6, 0.03, 81.8))
+    assert (*mixed.position[:2], mixed.heading.yaw) == pytest.approx((39.0, 21.0, 0.6), abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("x", "seconds", "estimate"),
+    [
+        (2.0, 2.0, (8.0, 2.5, 0.5, 0.3)),  # carried away
+        (2.0, 2.0, (5.0, 2.5, 2.5, 0.1)),  # turned by hand
+        (30.0, 2.0, (5.0, 2.5, None, 0.3)),  # odometry that starts elsewhere
+        (2.0, 40.0, (5.0, 2.5, None, 0.3)),  # too late
+    ],
+)
+def test_pose_before_a_crash_is_dropped_if_it_cannot_be_true(x: float, seconds: float, estimate: tuple):
+    robot = Continuation()
+    robot.drive(x, seconds)
+    new = robot.estimate(*estimate, seconds)
+    assert robot.motion.mixed(new) is new
+    assert robot.motion.carried_on(new.stamp_ns) is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"variance": [0.0] * 4}, {"speed": math.nan}, {"pose": [1.0]}, {"pose": None}]
+)
+def test_invalid_pose_before_a_crash_is_refused(change: dict):
+    with pytest.raises((TypeError, ValueError)):
+        MotionState.read(asdict(Continuation().motion.state) | change)
