@@ -448,42 +448,60 @@ class Continuation:
         message.twist.twist.linear.x = 0.5
         self._receive(message)
 
-    def estimate(self, x: float, y: float, yaw: float | None, sd: float, seconds: float) -> Estimate:
+    def mixed(
+        self, x: float, y: float, yaw: float | None, sd: float, seconds: float, *, trusts: bool = True
+    ) -> Estimate:
         heading = None if yaw is None else Heading(yaw, np.array([0.0, 0.0, 0.0, sd**2]))
-        return Estimate(
-            round(seconds * NANOSECONDS), np.array([x, y, 0.0]), np.zeros(3), np.eye(6) * sd**2, heading
-        )
+        stamp = round(seconds * NANOSECONDS)
+        estimate = Estimate(stamp, np.array([x, y, 0.0]), np.zeros(3), np.eye(6) * sd**2, heading)
+        return self.motion.mixed(estimate, trusts_odometry=trusts)
 
 
 def test_pose_before_a_crash_is_moved_on_and_replaced_by_the_estimates():
     robot = Continuation()
     robot.drive(2.0, 2.0)
     expected = 4.0 + math.cos(0.5), 2.0 + math.sin(0.5), 0.5
-    mixed = robot.motion.mixed(robot.estimate(5.0, 2.5, None, 0.3, 2.0))
-    assert (*mixed.position[:2], mixed.heading.yaw) == pytest.approx(expected)
-    mixed = robot.motion.mixed(robot.estimate(5.0, 2.5, 0.7, 0.3, 2.0))
-    assert 0.5 < mixed.heading.yaw < 0.51, "the new heading is uncertain"
+    for yaw in (None, 0.7):
+        mixed = robot.mixed(5.0, 2.5, yaw, 0.3, 2.0)
+        assert (*mixed.position[:2], mixed.heading.yaw) == pytest.approx(expected)
     for step in range(1, 400):
         robot.drive(2.0 + 0.1 * step, 2.0 + 0.2 * step)
-    mixed = robot.motion.mixed(robot.estimate(39.0, 21.0, 0.6, 0.03, 81.8))
+        if step == 2:
+            assert 0.5 < robot.mixed(5.0, 2.5, 0.7, 0.3, 2.4).heading.yaw < 0.51, (
+                "the new heading is uncertain"
+            )
+    mixed = robot.mixed(39.0, 21.0, 0.6, 0.03, 81.8)
     assert (*mixed.position[:2], mixed.heading.yaw) == pytest.approx((39.0, 21.0, 0.6), abs=0.03)
 
 
+def test_pose_before_a_short_gap_of_the_odometry_is_moved_on():
+    robot = Continuation()
+    for x, seconds in ((2.0, 2.0), (2.1, 2.2), (2.8, 3.6)):
+        robot.drive(x, seconds)
+        robot.motion.map_to_odom(robot.mixed(4.0, 2.0, None, 1.0, seconds), 0)
+    assert robot.mixed(4.0, 2.0, None, 1.0, 3.6).heading.yaw == pytest.approx(0.5)
+    robot.drive(3.8, 6.0)
+    assert robot.mixed(4.0, 2.0, None, 1.0, 6.0).heading is None, "a robot may be moved by hand"
+
+
 @pytest.mark.parametrize(
-    ("x", "seconds", "estimate"),
+    ("x", "seconds", "estimate", "trusts"),
     [
-        (2.0, 2.0, (8.0, 2.5, 0.5, 0.3)),  # carried away
-        (2.0, 2.0, (5.0, 2.5, 2.5, 0.1)),  # turned by hand
-        (30.0, 2.0, (5.0, 2.5, None, 0.3)),  # odometry that starts elsewhere
-        (2.0, 40.0, (5.0, 2.5, None, 0.3)),  # too late
+        (2.0, 2.0, (8.0, 2.5, 0.5, 0.3), True),  # carried away
+        (2.0, 2.0, (5.0, 2.5, 2.5, 0.1), True),  # turned by hand
+        (30.0, 2.0, (5.0, 2.5, None, 0.3), True),  # odometry that starts elsewhere
+        (2.0, 40.0, (5.0, 2.5, None, 0.3), True),  # too late
+        (2.0, 2.0, (5.0, 2.5, None, 0.3), False),  # wheels slip
     ],
 )
-def test_pose_before_a_crash_is_dropped_if_it_cannot_be_true(x: float, seconds: float, estimate: tuple):
+def test_pose_before_a_crash_is_dropped_if_it_cannot_be_true(
+    x: float, seconds: float, estimate: tuple, trusts: bool
+):
     robot = Continuation()
     robot.drive(x, seconds)
-    new = robot.estimate(*estimate, seconds)
-    assert robot.motion.mixed(new) is new
-    assert robot.motion.carried_on(new.stamp_ns) is None
+    mixed = robot.mixed(*estimate, seconds, trusts=trusts)
+    assert mixed.position[:2].tolist() == list(estimate[:2])
+    assert robot.motion.carried_on(mixed.stamp_ns) is None
 
 
 @pytest.mark.parametrize(

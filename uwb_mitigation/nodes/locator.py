@@ -351,7 +351,8 @@ class Locator(ManagedNode):
         base = self._at_base(outputs, estimate)
         if self._robot is not None and outputs.robot is not None:
             if not self._robot.is_resuming(estimate.stamp_ns):
-                self._publish_base(outputs, self._robot.mixed(base))
+                trusts = not outputs.robot.rejects_odometry
+                self._publish_base(outputs, self._robot.mixed(base, trusts_odometry=trusts))
             return
         outputs.pose.publish(encode_pose(base, self._map))
         outputs.odometry.publish(encode_odometry(estimate, self._map, outputs.frame))

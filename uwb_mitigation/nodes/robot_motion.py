@@ -36,11 +36,15 @@ _MAX_FRAMES = 1000
 MAX_GAP_SPEED = 0.5
 """If the odometry moved by this much faster than before and after a crash (m/s), it was reset meanwhile."""
 
-CONTRADICTION = 25.0
-"""The pose from before a crash is dropped if ranges contradict it by 5 standard deviations."""
+MAX_GAP_S, CURRENT_S = 2.0, 1.0
+"""The pose before a gap of the odometry of at most `MAX_GAP_S` is moved on, if it was estimated in the last `CURRENT_S`."""
 
-REPLACED_SHARE = 0.99
-"""It is dropped without a step if the estimates have this share of the mixture."""
+CONTRADICTION = 25.0
+"""The pose that is moved on is dropped if ranges contradict it by 5 standard deviations."""
+
+REPLACE_S, REPLACED_SHARE = 5.0, 0.99
+"""The share of new estimates with a heading grows in this time, so that the transform does not step. From `REPLACED_SHARE` on, the
+pose that is moved on is dropped."""
 
 
 @dataclass(slots=True)
@@ -82,12 +86,12 @@ class MotionState:
 
 
 class _Held(NamedTuple):
-    """The transform before a crash.
+    """The transform before a crash, or a gap of the odometry.
 
     Attributes:
         map_to_odom, variance: see `MotionState`.
-        segment, begin_ns: of the path since the crash.
-        distance_m: distance driven between the crash and the first odometry after it.
+        segment, begin_ns: of the path since then.
+        distance_m: distance driven in the gap.
     """
 
     map_to_odom: tuple[float, float, float, float]
@@ -126,6 +130,7 @@ class OdometryInput:
         self._uses_orientation = node.value("imu_orientation")
         self._is_resuming, self._resumed_ns = False, 0
         self._held: _Held | None = None
+        self._replace_ns: int | None = None
         self._antenna_frame: str | None = None
         self._static_topic = node.resolve_topic_name(relative(TF_STATIC))
         self._first_range_s = 0.0
@@ -194,7 +199,7 @@ class OdometryInput:
         return stamp_ns - self._resumed_ns < ODOMETRY_TIMEOUT_S * NS_PER_S
 
     def carried_on(self, stamp_ns: int) -> Estimate | None:
-        """Return the pose of the base before a crash, moved on by the odometry; None: there was none, or it was replaced."""
+        """Return the pose before a crash or gap, moved on by the odometry; None: there was none, or it was replaced."""
         point, pose = self.path.point_at(stamp_ns), self.path.pose_at(stamp_ns)
         if self._held is None or point is None or pose is None or point.segment != self._held.segment:
             return None
@@ -207,8 +212,10 @@ class OdometryInput:
         heading = Heading(yaw + pose[2], np.array([0.0, 0.0, 0.0, of_yaw]))
         return Estimate(stamp_ns, position, np.zeros(3), covariance, heading)
 
-    def mixed(self, base: Estimate) -> Estimate:
+    def mixed(self, base: Estimate, *, trusts_odometry: bool) -> Estimate:
         """Return an estimate of the base, mixed with `carried_on` by their variances: the transform does not step."""
+        if not trusts_odometry:
+            self._held = None
         held, new = self.carried_on(base.stamp_ns), base.heading
         if held is None or held.heading is None:
             return base
@@ -225,8 +232,10 @@ class OdometryInput:
             return base
         if new is None:
             return held
-        share = float(np.trace(of_held[:2, :2]) / np.trace((of_held + of_new)[:2, :2]))
-        of_heading = of_yaw / (of_yaw + of_turn)
+        self._replace_ns = base.stamp_ns if self._replace_ns is None else self._replace_ns
+        limit = (base.stamp_ns - self._replace_ns) / (REPLACE_S * NS_PER_S)
+        share = min(float(np.trace(of_held[:2, :2]) / np.trace((of_held + of_new)[:2, :2])), limit)
+        of_heading = min(of_yaw / (of_yaw + of_turn), limit)
         if min(share, of_heading) > REPLACED_SHARE:
             self._held = None
         # Their errors are correlated: the variance of the mixture is not smaller.
@@ -290,24 +299,28 @@ class OdometryInput:
         velocity = (twist.linear.x, twist.linear.y, twist.angular.z)
         variance = (covariance[0], covariance[7], covariance[35])
         speed = math.hypot(twist.linear.x, twist.linear.y)
+        before = self.path.point_at(state.pose_ns)
         self.path.add(stamp_ns, pose, velocity, variance)
-        if self._is_resuming:
-            self._is_resuming = False
-            self._hold(stamp_ns, pose, max(speed, state.speed))
+        point = self.path.point_at(stamp_ns)
+        if point is not None and (self._is_resuming or (before and before.segment != point.segment)):
+            self._hold(stamp_ns, pose, max(speed, state.speed), point.segment)
         state.pose, state.pose_ns, state.speed = pose, stamp_ns, speed
 
-    def _hold(self, stamp_ns: int, pose: Vector, speed: float) -> None:
-        """Hold the transform from before a crash, unless the odometry was reset meanwhile."""
-        state, point = self.state, self.path.point_at(stamp_ns)
-        before, last, gap_ns = state.pose, state.map_to_odom, stamp_ns - state.pose_ns
-        if before is None or last is None or point is None:
+    def _hold(self, stamp_ns: int, pose: Vector, speed: float, segment: int) -> None:
+        """Hold the transform from before a crash or gap, unless it was old, or the odometry was reset meanwhile."""
+        state, is_resuming = self.state, self._is_resuming
+        self._is_resuming, self._held, self._replace_ns = False, None, None
+        before, last, gap_s = state.pose, state.map_to_odom, (stamp_ns - state.pose_ns) / NS_PER_S
+        if before is None or last is None:
             return
         gap_m = math.hypot(pose[0] - before[0], pose[1] - before[1])
         # Also false for NaN.
-        if 0 < gap_ns <= HOLD_S * NS_PER_S and gap_m <= (speed + MAX_GAP_SPEED) * gap_ns / NS_PER_S:
-            self._held = _Held(last, state.variance, point.segment, stamp_ns, gap_m)
-        else:
+        if not gap_m <= (speed + MAX_GAP_SPEED) * gap_s <= (speed + MAX_GAP_SPEED) * HOLD_S:
             state.map_to_odom = None
+        elif (
+            is_resuming or gap_s <= MAX_GAP_S
+        ) and state.pose_ns - state.map_to_odom_ns <= CURRENT_S * NS_PER_S:
+            self._held = _Held(last, state.variance, segment, stamp_ns, gap_m)
 
     def _on_imu(self, message: Imu) -> None:
         # A -1 in front of the covariance marks rates that are not measured.
