@@ -59,7 +59,7 @@ def nodes_of(context):
                     parameters=[*files[node], launching.quoted(node_values), common],
                     output="screen",
                     respawn=flags["respawn"],
-                    respawn_delay=0.5,
+                    respawn_delay=0.1,
                     additional_env=environment,
                     ros_arguments=["--log-level", level],
                 )

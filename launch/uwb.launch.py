@@ -85,7 +85,7 @@ def nodes_of(context):
             parameters=parameters[name],
             output="screen",
             respawn=flags["respawn"] and name not in ending,
-            respawn_delay=0.5,
+            respawn_delay=0.1,
             additional_env=environment,
             ros_arguments=["--log-level", level],
         )
