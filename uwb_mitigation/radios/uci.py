@@ -14,7 +14,7 @@ from typing import Any
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
 from uwb_mitigation.radios.fira.capture import CaptureWriter
-from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES, parameter_name
+from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import (
     PERIOD_S,
@@ -150,7 +150,7 @@ class UciPort(StreamPort):
         settings.board.check()
         with self._lock:
             if settings.board != self.session.settings:
-                self.session.settings = settings.board
+                self.session.ranging.settings = settings.board
                 if self.device:
                     self._opened(time.monotonic_ns())
 
@@ -216,10 +216,8 @@ class UciPort(StreamPort):
                 return "the first-path positions contradict the whole taps, which are used instead"
         if self._originals.problem:
             return self._originals.problem
-        if rejected := session.ranging.rejected:
-            names = ", ".join(parameter_name(tag) for tag in sorted(rejected))
-            return f"ranging without the parameters that the board rejected: {names}"
-        return ""
+        rejected = "; ".join(session.ranging.rejected_texts())
+        return rejected and f"ranging without the parameters that the board rejected: {rejected}"
 
     def _opened(self, now_ns: int) -> list[Any]:
         if self._capture is not None:

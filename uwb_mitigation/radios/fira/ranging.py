@@ -76,10 +76,8 @@ class Ranging:
 
     def find(self, number: int) -> PeerSession | None:
         """Return the session with a handle, or with a number, which some boards put into notifications."""
-        found = [s for s in self.sessions if s.handle == number] or [
-            s for s in self.sessions if s.number == number
-        ]
-        return found[0] if found else None
+        found = [s for s in self.sessions if number in (s.handle, s.number)]
+        return min(found, key=lambda session: session.handle != number, default=None)
 
     def follow(self, packet: Packet) -> None:
         """Note the state of a session in a notification."""
@@ -182,7 +180,7 @@ class Ranging:
 
     def _refused(self, command: str, answer: Packet | None) -> str:
         """Return a problem, with the parameters that the board has rejected: one of them may be the cause."""
-        names = "".join(f"; {text}" for text in self.rejected_texts())
+        names = "".join(f"; it rejects {text}" for text in self.rejected_texts())
         if answer is None:
             return f"the board does not answer {command}{names}"
         return f"the board refuses {command}: {codes.status_text(answer.status)}{names}"
@@ -190,4 +188,4 @@ class Ranging:
     def rejected_texts(self) -> Iterator[str]:
         """Yield the parameters that the board did not accept, with their statuses."""
         for tag, status in sorted(self.rejected.items()):
-            yield f"it rejects {codes.parameter_name(tag)}: {codes.status_text(status)}"
+            yield f"{codes.parameter_name(tag)}: {codes.status_text(status)}"

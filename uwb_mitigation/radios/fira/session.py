@@ -87,12 +87,8 @@ class UciSession:
 
     @property
     def settings(self) -> UciSettings:
-        """What the board does; other settings take effect with `opened`."""
+        """What the board does; other settings of `ranging` take effect with `opened`."""
         return self.ranging.settings
-
-    @settings.setter
-    def settings(self, settings: UciSettings) -> None:
-        self.ranging.settings = settings
 
     def opened(self, now_ns: int) -> None:
         """Start the board after its port was opened."""
@@ -137,7 +133,7 @@ class UciSession:
             self._handle(packet, now_ns, stamp_ns)
         measurements = self.assembly.measurements(now_ns)
         if self._is_unanswered and (text := self._decoder.text):
-            self.state = f"{_TEXT_ANSWER} ({text!r}) instead of UCI packets: flash the UCI image"
+            self.state = f"{_TEXT_ANSWER} ({text!r}): flash the UCI image"
         self._commands.check_timeout(now_ns)
         self._supervise(now_ns)
         return measurements
@@ -183,9 +179,7 @@ class UciSession:
             self.state = "the board has not confirmed its settings"
         if self._identifies:
             answer = yield Command(codes.DEVICE_INFO, tries=1)
-            self.device_info = (
-                answer.payload[1:] if answer is not None and answer.status == STATUS_OK else b""
-            )
+            self.device_info = answer.payload[1:] if answer and answer.status == STATUS_OK else b""
             self._calibration.connected(self.device_info.hex())
         if self.settings.window:
             self.window = yield from self._calibration.set_window(self.settings.window, self.counts)
@@ -273,10 +267,6 @@ class UciSession:
         if packet.status != STATUS_OK:
             self.counts["error_answers"] += 1
         command = self._commands.command
-        # A refused reset is repeated after its timeout.
-        if (
-            command is not None
-            and command.name == name
-            and (name != codes.RESET or packet.status == STATUS_OK)
-        ):
+        is_refused_reset = name == codes.RESET and packet.status != STATUS_OK  # repeated after its timeout
+        if command is not None and command.name == name and not is_refused_reset:
             self._commands.advance(packet, now_ns)
