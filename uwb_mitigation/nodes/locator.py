@@ -126,7 +126,6 @@ class Locator(ManagedNode):
             self.autostart()
 
     def open(self) -> None:
-        prepare_encoders()
         path = self.value("anchors")
         if not path:
             raise ParameterError(
@@ -437,6 +436,9 @@ class Locator(ManagedNode):
             self._show_anchors()
         if estimator.tags:
             self._state_file.save(self._saved_state)
+        else:
+            # Not before the last transform is repeated after a crash: the first call takes long.
+            prepare_encoders()
 
     def _show_anchors(self) -> None:
         estimator, publisher = self._estimator, self._anchors_out
