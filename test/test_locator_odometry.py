@@ -448,6 +448,10 @@ class Continuation:
         message.twist.twist.linear.x = 0.5
         self._receive(message)
 
+    def truth(self, yaw: float, odom_x: float) -> tuple[float, float]:
+        """Return the position in the map of a robot that has driven from the crash on with another yaw of odom."""
+        return 4.0 + math.cos(yaw) * (odom_x - 1.0), 2.0 + math.sin(yaw) * (odom_x - 1.0)
+
     def mixed(
         self, x: float, y: float, yaw: float | None, sd: float, seconds: float, *, trusts: bool = True
     ) -> Estimate:
@@ -482,6 +486,17 @@ def test_pose_before_a_short_gap_of_the_odometry_is_moved_on():
     assert robot.mixed(4.0, 2.0, None, 1.0, 3.6).heading.yaw == pytest.approx(0.5)
     robot.drive(3.8, 6.0)
     assert robot.mixed(4.0, 2.0, None, 1.0, 6.0).heading is None, "a robot may be moved by hand"
+
+
+def test_pose_before_the_heading_is_lost_is_moved_on():
+    robot = Continuation()
+    for step in range(80):
+        robot.drive(2.0 + 0.1 * step, 2.0 + 0.2 * step)
+        yaw = None if step in (0, 79) else 0.6
+        mixed = robot.mixed(*robot.truth(0.6, 2.0 + 0.1 * step), yaw, 0.03, 2.0 + 0.2 * step)
+        robot.motion.map_to_odom(mixed, 0)
+    assert mixed.heading.yaw == pytest.approx(0.6, abs=0.02), "not that before the crash"
+    assert robot.motion.without_estimate(mixed.stamp_ns).heading.yaw == mixed.heading.yaw
 
 
 @pytest.mark.parametrize(

@@ -305,7 +305,7 @@ class Locator(ManagedNode):
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
         held = None
         if estimate is None and self._robot is not None and outputs.robot is not None:
-            held = self._robot.carried_on(stamp_ns)
+            held = self._robot.without_estimate(stamp_ns)
         known = estimate or held
         if known is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
             if stamp_ns < outputs.published_ns - NS_PER_S:

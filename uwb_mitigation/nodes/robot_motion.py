@@ -16,7 +16,7 @@ from sensor_msgs.msg import Imu
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
-from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning
+from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.odometry_filter import SCALE_SD
 from uwb_mitigation.types.ros.poses import BodyTwist, yaw_of
 from uwb_mitigation.types.ros.topics import TF_STATIC, relative
@@ -86,17 +86,17 @@ class MotionState:
 
 
 class _Held(NamedTuple):
-    """The transform before a crash, or a gap of the odometry.
+    """The transform before a crash, a gap of the odometry, or the loss of the heading.
 
     Attributes:
         map_to_odom, variance: see `MotionState`.
-        segment, begin_ns: of the path since then.
+        begin, begin_ns: first point of the path since then.
         distance_m: distance driven in the gap.
     """
 
     map_to_odom: tuple[float, float, float, float]
     variance: tuple[float, float, float, float]
-    segment: int
+    begin: PathPoint
     begin_ns: int
     distance_m: float
 
@@ -194,28 +194,43 @@ class OdometryInput:
     def is_resuming(self, stamp_ns: int) -> bool:
         """Return whether an estimate after a crash is older than the odometry, which may still arrive."""
         if not self._is_resuming:
-            return self._held is not None and stamp_ns < self._held.begin_ns
+            return self._held is not None and 0 < self._held.begin_ns - stamp_ns < MAX_GAP_S * NS_PER_S
         self._resumed_ns = self._resumed_ns or stamp_ns
-        return stamp_ns - self._resumed_ns < ODOMETRY_TIMEOUT_S * NS_PER_S
+        return 0 <= stamp_ns - self._resumed_ns < ODOMETRY_TIMEOUT_S * NS_PER_S
 
     def carried_on(self, stamp_ns: int) -> Estimate | None:
         """Return the pose before a crash or gap, moved on by the odometry; None: there was none, or it was replaced."""
         point, pose = self.path.point_at(stamp_ns), self.path.pose_at(stamp_ns)
-        if self._held is None or point is None or pose is None or point.segment != self._held.segment:
+        if self._held is None or point is None or pose is None or point.segment != self._held.begin.segment:
             return None
-        (x, y, z, yaw), variance, _, _, gap_m = self._held
+        (x, y, z, yaw), variance, begin, _, gap_m = self._held
         cosine, sine = math.cos(yaw), math.sin(yaw)
         position = np.array([x + cosine * pose[0] - sine * pose[1], y + sine * pose[0] + cosine * pose[1], z])
-        of_yaw = variance[3] + point.yaw_variance + point.drift**2 + point.turn**2
-        moved = point.position_variance + (SCALE_SD**2 + of_yaw) * (gap_m + point.distance_m) ** 2
+        drift, turn, distance = (
+            point.drift - begin.drift,
+            point.turn - begin.turn,
+            point.distance_m - begin.distance_m,
+        )
+        of_yaw = variance[3] + point.yaw_variance - begin.yaw_variance + drift**2 + turn**2
+        moved = point.position_variance - begin.position_variance
+        moved += (SCALE_SD**2 + of_yaw) * (gap_m + distance) ** 2
         covariance = np.diag([variance[0] + moved, variance[1] + moved, variance[2], 1.0, 1.0, 1.0])
         heading = Heading(yaw + pose[2], np.array([0.0, 0.0, 0.0, of_yaw]))
         return Estimate(stamp_ns, position, np.zeros(3), covariance, heading)
+
+    def without_estimate(self, stamp_ns: int) -> Estimate | None:
+        """Return the pose that is moved on while there is no position."""
+        if self._held is None:
+            return None
+        self._hold_latest(stamp_ns)
+        return self.carried_on(stamp_ns)
 
     def mixed(self, base: Estimate, *, trusts_odometry: bool) -> Estimate:
         """Return an estimate of the base, mixed with `carried_on` by their variances: the transform does not step."""
         if not trusts_odometry:
             self._held = None
+        elif base.heading is None:
+            self._hold_latest(base.stamp_ns)
         held, new = self.carried_on(base.stamp_ns), base.heading
         if held is None or held.heading is None:
             return base
@@ -228,7 +243,7 @@ class OdometryInput:
         of_yaw = float(held.heading.covariance[3])
         # The estimates may be right: the robot was moved, or the saved pose was wrong.
         if not max(error, turn**2 / (of_yaw + of_turn)) <= CONTRADICTION:
-            self._held = None
+            self._held = self.state.map_to_odom = None
             return base
         if new is None:
             return held
@@ -303,10 +318,21 @@ class OdometryInput:
         self.path.add(stamp_ns, pose, velocity, variance)
         point = self.path.point_at(stamp_ns)
         if point is not None and (self._is_resuming or (before and before.segment != point.segment)):
-            self._hold(stamp_ns, pose, max(speed, state.speed), point.segment)
+            self._hold(stamp_ns, pose, max(speed, state.speed), point)
         state.pose, state.pose_ns, state.speed = pose, stamp_ns, speed
 
-    def _hold(self, stamp_ns: int, pose: Vector, speed: float, segment: int) -> None:
+    def _hold_latest(self, stamp_ns: int) -> None:
+        """Hold the latest transform if it was current until now: the filter starts again if odometry arrives late."""
+        state, point = self.state, self.path.point_at(stamp_ns)
+        is_current = 0 <= stamp_ns - state.map_to_odom_ns <= CURRENT_S * NS_PER_S
+        is_newer = self._held is None or self._replace_ns is not None
+        if state.map_to_odom is not None and point is not None and is_current and is_newer:
+            self._held, self._replace_ns = (
+                _Held(state.map_to_odom, state.variance, point, stamp_ns, 0.0),
+                None,
+            )
+
+    def _hold(self, stamp_ns: int, pose: Vector, speed: float, begin: PathPoint) -> None:
         """Hold the transform from before a crash or gap, unless it was old, or the odometry was reset meanwhile."""
         state, is_resuming = self.state, self._is_resuming
         self._is_resuming, self._held, self._replace_ns = False, None, None
@@ -320,7 +346,7 @@ class OdometryInput:
         elif (
             is_resuming or gap_s <= MAX_GAP_S
         ) and state.pose_ns - state.map_to_odom_ns <= CURRENT_S * NS_PER_S:
-            self._held = _Held(last, state.variance, segment, stamp_ns, gap_m)
+            self._held = _Held(last, state.variance, begin, stamp_ns, gap_m)
 
     def _on_imu(self, message: Imu) -> None:
         # A -1 in front of the covariance marks rates that are not measured.
