@@ -16,7 +16,7 @@ from sensor_msgs.msg import Imu
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
-from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
+from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.odometry_filter import SCALE_SD
 from uwb_mitigation.types.ros.poses import BodyTwist, yaw_of
 from uwb_mitigation.types.ros.topics import TF_STATIC, relative
@@ -37,7 +37,8 @@ MAX_GAP_SPEED = 0.5
 """If the odometry moved by this much faster than before and after a crash (m/s), it was reset meanwhile."""
 
 MAX_GAP_S, CURRENT_S = 2.0, 1.0
-"""The pose before a gap of the odometry of at most `MAX_GAP_S` is moved on, if it was estimated in the last `CURRENT_S`."""
+"""The pose before a gap of the odometry of at most `MAX_GAP_S` is moved on, if it was estimated in the last `CURRENT_S`. After a
+crash, estimates wait for the first odometry for at most `MAX_GAP_S`."""
 
 CONTRADICTION = 25.0
 """The pose that is moved on is dropped if ranges contradict it by 5 standard deviations."""
@@ -196,7 +197,7 @@ class OdometryInput:
         if not self._is_resuming:
             return self._held is not None and 0 < self._held.begin_ns - stamp_ns < MAX_GAP_S * NS_PER_S
         self._resumed_ns = self._resumed_ns or stamp_ns
-        return 0 <= stamp_ns - self._resumed_ns < ODOMETRY_TIMEOUT_S * NS_PER_S
+        return 0 <= stamp_ns - self._resumed_ns < MAX_GAP_S * NS_PER_S
 
     def carried_on(self, stamp_ns: int) -> Estimate | None:
         """Return the pose before a crash or gap, moved on by the odometry; None: there was none, or it was replaced."""
