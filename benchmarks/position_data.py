@@ -426,7 +426,9 @@ def geometry_runs(data: Path, seeds: Iterable[int] = GEOMETRY_SEEDS) -> list[Run
     ]
 
 
-def load_geometry(set_name: str, name: str, file: str, layout_name: str, dims: int, seed: int) -> Run:
+def load_geometry(
+    set_name: str, name: str, file: str, layout_name: str, dims: int, seed: int, seconds: float = DRIVE_S
+) -> Run:
     """Return a drive along smooth waves through the volume of a layout, with odometry.
 
     With two dimensions the height is constant and known. Anchors on a line have two solutions even then: an area ends at them.
@@ -438,13 +440,15 @@ def load_geometry(set_name: str, name: str, file: str, layout_name: str, dims: i
     low, high = (np.array(layout["tag"][corner], float) for corner in ("low", "high"))
     if dims == 2:
         low[2] = high[2] = (low[2] + high[2]) / 2.0
-    path = _wave_path(low, high, layout["tag"]["speed"], rng)
+    path = _wave_path(low, high, layout["tag"]["speed"], rng, seconds)
     errors = {
         f"{kind}_m": layout["errors"][kind] for kind in ("common", "constant", "slow", "length", "white")
     }
     nlos_share, rate_hz = layout["errors"]["nlos"], layout["rate_hz"]
-    ranges, truth = _ranges(anchors, path, rng, nlos_share=nlos_share, rate_hz=rate_hz, **errors)
-    time_s = stamps_s(DRIVE_S)
+    ranges, truth = _ranges(
+        anchors, path, rng, nlos_share=nlos_share, rate_hz=rate_hz, seconds=seconds, **errors
+    )
+    time_s = stamps_s(seconds)
     position = path(time_s)[:, :2]
     # The robot faces its direction of travel, averaged over a second.
     direction = np.gradient(position, axis=0)
@@ -462,9 +466,13 @@ def load_geometry(set_name: str, name: str, file: str, layout_name: str, dims: i
 
 
 def _wave_path(
-    low: NDArray[np.float64], high: NDArray[np.float64], speed: float, rng: np.random.Generator
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    speed: float,
+    rng: np.random.Generator,
+    seconds: float,
 ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Return the position at times (n,) in s, of a path with constant speed that fills a box."""
+    """Return the position at times (n,) in s up to `seconds`, of a path with constant speed that fills a box."""
     extent = high - low
     rates = rng.uniform(0.7, 1.4, 3) / np.sqrt(np.maximum(extent, 0.1))
     phase = rng.uniform(0.0, math.tau, 3)
@@ -475,7 +483,7 @@ def _wave_path(
         )
         return position
 
-    angle = np.linspace(0.0, 4.0 * speed * (DRIVE_S + 2.0) / float((extent * rates).max()) + 20.0, 20_000)
+    angle = np.linspace(0.0, 4.0 * speed * (seconds + 2.0) / float((extent * rates).max()) + 20.0, 20_000)
     travelled = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at(angle), axis=0), axis=1)))
     return lambda time_s: at(np.interp(speed * (time_s + 1.0), travelled, angle))
 

@@ -155,9 +155,9 @@ def calibrated(run: Run, donor: Run) -> Ranges:
 
     universal = load_bundle(default_model_path())
     heights = None if donor.heights is None else [donor.heights]
-    site = read_site([donor.read_records()], donor.anchors, universal.card, heights=heights)
-    solution = solve_without_truth(site, universal, height=donor.height, area=None)
-    calibration = calibrate_site(site, universal, solution, seed=0)
+    site = read_site([donor.read_records()], donor.anchors, universal, heights=heights)
+    solution = solve_without_truth(site, height=donor.height, area=donor.area)
+    calibration = calibrate_site(site, universal, solution)
     if calibration.lacks_gain:
         raise DatasetError(f"refused: {calibration.summary()}")
     with tempfile.TemporaryDirectory() as folder:

@@ -1,234 +1,241 @@
-"""Calibrate simulated sites from a drive without ground truth, and test on a second drive. No radio is involved.
+"""Calibrate on one drive, and compare the live positions of another drive of the same site with and without the result.
 
-For each seed: a random flat or small office that the universal model was not trained on, 4 to 8 anchors, radios with their
-own offsets, one drive for calibration and another one for the test. The result is compared with `train` on the true ranges of
-the same drive, and with the universal model and the true offsets.
+Sets: `cirs`, simulated buildings that the universal model was not trained on, whose radios have offsets of their own; `levels`,
+the same ranges without CIRs; `bare`, also without powers; `flat`, a simulated flat whose radios have none; `geometry`, layouts of
+real deployments in two and three dimensions; `hanyang`, every ordered pair of real drives with the same anchors; `labyrinth`, the
+halves of a short real drive. With `--check`, a third drive is the check of the calibration.
 
-Seeds 0 to 9 were used for development; results are reported for seeds 10 to 19. Drives that end with an error are
-listed, and are not part of the means.
+Printed for each pair: the correction, the promised change of the live position error, its change on the other drive, RMSE without
+and with the calibration, and the standard deviation that it publishes; or the reason of the refusal. Seeds 0 to 9 were used for
+development; results are reported for seeds from 10 on.
 
-    python docs/experiments/calibrate_drives.py --first 10 --seeds 10 -o drives.json
-    python docs/experiments/calibrate_drives.py --first 10 --seeds 3 --truth-topic   # time offset and lever arm
-    python docs/experiments/calibrate_drives.py --minutes 30                         # time and memory only
-    python docs/experiments/calibrate_drives.py --flat                               # in the simulated flat
+    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 10 --seeds 2
+    PYTHONPATH=. python docs/experiments/calibrate_drives.py levels hanyang --check -o drives.jsonl
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
-import math
-import resource
 import tempfile
 import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
-from benchmarks.sites import RATE_HZ, Drive
-from uwb_mitigation.calibration import site as site_calibration
-from uwb_mitigation.calibration import solution as site_solution
-from uwb_mitigation.calibration.site_data import read_site
+from benchmarks import position_data
+from benchmarks.position_data import Run, RunSource, load_geometry, real_runs
+from uwb_mitigation.calibration.site import SiteCalibration, calibrate_site
+from uwb_mitigation.calibration.site_data import SiteData, read_site
+from uwb_mitigation.calibration.solution import solve_without_truth
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.mitigation.correction import Mitigation
-from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.robot_estimator import live_track
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.track_errors import track_errors
-from uwb_mitigation.training import train
-from uwb_mitigation.training.data.dataset import build_dataset
-from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.measurement import Record
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.types.tracks import PosePath, Ranges, TruePath
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
+from uwb_mitigation.types.tracks import Ranges
 
-TIME_OFFSET_S, LEVER_M = 0.3, (0.4, 0.0, 0.0)
+EMPTY = np.zeros(0, np.int16)
+UNIVERSAL = load_bundle(default_model_path())
+DRIVES = 3
+"""Drives of a site: for the calibration, for its check, and for the test."""
 
-
-def error_of(records: list[Record], bundle: Bundle | None, offsets: Offsets) -> float:
-    """Return the MAE of the corrected ranges, m; without a bundle, of the raw ranges."""
-    truth = np.array([record.truth.range_m for record in records if record.truth is not None])
-    if bundle is None:
-        return float(np.abs(np.array([record.measurement.range_m for record in records]) - truth).mean())
-    corrected = Mitigation(bundle, offsets).correct([record.measurement for record in records])
-    return float(np.abs(np.array([one.range_m for one in corrected]) - truth).mean())
+SITES = ("cirs", "levels", "bare")
 
 
-def position_rmse(
-    records: list[Record], anchors: AnchorMap, bundle: Bundle | None, offsets: Offsets
-) -> float:
-    """Return the RMSE of the live track, m."""
-    stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
-    truth = TruePath(stamps, np.array([record.tag_position for record in records], float))
-    row = np.array([anchors.index[record.measurement.anchor_id] for record in records])
-    value = np.array([record.measurement.range_m for record in records])
-    variance = np.full(len(value), np.nan)
-    if bundle is not None:
-        corrected = Mitigation(bundle, offsets).correct([record.measurement for record in records])
-        value = np.array([one.range_m for one in corrected])
-        variance = np.array([one.variance_m2 for one in corrected])
-    ranges = Ranges(stamps, row, np.maximum(value, 0.0), variance, np.full(len(value), np.nan), 101)
-    track = TagEstimator(EstimatorConfig(anchors, NoiseModel(), height=Height(0.0, 0.05))).run(ranges)
-    return track_errors(track, truth).rmse
+@dataclass(frozen=True)
+class Case:
+    """A function that returns the three drives of a case."""
+
+    kind: str
+    name: str
+    load: Callable[[], list[Run]]
 
 
-def trained(records: list[Record], universal: Bundle, folder: Path) -> Bundle:
-    """Run `train --data` on the true ranges of the drive; each metre of a pair is one configuration."""
-    dataset = build_dataset(records, universal.preprocessing)
-    from uwb_mitigation.mitigation.model.architecture import Remnet
-    from uwb_mitigation.training.fit.candidates import Recipe
-    from uwb_mitigation.training.fit.options import FitOptions
-
-    recipe = Recipe(Remnet(samples=universal.preprocessing.samples), FitOptions())
-    return train.train_new_model(
-        train.TrainingJob(dataset, "drive", folder / "trained.onnx", 4), recipe
-    ).bundle
+def site_runs(kind: str, seed: int) -> list[Run]:
+    """Return the drives at a simulated site."""
+    runs = [position_data.load_site("site", str(k), seed, k) for k in range(DRIVES)]
+    return runs if kind == "cirs" else [_without_cirs(run, has_levels=kind == "levels") for run in runs]
 
 
-def one(seed: int, seconds: float, truth_topic: bool, with_train: bool, flat: bool) -> dict[str, object]:
-    """Calibrate and test one site."""
-    universal = load_bundle(default_model_path())
-    anchors = 4 + seed % 5
-    drive, other = (Drive(seed, which, anchors, seconds, flat) for which in (0, 1))
-    records = list(drive)
-    site = read_site([records], drive.anchors, universal.card)
-    began = time.perf_counter()
-    height = Height(0.0, 0.05)
-    if truth_topic:
-        # The robot faces its direction of travel, its antenna is ahead of its frame, and its localisation is late.
-        stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
-        antenna = np.array([record.tag_position for record in records], float)
-        heading = _headings(antenna)
-        frame = antenna - np.stack(
-            [LEVER_M[0] * np.cos(heading), LEVER_M[0] * np.sin(heading), np.zeros_like(heading)], axis=1
+def flat_runs(anchors: int) -> list[Run]:
+    """Return the drives in the simulated flat."""
+    runs = [position_data.load_flat("flat", str(k), anchors, k) for k in range(DRIVES)]
+    return [_without_cirs(run, has_levels=True) for run in runs]
+
+
+def _without_cirs(run: Run, *, has_levels: bool) -> Run:
+    def read_records() -> list[Record]:
+        records = []
+        for record in run.read_records():
+            cir = record.measurement.cir
+            levels = (cir.rx_power_dbm, cir.first_path_power_dbm) if has_levels else (np.nan, np.nan)
+            bare = Cir(EMPTY, rx_power_dbm=levels[0], first_path_power_dbm=levels[1])
+            records.append(replace(record, measurement=replace(record.measurement, cir=bare)))
+        return records
+
+    return replace(run, read_records=read_records, has_cirs=False)
+
+
+def geometry_runs(file: str, layout: str, dims: int, seed: int) -> list[Run]:
+    """Return parts of one long drive, so that anchors and reflections have the same errors in all of them."""
+    seconds = DRIVES * position_data.DRIVE_S
+    return _parts(load_geometry("geometry", "", file, layout, dims, seed, seconds), DRIVES)
+
+
+def _parts(run: Run, count: int) -> list[Run]:
+    edges = np.linspace(run.ranges.stamp_ns[0], run.ranges.stamp_ns[-1] + 1, count + 1)
+    parts = []
+    for low, high in itertools.pairwise(edges):
+        ranges = run.ranges.take((run.ranges.stamp_ns >= low) & (run.ranges.stamp_ns < high))
+        truth = run.truth.take((run.truth.stamp_ns >= low) & (run.truth.stamp_ns < high))
+        records = _records(run, ranges)
+        parts.append(replace(run, ranges=ranges, truth=truth, read_records=lambda records=records: records))
+    return parts
+
+
+def half_runs(source: RunSource) -> list[Run]:
+    """Return the halves of a run; the second one is also the check."""
+    first, second = _parts(source.read(), 2)
+    return [first, second, second]
+
+
+def _records(run: Run, ranges: Ranges) -> list[Record]:
+    ids = [anchor.id for anchor in run.anchors.anchors]
+    columns = ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.rx_power_dbm
+    return [
+        Record(
+            RangeMeasurement(
+                stamp, ranges.tag_id, ids[row], n % 256, 0, range_m, Cir(EMPTY, rx_power_dbm=power)
+            )
         )
-        noise = np.random.default_rng(seed).normal(0.0, 0.02, frame.shape) * (1.0, 1.0, 0.0)
-        quaternion = np.stack(
-            [np.zeros_like(heading), np.zeros_like(heading), np.sin(heading / 2), np.cos(heading / 2)], axis=1
-        )
-        path = PosePath(stamps + round(TIME_OFFSET_S * 1e9), frame + noise, quaternion)
-        localisation = site_solution.Localisation("/odom", [[path]], estimate_lever_arm=True)
-        solution = site_solution.solve_with_truth(site, universal, localisation, height=height)
-    else:
-        solution = site_solution.solve_without_truth(site, universal, height=height, area=None)
-    found = site_calibration.calibrate_site(site, universal, solution, seed=0)
-    took = time.perf_counter() - began
-    test = list(other)
-    off = np.array(
-        [found.solution.pairs[101, k + 1][0] for k in range(anchors) if (101, k + 1) in found.solution.pairs]
+        for n, (stamp, row, range_m, power) in enumerate(zip(*(c.tolist() for c in columns), strict=True))
+    ]
+
+
+def cases(kinds: list[str], seeds: range, data: Path) -> Iterator[Case]:
+    """Yield the cases of each set."""
+    for kind in kinds:
+        if kind in SITES:
+            for seed in seeds:
+                yield Case(kind, str(seed), lambda kind=kind, seed=seed: site_runs(kind, seed))
+        elif kind == "flat":
+            for anchors in (4, 6, 8):
+                yield Case(kind, f"{anchors} anchors", lambda anchors=anchors: flat_runs(anchors))
+        elif kind == "geometry":
+            file = next(data.glob(f"*/{position_data.GEOMETRIES}"))
+            layouts = [layout["name"] for layout in yaml.safe_load(file.read_text())["geometries"]]
+            for arguments in itertools.product([str(file)], layouts, (2, 3), seeds):
+                name = "{1} {2}-D {3}".format(*arguments)
+                yield Case(kind, name, lambda arguments=arguments: geometry_runs(*arguments))
+        else:
+            sources = [source for source in real_runs(data)[0] if source.set_name == kind]
+            for source in sources if len(sources) == 1 else []:
+                yield Case(kind, source.name, lambda source=source: half_runs(source))
+            for first, second in itertools.permutations(sources, 2):
+                third = next(source for source in sources if source not in (first, second))
+                drives = first, third, second
+                yield Case(
+                    kind, f"{first.name} to {second.name}", lambda drives=drives: [d.read() for d in drives]
+                )
+
+
+def live_rmse_m(run: Run, ranges: Ranges) -> float:
+    """Return the RMSE of the live position."""
+    track = live_track(
+        EstimatorConfig(run.anchors, height=run.height, area=run.area, heights=run.heights), ranges
     )
-    sd = np.array(
-        [found.solution.pairs[101, k + 1][1] for k in range(anchors) if (101, k + 1) in found.solution.pairs]
-    )
-    true = np.array([drive.offset_m[k] for k in range(anchors) if (101, k + 1) in found.solution.pairs])
-    known = Offsets(pairs={(101, k + 1): off for k, off in enumerate(drive.offset_m.tolist())})
+    return track_errors(track, run.truth).rmse if len(track) else np.nan
+
+
+def calibrated(drive: Run, check: Run | None) -> SiteCalibration:
+    """Return the calibration of a drive without ground truth."""
+
+    def read(run: Run) -> SiteData:
+        heights = None if run.heights is None else [run.heights]
+        return read_site([run.read_records()], run.anchors, UNIVERSAL, heights=heights)
+
+    site = read(drive)
+    solution = solve_without_truth(site, height=drive.height, area=drive.area)
+    return calibrate_site(site, UNIVERSAL, solution, check=[] if check is None else [read(check)])
+
+
+def evaluate(case: Case, has_check: bool) -> dict[str, Any]:
+    """Calibrate and test one case."""
+    drive, check, test = case.load()
+    row: dict[str, Any] = {"kind": case.kind, "case": case.name, "raw_m": live_rmse_m(test, test.ranges)}
+    began = time.process_time()
+    try:
+        found = calibrated(drive, check if has_check else None)
+    except DatasetError as error:
+        return row | {"refused": str(error), "seconds": time.process_time() - began}
+    row |= {
+        "seconds": time.process_time() - began,
+        "refused": found.refusal,
+        "chosen": found.chosen,
+        "promised": found.live_position_change,
+        "offsets": [value for value, _ in found.pairs.values()],
+        "offset_sds": [sd for _, sd in found.pairs.values()],
+        "range_gain": {
+            name: [part.range_gain(name, "common offset").low for part in found.held_out]
+            for name in found.mae_m
+        },
+    }
     with tempfile.TemporaryDirectory() as folder:
-        bundle, _ = found.write(Path(folder) / "site.onnx", universal, "drive")
-        row: dict[str, object] = {
-            "seed": seed,
-            "anchors": anchors,
-            "size_m": list(drive.plan.size),
-            "walls": len(drive.plan.walls),
-            "chosen": found.chosen,
-            "level": found.solution.offset_level,
-            "refused": found.refusal,
-            "seconds": took,
-            "raw_mae": error_of(test, None, NO_OFFSETS),
-            "calibrated_mae": error_of(test, bundle, found.offsets),
-            "known_offsets_mae": error_of(test, universal, known),
-            "raw_rmse": position_rmse(test, drive.anchors, None, NO_OFFSETS),
-            "calibrated_rmse": position_rmse(test, drive.anchors, bundle, found.offsets),
-            "known_offsets_rmse": position_rmse(test, drive.anchors, universal, known),
-            "offset_mae": float(np.abs(off - true).mean()),
-            "offset_worst": float(np.abs(off - true).max()),
-            "in_two_sd": float((np.abs(off - true) <= 2.0 * sd).mean()),
-            "sd": float(sd.mean()),
-        }
-        if found.solution.alignment is not None:
-            row["time_offset_error"] = found.solution.alignment.time_offset_s - TIME_OFFSET_S
-            row["lever_error"] = (found.solution.alignment.lever_arm_m[0] - LEVER_M).tolist()
-            row["time_offset_sd"] = found.solution.alignment.time_offset_sd_s
-            row["lever_sd"] = found.solution.alignment.lever_arm_sd_m[0].tolist()
-        if with_train:
-            bundle = trained(records, universal, Path(folder))
-            row["trained_mae"] = error_of(test, bundle, NO_OFFSETS)
-            row["trained_rmse"] = position_rmse(test, drive.anchors, bundle, NO_OFFSETS)
+        bundle, _ = found.write(Path(folder) / "site.onnx", UNIVERSAL, "drive")
+        corrected = test.corrected(bundle, found.offsets)
+    row["calibrated_m"] = live_rmse_m(test, corrected)
+    row["change"] = row["calibrated_m"] / row["raw_m"] - 1.0
+    row["published_sd_m"] = float(np.sqrt(np.median(corrected.variance_m2)))
     return row
 
 
-def _headings(position: np.ndarray) -> np.ndarray:
-    """Return the direction of travel, averaged over two seconds, because no robot turns instantly."""
-    ahead = np.minimum(np.arange(len(position)) + 20, len(position) - 1)
-    before = np.maximum(np.arange(len(position)) - 20, 0)
-    away = position[ahead] - position[before]
-    heading = np.unwrap(np.arctan2(away[:, 1], away[:, 0]))
-    window = round(2.0 * RATE_HZ)
-    padded = np.pad(heading, (window // 2, window - window // 2 - 1), mode="edge")
-    return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
-
-
-def speed(minutes: float) -> dict[str, object]:
-    """Measure time and memory for one long drive."""
-    universal = load_bundle(default_model_path())
-    drive = Drive(1, 0, 6, 60.0 * minutes)
-    site = read_site([drive], drive.anchors, universal.card)
-    began, cpu = time.perf_counter(), time.process_time()
-    solution = site_solution.solve_without_truth(site, universal, height=Height(0.0, 0.05), area=None)
-    found = site_calibration.calibrate_site(site, universal, solution, seed=0)
-    return {
-        "minutes": minutes,
-        "ranges": sum(map(len, site.tags)),
-        "seconds": time.perf_counter() - began,
-        "cpu_seconds": time.process_time() - cpu,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "chosen": found.chosen,
-    }
+def show(row: dict[str, Any]) -> None:
+    text = f"{row['kind']:9} {row['case']:32} "
+    if "chosen" in row:
+        text += f"{row['chosen']:42} promised {row['promised']:+.2f} actual {row['change']:+.2f} "
+        text += f"({row['raw_m']:.3f} to {row['calibrated_m']:.3f} m, sd {row['published_sd_m']:.2f} m) "
+    print(text + (f"REFUSED: {row['refused']}" if row["refused"] else ""), flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("kinds", nargs="+", metavar="SET")
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=120.0)
-    parser.add_argument("--minutes", type=float, help="one drive of this duration, for time and memory")
-    parser.add_argument("--flat", action="store_true")
-    parser.add_argument("--truth-topic", action="store_true")
-    parser.add_argument("--no-train", action="store_true")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
-    rows, num_stopped = [], 0
-    if arguments.minutes:
-        rows.append(speed(arguments.minutes))
-        print(json.dumps(rows[0]))
-    else:
-        for seed in range(arguments.first, arguments.first + arguments.seeds):
-            try:
-                row = one(
-                    seed, arguments.seconds, arguments.truth_topic, not arguments.no_train, arguments.flat
-                )
-                rows.append(row)
-            except DatasetError as error:
-                row = {"seed": seed, "refused": str(error)}
-                num_stopped += 1
-            print(
-                json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}),
-                flush=True,
-            )
-        if not rows:
-            return
-        numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
-        mean = {key: round(math.fsum(float(row[key]) for row in rows) / len(rows), 4) for key in numbers}  # type: ignore[arg-type]
-        # A refused calibration is not written: the robot continues with raw ranges.
-        ratio = [1.0 if row["refused"] else row["calibrated_rmse"] / row["raw_rmse"] for row in rows]  # type: ignore[operator]
-        ratio += [1.0] * num_stopped
-        of_live = {"mean": round(float(np.mean(ratio)), 3), "max": round(max(ratio), 3)}
-        print(json.dumps({"drives": len(rows), "mean": mean, "calibrated_to_raw_rmse": of_live}))
-    if arguments.output:
-        arguments.output.write_text(json.dumps(rows, indent=2) + "\n")
+    accepted: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    counts: dict[str, int] = defaultdict(int)
+    for case in cases(
+        arguments.kinds, range(arguments.first, arguments.first + arguments.seeds), arguments.data
+    ):
+        row = evaluate(case, arguments.check)
+        show(row)
+        counts[case.kind] += 1
+        accepted[case.kind] += [] if row["refused"] else [row]
+        if arguments.output:
+            with arguments.output.open("a") as stream:
+                stream.write(json.dumps(row, default=float) + "\n")
+    for kind, rows in accepted.items():
+        changes = np.array([row["change"] for row in rows] or [0.0])
+        kept = np.mean([row["change"] <= row["promised"] + 0.02 for row in rows] or [1.0])
+        print(
+            f"{kind}: {len(rows)} of {counts[kind]} accepted; calibrated / raw live RMSE: mean {1.0 + changes.mean():.2f}, "
+            f"largest {1.0 + changes.max():.2f}; promise kept (within 2 %) by {kept:.0%}"
+        )
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
     by_anchor: list[tuple[str, int, float, float]] = []
     boxes: list[tuple[str, list[list[float]]]] = []
     for anchor in calibration.site.anchors.anchors:
-        anchor_rows = data.anchors == anchor.id
+        anchor_rows = (data.anchors == anchor.id) & np.isfinite(calibration.held_out_error_m)
         if anchor_rows.any():
             errors = [error[anchor_rows] for error in (calibration.raw_error_m, calibration.held_out_error_m)]
             before, after = (float(np.abs(error).mean()) for error in errors)
@@ -49,14 +49,11 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         details.append(
             f"Localisation {solution.truth}: time offset {solution.alignment.time_offset_s:.3f} s, lever arm {arms} m."
         )
-    if calibration.model.factor is not None and solution.network_sd:
+    if calibration.model.has_network and solution.network_sd:
         factor = f"{calibration.model.factor:.2f} +- {solution.network_sd:.2f}"
         details.append(f"Factor of the universal network's predictions: {factor}.")
-    if solution.line[1]:
-        slope, sd = (100.0 * value for value in solution.line)
-        details.append(f"Received power: {slope:.2f} +- {sd:.2f} cm of range per dB.")
     offsets = [
-        (format_id(tag), format_id(anchor), *values) for (tag, anchor), values in solution.pairs.items()
+        (format_id(tag), format_id(anchor), *values) for (tag, anchor), values in calibration.pairs.items()
     ]
     return render_page(
         "site.html.j2",
@@ -72,7 +69,7 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         files=files,
         colours={"raw": "#d55e00", "calibrated": "#0072b2"},
         offsets=offsets,
-        candidates={"raw": calibration.raw_mae_m, **calibration.errors.mae()},
+        candidates=calibration.mae_m,
         chosen=calibration.chosen,
         width=WIDTH,
         height=HEIGHT,

@@ -2,42 +2,77 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.calibration.live_position import RAW, LiveError, live_errors
-from uwb_mitigation.calibration.selection import SiteErrors, held_out_site_errors
+from uwb_mitigation.calibration.held_out import (
+    BLOCK_S,
+    MAX_INCREASE,
+    MIN_GAIN,
+    PROMISED_SHARE,
+    RAW,
+    HeldOut,
+    decisive,
+    select,
+)
+from uwb_mitigation.calibration.models import (
+    FINE_TUNED,
+    LINE,
+    NETWORK,
+    NETWORK_LINE,
+    NO_MODEL,
+    FineTune,
+    SiteModel,
+    fit_model,
+)
 from uwb_mitigation.calibration.site_data import SiteData, read_site
 from uwb_mitigation.calibration.solution import (
+    ONE,
+    PAIR,
+    SEVERAL,
     Pairs,
     Progress,
     SiteSolution,
     solve_without_truth,
-    usable_ranges,
 )
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, format_id
 from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.model import graph
-from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.positioning.geometry import Height
+from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.online.robot_estimator import live_track
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
-from uwb_mitigation.training.fit.candidates import FittedModel, site_models
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
-from uwb_mitigation.training.fit.selection import MIN_GAIN
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import Offsets, dump_offsets
+from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.types.tracks import Heights
 
 MIN_LABELLED = 40
+"""Ranges with a known true value: with fewer, the held-out half does not show a gain of `MIN_GAIN`."""
+
 MAX_OFFSET_M = 1.0
 """Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
+
+MAX_SD_M = NoiseModel().range_sd
+"""Offsets alone do not make ranges less accurate than the locator assumes without a calibration."""
+
+HEIGHT_SD_M = 0.1
+"""Standard deviation of measured heights for the locator of a test."""
+
+COMMON, OFFSETS = "common offset", "offsets"
+"""What is subtracted: one offset from all ranges, or one from the ranges of each pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -47,8 +82,9 @@ class SiteCalibration:
     Attributes:
         site: recorded data. solution: true ranges and offsets.
         data: the ranges of `solution.rows`, with the offsets subtracted. raw_error_m: their errors as measured, (n,).
-        errors: held-out errors of each candidate. chosen: name of the selected candidate, `model`: fitted to all ranges.
-        live: {`raw` or candidate: error of the live position on held-out segments}.
+        held_out: errors of `raw` and of each correction on the halves of the drive, each corrected by the other half, and on
+            each drive of the check.
+        chosen: name of the selected correction. level: what has a separate offset. model: fitted to all ranges.
         notes: all notes.
     """
 
@@ -56,47 +92,73 @@ class SiteCalibration:
     solution: SiteSolution
     data: Dataset
     raw_error_m: NDArray[np.float64]
-    errors: SiteErrors
+    held_out: tuple[HeldOut, ...]
     chosen: str
-    model: FittedModel
-    live: dict[str, LiveError]
+    level: str
+    model: SiteModel
     notes: tuple[str, ...]
 
     @property
     def offsets(self) -> Offsets:
         """Offsets of the radios."""
-        return self.solution.offsets
+        return self.solution.offsets(self.level)
+
+    @property
+    def pairs(self) -> Pairs:
+        """The offset of each pair that is subtracted, and its standard deviation, m."""
+        if self.level == PAIR:
+            return self.solution.pairs
+        common_m = self.solution.common[0]
+        return {
+            pair: (common_m, math.hypot(sd, value - common_m))
+            for pair, (value, sd) in self.solution.pairs.items()
+        }
 
     @property
     def held_out_error_m(self) -> NDArray[np.float64]:
-        """Return the errors of the chosen model on held-out segments, shape (n,), m."""
-        return self.errors.by_segment[self.chosen]
+        """Return the held-out errors of the ranges of `data`, corrected by the chosen correction, (n,), m; NaN: unknown."""
+        return self.held_out[0].residual_m[self.chosen][self.solution.rows]
+
+    @property
+    def mae_m(self) -> dict[str, float]:
+        """Return {`raw` or correction: MAE on the held-out halves}, m."""
+        return {name: self.held_out[0].mae_m(name) for name in self.held_out[0].residual_m}
 
     @property
     def raw_mae_m(self) -> float:
         """Return the MAE of the measured ranges."""
-        return float(np.abs(self.raw_error_m).mean())
+        return self.mae_m[RAW]
 
     @property
     def calibrated_mae_m(self) -> float:
-        """Return the MAE of the chosen model on held-out segments and anchors."""
-        return self.errors.mae()[self.chosen]
+        """Return the MAE of the chosen correction on the held-out halves."""
+        return self.mae_m[self.chosen]
 
     @property
     def live_position_change(self) -> float:
-        """Return the change of the live position error (share); negative: it decreases; NaN: unknown."""
-        return self.live[self.chosen].change_from(self.live[RAW])
+        """Return the promised change of the live position error on another drive, a share from -1 to 0; NaN: unknown.
+
+        It is the upper end of an interval. The locator estimates the common offset itself, so that the promise without ground
+        truth is that of the other corrections.
+        """
+        parts = decisive(self.held_out)
+        if self.solution.truth is not None:
+            return -min(part.live_gain(self.chosen, RAW).low for part in parts)
+        gain = min(part.range_gain(self.chosen, COMMON).low for part in parts)
+        return -PROMISED_SHARE * max(gain, 0.0)
 
     @property
     def refusal(self) -> str:
         """Return why the calibration does not help; empty: it does."""
-        if self.live[self.chosen].is_worse_than(self.live[RAW]):
-            return "the live position becomes worse"
-        if self.calibrated_mae_m > (1.0 - MIN_GAIN) * self.raw_mae_m:
-            return "the ranges do not improve"
-        raw_m, calibrated_m = self.solution.position_scatter_m
-        if calibrated_m > raw_m:
-            return "the anchors agree less about the positions"
+        common, sd = self.solution.common
+        if self.solution.truth is None and self.chosen == COMMON and abs(common) < SEVERAL * sd:
+            return f"no offset is significant: {common:.2f} m with a standard deviation of {sd:.2f} m"
+        for part in self.held_out:
+            drive = "on the drive of the check " if part is not self.held_out[0] else ""
+            if part.live_gain(self.chosen, RAW).mean < -MAX_INCREASE:
+                return f"{drive}the live position becomes worse"
+            if not part.range_gain(self.chosen, RAW).mean >= MIN_GAIN:
+                return f"{drive}the ranges do not improve"
         return ""
 
     @property
@@ -105,17 +167,15 @@ class SiteCalibration:
         return bool(self.refusal)
 
     def summary(self) -> str:
-        """Return the result in a few sentences, live position first."""
-        truth = self.solution.truth
-        raw, calibrated = self.live[RAW], self.live[self.chosen]
-        text = ""
-        if not math.isnan(raw.locator_m):
-            against = (
-                "an estimate: the reference is the smoothed track" if truth is None else f"against {truth}"
-            )
+        """Return the result in a few sentences."""
+        truth, change = self.solution.truth, self.live_position_change
+        text = "The live position error on another drive is not expected to change. "
+        if change < 0.0:
+            text = f"The live position error on another drive decreases by at least {-change:.0%}. "
+        if not math.isnan(raw_m := self.held_out[0].live_rmse_m(RAW)):
             text = (
-                f"Live position error on held-out segments ({against}): {raw.locator_m:.3f} m raw, "
-                f"{calibrated.locator_m:.3f} m calibrated ({self.live_position_change:+.0%}). "
+                f"Live position error on held-out halves (against {truth}): {raw_m:.3f} m raw, "
+                f"{self.held_out[0].live_rmse_m(self.chosen):.3f} m calibrated ({change:+.0%} or better). "
             )
         kind = "residual against the other anchors" if truth is None else f"error against {truth}"
         text += (
@@ -123,30 +183,29 @@ class SiteCalibration:
             f"({self.chosen})."
         )
         if self.refusal:
-            text += f" Calibration does not help: {self.refusal}."
+            text = f"Calibration does not help: {self.refusal}. " + text
         return text
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation calibrate`."""
-        solution, model = self.solution, self.model
-        factor = 0.0 if model.network is None else 1.0 if model.factor is None else model.factor
+        solution, model, halves = self.solution, self.model, self.held_out[0]
         return {
-            "offsets_m": {pair: value for pair, (value, _) in solution.pairs.items()},
-            "offset_sd_m": {pair: sd for pair, (_, sd) in solution.pairs.items()},
-            "offsets_of": solution.offset_level,
+            "offsets_m": {pair: value for pair, (value, _) in self.pairs.items()},
+            "offset_sd_m": {pair: sd for pair, (_, sd) in self.pairs.items()},
+            "offsets_of": self.level,
             "live_position_change": self.live_position_change,
-            "live_position_m": self.live,
+            "live_position_m": {name: halves.live_rmse_m(name) for name in halves.residual_m},
             "raw_mae_m": self.raw_mae_m,
             "calibrated_mae_m": self.calibrated_mae_m,
+            "check_mae_m": [[part.mae_m(RAW), part.mae_m(self.chosen)] for part in self.held_out[1:]],
             "truth": solution.truth or "none",
             "refused": None,
             "chosen": self.chosen,
-            "candidates": self.errors.mae(),
+            "candidates": {name: mae_m for name, mae_m in self.mae_m.items() if name != RAW},
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(self.data),
             "outliers": solution.outliers,
-            "position_scatter_m": solution.position_scatter_m,
-            "network_factor": [factor, solution.network_sd],
+            "network_factor": [model.factor, solution.network_sd],
             "line": model.linear_bias,
             "positions": solution.stationary_positions,
             "notes": self.notes,
@@ -159,7 +218,7 @@ class SiteCalibration:
 
         Args:
             output: path of the bundle.
-            universal: bundle that the candidates started from.
+            universal: bundle that the models started from.
             name: human-readable name of the recordings.
 
         Raises:
@@ -167,30 +226,30 @@ class SiteCalibration:
         """
         truth, model = self.solution.truth, self.model
         method = "without truth" if truth is None else f"with truth from {truth}"
-        metrics = {"raw": self.raw_mae_m, **self.errors.mae()}
         training = {
             "data": f"{name}, calibrated {method}",
             "calibrated": method,
             "chosen": self.chosen,
             "measurements": len(self.data),
             "configurations": len(self.data.names),
-            "split": "held out: segments of the track, and anchors",
+            "split": "held out: halves of the drive",
             "started_from": f"{universal.model_id:08x}",
-            "recipe": {"line": model.linear_bias.needs_power, "network": model.network is not None},
-            "metrics_m": {row: {"mae": round(value, 4)} for row, value in metrics.items()},
+            "recipe": {"line": model.linear_bias.needs_power, "network": model.has_network},
+            "metrics_m": {row: {"mae": round(value, 4)} for row, value in self.mae_m.items()},
         }
-        has_network = model.network is not None
-        network = scaled(float_network(universal), 0.0) if model.network is None else model.network
-        ood_bands = ood_bands_of(self.data) if has_network else None
         residual_m = self.held_out_error_m * self.solution.residual_scale
+        ood_bands = ood_bands_of(self.data) if model.has_network else None
         fitted = output.stem, universal.architecture, self.data, model.linear_bias
         card = card_of(*fitted, self.data, residual_m, training, ood_bands)
-        if has_network:
+        if model.has_network:
             # The drive does not cover the whole site, so the limits include those of the universal model.
             (low, high), (lowest, highest) = universal.card.correction_limits_m, card.correction_limits_m
             card = replace(card, correction_limits_m=(min(low, lowest), max(high, highest)))
+        elif not model.linear_bias.needs_power:
+            card = _with_limited_sd(card)
+        network = model.network or scaled(float_network(universal), model.factor)
         bundle, content = build_bundle(
-            output, graph.float_model(network), replace(card, needs_cir=has_network)
+            output, graph.float_model(network), replace(card, needs_cir=model.has_network)
         )
         offsets_path = offsets_file(output)
         comment = (
@@ -199,6 +258,17 @@ class SiteCalibration:
         )
         write_all_atomically({output: content, offsets_path: dump_offsets(self.offsets, comment)}, ModelError)
         return bundle, offsets_path
+
+
+def _with_limited_sd(card: ModelCard) -> ModelCard:
+    """Return the card with a standard deviation of at most `MAX_SD_M`; its 95 % interval is unchanged."""
+    factor = min(MAX_SD_M / math.sqrt(card.variance_m2), 1.0)
+    return replace(
+        card,
+        variance_m2=float(np.float32(card.variance_m2 * factor**2)),
+        variance_per_m2=0.0,
+        interval95_sigmas=min(card.interval95_sigmas / factor, 1e3),
+    )
 
 
 def offsets_file(bundle: Path) -> Path:
@@ -212,6 +282,7 @@ def calibrate(
     model: Bundle,
     *,
     height_m: float | None = None,
+    check: Iterable[Iterable[Record]] = (),
 ) -> SiteCalibration:
     """Calibrate a site from drives, without true positions of the tags.
 
@@ -222,6 +293,7 @@ def calibrate(
         anchors: surveyed positions of the anchors.
         model: bundle to start from, such as `load_model("universal")`.
         height_m: constant height of the tags' antennas in the frame of the anchors; None: unknown.
+        check: records of other drives, on which the calibration is only tested.
 
     Raises:
         DatasetError: the drives do not determine the calibration, or an anchor position is wrong.
@@ -229,9 +301,10 @@ def calibrate(
     """
     if not isinstance(model, Bundle):
         raise ParameterError("several models", valid='one to start from, such as load_model("universal")')
-    site = read_site(recordings, anchors, model.card)
     height = None if height_m is None else Height(height_m)
-    return calibrate_site(site, model, solve_without_truth(site, model, height=height, area=None), seed=0)
+    site = read_site(recordings, anchors, model)
+    checks = [read_site([records], anchors, model) for records in check]
+    return calibrate_site(site, model, solve_without_truth(site, height=height, area=None), check=checks)
 
 
 def calibrate_site(
@@ -239,22 +312,23 @@ def calibrate_site(
     universal: Bundle,
     solution: SiteSolution,
     *,
-    seed: int,
+    check: Sequence[SiteData] = (),
+    fine_tune: FineTune | None = None,
     on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteCalibration:
-    """Select a model for the ranges and offsets of a solution.
-
-    See `SiteErrors.select`. If offsets of pairs increase the error of the live position, all pairs share one offset.
+    """Select a correction for the ranges of a solution, see `held_out.select`.
 
     Args:
         site: recorded ranges.
-        universal: bundle that the candidates start from.
+        universal: bundle that the models start from.
         solution: true ranges and offsets.
-        seed: seed of the splits and of the training.
+        check: other drives at the site, on which the correction must not be worse, either.
+        fine_tune: trains the universal network further; None: not tried.
         on_progress: called with the stage and the finished share of it, 0 to 1.
 
     Raises:
-        DatasetError: too few ranges have a known true range, or an offset is implausible.
+        DatasetError: too few ranges have a known true range, an offset is implausible, or a half of the drive does not
+            determine the calibration.
     """
     if len(solution.rows) < MIN_LABELLED:
         raise DatasetError(
@@ -262,59 +336,137 @@ def calibrate_site(
             valid=f"at least {MIN_LABELLED}",
         )
     _check_offsets(solution.pairs)
-    calibration = _select_model(site, universal, solution, seed, on_progress)
-    if calibration.refusal and solution.offset_level != "one":
-        common = _select_model(site, universal, solution.with_common_offset(), seed, on_progress)
-        if not common.refusal:
-            return common
-    return calibration
+    test = _HeldOutTest(site, solution, check, fine_tune, on_progress)
+    return test.calibration()
 
 
-def _select_model(
-    site: SiteData, universal: Bundle, solution: SiteSolution, seed: int, on_progress: Progress
-) -> SiteCalibration:
-    raw = site.to_dataset(
-        solution.rows, solution.true_m, solution.segment, solution.stationary[solution.segment]
-    )
-    assert raw.tags is not None
-    assert raw.anchors is not None
-    data = raw.shifted(-solution.offsets.lookup(raw.tags, raw.anchors).astype(np.float64))
-    data, candidates, notes = site_models(data, site.has_cirs, universal)
-    if without_cir := int((~usable_ranges(site)).sum()):
-        notes = [f"{without_cir} ranges without a usable CIR are only used for track and offsets", *notes]
-    pairs = list(zip(raw.tags.tolist(), raw.anchors.tolist(), strict=True))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fold:
+    """Ranges of a test and their reference, and what the corrections are fitted to."""
 
-    def offset_change(held_out: NDArray[np.intp]) -> NDArray[np.float64]:
-        changes = solution.offset_changes_without(held_out)
-        return np.array([-changes.get(pair, 0.0) for pair in pairs])
+    site: SiteData
+    reference: SiteSolution
+    training: tuple[SiteData, SiteSolution]
 
-    errors = held_out_site_errors(
-        data, candidates, seed, offset_change, lambda fraction: on_progress("selecting the model", fraction)
-    )
-    live = live_errors(site, solution, errors.by_segment, _variances(raw, errors, solution.residual_scale))
-    chosen = errors.select(live)
-    (candidate,) = (item for item in candidates if item.name == chosen)
-    return SiteCalibration(
-        site=site,
-        solution=solution,
-        data=data,
-        raw_error_m=raw.error_m,
-        errors=errors,
-        chosen=chosen,
-        model=candidate.fit(data, seed),
-        live=live,
-        notes=(*solution.notes, *notes),
-    )
+    def evaluate(
+        self, corrections: Mapping[str, tuple[str, str]], fine_tune: FineTune | None, *, is_separate: bool
+    ) -> HeldOut:
+        """Return the errors of `RAW` and of corrections, {name: (level of the offsets, kind of the model)}."""
+        site, (training_site, solution) = self.site, self.training
+        raw_m = site.ranges.range_m
+        residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
+        block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
+        for name, (level, kind) in corrections.items():
+            data, _ = _labelled(training_site, solution, level)
+            model = fit_model(kind, data, training_site.universal_m[solution.rows], fine_tune)
+            predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
+            corrected_m = np.maximum(raw_m - _offsets_m(site, solution.offsets(level)) - predicted_m, 0.0)
+            residual_m[name] = self.reference.errors_of(corrected_m)
+            if solution.truth is not None:
+                variance_m2 = fit_intervals(residual_m[name], predicted_m, block.astype(str)).variance_of(
+                    predicted_m
+                )
+                if kind == NO_MODEL:
+                    variance_m2 = np.minimum(variance_m2, MAX_SD_M**2)
+                live_m[name] = self._live_errors_m(corrected_m, variance_m2)
+        # Without ground truth the reference of the raw ranges contains no common offset, because the locator estimates it.
+        residual_m[RAW] = residual_m[next(iter(corrections))] + solution.common[0]
+        if solution.truth is not None:
+            live_m[RAW] = self._live_errors_m(raw_m, np.nan)
+        return HeldOut(block, residual_m, live_m, is_separate)
+
+    def _live_errors_m(
+        self, range_m: NDArray[np.float64], variance_m2: NDArray[np.float64] | float
+    ) -> NDArray[np.float64]:
+        """Return the error of the live position at each range, (r,), m; NaN: no position, or no reference."""
+        site, height = self.site, self.reference.height
+        variance_m2 = np.broadcast_to(variance_m2, len(range_m))
+        corrected = replace(site.ranges, range_m=range_m, variance_m2=variance_m2)
+        error_m = np.full(len(range_m), np.nan)
+        axes = slice(0, 3 if height is None and site.height_m is None else 2)
+        for number in range(len(site.tags)):
+            rows = np.flatnonzero(site.tag == number)
+            ranges, heights = corrected.take(rows), None
+            if site.height_m is not None:
+                heights = Heights(ranges.stamp_ns, site.height_m[rows], np.full(len(rows), HEIGHT_SD_M**2))
+            track = live_track(EstimatorConfig(site.anchors, height=height, heights=heights), ranges)
+            if not len(track):
+                continue
+            index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1
+            difference = track.position[index] - self.reference.antenna_position[rows]
+            has_position = track.stamp_ns[index] == ranges.stamp_ns
+            error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
+        return error_m
 
 
-def _variances(raw: Dataset, errors: SiteErrors, scale: float) -> dict[str, NDArray[np.float64]]:
-    """Return the variances (n,) that a bundle with each model publishes, m^2."""
-    variances = {}
-    for name, error_m in errors.by_segment.items():
-        predicted_m = raw.error_m - error_m
-        intervals = fit_intervals(scale * error_m, predicted_m, raw.configurations)
-        variances[name] = intervals.variance_m2 + intervals.variance_per_m2 * predicted_m**2
-    return variances
+class _HeldOutTest:
+    """Fits corrections to one part of the data and tests them on another one."""
+
+    def __init__(
+        self,
+        site: SiteData,
+        solution: SiteSolution,
+        check: Sequence[SiteData],
+        fine_tune: FineTune | None,
+        on_progress: Progress,
+    ) -> None:
+        self._site, self._solution, self._fine_tune = site, solution, fine_tune
+        self._on_progress = functools.partial(on_progress, "testing on held-out ranges")
+        self._on_progress(0.1)
+        self._is_first, self._is_separate = site.halves()
+        halves = [site.select(mask) for mask in (self._is_first, ~self._is_first)]
+        try:
+            solved = [solution.solve_part(half) for half in halves]
+        except DatasetError as error:
+            raise DatasetError(f"a half of the drive: {error}", valid="a longer drive") from error
+        first, second = zip(halves, solved, strict=True)
+        self._halves = _Fold(*first, second), _Fold(*second, first)
+        self._checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
+
+    def calibration(self) -> SiteCalibration:
+        """Return the calibration with the selected correction."""
+        site, solution = self._site, self._solution
+        levels = {COMMON: (ONE, NO_MODEL), OFFSETS: (PAIR, NO_MODEL)}
+        needs_separate: list[str] = []
+        base = select(self._evaluate(levels), list(levels), needs_separate)
+        kinds, notes = [LINE], list(solution.notes)
+        if site.has_cirs:
+            kinds = [NETWORK, NETWORK_LINE, *([FINE_TUNED] if self._fine_tune else [])]
+            if without_cir := int((~site.is_usable).sum()):
+                notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
+        else:
+            notes.append("no networks: the recording has no CIRs that the universal model was trained for")
+        corrections = levels | {f"{base} + {kind}": (levels[base][0], kind) for kind in kinds}
+        if solution.truth is None:
+            needs_separate = [name for name, (_, kind) in corrections.items() if kind == LINE]
+        held_out = self._evaluate(corrections)
+        candidates = [base, *list(corrections)[2:]]
+        chosen = select(held_out, candidates, needs_separate)
+        level, kind = corrections[chosen]
+        data, raw_error_m = _labelled(site, solution, level)
+        self._on_progress(1.0)
+        return SiteCalibration(
+            site=site,
+            solution=solution,
+            data=data,
+            raw_error_m=raw_error_m,
+            held_out=tuple(held_out),
+            chosen=chosen,
+            level=level,
+            model=fit_model(kind, data, site.universal_m[solution.rows], self._fine_tune),
+            notes=tuple(notes),
+        )
+
+    def _evaluate(self, corrections: Mapping[str, tuple[str, str]]) -> list[HeldOut]:
+        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, on the halves and on each drive."""
+        halves = [
+            fold.evaluate(corrections, self._fine_tune, is_separate=self._is_separate)
+            for fold in self._halves
+        ]
+        return [
+            halves[0].merged(halves[1], self._is_first),
+            *(fold.evaluate(corrections, self._fine_tune, is_separate=True) for fold in self._checks),
+        ]
 
 
 def _check_offsets(pairs: Pairs) -> None:
@@ -332,3 +484,19 @@ def _check_offsets(pairs: Pairs) -> None:
                 what,
                 valid=f"at most {MAX_OFFSET_M:g} m: check the unit (metres) and the antenna delays of the radios",
             )
+
+
+def _offsets_m(site: SiteData, offsets: Offsets) -> NDArray[np.float64]:
+    """Return the offset of each range, (r,), m."""
+    tag_ids = np.array([tag.tag_id for tag in site.tags], np.uint64)[site.tag]
+    anchor_ids = np.array([anchor.id for anchor in site.anchors.anchors], np.uint64)[site.ranges.anchor]
+    return offsets.lookup(tag_ids, anchor_ids).astype(np.float64)
+
+
+def _labelled(site: SiteData, solution: SiteSolution, level: str) -> tuple[Dataset, NDArray[np.float64]]:
+    """Return the ranges of `solution.rows` with the offsets subtracted, and their errors as measured, (n,), m."""
+    raw = site.to_dataset(
+        solution.rows, solution.true_m, solution.segment, solution.stationary[solution.segment]
+    )
+    offsets_m = _offsets_m(site, solution.offsets(level))[solution.rows]
+    return raw.shifted(-offsets_m), raw.error_m

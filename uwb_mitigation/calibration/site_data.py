@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.motion_segments import GAP_S
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.mitigation.correction import MAX_RANGE_M
-from uwb_mitigation.mitigation.model.bundle import ModelCard
+from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.choice import CirKind, is_trained_for
+from uwb_mitigation.mitigation.model.floating import float_network, predict_m
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.training.data.dataset import CirSources, Dataset
 from uwb_mitigation.types.anchors import AnchorMap
@@ -28,10 +30,10 @@ MIN_CIR_SHARE = 0.5
 CONFIGURATION_S = 2.0
 """Duration of a configuration in motion: the errors of a pair are correlated for about this time."""
 
-FOLD_S = 10.0
-"""Duration of the segments of motion that are held out as a whole."""
-
 RECORDING_GAP_NS = 3_600_000_000_000
+
+MIN_HALF = 0.3
+"""Minimum share of the ranges in each part of a recording that is divided for a test."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +47,9 @@ class SiteData:
         inputs: float32 (r, K), zeros if there is no CIR.
         rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
         has_cirs: whether CIRs are used.
-        has_usable_cir: bool (r,), ranges with a usable CIR.
+        is_usable: bool (r,), ranges to which a model can be fitted; the others only affect track and offsets.
+        universal_m: float64 (r,), predictions of the universal network, m; 0: none.
+        recording: int (r,), number of the recording of each range.
         height_m: float64 (r,), measured heights of the tags; None: not measured.
         frame_ids: {tag id: the frame ids of its ranges}.
         skipped: {reason: number of excluded ranges}.
@@ -60,7 +64,9 @@ class SiteData:
     rx_power_dbm: NDArray[np.float32]
     first_path_power_dbm: NDArray[np.float32]
     has_cirs: bool
-    has_usable_cir: NDArray[np.bool_]
+    is_usable: NDArray[np.bool_]
+    universal_m: NDArray[np.float64]
+    recording: NDArray[np.intp]
     height_m: NDArray[np.float64] | None
     frame_ids: dict[int, tuple[str, ...]]
     skipped: Counter[str]
@@ -82,6 +88,33 @@ class SiteData:
         """Index of the tag of each range, shape (r,)."""
         return np.repeat(np.arange(len(self.tags)), list(map(len, self.tags)))
 
+    def select(self, is_selected: NDArray[np.bool_]) -> SiteData:
+        """Return only these ranges, bool (r,), and the tags that have any."""
+        columns = ("inputs", "rx_power_dbm", "first_path_power_dbm", "is_usable", "universal_m", "recording")
+        tags = [tag.take(is_selected[self.tag == number]) for number, tag in enumerate(self.tags)]
+        return replace(
+            self,
+            tags=tuple(tag for tag in tags if len(tag)),
+            height_m=None if self.height_m is None else self.height_m[is_selected],
+            **{name: getattr(self, name)[is_selected] for name in columns},
+        )
+
+    def halves(self) -> tuple[NDArray[np.bool_], bool]:
+        """Return which ranges belong to the first half, bool (r,), and whether the halves are separate recordings.
+
+        The halves are separated between recordings if these allow it, or else by time, if possible in a pause.
+        """
+        counts = np.cumsum(np.bincount(self.recording))
+        number = int(np.argmin(np.abs(counts - counts[-1] / 2.0)))
+        if MIN_HALF <= counts[number] / counts[-1] <= 1.0 - MIN_HALF:
+            return self.recording <= number, True
+        stamps = np.sort(self.ranges.stamp_ns)
+        first, last = (round(share * (len(stamps) - 1)) for share in (MIN_HALF, 1.0 - MIN_HALF))
+        pauses = first + np.flatnonzero(np.diff(stamps[first : last + 1]) > GAP_S * NS_PER_S)
+        middle = len(stamps) // 2
+        cut = int(pauses[np.argmin(np.abs(pauses - middle))]) if len(pauses) else middle
+        return self.ranges.stamp_ns <= stamps[cut], False
+
     def to_dataset(
         self,
         rows: NDArray[np.intp],
@@ -96,8 +129,7 @@ class SiteData:
             true_m: (k,), their true ranges.
             segment: int (k,), segment of the track.
             is_stationary: bool (k,), whether the tag is stationary. A configuration is a
-                pair while the tag is stationary, or for `CONFIGURATION_S` of motion. Its name begins with the unit that is
-                held out as a whole: "segment 3.1/".
+                pair while the tag is stationary, or for `CONFIGURATION_S` of motion.
         """
         ranges = self.ranges.take(rows)
         tag = np.array([tag.tag_id for tag in self.tags], np.uint64)[self.tag[rows]]
@@ -105,10 +137,9 @@ class SiteData:
         np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
         elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / NS_PER_S
         interval = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
-        fold = np.where(is_stationary, 0, elapsed_s // FOLD_S).astype(int)
         names = [
-            f"segment {s}.{f}/{c}/tag {t}/anchor {a}"
-            for s, f, c, t, a in zip(segment, fold, interval, tag, ranges.anchor, strict=True)
+            f"segment {s}/{c}/tag {t}/anchor {a}"
+            for s, c, t, a in zip(segment, interval, tag, ranges.anchor, strict=True)
         ]
         anchor_ids = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
         return Dataset(
@@ -130,7 +161,7 @@ class SiteData:
 def read_site(
     recordings: Iterable[Iterable[Record]],
     anchors: AnchorMap,
-    card: ModelCard,
+    universal: Bundle,
     on_record: Callable[[], None] = lambda: None,
     *,
     stamp_offset_s: float = 0.0,
@@ -141,7 +172,8 @@ def read_site(
     Args:
         recordings: records of each recording, in the order of time.
         anchors: anchors of the site; other anchors are skipped.
-        card: of the universal model. CIRs that it was not trained for are not used, but their levels are.
+        universal: bundle that the models of the site start from. CIRs that it was not trained for are not used, but their levels
+            are.
         on_record: called for each record that was read.
         stamp_offset_s: time offset added to the stamps of ranges: -0.2 if they are 0.2 s late.
         heights: heights of the tags for each recording. Ranges without a height are excluded.
@@ -149,7 +181,7 @@ def read_site(
     Raises:
         DatasetError: no range belongs to an anchor in the map.
     """
-    table = _RangeTable(anchors, card, has_heights=heights is not None)
+    table = _RangeTable(anchors, universal, has_heights=heights is not None)
     shifts: list[int] = []
     for number, recording in enumerate(recordings):
         shift_ns: int | None = None
@@ -165,7 +197,7 @@ def read_site(
             height_m = math.nan
             if heights_of_recording is not None:
                 height_m = float(heights_of_recording.height_at(np.array([stamp_ns]))[0][0])
-            table.add(record.measurement, stamp_ns + shift_ns, height_m)
+            table.add(record.measurement, stamp_ns + shift_ns, height_m, number)
         shifts.append(shift_ns or 0)
     return table.to_site(tuple(shifts))
 
@@ -177,16 +209,16 @@ class _RangeTable:
         last_stamp_ns: latest stamp; None: no range yet.
     """
 
-    def __init__(self, anchors: AnchorMap, card: ModelCard, *, has_heights: bool) -> None:
+    def __init__(self, anchors: AnchorMap, universal: Bundle, *, has_heights: bool) -> None:
         self.last_stamp_ns: int | None = None
-        self._anchors, self._card, self._has_heights = anchors, card, has_heights
+        self._anchors, self._universal, self._has_heights = anchors, universal, has_heights
         self._skipped, self._unknown_anchors = Counter[str](), Counter[int]()
-        self._rows: list[tuple[int, int, int, float, float, float, float, bool]] = []
+        self._rows: list[tuple[int, int, int, float, float, float, float, bool, int]] = []
         self._windows: list[NDArray[np.float32]] = []
         self._sources = CirSources()
         self._frame_ids: dict[int, dict[str, None]] = {}
 
-    def add(self, measured: RangeMeasurement, stamp_ns: int, height_m: float) -> None:
+    def add(self, measured: RangeMeasurement, stamp_ns: int, height_m: float, recording: int) -> None:
         """Add a range, or count why it is skipped."""
         row = self._anchors.index.get(measured.anchor_id)
         if row is None:
@@ -197,13 +229,14 @@ class _RangeTable:
             self._skipped["no height at that time"] += 1
         else:
             self._frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
-            (fault,), (window,) = self._card.preprocessing.windows_of([measured])
+            card = self._universal.card
+            (fault,), (window,) = card.preprocessing.windows_of([measured])
             self.last_stamp_ns = max(stamp_ns, self.last_stamp_ns or stamp_ns)
             cir = measured.cir
             powers = cir.rx_power_dbm, cir.first_path_power_dbm
-            is_usable = fault == 0 and is_trained_for(self._card, CirKind.of(cir))
+            is_usable = fault == 0 and is_trained_for(card, CirKind.of(cir))
             self._rows.append(
-                (measured.tag_id, stamp_ns, row, measured.range_m, *powers, height_m, is_usable)
+                (measured.tag_id, stamp_ns, row, measured.range_m, *powers, height_m, is_usable, recording)
             )
             self._windows.append(window)
             self._sources.add(cir)
@@ -229,12 +262,12 @@ class _RangeTable:
                 f"{unknown_ids}",
                 valid=f"anchors of the file: {', '.join(map(format_id, sorted(self._anchors.index)))}",
             )
-        types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_]
+        types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_, np.intp]
         columns: list[NDArray[Any]] = [
             np.array(column, kind) for column, kind in zip(zip(*self._rows, strict=True), types, strict=True)
         ]
         order = np.lexsort((columns[1], columns[0]))
-        tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir = (
+        tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir, recording = (
             column[order] for column in columns
         )
         rx, first_path = (np.where(np.isfinite(powers), powers, np.nan) for powers in (rx, first_path))
@@ -242,15 +275,22 @@ class _RangeTable:
             Ranges(stamp[i], anchor[i], range_m[i], np.full(len(i), np.nan), rx[i], int(tag[i[0]]))
             for i in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
         )
+        inputs = np.stack([self._windows[index] for index in order])
+        has_cirs = bool(has_usable_cir.mean() >= MIN_CIR_SHARE)
+        universal_m = np.zeros(len(inputs))
+        if has_cirs:
+            universal_m[has_usable_cir] = predict_m(float_network(self._universal), inputs[has_usable_cir])
         return SiteData(
             anchors=self._anchors,
             tags=tags,
-            preprocessing=self._card.preprocessing,
-            inputs=np.stack([self._windows[index] for index in order]),
+            preprocessing=self._universal.preprocessing,
+            inputs=inputs,
             rx_power_dbm=rx.astype(np.float32),
             first_path_power_dbm=first_path.astype(np.float32),
-            has_cirs=bool(has_usable_cir.mean() >= MIN_CIR_SHARE),
-            has_usable_cir=has_usable_cir,
+            has_cirs=has_cirs,
+            is_usable=has_usable_cir if has_cirs else np.ones(len(inputs), np.bool_),
+            universal_m=np.nan_to_num(universal_m, nan=0.0, posinf=0.0, neginf=0.0),
+            recording=recording,
             height_m=height_m if self._has_heights else None,
             frame_ids={tag_id: tuple(names) for tag_id, names in self._frame_ids.items()},
             skipped=self._skipped,

@@ -6,25 +6,24 @@ the guesses, or from fixed anchors. Swapped anchors are tried first, because Gau
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration.hypotheses import LIMITS, AnchorHypotheses, find_swapped
+from uwb_mitigation.calibration.motion_segments import find_segments
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.batch.least_squares import gauss_newton
 from uwb_mitigation.positioning.batch.smoother import Smoothed, Smoother
-from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, unit_vectors
+from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank
+from uwb_mitigation.positioning.noise_model import Regressors
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Ranges, Track
 
-MISPLACED_M = 0.3
-"""An anchor is misplaced if it is further from its guess than this and than `_UNLIKELY` standard deviations."""
-
 _UNLIKELY = 2.2
-"""In a plane, an error exceeds this multiple of its RMS with a probability of 1/126: exp(-2.2^2)."""
+"""An anchor is misplaced if it is further from its guess than `LIMITS.displacement_m` and than this number of standard
+deviations. In a plane, an error exceeds this multiple of its RMS with a probability of 1/126: exp(-2.2^2)."""
 
 TAPE_M = 0.1
 """Accuracy of a measured height."""
@@ -35,16 +34,10 @@ _STEPS_M = (1.0, 0.5, 0.25, 0.0)
 UNEXPLAINED = 0.6
 """In real drives the loss was 0.7 or more if anchors were not found, or if a pair was wrongly reported as swapped."""
 
-_TRIAL_NS = 60_000_000_000
-_TRIAL_RANGES = 800
-_SWAP_GAIN = 0.15
-"""A correct swap reduces the mean loss by far more; a wrong one increases it."""
-
 _MOVES_M = 1.0
 
 _AS_WELL = 1.5
-_SAME_LOSS = 0.2
-"""Mean losses of two positions of an anchor that differ by less do not distinguish them."""
+"""Mirror images whose distances from the guesses differ by a smaller factor fit them equally well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +52,8 @@ class SurveyResult:
         track: of the tag.
         loss: mean robust loss of a range.
         alternatives: {row: float64 (3,)}, other positions of single anchors that explain the ranges equally well.
-        undetermined: rows of anchors whose standard deviation relative to the others exceeds `MISPLACED_M`.
+        undetermined: rows of anchors whose standard deviation relative to the others exceeds
+            `LIMITS.displacement_m`.
         mirrored: the mirror image of all anchors fits the guesses about as well; ranges never decide between the two.
     """
 
@@ -122,8 +116,12 @@ def survey_anchors(
     deviations = np.array(
         [sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())]
     )
-    fit, loss, order = _fit_best_order(config, ranges, deviations, off_m)
-    swapped = np.flatnonzero(order != np.arange(len(order))).tolist()
+    swapped = _swapped_guesses(config, ranges, off_m)
+    order = np.arange(len(guesses))
+    order[swapped] = swapped[::-1]
+    fit = _fit(replace(config, anchors=guesses.moved(guesses.position[order], deviations)), ranges)
+    sd_m = np.sqrt(config.model.variances(ranges.variance_m2))
+    loss = float(config.model.loss(fit.residual_m / sd_m).mean())
     free = [row for row in used.tolist() if row not in fixed]
     # A drive at constant height hardly determines heights: they are those of the guesses.
     axes = slice(0, config.dims)
@@ -131,7 +129,8 @@ def survey_anchors(
     distance[used] = np.linalg.norm(displacements(fit.anchors[used], guesses.position[used])[:, axes], axis=1)
     relative_sd = np.linalg.norm(_relative_sd(fit.anchors, fit.anchor_covariance)[:, axes], axis=1)
     sd = np.sqrt(np.einsum("ijij->i", fit.anchor_covariance) / 3.0)
-    alternatives = {row: _alternative(config, fit, ranges, row) for row in free}
+    hypotheses = _hypotheses(config, fit, ranges)
+    alternatives = {row: hypotheses.mirror_image(row, config.dims) for row in free}
     plain, mirror = (
         _misfit(fit.anchors[used], guesses.position[order][used], mirrored=side) for side in (False, True)
     )
@@ -139,43 +138,33 @@ def survey_anchors(
         anchors=guesses.moved(fit.anchors, np.maximum(sd, 1e-3)),
         moved_m=distance,
         misplaced=[
-            int(row) for row in used if distance[row] > max(MISPLACED_M, _UNLIKELY * relative_sd[row])
+            int(row)
+            for row in used
+            if distance[row] > max(LIMITS.displacement_m, _UNLIKELY * relative_sd[row])
         ],
         swapped=[(swapped[0], swapped[1])] if swapped else [],
         track=fit.track,
         loss=loss,
         alternatives={row: position for row, position in alternatives.items() if position is not None},
-        undetermined=[row for row in free if relative_sd[row] > MISPLACED_M],
+        undetermined=[row for row in free if relative_sd[row] > LIMITS.displacement_m],
         mirrored=not fixed and mirror < _AS_WELL * max(plain, TAPE_M),
     )
 
 
-def _fit_best_order(
-    config: EstimatorConfig, ranges: Ranges, deviations: NDArray[np.float64], off_m: float
-) -> tuple[Smoothed, float, NDArray[np.intp]]:
-    """Return the fit with the better order of the guesses (as given, or a pair swapped), its loss, and the order."""
-    guesses, model, used = config.anchors, config.model, np.unique(ranges.anchor)
-
-    def fit_order(order: NDArray[np.intp]) -> tuple[Smoothed, float]:
-        start = guesses.moved(guesses.position[order], deviations)
-        fit = _fit(replace(config, anchors=start), ranges)
-        sd = np.sqrt(model.variances(ranges.variance_m2))
-        return fit, float(model.loss(fit.residual_m / sd).mean())
-
-    identity, order = np.arange(len(guesses)), _unswap(config, ranges, off_m)
-    fit, loss = fit_order(identity)
-    if (order == identity).all():
-        return fit, loss, identity
+def _swapped_guesses(config: EstimatorConfig, ranges: Ranges, off_m: float) -> list[int]:
+    """Return the rows of two guesses that are swapped, or an empty list."""
+    guesses, used = config.anchors, np.unique(ranges.anchor)
+    tried = replace(config, anchors=guesses.moved(guesses.position, np.full(len(guesses), off_m)))
+    scale_m = np.array([np.hypot(off_m / 2.0, config.model.range_sd)])
+    segments = find_segments([ranges])
+    pair = find_swapped(tried, segments, Regressors.none(len(segments.ranges)), scale_m, used)
+    if pair is None:
+        return []
+    order = np.arange(len(guesses))
+    order[list(pair)] = pair[::-1]
     # In a square, swapped opposite anchors are the mirror image of the right ones: ranges cannot distinguish the two.
-    swapped_fit, swapped_loss = fit_order(order)
-    misfit = _misfit(fit.anchors[used], guesses.position[used], mirrored=False)
-    mirrored_misfit = _misfit(swapped_fit.anchors[used], guesses.position[used], mirrored=True)
-    swapped_misfit = _misfit(swapped_fit.anchors[used], guesses.position[order][used], mirrored=False)
-    limit = _AS_WELL * off_m
-    is_better = swapped_loss < loss - _SWAP_GAIN or misfit > max(limit, _AS_WELL * swapped_misfit)
-    if is_better and mirrored_misfit > limit:
-        return swapped_fit, swapped_loss, order
-    return fit, loss, identity
+    mirrored_m = _misfit(guesses.position[order][used], guesses.position[used], mirrored=True)
+    return list(pair) if mirrored_m > _AS_WELL * off_m else []
 
 
 def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
@@ -211,40 +200,14 @@ def _misfit(position: NDArray[np.float64], guess: NDArray[np.float64], *, mirror
     return float(np.sqrt(np.mean(displacements(position * (side, 1.0, 1.0), guess)[:, :2] ** 2)))
 
 
-def _alternative(
-    config: EstimatorConfig, fit: Smoothed, ranges: Ranges, row: int
-) -> NDArray[np.float64] | None:
-    """Return another position of an anchor that explains its ranges to the track equally well, or None.
-
-    Candidate: the mirror image beyond the track's plane (with a constant height: its line in plan), refined for this track.
-    """
-    is_of_anchor = ranges.anchor == row
-    track, axes, model = fit.track, config.dims, config.model
-    tag = np.stack(
-        [np.interp(ranges.stamp_ns[is_of_anchor], track.stamp_ns, axis) for axis in track.position.T], axis=1
-    )
-    centre = tag.mean(axis=0)
-    normal = np.zeros(3)
-    normal[:axes] = np.linalg.svd((tag - centre)[:, :axes], full_matrices=False)[2][-1]
-    anchor = fit.anchors[row]
-    position = anchor - 2.0 * float((anchor - centre) @ normal) * normal
-    sd = np.sqrt(model.variances(ranges.variance_m2[is_of_anchor]))
-    # Residuals of the fit, with what it attributes to offsets: the other position has to explain the same ranges.
-    range_m = np.linalg.norm(tag - anchor, axis=1) + fit.residual_m[is_of_anchor]
-
-    def improve(iteration: int) -> float:
-        unit, expected = unit_vectors(position, tag)
-        z = (range_m - expected) / sd
-        slope = (unit / sd[:, None])[:, :axes]
-        weighted = slope * model.weight(z)[:, None]
-        step = np.linalg.solve(weighted.T @ slope + np.eye(axes), weighted.T @ z)
-        position[:axes] += step
-        return float(np.abs(step).max())
-
-    gauss_newton(improve, iterations=10, converged=1e-3)
-    loss = float(model.loss((range_m - np.linalg.norm(position - tag, axis=1)) / sd).mean())
-    is_equal = loss < float(model.loss(fit.residual_m[is_of_anchor] / sd).mean()) + _SAME_LOSS
-    return position if is_equal and np.linalg.norm(position - anchor) > MISPLACED_M else None
+def _hypotheses(config: EstimatorConfig, fit: Smoothed, ranges: Ranges) -> AnchorHypotheses:
+    """Return hypotheses about the estimated positions, for the estimated track."""
+    track = fit.track
+    tag = np.stack([np.interp(ranges.stamp_ns, track.stamp_ns, axis) for axis in track.position.T], axis=1)
+    # Residuals of the fit, with what it attributes to offsets: another position has to explain the same ranges.
+    distance_m = np.linalg.norm(tag - fit.anchors[ranges.anchor], axis=1)
+    ranges = replace(ranges, range_m=distance_m + fit.residual_m)
+    return AnchorHypotheses(config.anchors.moved(fit.anchors, config.anchors.sd), ranges, tag)
 
 
 def displacements(position: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -286,32 +249,3 @@ def _relative_sd(position: NDArray[np.float64], covariance: NDArray[np.float64])
     spread = np.diag(projection @ covariance.reshape(3 * m, 3 * m) @ projection).reshape(m, 3)
     sd: NDArray[np.float64] = np.sqrt(spread)
     return sd
-
-
-def _unswap(config: EstimatorConfig, ranges: Ranges, off_m: float) -> NDArray[np.intp]:
-    """Return the order of guesses that explains the first minute best, of all with at most one pair swapped, int (m,)."""
-    guesses, model = config.anchors, config.model
-    trial = ranges.take(ranges.stamp_ns < ranges.stamp_ns[0] + _TRIAL_NS)
-    if len(trial) > _TRIAL_RANGES:
-        # A random choice: with a constant stride, all might be from the same anchor.
-        chosen = np.random.default_rng(1).choice(len(trial), _TRIAL_RANGES, replace=False)
-        trial = trial.take(np.sort(chosen))
-    identity = np.arange(len(guesses))
-
-    def loss(order: NDArray[np.intp]) -> float:
-        tried = replace(config, anchors=guesses.moved(guesses.position[order], np.full(len(guesses), off_m)))
-        track = TagEstimator(tried).run(trial)
-        if len(track) < 2:
-            return np.inf
-        fit = Smoother(tried, trial).fit(track, iterations=4)
-        return float(model.loss(fit.residual_m / np.sqrt(off_m**2 / 4.0 + model.range_sd**2)).mean())
-
-    best, order = loss(identity), identity
-    if best < _SWAP_GAIN:
-        return order
-    for a, b in itertools.combinations(np.unique(trial.anchor).tolist(), 2):
-        swapped = identity.copy()
-        swapped[[a, b]] = b, a
-        if (swapped_loss := loss(swapped)) < best - _SWAP_GAIN:
-            best, order = swapped_loss, swapped
-    return order

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwb_mitigation.commands.positioning import (
+from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.checks import check_output
+from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
+from uwb_mitigation.commands.support.position_options import (
     AnchorsOption,
     AreaOption,
     HeightOption,
@@ -18,15 +23,13 @@ from uwb_mitigation.commands.positioning import (
     HeightTopicOption,
     OffsetOption,
 )
-from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import check_output
-from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
+    from uwb_mitigation.calibration.models import FineTune
     from uwb_mitigation.calibration.site import SiteCalibration
     from uwb_mitigation.calibration.site_data import SiteData
-    from uwb_mitigation.calibration.solution import LivePrior, Localisation, SiteSolution
+    from uwb_mitigation.calibration.solution import Localisation
     from uwb_mitigation.mitigation.model.bundle import Bundle
     from uwb_mitigation.types.anchors import AnchorMap
 
@@ -92,13 +95,20 @@ def calibrate(
             help="With --truth-topic: estimate the lever arm, starting from the given one. Needs a drive with turns.",
         ),
     ] = False,
+    check: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="BAG",
+            help="Recording of another drive at the same site, on which the calibration is only tested; may be repeated. "
+            "Without CIRs and ground truth, a line in the received power is used only if it improves this drive.",
+        ),
+    ] = None,
     height_topic: HeightTopicOption = None,
     stamp_offset: OffsetOption = 0.0,
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also write an HTML page with the results."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the held-out segments and of the training.")] = 0,
     force: Annotated[
         bool,
         typer.Option(
@@ -110,14 +120,14 @@ def calibrate(
     """Calibrate a site from a drive, without surveyed positions.
 
     Drive a tag past four anchors or more for two minutes, or put tags at a dozen positions. The track, the offsets of
-    the radios and a model of the NLOS errors are estimated jointly and tested on held-out parts of the drive.
+    the radios and a model of the NLOS errors are estimated jointly and tested on held-out halves of the drive.
 
         uwb-mitigation calibrate drive.mcap --anchors anchors.yaml --height 0.4 -o site.onnx
 
         uwb-mitigation process other.mcap --model site.onnx --offsets site.offsets.yaml -o corrected.mcap
     """
     from uwb_mitigation.calibration.site import calibrate_site
-    from uwb_mitigation.calibration.solution import LivePrior
+    from uwb_mitigation.calibration.solution import solve_with_truth, solve_without_truth
     from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
@@ -132,17 +142,37 @@ def calibrate(
         raise ParameterError("--height and --height-topic", valid="either of them")
     if not abs(stamp_offset) <= MAX_STAMP_OFFSET_S:
         raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
-    prior = LivePrior(None if height is None else Height(height, height_sd), Area.parse(area), height_sd)
+    if check and truth_topic is not None:
+        raise ParameterError("--check with --truth-topic", valid="either of them")
+    prior = None if height is None else Height(height, height_sd)
+    box = Area.parse(area)
     anchor_map = (None if anchors else recorded_anchors(bags[0])) or load_anchors(
         anchors or anchors_path(bags[0])
     )
     # For CIRs of another radio, a line in the levels is compared with offsets only.
     source = bundle_for(None, bags[0], may_be_experimental=False)
     try:
-        site = _gather(bags, anchor_map, source, stamp_offset, height_topic, height_sd)
+        gather = functools.partial(
+            _gather, anchors=anchor_map, source=source, stamp_offset=stamp_offset,
+            height_topic=height_topic, height_sd=height_sd,
+        )  # fmt: skip
+        site, drives = gather(bags), [gather([bag]) for bag in check or []]
         with console.stage_bars() as on_progress:
-            solution = _solve(bags, site, source, prior, pose_options, on_progress)
-            calibration = calibrate_site(site, source, solution, seed=seed, on_progress=on_progress)
+            if pose_options.topic is not None:
+                localisation = _localisation(bags, site, pose_options.topic, pose_options)
+                solution = solve_with_truth(site, localisation, height=prior, on_progress=on_progress)
+            else:
+                solution = solve_without_truth(
+                    site, height=prior, area=box, height_sd_m=height_sd, on_progress=on_progress
+                )
+            calibration = calibrate_site(
+                site,
+                source,
+                solution,
+                check=drives,
+                fine_tune=_fine_tune(source) if site.has_cirs else None,
+                on_progress=on_progress,
+            )
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
         refused: dict[str, object] = {
@@ -195,29 +225,15 @@ def _check_files(output: Path, report: Path | None, force: bool) -> None:
             raise ParameterError("the file exists", where=str(file), valid="--force replaces it")
 
 
-def _solve(
-    bags: list[Path],
-    site: SiteData,
-    source: Bundle,
-    prior: LivePrior,
-    pose_options: _PoseOptions,
-    on_progress: Callable[[str, float], None],
-) -> SiteSolution:
-    from uwb_mitigation.calibration import solution
+def _fine_tune(source: Bundle) -> FineTune | None:
+    """Return the function that trains the network of a bundle further; None without torch."""
+    if importlib.util.find_spec("torch") is None:
+        warn("no fine-tuned network: torch is not installed (`make setup-training`)")
+        return None
+    from uwb_mitigation.mitigation.model.floating import float_network
+    from uwb_mitigation.training.fit.fine_tuning import fine_tune
 
-    if pose_options.topic is not None:
-        localisation = _localisation(bags, site, pose_options.topic, pose_options)
-        return solution.solve_with_truth(
-            site, source, localisation, height=prior.height, on_progress=on_progress
-        )
-    return solution.solve_without_truth(
-        site,
-        source,
-        height=prior.height,
-        area=prior.area,
-        height_sd_m=prior.height_sd_m,
-        on_progress=on_progress,
-    )
+    return functools.partial(fine_tune, float_network(source))
 
 
 def _write(
@@ -255,7 +271,7 @@ def _gather(
         site = read_site(
             [stack.enter_context(open_recording(bag)) for bag in bags],
             anchors,
-            source.card,
+            source,
             on_record,
             stamp_offset_s=stamp_offset,
             heights=heights,
@@ -300,7 +316,8 @@ def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOp
                     f"tag {format_id(tag.tag_id)}: the bag contains no transform from {names[0] or BASE_FRAME} to the "
                     "antenna; the lever arm is 0. Set --lever-arm"
                 )
-    return Localisation(topic, paths, options.time_offset_s, lever_arms_m, options.estimate_lever_arm)
+    ids = [tag.tag_id for tag in site.tags]
+    return Localisation(topic, ids, paths, options.time_offset_s, lever_arms_m, options.estimate_lever_arm)
 
 
 def _body_of_tag(tag_id: int, bodies: Iterable[str], where: str) -> str:
@@ -342,7 +359,7 @@ def _lever_arm_in(
 
 
 def _show(calibration: SiteCalibration) -> None:
-    from uwb_mitigation.calibration.live_position import RAW
+    from uwb_mitigation.calibration.held_out import RAW
 
     solution = calibration.solution
     if solution.alignment is not None:
@@ -356,15 +373,22 @@ def _show(calibration: SiteCalibration) -> None:
                 for value, sd in zip(lever_arm_m.tolist(), arm_sd.tolist(), strict=True)
             )
             print_line(f"tag {format_id(ranges.tag_id)}: lever arm {values} m")
-    rows = [(format_id(tag), format_id(anchor), *values) for (tag, anchor), values in solution.pairs.items()]
+    rows = [
+        (format_id(tag), format_id(anchor), *values) for (tag, anchor), values in calibration.pairs.items()
+    ]
     show_table("Offsets", ("tag", "anchor", "offset, m", "standard deviation, m"), rows, left=2)
-    mae_m = {RAW: calibration.raw_mae_m, **calibration.errors.mae()}
+    halves, *checks = calibration.held_out
+    columns = {"range MAE, m": halves.mae_m}
+    if solution.truth is not None:
+        columns = {"live position RMSE, m": halves.live_rmse_m} | columns
+    for number, part in enumerate(checks, 1):
+        columns[f"MAE on check {number}, m"] = part.mae_m
     show_table(
-        "On held-out segments",
-        ("ranges", "live position RMSE, m", "range MAE, m", "chosen"),
+        "On held-out halves of the drive",
+        ("ranges", *columns, "chosen"),
         [
-            (name, calibration.live[name].locator_m, mae, "<-" if name == calibration.chosen else "")
-            for name, mae in mae_m.items()
+            (name, *(value(name) for value in columns.values()), "<-" if name == calibration.chosen else "")
+            for name in [RAW, *(name for name in halves.residual_m if name != RAW)]
         ],
         calibration.chosen,
     )

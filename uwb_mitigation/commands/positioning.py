@@ -13,6 +13,14 @@ from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 from uwb_mitigation.commands.support.checks import OffsetsOption
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
+from uwb_mitigation.commands.support.position_options import (
+    AnchorsOption,
+    AreaOption,
+    HeightOption,
+    HeightSdOption,
+    HeightTopicOption,
+    OffsetOption,
+)
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
 
 if TYPE_CHECKING:
@@ -45,41 +53,6 @@ TRACK_COLUMNS = {
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
-]
-AnchorsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--anchors",
-        metavar="FILE",
-        help="YAML file of the anchors: `anchors: [{id: 1, x: 0.0, y: 0.0, z: 2.1}]`. Default: X.anchors.yaml next to the first "
-        "BAG X.mcap.",
-    ),
-]
-HeightOption = Annotated[
-    float | None,
-    typer.Option(help="Height of the tag's antenna in the anchors' frame, m, where it stays the same."),
-]
-HeightSdOption = Annotated[float, typer.Option("--height-sd", help="Standard deviation of the height, m.")]
-HeightTopicOption = Annotated[
-    str | None,
-    typer.Option(
-        "--height-topic",
-        metavar="TOPIC",
-        help="Topic of BAG with the measured height of the tag's antenna (Range above z = 0, Odometry or "
-        "PoseWithCovarianceStamped). --height-sd is used if a message has no variance.",
-    ),
-]
-AreaOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y,Z,X,Y,Z", help="Where tags can be: the lower and the upper corner of a box, m."
-    ),
-]
-OffsetOption = Annotated[
-    float,
-    typer.Option(
-        "--stamp-offset", help="Time to add to the stamps of the ranges, s; -0.2 if they are late by 0.2 s."
-    ),
 ]
 AccelerationOption = Annotated[
     float,

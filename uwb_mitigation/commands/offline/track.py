@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.calibration.anchor_errors import MIN_LOSS_GAIN, is_displaced
+from uwb_mitigation.calibration.hypotheses import LIMITS, AnchorHypotheses
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, dop
@@ -220,20 +220,21 @@ def _residuals(
         residual = ranges.range_m[mask] - np.linalg.norm(position - config.anchors.position[row], axis=1)
         residuals.append(residual[np.isfinite(residual)])
         # A displaced anchor also bends the tracks with which the others are judged: an accusation holds without each of them.
-        displaced |= is_displaced(config.anchors, ranges, row, track) and (
+        displaced |= _gain(row, ranges, track, config) > LIMITS.gain and (
             len(reference) == MIN_OTHERS
             or all(
-                is_displaced(
-                    config.anchors,
-                    ranges,
-                    row,
-                    _track_without([row, excluded], initial, ranges, config),
-                    MIN_LOSS_GAIN / 2.0,
-                )
+                _gain(row, ranges, _track_without([row, excluded], initial, ranges, config), config)
+                > LIMITS.gain / 2.0
                 for excluded in reference.tolist()
             )
         )
     return np.concatenate(residuals), displaced
+
+
+def _gain(row: int, ranges: Ranges, track: Track, config: EstimatorConfig) -> float:
+    """Return the gain in log likelihood of another position of an anchor, for a track that was estimated without it."""
+    antenna = TruePath(track.stamp_ns, track.position).position_at(ranges.stamp_ns)
+    return AnchorHypotheses(config.anchors, ranges, antenna).gain(row)
 
 
 def _track_without(rows: list[int], initial: Track, ranges: Ranges, config: EstimatorConfig) -> Track:

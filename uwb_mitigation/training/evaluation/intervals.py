@@ -34,6 +34,10 @@ class Intervals:
     variance_per_m2: float
     sigmas95: float
 
+    def variance_of(self, predicted_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the variances of ranges with these predicted errors, (n,), m^2."""
+        return self.variance_m2 + self.variance_per_m2 * predicted_m**2
+
 
 def fit_intervals(
     residual_m: NDArray[np.floating], predicted_m: NDArray[np.floating], configurations: NDArray[np.str_]

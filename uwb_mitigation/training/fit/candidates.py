@@ -1,13 +1,11 @@
 """Candidates for model selection: models that can be fitted to labelled ranges, in order of complexity.
 
 `train` chooses between new models (`new_models`) or models that start from a bundle (`from_bundle`), both with the
-universal network and an offset (`with_cold_start`); `calibrate` chooses between the models of a site (`site_models`).
-Only candidates that train a network need torch.
+universal network and an offset (`with_cold_start`). Only candidates that train a network need torch.
 """
 
 from __future__ import annotations
 
-import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -33,41 +31,28 @@ NEW_MODELS = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+n
 
 COLD_START, COLD_START_MEAN = "cold start", "mean of line and cold start"
 AS_SHIPPED, NEW_OFFSET, FINE_TUNED = "as shipped", "new offset", "fine-tuned"
-SITE_OFFSETS, SITE_LINE = "offsets", "offsets + line"
-SITE_UNIVERSAL, SITE_UNIVERSAL_LINE = "offsets + universal network", "offsets + universal network + line"
-SITE_FINE_TUNED = "fine-tuned network"
 
 NETWORK_ONLY = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
 """Options of a network without a line: it needs more training than one that refines a line."""
 
-FINE_TUNING = FitOptions(epochs=2, learning_rate=3e-4, dropout=0.2)
-FINE_TUNING_PER_CONFIGURATION, MAX_FINE_TUNING_INPUTS = 6, 2500
-"""The fine-tuned network of a site is fitted to at most this number of inputs per configuration, and in total."""
-
 PER_CONFIGURATION = 20
 MIN_CONFIGURATIONS_FOR_MEAN = 20
 """Number of configurations from which a line is averaged with the universal network."""
-
-FACTOR_BOUNDS, MIN_SPREAD_M = (0.0, 1.5), 0.05
-"""Bounds of the factor of the universal network's predictions, and the minimum spread that makes it observable."""
 
 _BATCH = 1024
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedModel:
-    """A linear bias model, and a network or None. `factor`: the network is the universal one, multiplied by this factor."""
+    """A linear bias model, and a network or None."""
 
     linear_bias: LinearBiasModel
     network: FloatWeights | None = None
-    factor: float | None = None
 
     def correction_m(self, data: Dataset) -> NDArray[np.float64]:
         """Return linear bias + network, shape (n,), m; 0 where a power that the linear bias model needs is unknown."""
         predicted = linear_bias_m(self.linear_bias, data).astype(np.float64)
-        if self.factor is not None and data.headers is not None:
-            predicted = predicted + self.factor * _universal_m(data)
-        elif self.network is not None:
+        if self.network is not None:
             predicted = predicted + network_m(self.network, data.inputs)
         return np.where(np.isfinite(predicted), predicted, 0.0)
 
@@ -230,17 +215,6 @@ class Constant(Candidate):
 
 
 @dataclass(frozen=True, eq=False)
-class SiteOffset(Candidate):
-    """One offset for all ranges in addition to those of the radios."""
-
-    name: str = SITE_OFFSETS
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        return FittedModel(linear_fit.fit_constant(data.configurations, data.error_m))
-
-
-@dataclass(frozen=True, eq=False)
 class Line(Candidate):
     """A line in both powers."""
 
@@ -366,113 +340,3 @@ def has_few_configurations(data: Dataset) -> bool:
 
 def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
     return linear_fit.fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
-
-
-@dataclass(frozen=True, eq=False)
-class SiteLine(Candidate):
-    """A line in the powers that the radios report."""
-
-    name: str = SITE_LINE
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        return FittedModel(_site_line(data, data.error_m))
-
-
-@dataclass(frozen=True, eq=False)
-class SiteUniversal(Candidate):
-    """The universal network, multiplied by a factor, with an offset or a line."""
-
-    network: FloatWeights
-    has_line: bool
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        factor = _factor(data)
-        residual = data.error_m - factor * _universal_m(data)
-        # A bundle with a network passes a range through if its first-path power is unknown.
-        if self.has_line and _has_both_powers(data):
-            linear_bias = _site_line(data, residual)
-        else:
-            linear_bias = linear_fit.fit_constant(data.configurations, residual)
-        return FittedModel(linear_bias, scaled(self.network, factor), factor)
-
-
-@dataclass(frozen=True, eq=False)
-class SiteFineTuned(Candidate):
-    """The universal network, trained further on the data."""
-
-    network: FloatWeights
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        from uwb_mitigation.training.fit import fitting
-
-        shift = linear_fit.fit_constant(data.configurations, data.error_m - _universal_m(data))
-        subset = data.rows(splits.subsample(data.configurations, FINE_TUNING_PER_CONFIGURATION, seed))
-        if len(subset) > MAX_FINE_TUNING_INPUTS:
-            chosen = np.random.default_rng(seed).choice(len(subset), MAX_FINE_TUNING_INPUTS, replace=False)
-            subset = subset.rows(np.sort(chosen))
-        options, targets = replace(FINE_TUNING, seed=seed), subset.error_m - shift.offset_m
-        network, architecture = self.network, self.network.architecture
-        return FittedModel(shift, fitting.fit(architecture, subset.inputs, targets, options, start=network))
-
-
-def site_models(
-    data: Dataset, has_cirs: bool, universal: Bundle
-) -> tuple[Dataset, list[Candidate], list[str]]:
-    """Return the models of a site, which are used together with the offsets of its radios.
-
-    Returns:
-        The data with the predictions of the universal network, so that they are computed only once; the candidates;
-        notes about missing candidates.
-    """
-    offsets = SiteOffset()
-    if not has_cirs:
-        missing = "no networks: the recording has no CIRs that the universal model was trained for"
-        return data, [offsets, SiteLine()], [missing]
-    network = float_network(universal)
-    data = replace(data, headers=network_m(network, data.inputs)[:, None].astype(np.float32))
-    candidates: list[Candidate] = [
-        offsets,
-        SiteUniversal(SITE_UNIVERSAL, network, has_line=False),
-        SiteUniversal(SITE_UNIVERSAL_LINE, network, has_line=True),
-    ]
-    if importlib.util.find_spec("torch") is None:
-        return data, candidates, ["no fine-tuned network: torch is not installed (`make setup-training`)"]
-    return data, [*candidates, SiteFineTuned(SITE_FINE_TUNED, network)], []
-
-
-def _universal_m(data: Dataset) -> NDArray[np.float64]:
-    """Return the predictions of the universal network, which `site_models` stores in the headers."""
-    assert data.headers is not None
-    return data.headers[:, 0].astype(np.float64)
-
-
-def _factor(data: Dataset) -> float:
-    """Fit the factor of the universal network's predictions to the errors.
-
-    Noise of the predictions would bias the factor towards 0, and with it the estimated offsets.
-    """
-    predicted, error = (
-        linear_fit.configuration_means(data.configurations, values)
-        for values in (_universal_m(data), data.error_m)
-    )
-    if len(predicted) < linear_fit.MIN_CONFIGURATIONS or float(np.ptp(predicted)) < MIN_SPREAD_M:
-        return 1.0
-    design = np.column_stack([np.ones(len(predicted)), predicted])
-    factor = float(linear_fit.least_absolute_deviations(design, error)[1])
-    return float(np.float32(np.clip(factor, *FACTOR_BOUNDS)))
-
-
-def _has_both_powers(data: Dataset) -> bool:
-    return bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
-
-
-def _site_line(data: Dataset, error_m: NDArray[np.float64]) -> LinearBiasModel:
-    """Fit a line in both powers if both are known, otherwise in the received power if known, otherwise a constant."""
-    if _has_both_powers(data):
-        return linear_fit.fit_linear_bias(
-            data.configurations, data.rx_power_dbm, data.first_path_power_dbm, error_m
-        )
-    return linear_fit.fit_linear_bias(data.configurations, data.rx_power_dbm, None, error_m)

@@ -1,0 +1,154 @@
+"""Errors of corrections on ranges that they were not fitted to, their comparison, and what it promises for another drive.
+
+Without ground truth, the ranges of each anchor are compared with the positions that the other anchors give: no range judges the
+track that it moved. With ground truth, ranges and live positions are compared with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+RAW = "raw"
+
+MIN_GAIN = 0.02
+"""A more complex correction must reduce the error by at least this share; smaller gains are not significant."""
+
+MAX_INCREASE = 0.02
+"""A larger increase of the live position error is harm; a smaller one is not significant."""
+
+BLOCK_S = 10.0
+"""Errors of blocks of this duration count as independent: obstacles persist for seconds."""
+
+ONE_SIDED_95 = 1.645
+"""Standard deviations below which 5 % of a normal distribution are."""
+
+OUTLIER_SDS = 4.0
+"""Larger errors count as this multiple of the scatter of the raw ranges: ranges behind obstacles must not decide alone."""
+
+PROMISED_SHARE = 0.3
+"""Share of the gain in residuals without ground truth that is promised for the live position."""
+
+MIN_RANGES = 20
+"""With fewer ranges, nothing is compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """Relative decrease of an error: the estimate, and the lower end of its one-sided 95 % interval; NaN: unknown."""
+
+    mean: float
+    low: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is large enough for a more complex correction, and not by chance."""
+        return self.low > 0.0 and self.mean >= MIN_GAIN
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Errors of corrections on one or more parts of a recording; all arrays have r rows, NaN: unknown.
+
+    Attributes:
+        block: int, number of the block of each range.
+        residual_m: {`RAW` or correction: error of the range against the reference}, m.
+        live_m: {`RAW` or correction: error of the live position}, m; empty without ground truth.
+        is_separate: the correction was fitted to another drive.
+    """
+
+    block: NDArray[np.int64]
+    residual_m: Mapping[str, NDArray[np.float64]]
+    live_m: Mapping[str, NDArray[np.float64]]
+    is_separate: bool
+
+    def merged(self, other: HeldOut, is_first: NDArray[np.bool_]) -> HeldOut:
+        """Return the errors of this and another part of a recording; `is_first` shows which ranges are of this part, bool (r,)."""
+
+        def both(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
+            values = np.empty(len(is_first), first.dtype)
+            values[is_first], values[~is_first] = first, second
+            return values
+
+        residual_m = {name: both(value, other.residual_m[name]) for name, value in self.residual_m.items()}
+        live_m = {name: both(value, other.live_m[name]) for name, value in self.live_m.items()}
+        return HeldOut(both(self.block, other.block), residual_m, live_m, self.is_separate)
+
+    def mae_m(self, name: str) -> float:
+        """Return the mean absolute range error, m."""
+        return float(np.nanmean(np.abs(self.residual_m[name])))
+
+    def live_rmse_m(self, name: str) -> float:
+        """Return the RMSE of the live position, m; NaN: unknown."""
+        if name not in self.live_m or not np.isfinite(self.live_m[name]).any():
+            return math.nan
+        return float(np.sqrt(np.nanmean(self.live_m[name] ** 2)))
+
+    def range_gain(self, name: str, base: str) -> Gain:
+        """Return the decrease of the mean absolute range error relative to another correction."""
+        before, after = np.abs(self.residual_m[base]), np.abs(self.residual_m[name])
+        centre = np.nanmedian(before)
+        limit_m = float(centre + OUTLIER_SDS * 1.4826 * np.nanmedian(np.abs(before - centre)))
+        return self._gain(np.minimum(before, limit_m), np.minimum(after, limit_m))
+
+    def live_gain(self, name: str, base: str) -> Gain:
+        """Return the decrease of the RMSE of the live position; NaN without ground truth."""
+        if name not in self.live_m:
+            return Gain(math.nan, math.nan)
+        gain = self._gain(self.live_m[base] ** 2, self.live_m[name] ** 2)
+        return Gain(*(1.0 - math.sqrt(max(1.0 - share, 0.0)) for share in (gain.mean, gain.low)))
+
+    def _gain(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> Gain:
+        """Return the relative decrease of the mean of n values, with the scatter of the decrease between blocks."""
+        is_known = np.isfinite(before) & np.isfinite(after)
+        if is_known.sum() < MIN_RANGES:
+            return Gain(math.nan, math.nan)
+        _, block = np.unique(self.block[is_known], return_inverse=True)
+        count, decrease = np.bincount(block), np.bincount(block, (before - after)[is_known])
+        mean = decrease.sum() / count.sum()
+        blocks = len(count)
+        scatter = math.sqrt(float(np.sum((decrease - mean * count) ** 2)) * blocks / max(blocks - 1, 1))
+        low = mean - ONE_SIDED_95 * scatter / count.sum()
+        level = float(before[is_known].mean())
+        return Gain(float(mean) / level, float(low) / level)
+
+
+def decisive(parts: Sequence[HeldOut]) -> list[HeldOut]:
+    """Return the separate drives, or if there are none, all parts."""
+    return [part for part in parts if part.is_separate] or list(parts)
+
+
+def select(parts: Sequence[HeldOut], names: Sequence[str], needs_separate: Sequence[str]) -> str:
+    """Return the simplest correction that no more complex one improves.
+
+    A more complex correction must improve significantly on each separate drive, and without any on the halves of the drive; the
+    other parts must not become worse. With ground truth it must reduce the live position error, or the range error without
+    increasing the former: better ranges do not always give better positions.
+
+    Args:
+        parts: errors.
+        names: corrections in order of complexity.
+        needs_separate: corrections that must improve a separate drive.
+    """
+    decisive_parts = decisive(parts)
+    has_separate = decisive_parts[0].is_separate
+
+    def improves(part: HeldOut, name: str, base: str) -> bool:
+        gain, live = part.range_gain(name, base), part.live_gain(name, base)
+        if part not in decisive_parts:
+            return gain.mean > 0.0
+        if math.isnan(live.mean):
+            return gain.is_significant
+        return live.is_significant or (gain.is_significant and live.mean > -MAX_INCREASE)
+
+    best = names[0]
+    for name in names[1:]:
+        has_evidence = has_separate or name not in needs_separate
+        if has_evidence and all(improves(part, name, best) for part in parts):
+            best = name
+    return best

@@ -1,0 +1,345 @@
+"""Hypotheses that contradict the anchors file: an anchor is elsewhere, or two are swapped.
+
+The ranges of an anchor that is not where the file says look like ranges with an offset, but their errors depend on the
+direction to the tag. So each hypothesis competes with the position of the file and an offset, by their likelihoods.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from uwb_mitigation.calibration.first_positions import first_positions
+from uwb_mitigation.calibration.joint_fit import JointFit, Start, fit_joint, observations_of
+from uwb_mitigation.calibration.motion_segments import GAP_S, Segments
+from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.noise_model import MAD_TO_SD, Regressors
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.types.tracks import Ranges
+
+
+@dataclass(frozen=True, slots=True)
+class HypothesisLimits:
+    """How much better a hypothesis must explain the ranges than the anchors file.
+
+    Attributes:
+        displacement_m: a smaller displacement looks like reflections.
+        gain: minimum gain in log likelihood (chi-squared of two unknowns: e^-12 by chance).
+        share: minimum share of the anchor's misfit that a displacement explains. Obstacles that fit one explain 0.39 to 0.62 of it
+            (simulated sites 4, 7, 8 and 9); a true one by 1 m explains 0.72 to 0.86 (sites 3 and 6).
+        swap_share: minimum share of the misfit of all anchors that a swap explains.
+        stands_out: minimum ratio of the gain to that of the next anchor, if the positions come from the other anchors: obstacles
+            make several anchors look displaced, and a displaced one bends the tracks that judge the others.
+        indistinct: log likelihoods of mirror images that differ by less do not distinguish them (a factor of e^4.5).
+        offset_sd_m: prior standard deviation of the offset of an anchor about the common one, twice that of uncalibrated antenna
+            delays: without it, a displacement by metres in the direction of the tag costs nothing.
+        independent_s: errors of an anchor within this time count as one independent error: obstacles persist for metres.
+        min_independent: an anchor with fewer independent errors is not examined.
+        min_sd_m: minimum noise of a range: that of a DW1000 and the persisting error at one position.
+        misfit_m, misfit_share: swaps are examined if this share of the ranges has larger residuals.
+        max_misfit_share: if a larger share has such residuals, the track is wrong. Simulated: at most 0.11 of the ranges of
+            drives and placements, 0.67 or more of those of placements that are recorded as one drive.
+        suspects: number of anchors with the largest misfit that are tried in pairs: all pairs of 24 would take minutes.
+        trial_ranges: number of ranges with which a pair is tried; `mean_gain`: minimum gain of a range, in addition to
+            `swap_share`.
+        no_position_loss: loss of a range without a position: that of a large outlier.
+    """
+
+    displacement_m: float = 0.3
+    gain: float = 12.0
+    share: float = 0.65
+    swap_share: float = 0.35
+    stands_out: float = 1.5
+    indistinct: float = 4.5
+    offset_sd_m: float = 0.3
+    independent_s: float = 2.0
+    min_independent: int = 8
+    min_sd_m: float = 0.1
+    misfit_m: float = 0.5
+    misfit_share: float = 0.08
+    max_misfit_share: float = 0.5
+    suspects: int = 6
+    trial_ranges: int = 1000
+    mean_gain: float = 0.1
+    no_position_loss: float = 6.0
+
+
+LIMITS = HypothesisLimits()
+_MAX_ANCHOR_RANGES, _SIMPLEX_M = 1000, 0.5
+_REMEDY = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
+
+
+class AnchorHypotheses:
+    """Other positions of anchors, for known positions of the tags.
+
+    Args:
+        anchors: anchors of the file.
+        ranges: r ranges.
+        antenna: float64 (r, 3), position of the tag's antenna at each range, m, from a localisation or a track of the other
+            anchors; NaN: unknown.
+        tag: int (r,), tag of each range; None: there is one.
+    """
+
+    def __init__(
+        self,
+        anchors: AnchorMap,
+        ranges: Ranges,
+        antenna: NDArray[np.float64],
+        tag: NDArray[np.intp] | None = None,
+    ) -> None:
+        self._anchors, self._ranges, self._antenna = anchors, ranges, antenna
+        self._tag = np.zeros(len(ranges), np.intp) if tag is None else tag
+        self._misfits: dict[int, _Misfit | None] = {}
+        error_m = ranges.range_m - np.linalg.norm(antenna - anchors.position[ranges.anchor], axis=1)
+        self._common_m = float(np.nanmedian(error_m)) if np.isfinite(error_m).any() else 0.0
+
+    def _misfit(self, row: int) -> _Misfit | None:
+        """Return the misfit of an anchor; None: it has too few independent errors."""
+        if row not in self._misfits:
+            is_used = np.isfinite(self._antenna).all(axis=1) & (self._ranges.anchor == row)
+            rows = np.flatnonzero(is_used)
+            interval = self._ranges.stamp_ns[rows] // round(LIMITS.independent_s * NS_PER_S)
+            independent = np.unique(np.stack([interval, self._tag[rows]]), axis=1).shape[1]
+            misfit = None
+            if independent >= LIMITS.min_independent:
+                rows = rows[:: math.ceil(len(rows) / _MAX_ANCHOR_RANGES)]
+                range_m = self._ranges.range_m[rows] - self._common_m
+                columns = self._antenna[rows], range_m, self._tag[rows]
+                misfit = _Misfit(*columns, independent / len(rows), self._anchors.position[row])
+            self._misfits[row] = misfit
+        return self._misfits[row]
+
+    def gain(self, row: int) -> float:
+        """Return the gain in log likelihood of a displacement of this anchor; 0: within the limits."""
+        misfit = self._misfit(row)
+        if misfit is None or misfit.moved_m <= LIMITS.displacement_m:
+            return 0.0
+        gain = misfit.loss - misfit.loss_at(misfit.best)
+        return gain if gain > LIMITS.share * misfit.loss else 0.0
+
+    def check(self, reference: str, *, is_independent: bool) -> None:
+        """Refuse positions that the ranges contradict.
+
+        Args:
+            reference: source of the positions of the tags, for the message.
+            is_independent: they do not depend on the anchors.
+
+        Raises:
+            DatasetError: names the anchors.
+        """
+        gains = {row: self.gain(row) for row in np.unique(self._ranges.anchor).tolist()}
+        suspects = sorted((row for row in gains if gains[row] > LIMITS.gain), key=gains.__getitem__)
+        swaps = [
+            (self._swap_gain(a, b), a, b)
+            for a, b in itertools.combinations(suspects, 2)
+            # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
+            if self._swap_gain(a, b) > LIMITS.share * (gains[a] + gains[b])
+        ]
+        if swaps:
+            _, a, b = max(swaps)
+            raise _swapped(self._anchors, (min(a, b), max(a, b)), reference)
+        if not suspects or (
+            len(suspects) > 1
+            and not is_independent
+            and gains[suspects[-1]] < LIMITS.stands_out * gains[suspects[-2]]
+        ):
+            return
+        row = suspects[-1]
+        moved_m = getattr(self._misfit(row), "moved_m", 0.0)
+        raise DatasetError(
+            f"anchor {self._anchors.anchors[row]} contradicts {reference}: {moved_m:.1f} m from its position in the anchors "
+            "file, it explains the ranges",
+            valid=_REMEDY,
+        )
+
+    def _swap_gain(self, a: int, b: int) -> float:
+        one, other = self._misfit(a), self._misfit(b)
+        if one is None or other is None:
+            return 0.0
+        return one.loss + other.loss - one.loss_at(other.position) - other.loss_at(one.position)
+
+    def mirror_image(self, row: int, axes: int) -> NDArray[np.float64] | None:
+        """Return another position of an anchor that explains its ranges equally well, float64 (3,), m, or None.
+
+        The candidate is the mirror image beyond the plane of the track; with two `axes`, beyond its line in plan.
+        """
+        misfit = self._misfit(row)
+        if misfit is None:
+            return None
+        centre, normal = misfit.antenna.mean(axis=0), np.zeros(3)
+        normal[:axes] = np.linalg.svd((misfit.antenna - centre)[:, :axes], full_matrices=False)[2][-1]
+        image = misfit.position - 2.0 * float((misfit.position - centre) @ normal) * normal
+        image = misfit.refined(image, misfit.sd_m)
+        is_elsewhere = float(np.linalg.norm(image - misfit.position)) > LIMITS.displacement_m
+        return image if is_elsewhere and misfit.loss_at(image) - misfit.loss < LIMITS.indistinct else None
+
+
+class _Misfit:
+    """How well positions of one anchor explain its ranges, with an unknown offset of each tag.
+
+    Attributes:
+        antenna: (n, 3), position of the tag, m.
+        position: of the anchor in the file. best: the position that explains the ranges best.
+        sd_m: robust standard deviation of the errors at `best`: elsewhere, the displacement would count as noise.
+        moved_m: distance of the two. loss: minus the log likelihood of `position`.
+    """
+
+    def __init__(
+        self,
+        antenna: NDArray[np.float64],
+        range_m: NDArray[np.float64],
+        tag: NDArray[np.intp],
+        weight: float,
+        position: NDArray[np.float64],
+    ) -> None:
+        self.antenna, self.position = antenna, position
+        self._range_m, self._weight = range_m, min(1.0, weight)
+        self._tags = [tag == number for number in np.unique(tag)]
+        self.best = self.refined(position, self._sd_at(position))
+        self.sd_m = self._sd_at(self.best)
+        self.moved_m = float(np.linalg.norm(self.best - position))
+        self.loss = self.loss_at(position)
+
+    def _residual_m(self, position: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the errors for an anchor at `position` minus the offset of each tag, (n,), and these offsets, m."""
+        error: NDArray[np.float64] = self._range_m - np.linalg.norm(self.antenna - position, axis=1)
+        offset_m = np.array([np.median(error[is_of_tag]) for is_of_tag in self._tags])
+        for is_of_tag, value in zip(self._tags, offset_m.tolist(), strict=True):
+            error[is_of_tag] -= value
+        return error, offset_m
+
+    def _sd_at(self, position: NDArray[np.float64]) -> float:
+        residual_m, _ = self._residual_m(position)
+        return max(LIMITS.min_sd_m, MAD_TO_SD * float(np.median(np.abs(residual_m))))
+
+    def loss_at(self, position: NDArray[np.float64], sd_m: float | None = None) -> float:
+        """Return minus the log likelihood (Cauchy) of an anchor at `position`, by default with the noise at `best`."""
+        residual_m, offset_m = self._residual_m(position)
+        of_offsets = 0.5 * float(np.sum((offset_m / LIMITS.offset_sd_m) ** 2))
+        return self._weight * float(np.log1p((residual_m / (sd_m or self.sd_m)) ** 2).sum()) + of_offsets
+
+    def refined(self, position: NDArray[np.float64], sd_m: float) -> NDArray[np.float64]:
+        """Return the position near `position`, at the same height, that explains the ranges best."""
+        start = np.array([[0.0, 0.0], [_SIMPLEX_M, 0.0], [0.0, _SIMPLEX_M]])
+        solution = minimize(
+            lambda shift: self.loss_at(position + np.append(shift, 0.0), sd_m),
+            start[0],
+            method="Nelder-Mead",
+            options={"initial_simplex": start, "xatol": 0.01, "fatol": 0.01},
+        )
+        refined: NDArray[np.float64] = position + np.append(solution.x, 0.0)
+        return refined
+
+
+def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64]) -> None:
+    """Refuse ranges that contradict the anchors file, without known positions of the tags.
+
+    Args:
+        segments: r ranges.
+        fit: their solution with the positions of the file.
+        antenna: float64 (r, 3), position of the tag's antenna at each range according to the other anchors, m.
+
+    Raises:
+        DatasetError: names the anchors; or most ranges contradict the track.
+    """
+    observations, independent = fit.observations, fit.observations.independent
+    is_misfit = np.abs(fit.residual_m) > LIMITS.misfit_m
+    share = float((independent * is_misfit).sum() / independent.sum())
+    if share > LIMITS.misfit_share:
+        loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
+        by_anchor = np.bincount(observations.anchor, loss * independent)
+        check_swapped(fit.config, segments, fit.prior, fit.scale_m, np.argsort(by_anchor)[::-1])
+    if share > LIMITS.max_misfit_share:
+        raise DatasetError(
+            f"{share:.0%} of the ranges contradict the estimated track by more than {LIMITS.misfit_m:g} m",
+            valid=f"a drive, or pauses of more than {GAP_S:g} s between the positions of a carried tag; the anchors file of this "
+            "site",
+        )
+    # The offset of an anchor competes with its displacement.
+    is_common = [name.split()[0] not in ("anchor", "tag", "pair") for name in fit.prior.names]
+    correction_m = fit.prior.rows[:, is_common] @ fit.parameters[is_common]
+    ranges = replace(segments.ranges, range_m=segments.ranges.range_m - correction_m)
+    hypotheses = AnchorHypotheses(fit.config.anchors, ranges, antenna, segments.tag)
+    hypotheses.check("the others", is_independent=False)
+
+
+def check_swapped(
+    config: EstimatorConfig,
+    segments: Segments,
+    prior: Regressors,
+    scale_m: NDArray[np.float64],
+    suspects: NDArray[np.intp],
+) -> None:
+    """Refuse two anchors whose exchange explains the ranges much better, see `find_swapped`.
+
+    Raises:
+        DatasetError: names them.
+    """
+    pair = find_swapped(config, segments, prior, scale_m, suspects)
+    if pair is not None:
+        raise _swapped(config.anchors, pair, "the others")
+
+
+def _swapped(anchors: AnchorMap, pair: tuple[int, int], reference: str) -> DatasetError:
+    first, second = (anchors.anchors[row] for row in pair)
+    return DatasetError(
+        f"anchors {first} and {second} contradict {reference}: swapped, they explain the ranges",
+        valid=_REMEDY,
+    )
+
+
+def find_swapped(
+    config: EstimatorConfig,
+    segments: Segments,
+    prior: Regressors,
+    scale_m: NDArray[np.float64],
+    suspects: NDArray[np.intp],
+) -> tuple[int, int] | None:
+    """Return the two anchors whose exchange explains the first ranges much better, without known positions of the tags.
+
+    Args:
+        config: anchors, noise model, height and area.
+        segments: ranges.
+        prior: parameters of the ranges.
+        scale_m: float64 (g,), of the residuals.
+        suspects: rows of anchors, those with the largest misfit first.
+    """
+    is_trial = np.arange(len(segments.ranges)) < LIMITS.trial_ranges
+    segments, prior = segments.select_ranges(is_trial), prior.select_rows(is_trial)
+    anchors, scale_m = config.anchors, np.maximum(scale_m, LIMITS.min_sd_m)
+
+    def loss(pair: tuple[int, int] | None) -> float:
+        """Return the mean loss of a range; a range without a position counts as an outlier."""
+        position = anchors.position.copy()
+        if pair is not None:
+            position[list(pair)] = position[list(pair)[::-1]]
+        trial = replace(config, anchors=anchors.moved(position, anchors.sd))
+        start, has_position = first_positions(trial, segments, prior.rows @ prior.mean)
+        if not has_position.any():
+            return LIMITS.no_position_loss
+        is_used = has_position[segments.segment]
+        selected = prior.select_rows(is_used)
+        observations = observations_of(segments.select(has_position), selected, config.model)
+        try:
+            fit = fit_joint(trial, observations, selected, Start(start), scale_m)
+        except DatasetError:
+            return LIMITS.no_position_loss
+        used = float(is_used.mean())
+        return (
+            used * fit.loss / float(observations.independent.sum()) + (1.0 - used) * LIMITS.no_position_loss
+        )
+
+    as_given = loss(None)
+    examined = np.intersect1d(suspects[: LIMITS.suspects], segments.ranges.anchor).tolist()
+    losses = {pair: loss(pair) for pair in itertools.combinations(examined, 2)}
+    best = min(losses, key=losses.__getitem__, default=None)
+    if best is None or losses[best] > (1.0 - LIMITS.swap_share) * as_given - LIMITS.mean_gain:
+        return None
+    return best
