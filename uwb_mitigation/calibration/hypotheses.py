@@ -34,6 +34,8 @@ class HypothesisLimits:
         gain: minimum gain in log likelihood (chi-squared of two unknowns: e^-12 by chance).
         share: minimum share of the anchor's misfit that a displacement explains. Obstacles that fit one explain 0.39 to 0.62 of it
             (simulated sites 4, 7, 8 and 9); a true one by 1 m explains 0.72 to 0.86 (sites 3 and 6).
+        independent_share: the same if the positions do not depend on the anchors, or if the accusation holds without each of the
+            other anchors: errors of these cannot look like a displacement then.
         swap_share: minimum share of the misfit of all anchors that a swap explains.
         stands_out: minimum ratio of the gain to that of the next anchor, if the positions come from the other anchors: obstacles
             make several anchors look displaced, and a displaced one bends the tracks that judge the others.
@@ -55,6 +57,7 @@ class HypothesisLimits:
     displacement_m: float = 0.3
     gain: float = 12.0
     share: float = 0.65
+    independent_share: float = 0.35
     swap_share: float = 0.35
     stands_out: float = 1.5
     indistinct: float = 4.5
@@ -116,13 +119,19 @@ class AnchorHypotheses:
             self._misfits[row] = misfit
         return self._misfits[row]
 
-    def gain(self, row: int) -> float:
-        """Return the gain in log likelihood of a displacement of this anchor; 0: within the limits."""
+    def gain(self, row: int, *, is_independent: bool) -> float:
+        """Return the gain in log likelihood of a displacement of this anchor; 0: within the limits.
+
+        Args:
+            row: of the anchor.
+            is_independent: see `HypothesisLimits.independent_share`.
+        """
         misfit = self._misfit(row)
         if misfit is None or misfit.moved_m <= LIMITS.displacement_m:
             return 0.0
         gain = misfit.loss - misfit.loss_at(misfit.best)
-        return gain if gain > LIMITS.share * misfit.loss else 0.0
+        share = LIMITS.independent_share if is_independent else LIMITS.share
+        return gain if gain > share * misfit.loss else 0.0
 
     def check(self, reference: str, *, is_independent: bool) -> None:
         """Refuse positions that the ranges contradict.
@@ -134,7 +143,8 @@ class AnchorHypotheses:
         Raises:
             DatasetError: names the anchors.
         """
-        gains = {row: self.gain(row) for row in np.unique(self._ranges.anchor).tolist()}
+        rows = np.unique(self._ranges.anchor).tolist()
+        gains = {row: self.gain(row, is_independent=is_independent) for row in rows}
         suspects = sorted((row for row in gains if gains[row] > LIMITS.gain), key=gains.__getitem__)
         swaps = [
             (self._swap_gain(a, b), a, b)

@@ -319,8 +319,8 @@ def solve_with_truth(
     if not is_part:
         if not localisation.estimate_lever_arm:
             _check_lever_arm(site, align, alignment)
-        position = np.where(is_used[:, None], alignment.position, np.nan)
-        hypotheses = AnchorHypotheses(site.anchors, site.ranges, position, site.tag)
+        # With outliers: many ranges of swapped anchors are some.
+        hypotheses = AnchorHypotheses(site.anchors, site.ranges, alignment.position, site.tag)
         hypotheses.check("the localisation", is_independent=True)
         on_progress(stage, 1.0)
     given = replace(

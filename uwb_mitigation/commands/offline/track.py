@@ -234,7 +234,7 @@ def _residuals(
 def _gain(row: int, ranges: Ranges, track: Track, config: EstimatorConfig) -> float:
     """Return the gain in log likelihood of another position of an anchor, for a track that was estimated without it."""
     antenna = TruePath(track.stamp_ns, track.position).position_at(ranges.stamp_ns)
-    return AnchorHypotheses(config.anchors, ranges, antenna).gain(row)
+    return AnchorHypotheses(config.anchors, ranges, antenna).gain(row, is_independent=True)
 
 
 def _track_without(rows: list[int], initial: Track, ranges: Ranges, config: EstimatorConfig) -> Track:
