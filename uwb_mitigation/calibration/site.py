@@ -427,6 +427,9 @@ class _HeldOutTest:
         """Return the calibration with the selected correction."""
         site, solution = self._site, self._solution
         levels = {COMMON: (ONE, NO_MODEL), OFFSETS: (PAIR, NO_MODEL)}
+        if solution.truth is None and not solution.offsets_differ:
+            # Errors that persist for metres look like offsets in each half of a drive.
+            del levels[OFFSETS]
         needs_separate: list[str] = []
         base = select(self._evaluate(levels), list(levels), needs_separate)
         kinds, notes = [LINE], list(solution.notes)
@@ -440,7 +443,7 @@ class _HeldOutTest:
         if solution.truth is None:
             needs_separate = [name for name, (_, kind) in corrections.items() if kind == LINE]
         held_out = self._evaluate(corrections)
-        candidates = [base, *list(corrections)[2:]]
+        candidates = [base, *list(corrections)[len(levels) :]]
         chosen = select(held_out, candidates, needs_separate)
         level, kind = corrections[chosen]
         data, raw_error_m = _labelled(site, solution, level)

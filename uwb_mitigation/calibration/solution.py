@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from uwb_mitigation.calibration.hypotheses import AnchorHypotheses
 from uwb_mitigation.calibration.joint_fit import medians
@@ -36,6 +37,9 @@ MAX_OFFSET_SD_M = 0.2
 
 SEVERAL = 3.0
 """A common offset is significant if it is at least this number of standard deviations away from zero."""
+
+BY_CHANCE = 0.05
+"""Probability that offsets which are all the same are found to differ."""
 
 OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
 """A range is an outlier if the distance of its error from the median exceeds both limits."""
@@ -102,6 +106,12 @@ class SiteSolution:
     stationary_positions: Mapping[str, tuple[float, float, float]]
     residual_scale: float = 1.0
     network_sd: float = 0.0
+
+    @property
+    def offsets_differ(self) -> bool:
+        """Whether the offsets of the pairs differ by more than their standard deviations explain (chi-squared test)."""
+        deviation2 = sum(((value - self.common[0]) / sd) ** 2 for value, sd in self.pairs.values())
+        return deviation2 > float(chdtri(len(self.pairs) - 1, BY_CHANCE))
 
     def offsets(self, level: str) -> Offsets:
         """Return the offset of each pair, or with the level `ONE` the common offset for all."""
