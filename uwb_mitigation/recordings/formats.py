@@ -60,7 +60,8 @@ def open_recording(path: Path | str, *, mapping: str = "", cir: Literal["final",
             return open_mapped(path, "hanyang")
     if path.is_dir() or path.name.endswith((".log", ".log.xz")) or _looks_like_log(path):
         logs = _reader("decaranging")
-        return logs.open_decaranging(path, cir=logs.CirFrame[cir.upper()])
+        log: Source = logs.open_decaranging(path, cir=logs.CirFrame[cir.upper()])
+        return log
     raise RecordingError("unknown kind of recording", where=str(path), valid=ACCEPTED)
 
 
@@ -73,10 +74,11 @@ def open_mapped(path: Path, mapping: str) -> MappedRecording:
     """
     table = _reader("mapping.mapping").load_mapping(mapping)
     try:
-        return _reader("mapping.mapped").MappedRecording(table, path)
+        recording: MappedRecording = _reader("mapping.mapped").MappedRecording(table, path)
     except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError) as error:
         what = f"the values cannot be converted: {type(error).__name__}: {error!s:.200}"
         raise RecordingError(what, where=str(path), valid=f"values as mapping {mapping} describes") from error
+    return recording
 
 
 def _reader(name: str) -> Any:
