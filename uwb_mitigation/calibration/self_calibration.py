@@ -80,23 +80,31 @@ class SelfCalibration:
 
     def pair(self, tag: int, row: int) -> tuple[float, float]:
         """Return the offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
-        return self._weighted([(tag, row)])
+        return self._weighted([(tag, row)], 1.0)
 
     def mean(self) -> tuple[float, float]:
         """The mean offset of all pairs, m, and its standard deviation."""
-        return self._weighted(self.pairs())
+        return self._weighted(self.pairs(), 1.0)
 
-    def _weighted(self, pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
-        """Return the mean offset of pairs and its standard deviation, m."""
+    def deviation(self, tag: int, row: int) -> tuple[float, float]:
+        """Return the difference of the offset of a pair from the mean, m, and its standard deviation."""
+        pairs = self.pairs()
+        is_pair = np.array([pair == (tag, row) for pair in pairs])
+        return self._weighted(pairs, len(pairs) * is_pair - 1.0)
+
+    def _weighted(
+        self, pairs: Sequence[tuple[int, int]], factor: NDArray[np.float64] | float
+    ) -> tuple[float, float]:
+        """Return the mean of the offsets of pairs, each multiplied by its factor, and its standard deviation, m."""
+        share = np.broadcast_to(factor, len(pairs)) / len(pairs)
         weight = np.zeros(len(self.fit.parameters))
-        for tag, row in pairs:
+        for (tag, row), share_of_pair in zip(pairs, share.tolist(), strict=True):
             names = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
-            weight += [name in names for name in self.fit.prior.names]
-        weight /= len(pairs)
+            weight += share_of_pair * np.array([name in names for name in self.fit.prior.names])
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
         placed = self.fit.config.anchors.sd[[row for _, row in pairs]] ** 2 / 2.0
-        variance = float(weight @ self.fit.covariance @ weight) + float(placed.mean()) / len(pairs)
+        variance = float(weight @ self.fit.covariance @ weight) + float(share**2 @ placed)
         return float(weight @ self.fit.parameters), float(np.sqrt(variance))
 
 

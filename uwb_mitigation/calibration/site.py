@@ -427,10 +427,8 @@ class _HeldOutTest:
         """Return the calibration with the selected correction."""
         site, solution = self._site, self._solution
         levels = {COMMON: (ONE, NO_MODEL), OFFSETS: (PAIR, NO_MODEL)}
-        if solution.truth is None and not solution.offsets_differ:
-            # Errors that persist for metres look like offsets in each half of a drive.
-            del levels[OFFSETS]
-        needs_separate: list[str] = []
+        # Errors that persist for metres look like offsets in each half of a drive.
+        needs_separate = [] if solution.offsets_differ else [OFFSETS]
         base = select(self._evaluate(levels), list(levels), needs_separate)
         kinds, notes = [LINE], list(solution.notes)
         if site.has_cirs:
@@ -443,7 +441,7 @@ class _HeldOutTest:
         if solution.truth is None:
             needs_separate = [name for name, (_, kind) in corrections.items() if kind == LINE]
         held_out = self._evaluate(corrections)
-        candidates = [base, *list(corrections)[len(levels) :]]
+        candidates = [base, *list(corrections)[2:]]
         chosen = select(held_out, candidates, needs_separate)
         level, kind = corrections[chosen]
         data, raw_error_m = _labelled(site, solution, level)

@@ -39,7 +39,7 @@ SEVERAL = 3.0
 """A common offset is significant if it is at least this number of standard deviations away from zero."""
 
 BY_CHANCE = 0.05
-"""Probability that offsets which are all the same are found to differ."""
+"""Probability with which offsets that are all the same are found to differ."""
 
 OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
 """A range is an outlier if the distance of its error from the median exceeds both limits."""
@@ -70,6 +70,7 @@ class SiteSolution:
         rows: int (n,), the ranges of the site that the model is fitted to. true_m: (n,), their true ranges.
         segment: int (n,), segment of the track. stationary: bool, for each segment.
         pairs: offsets of the radios. common: mean offset, m, and its standard deviation.
+        offsets_differ: without ground truth, whether the offsets differ by more than their standard deviations explain.
         outliers: number of ranges that were excluded everywhere because their errors are implausible.
         notes: what was left out.
         errors_of: returns for corrected ranges of all tags, (r,), m, their errors against the reference, (r,), m; NaN:
@@ -104,14 +105,9 @@ class SiteSolution:
     track: NDArray[np.float64]
     track_of: NDArray[np.intp]
     stationary_positions: Mapping[str, tuple[float, float, float]]
+    offsets_differ: bool = True
     residual_scale: float = 1.0
     network_sd: float = 0.0
-
-    @property
-    def offsets_differ(self) -> bool:
-        """Whether the offsets of the pairs differ by more than their standard deviations explain (chi-squared test)."""
-        deviation2 = sum(((value - self.common[0]) / sd) ** 2 for value, sd in self.pairs.values())
-        return deviation2 > float(chdtri(len(self.pairs) - 1, BY_CHANCE))
 
     def offsets(self, level: str) -> Offsets:
         """Return the offset of each pair, or with the level `ONE` the common offset for all."""
@@ -251,6 +247,7 @@ class _RangesOnly:
             stationary=segments.is_stationary,
             pairs=self._pairs,
             common=calibration.mean(),
+            offsets_differ=self._offsets_differ(),
             outliers=outliers,
             notes=tuple(notes),
             errors_of=functools.partial(self._errors_of, has_truth),
@@ -263,6 +260,12 @@ class _RangesOnly:
             residual_scale=self._residual_scale(has_truth),
             network_sd=calibration.value(NETWORK)[1],
         )
+
+    def _offsets_differ(self) -> bool:
+        """Test with chi-squared whether the offsets of the pairs differ."""
+        pairs = self._calibration.pairs()
+        deviations = [self._calibration.deviation(tag, row) for tag, row in pairs]
+        return sum((value / sd) ** 2 for value, sd in deviations) > float(chdtri(len(pairs) - 1, BY_CHANCE))
 
     def _residual_scale(self, has_truth: NDArray[np.bool_]) -> float:
         fit, segments = self._calibration.fit, self._calibration.segments
