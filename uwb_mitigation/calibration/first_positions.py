@@ -17,11 +17,17 @@ from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 
 OFFSETS_M = np.arange(-1.0, 2.01, 0.5)
+"""Common offsets that are tried, m: from usual antenna delays to those that were never set."""
+
 START_SD_M = 0.2
-WINDOW_S = 0.5
-MAX_WINDOWS = 12
+"""Standard deviation of a range from which an offset is subtracted that is wrong by up to half a step."""
+
+WINDOW_S, MAX_WINDOWS = 0.5, 12
+"""Duration of a moment, in which a tag at walking speed moves by less than a metre, and the number of moments that are tried."""
 
 NO_POSITION_LOSS = 50.0
+"""Loss of a moment without a position, ten times that of bad ones."""
+
 MIN_UNIT_LOSS = 5.0
 """Loss of a moment from which other units are examined."""
 

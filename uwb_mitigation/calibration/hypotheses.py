@@ -75,7 +75,10 @@ class HypothesisLimits:
 
 
 LIMITS = HypothesisLimits()
+
 _MAX_ANCHOR_RANGES, _SIMPLEX_M = 1000, 0.5
+"""Ranges of an anchor that are used, which limits the time, and the first step of the search for a better position."""
+
 _REMEDY = "their true positions in the anchors file (`uwb-mitigation survey` finds them)"
 
 

@@ -22,8 +22,11 @@ from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.stamps import NS_PER_S
 
 KNOT_S = 0.15
-LEAST_SCALE_M = 0.02
-_FIRST_SCALE_M = 0.3
+"""Between knots the velocity is constant: at 1 m/s^2 the position differs by less than 3 mm."""
+
+LEAST_SCALE_M, _FIRST_SCALE_M = 0.02, 0.3
+"""Minimum standard deviation of the residuals, the noise of a DW1000, and that of the first iteration, with offsets and NLOS errors."""
+
 SD_INFLATION = 1.5
 """Factor of standard deviations: errors of one position return with each lap, and a track follows persisting errors, which
 the number of independent ranges does not contain. With it, 9 of 10 offsets of simulated drives are within two standard
@@ -47,13 +50,13 @@ FAR_S = 0.5
 MAX_REFITS = 5
 """With more anchors, several are left out together."""
 
-_ITERATIONS = 25
-_HUBER_ITERATIONS = 4
-_CONVERGED_M = 1e-3
+_ITERATIONS, _HUBER_ITERATIONS, _CONVERGED_M = 25, 4, 1e-3
+"""Maximum number of iterations; those with a convex loss, for starts that are far away; and the change of positions that ends them."""
+
 PARAMETER_PRECISION = 0.2
 """The parameters are the result: they must change by less than this share of the limit for positions."""
-_NO_PRIOR = 1e-8
-_STATIONARY = 1e-6
+_NO_PRIOR, _STATIONARY = 1e-8, 1e-6
+"""Information of a position without a prior, m^-2, which keeps the matrix regular; standard deviation of the velocity at rest, m/s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,8 @@ FEW = 3
 """If the median number of ranges per anchor is smaller, the tag is treated as stationary."""
 
 BIN_S = 1.0
+"""Duration of the parts that are compared with the next one: a tag at walking speed moves by much more than `STILL_M`."""
+
 LEAST_S = 4.0
 """Shorter stationary parts belong to the motion around them."""
 

@@ -23,10 +23,16 @@ from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import PosePath, Ranges
 
 MAX_TIME_OFFSET_S = 2.0
+"""Clocks that differ more are not synchronised, which is refused. The steps below: at 1 m/s, 0.1 s are 0.1 m, the noise of a range."""
+
 COARSE_OFFSETS_S = np.arange(-MAX_TIME_OFFSET_S, MAX_TIME_OFFSET_S + 0.01, 0.1)
 FINE_OFFSETS_S = np.arange(-0.1, 0.101, 0.02)
 TIME_OFFSET_SD_S, LEVER_SD_M, OFFSET_SD_M = 2.0, 1.0, 2.0
+"""Prior standard deviations: as large as these values can be on robots, so that the ranges decide."""
+
 MIN_RANGES = 40
+"""Fewer do not determine time offset, lever arm and offsets."""
+
 MAX_RANGES, SEARCHED = 20_000, 4000
 """The fit, and the search for the time offset, use at most this number of ranges."""
 
@@ -42,13 +48,15 @@ BLOCK_S, SD_INFLATION = 10.0, 1.5
 recur with each lap, which are not in their scatter."""
 
 LEVER_STEPS = 5
+"""Iterations for the lever arm at each time offset of the search; the fit continues from there."""
+
 MIN_SD_M = 0.01
 """Minimum standard deviation of white noise and of persisting errors."""
 
-_ITERATIONS = 40
-_CONVERGED = 1e-5
-_FIXED_SD = 1e-9
-_SMALL_M = 0.02
+_ITERATIONS, _CONVERGED, _FIXED_SD, _SMALL_M = 40, 1e-5, 1e-9, 0.02
+"""Maximum number of iterations and the change that ends them, m or s; standard deviation of given values; residuals below `_SMALL_M`, the
+noise of a DW1000, have the same weight."""
+
 _MODEL = NoiseModel(long=1.5, short=1.5)
 
 

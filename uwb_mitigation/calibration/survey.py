@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.hypotheses import LIMITS, AnchorHypotheses, find_swapped
 from uwb_mitigation.calibration.motion_segments import find_segments
+from uwb_mitigation.calibration.observability import MOVES_M
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.smoother import Smoothed, Smoother
 from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank
@@ -33,8 +34,6 @@ _STEPS_M = (1.0, 0.5, 0.25, 0.0)
 
 UNEXPLAINED = 0.6
 """In real drives the loss was 0.7 or more if anchors were not found, or if a pair was wrongly reported as swapped."""
-
-_MOVES_M = 1.0
 
 _AS_WELL = 1.5
 """Mirror images whose distances from the guesses differ by a smaller factor fit them equally well."""
@@ -176,8 +175,8 @@ def _fit(config: EstimatorConfig, ranges: Ranges) -> Smoothed:
             valid="better guesses, an area, or a height; four anchors or more",
         )
     spread = float(np.hypot(*np.ptp(track.position[:, :2], axis=0)))
-    if spread < _MOVES_M:
-        raise DatasetError(f"the tag moves by {spread:.1f} m only", valid=f"{_MOVES_M:g} m or more")
+    if spread < MOVES_M:
+        raise DatasetError(f"the tag moves by {spread:.1f} m only", valid=f"{MOVES_M:g} m or more")
     around = np.repeat(start.sd[:, None], 3, axis=1)
     if config.height is not None:
         around[:, 2] = np.minimum(around[:, 2], TAPE_M)
