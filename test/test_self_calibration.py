@@ -58,6 +58,10 @@ def test_pair_offsets_of_a_drive_match_their_standard_deviations(solved):
     error = found[:, 0] - 0.25 - OWN
     assert np.abs(error).max() < 0.12
     assert np.abs(error / found[:, 1]).max() < 3.0
+    deviation = np.array([solved.deviation(0, row) for row in range(5)])
+    assert deviation[:, 0] == pytest.approx(found[:, 0] - solved.mean()[0])
+    assert (deviation[:, 1] < found[:, 1] + solved.mean()[1]).all()
+    assert np.abs(deviation[:, 0] / deviation[:, 1]).max() > 3.0
 
 
 def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved, recorded):
