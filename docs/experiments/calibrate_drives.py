@@ -6,10 +6,10 @@ real deployments in two and three dimensions; `hanyang`, every ordered pair of r
 halves of a short real drive. With `--check`, a third drive is the check of the calibration.
 
 Printed for each pair: the correction, the promised change of the live position error, its change on the other drive, RMSE without
-and with the calibration, and the standard deviation that it publishes; or the reason of the refusal. Seeds 0 to 11 were used for
-development; results are reported for seeds from 12 on.
+and with the calibration, and the standard deviation that it publishes; or the reason of the refusal. Seeds 0 to 15 were used for
+development; results are reported for seeds from 16 on.
 
-    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 12 --seeds 2
+    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 16 --seeds 2
     PYTHONPATH=. python docs/experiments/calibrate_drives.py levels hanyang --check -o drives.jsonl
 """
 

@@ -33,6 +33,7 @@ from uwb_mitigation.calibration.models import (
 )
 from uwb_mitigation.calibration.site_data import SiteData, read_site
 from uwb_mitigation.calibration.solution import (
+    MAX_OFFSET_SD_M,
     ONE,
     PAIR,
     SEVERAL,
@@ -153,6 +154,13 @@ class SiteCalibration:
         common, sd = self.solution.common
         if self.solution.truth is None and self.chosen == COMMON and abs(common) < SEVERAL * sd:
             return f"no offset is significant: {common:.2f} m with a standard deviation of {sd:.2f} m"
+        for (tag, anchor), (value, sd) in self.pairs.items():
+            # The common offset is not that of an anchor that differs from it.
+            if self.solution.truth is None and sd > MAX_OFFSET_SD_M:
+                return (
+                    f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is unknown: {value:.2f} m with a standard "
+                    f"deviation of {sd:.2f} m"
+                )
         for part in self.held_out:
             drive = "on the drive of the check " if part is not self.held_out[0] else ""
             if part.live_gain(self.chosen, RAW).mean < -MAX_INCREASE:
