@@ -197,10 +197,11 @@ def test_errors_of_a_half_are_computed_with_the_offsets_of_the_other(truth):
     else:
         solution = solve_without_truth(site, height=Height(1.0), area=None)
     errors = calibrate_site(site, universal, solution).held_out[0].residual_m["offsets"]
-    # Without ground truth, the error of one anchor also moves the positions that the others are compared with.
+    # Without ground truth, the error of one anchor also moves the positions that the others are compared with (by up to 0.16 m).
+    tolerance_m = 0.1 if truth else 0.19
     for is_half, expected_m in ((is_late, 0.4), (~is_late, -0.4)):
-        assert np.nanmedian(errors[is_half & (ranges.anchor == 2)]) == pytest.approx(expected_m, abs=0.19)
-        assert np.nanmedian(errors[is_half & (ranges.anchor == 0)]) == pytest.approx(0.0, abs=0.19)
+        assert np.nanmedian(errors[is_half & (ranges.anchor == 2)]) == pytest.approx(expected_m, abs=tolerance_m)
+        assert np.nanmedian(errors[is_half & (ranges.anchor == 0)]) == pytest.approx(0.0, abs=tolerance_m)
 
 
 def test_line_and_offsets_are_selected_only_if_they_improve_each_drive():
