@@ -62,6 +62,7 @@ TUTORIAL_OFFSET_M = 0.22
 MAX_RUNS, MIN_TRUE_POSITIONS = 200, 10
 _SIMULATED_HEIGHT = Height(0.0, 0.05)
 _GROUPS = 10
+_WAVES = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -396,7 +397,7 @@ def load_hall(set_name: str, name: str, kind: str) -> Run:
         phase = 0.2 * time_s
         return np.stack([6 + 4 * np.cos(phase), 4.5 + 3 * np.sin(phase), np.ones_like(phase)], axis=1)
 
-    ranges, truth = _ranges(anchors, path, rng, white_m=0.03)
+    ranges, truth = _ranges(anchors, path, rng, white_m=0.03, common_m=0.0)
     range_m = ranges.range_m.copy()
     if kind == "nlos":
         interval = ranges.stamp_ns // (10 * NS_PER_S)
@@ -498,7 +499,7 @@ def _ranges(
     constant_m: float = 0.0,
     nlos_share: float = 0.0,
     common_m: float = 0.1,
-    length_m: float = 2.0 / math.tau,
+    length_m: float = 0.3,
     seconds: float = DRIVE_S,
     rate_hz: float = 40.0,
 ) -> tuple[Ranges, TruePath]:
@@ -508,10 +509,12 @@ def _ranges(
     position = path(time_s)
     distance = np.linalg.norm(position - anchors.position[anchor], axis=1)
     error = white_m * rng.standard_t(5.0, n) / math.sqrt(5.0 / 3.0)
-    # Errors that depend on the position of the tag: waves that change within `length_m`.
-    waves = rng.normal(0.0, 1.0 / length_m, (len(anchors), 3))
-    error += slow_m * math.sqrt(2.0) * np.sin(np.einsum("ni,ni->n", waves[anchor], position))
-    error += rng.normal(common_m, constant_m, len(anchors))[anchor] if constant_m else 0.0
+    # Errors that depend on the position of the tag: a Gaussian process of each anchor (random Fourier features).
+    waves = rng.normal(0.0, 1.0 / length_m, (len(anchors), _WAVES, 3))
+    phase = rng.uniform(0.0, math.tau, (len(anchors), _WAVES))[anchor]
+    angle = np.einsum("nwi,ni->nw", waves[anchor], position) + phase
+    error += slow_m * math.sqrt(2.0 / _WAVES) * np.sin(angle).sum(axis=1)
+    error += rng.normal(common_m, constant_m, len(anchors))[anchor]
     interval = (time_s // 2.0).astype(int)
     blocked = rng.random((len(anchors), interval[-1] + 1)) < nlos_share
     error += (blocked * rng.exponential(0.5, blocked.shape))[anchor, interval]
