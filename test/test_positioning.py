@@ -14,13 +14,26 @@ from benchmarks.position_data import simulated_runs
 from benchmarks.positions import ambiguous_drives, evaluate
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.batch.smoother import smooth
-from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank, dop, horizontal_ellipse
+from uwb_mitigation.positioning.geometry import (
+    AnchorRank,
+    Area,
+    Height,
+    anchor_rank,
+    constant_error_gain,
+    dop,
+    horizontal_ellipse,
+)
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import candidate_positions
 from uwb_mitigation.positioning.online.measurements import TagRange
-from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import (
+    RANGE_TIMEOUT_S,
+    Ambiguity,
+    EstimatorConfig,
+    TagEstimator,
+)
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track, TruePath
@@ -126,6 +139,43 @@ def test_ambiguous_position_is_not_published_until_an_area_resolves_it():
     assert locator.candidates == 2
     inside = TagEstimator(EstimatorConfig(wall, height=Height(1.0), area=Area((-50, 0.1, 0), (50, 50, 3))))
     assert track_errors(inside.run(ranges), truth).rmse < 0.4
+
+
+SQUARE = AnchorMap(
+    [Anchor(1, (-4, -3, 1.5)), Anchor(2, (4, -3, 1.52)), Anchor(3, (4, 3, 1.5)), Anchor(4, (-4, 3, 1.48))]
+)
+"""Anchors at one height: their ranges do not show whether a tag is above or below it."""
+
+
+def around(time_s: np.ndarray) -> np.ndarray:
+    return np.stack([2 * np.cos(0.3 * time_s), 2 * np.sin(0.3 * time_s), 2.5 + 0 * time_s], axis=1)
+
+
+@pytest.mark.parametrize("area", [None, Area((-9, -9, 1.45), (9, 9, 3.5))])
+def test_level_anchors_give_x_and_y_and_a_variance_of_the_height_that_contains_the_image(area: Area | None):
+    ranges, truth = drive(SQUARE, path=around, seconds=30)
+    locator = TagEstimator(EstimatorConfig(SQUARE, area=area))
+    errors = track_errors(locator.run(ranges), truth)
+    assert errors.epochs > 0.9 * len(ranges)
+    assert errors.rmse < 0.2
+    if area is None:
+        assert locator.ambiguity is Ambiguity.HEIGHT
+        assert errors.height_exceeded < 0.01
+
+
+def test_area_excludes_the_image_of_a_height():
+    ranges, truth = drive(SQUARE, path=around, seconds=30)
+    locator = TagEstimator(EstimatorConfig(SQUARE, area=Area((-9, -9, 1.7), (9, 9, 3.5))))
+    track = locator.run(ranges)
+    assert locator.ambiguity is Ambiguity.NONE
+    assert track_errors(track, truth).height_rmse < 0.6, "the image is 2 m away"
+
+
+def test_anchors_on_a_line_leave_a_circle_without_a_height():
+    line = AnchorMap([Anchor(i, (0.01 * (-1) ** i, 0.3 * i, 1.0), 0.01) for i in range(1, 5)])
+    ranges, _ = drive(line, seconds=20)
+    locator = TagEstimator(EstimatorConfig(line, area=Area((0, -20, -10), (20, 20, 20))))
+    assert len(locator.run(ranges)) == 0
 
 
 @pytest.mark.parametrize("seed", [2, 3])
@@ -365,3 +415,14 @@ def test_errors_are_near_those_of_simple_filters(kind: str):
     assert entry["ratio_to_best_baseline"] < 1.1
     assert entry["rows"]["raw_locator"]["coverage95"] > 0.89
     assert entry["rows"]["raw_locator"]["rmse_m"] < 0.12
+
+
+def test_constant_errors_move_a_position_as_least_squares_with_an_offset_does():
+    anchors, position = np.array([(0, 0, 1), (9, 0, 1), (9, 7, 1), (0, 7, 1.0)]), np.array([3.0, 4.0, 1.0])
+    covariance, redundancy = constant_error_gain(anchors, position, 2, 100.0)
+    away = position - anchors
+    rows = np.column_stack([away[:, :2] / np.linalg.norm(away, axis=1)[:, None], np.ones(4)])
+    expected = np.linalg.inv(rows.T @ rows)[:2, :2]
+    np.testing.assert_allclose(covariance[:2, :2], expected, rtol=0.01)
+    assert not covariance[2].any()
+    assert redundancy == pytest.approx(1 / 4, abs=0.01), "four ranges, three unknowns"

@@ -14,6 +14,15 @@ from uwb_mitigation.errors import ParameterError
 FLAT = 0.05
 """Anchors whose spread in a direction is a smaller part of their largest one have no extent in it."""
 
+CIRCLE_POINTS = 36
+"""Points on a circle of positions: 10 degrees apart."""
+
+IMAGE_SHIFT_M = 0.5
+"""An image that is shifted by this (standard deviation) to fit the ranges is the same solution."""
+
+CONSTANT_ERROR_M, POSITION_SD_M = 0.1, (5.0, 5.0, 1.0)
+"""Constant errors of ranges, and what else is known of a position: without it, weak directions would have infinite variances."""
+
 
 class AnchorRank(enum.Enum):
     """Arrangement of a set of anchors."""
@@ -107,10 +116,10 @@ def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
 def unit_vectors(
     tag: NDArray[np.float64], anchor: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return unit vectors (n, 3) from anchors to tags, and distances (n,), 0.05 m at least."""
+    """Return unit vectors (..., 3) from anchors to tags, and distances (...), 0.05 m at least."""
     away = tag - anchor
-    distance = np.maximum(np.sqrt(np.einsum("ni,ni->n", away, away)), 0.05)
-    return away / distance[:, None], distance
+    distance = np.maximum(np.sqrt(np.einsum("...i,...i->...", away, away)), 0.05)
+    return away / distance[..., None], distance
 
 
 def anchor_rank(position: NDArray[np.float64]) -> AnchorRank:
@@ -123,6 +132,101 @@ def anchor_rank(position: NDArray[np.float64]) -> AnchorRank:
         return AnchorRank.POINT
     extents = int((spread > FLAT * spread[0]).sum())
     return (AnchorRank.LINE, AnchorRank.PLANE, AnchorRank.SPACE)[extents - 1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Symmetry:
+    """What maps a position to others with the same ranges: a mirror, or the rotations about a line.
+
+    Attributes:
+        center: a point of the mirror or the line, float64 (3,), m.
+        axis: normal of the mirror or direction of the line, float64 (3,).
+        is_rotation: anchors on a line (at known heights: in one place) leave a circle.
+    """
+
+    center: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    is_rotation: bool
+
+    @classmethod
+    def of(cls, anchors: NDArray[np.float64], dims: int, sd_m: float) -> Symmetry:
+        """Return the symmetry that anchors float64 (m, 3) have approximately; whether ranges show the difference: `separation`.
+
+        Args:
+            anchors: at least one.
+            dims: number of unknown coordinates: 2 if the height is known.
+            sd_m: errors of ranges. Anchors whose distances from a line are smaller are on it.
+        """
+        center, count = anchors.mean(axis=0), len(anchors)
+        offsets = np.pad((anchors - center)[:, :dims], ((0, max(0, dims - count)), (0, 0)))
+        _, spread, axes = np.linalg.svd(offsets)
+        is_rotation = bool(spread[dims - 2] < sd_m * math.sqrt(count))
+        axis = np.zeros(3)
+        if is_rotation and dims == 2:
+            axis[2] = 1.0
+        else:
+            axis[:dims] = axes[0 if is_rotation else dims - 1]
+        return cls(center, axis, is_rotation)
+
+    def images(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the other positions float64 (n, 3), around the line in the order of their angles."""
+        offset = position - self.center
+        along = float(offset @ self.axis) * self.axis
+        if not self.is_rotation:
+            return (position - 2.0 * along)[None]
+        angle = np.arange(1, CIRCLE_POINTS)[:, None] * (math.tau / CIRCLE_POINTS)
+        across, turned = offset - along, np.cross(self.axis, offset)
+        images: NDArray[np.float64] = self.center + along + np.cos(angle) * across + np.sin(angle) * turned
+        return images
+
+
+def separation(
+    anchors: NDArray[np.float64],
+    position: NDArray[np.float64],
+    images: NDArray[np.float64],
+    sd_m: float,
+    offset_sd_m: float,
+    dims: int,
+) -> NDArray[np.float64]:
+    """Return by how many standard deviations of the ranges the ranges of each image float64 (n, 3) differ from those of a position.
+
+    The first `dims` coordinates of an image and the common offset of the ranges are changed so that the difference becomes as
+    small as possible.
+    """
+    unit, distance = unit_vectors(images[:, None], anchors)
+    difference = distance - unit_vectors(position[None], anchors)[1]
+    rows = np.concatenate([unit[..., :dims], np.ones((*distance.shape, 1))], axis=2)
+    normal = np.einsum("nki,nkj->nij", rows, rows) / sd_m**2
+    prior_sd = np.array([*[IMAGE_SHIFT_M] * dims, max(offset_sd_m, 1e-3)])
+    normal[:, range(dims + 1), range(dims + 1)] += 1.0 / prior_sd**2
+    right = np.einsum("nki,nk->ni", rows, difference) / sd_m**2
+    explained = np.einsum("ni,ni->n", right, np.linalg.solve(normal, right[..., None])[..., 0])
+    squared = np.einsum("nk,nk->n", difference, difference) / sd_m**2 - explained
+    separations: NDArray[np.float64] = np.sqrt(np.maximum(squared, 0.0))
+    return separations
+
+
+def constant_error_gain(
+    anchors: NDArray[np.float64], position: NDArray[np.float64], dims: int, offset_sd_m: float
+) -> tuple[NDArray[np.float64], float]:
+    """Return the covariance of a position float64 (3,) for constant errors of the ranges, and the share of redundant ranges.
+
+    These are the sensitivities of least squares for a position and a common offset, for independent errors with a variance of 1.
+
+    Args:
+        anchors: float64 (m, 3), at least one.
+        position: float64 (3,).
+        dims: number of unknown coordinates; the covariance of the others is zero.
+        offset_sd_m: prior of the common offset.
+    """
+    rows = np.ones((len(anchors), dims + 1))
+    rows[:, :dims] = unit_vectors(position, anchors)[0][:, :dims]
+    prior = np.diag([(CONSTANT_ERROR_M / sd) ** 2 for sd in (*POSITION_SD_M[:dims], max(offset_sd_m, 1e-3))])
+    gain = np.linalg.solve(rows.T @ rows + prior, rows.T)
+    residual = np.eye(len(anchors)) - rows @ gain
+    covariance = np.zeros((3, 3))
+    covariance[:dims, :dims] = gain[:dims] @ gain[:dims].T
+    return covariance, float(np.einsum("ij,ij->", residual, residual)) / len(anchors)
 
 
 def dop(anchors: NDArray[np.float64], position: NDArray[np.float64], *, level: bool = False) -> Dop:

@@ -274,11 +274,15 @@ def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
         odometry=config.robot.odometry and config.robot.odometry.reversed(end_ns),
         imu=config.robot.imu and config.robot.imu.reversed(end_ns),
     )
-    track = make_estimator(replace(config, heights=heights, robot=robot)).run(ranges.reversed(end_ns))
+    # Constant errors of ranges, and mirrored heights, are the same in both directions: they are no reason to prefer one.
+    alone = replace(config, widens=False)
+    earlier = _states_at(make_estimator(alone).run(ranges), stamp_ns)
+    unseen = np.nan_to_num(_states_at(live, stamp_ns)[1] - earlier[1])
+    track = make_estimator(replace(alone, heights=heights, robot=robot)).run(ranges.reversed(end_ns))
     later = _states_at(track, (end_ns - stamp_ns)[backwards])
     flip = np.diag([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     later = later[0][backwards] @ flip, flip @ later[1][backwards] @ flip
-    state, covariance, spread = _fused(_states_at(live, stamp_ns), later)
+    state, covariance, spread = _fused(earlier, later)
     # Without a position of either filter the batch smoother's choice among several optima is arbitrary.
     is_known = np.asarray(np.isfinite(state).all(axis=1), np.bool_)
     yaw = _fused_yaw(_yaw_at(live, stamp_ns), _yaw_at(track, end_ns - stamp_ns))
@@ -291,7 +295,7 @@ def smooth(config: EstimatorConfig, ranges: Ranges, live: Track) -> Track:
         state, covariance, more = fused_with_batch(state, covariance, batch)
         spread += more
     position = state[:, :3] if config.area is None else config.area.clip(state[:, :3])
-    return Track(stamp_ns, position, state[:, 3:], covariance + spread, yaw).take(is_known)
+    return Track(stamp_ns, position, state[:, 3:], covariance + spread + unseen, yaw).take(is_known)
 
 
 def fused_with_batch(

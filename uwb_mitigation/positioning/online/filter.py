@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.positioning.geometry import Symmetry
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.robust_update import RobustUpdate
 from uwb_mitigation.types.anchors import AnchorMap
@@ -38,9 +39,10 @@ class RangeFilter:
     Attributes:
         time_s: of the state, s.
         state: mean, covariance and updates.
+        unseen: float64 (3, 3), m^2, covariance of the position for what the state does not contain: constant errors, other solutions.
     """
 
-    __slots__ = ("_anchors", "_level", "_model", "state", "time_s")
+    __slots__ = ("_anchors", "_level", "_model", "state", "time_s", "unseen")
 
     def __init__(
         self,
@@ -54,7 +56,7 @@ class RangeFilter:
     ) -> None:
         self._anchors, self._model, self._level, self.time_s = anchors.position, model, level, time_s
         self.state = RobustUpdate(anchors, model, np.concatenate([position, np.zeros(3)]))
-        self.P[:3, :3] = covariance
+        self.P[:3, :3], self.unseen = covariance, np.zeros((3, 3))
         for axis in range(2 if level else 3):
             self.P[3 + axis, 3 + axis] = model.speed**2
 
@@ -123,9 +125,19 @@ class RangeFilter:
                 self.state.project(axis, nearest)
         self.x[:3] = np.clip(self.x[:3], low, high)
 
+    def reflect(self, mirror: Symmetry) -> None:
+        """Replace position and velocity by their mirror images."""
+        reflection = np.eye(3) - 2.0 * np.multiply.outer(mirror.axis, mirror.axis)
+        self.x[:3] = mirror.images(self.x[:3])[0]
+        self.x[3:6] = reflection @ self.x[3:6]
+        for rows in (slice(3), slice(3, 6)):
+            self.P[rows] = reflection @ self.P[rows]
+            self.P[:, rows] = self.P[:, rows] @ reflection
+
     def estimate(self, stamp_ns: int) -> Estimate:
         """Return position and velocity, at the stamp that the state is for."""
         x, covariance = self.x, self.P[:6, :6] * self.state.covariance_scale()
+        covariance[:3, :3] += self.unseen
         return Estimate(stamp_ns, x[:3].copy(), x[3:6].copy(), covariance)
 
     @property

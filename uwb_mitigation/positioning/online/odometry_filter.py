@@ -25,9 +25,6 @@ YAW, SCALE, DRIFT, TURN = 3, 4, 5, 6
 SCALE_SD = 0.05
 """Standard deviation of the constant relative error of distances: wheel diameters."""
 
-SLOPE = 0.1
-"""Without a known height, it changes by this share of the distance."""
-
 STATIONARY_S = 30.0
 """Range errors of a stationary robot change in about this time: people and doors move."""
 
@@ -115,8 +112,6 @@ class OdometryFilter:
         P[0, 0] += q
         P[1, 1] += q
         P[YAW, YAW] += max(point.yaw_variance - before.yaw_variance, 0.0)
-        if not self._level:
-            P[2, 2] += SLOPE**2 * distance
         self.state.predict_errors(distance / (self._model.persistence_s * WALKING_SPEED) + dt / STATIONARY_S)
 
     def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
@@ -130,13 +125,12 @@ class OdometryFilter:
         H[YAW] = H[1] * arm_x - H[0] * arm_y
         return self.state.update_range(anchor, range_m - distance, variance_m2)
 
-    def update_height(self, height_m: float, variance_m2: float) -> None:
-        """Update with the height of the antenna."""
-        H = np.zeros(len(self.state.x))
-        H[2] = 1.0
-        self.state.update(
-            H, height_m - self._lever_arm[2] - float(self.state.x[2]), variance_m2, robust=False
-        )
+    def set_height(self, height_m: float, variance_m2: float) -> None:
+        """Set the height of the antenna: the odometry is horizontal, so that ranges only determine it, unless it is constant."""
+        if not self._level:
+            P = self.state.P
+            P[2] = P[:, 2] = 0.0
+            self.state.x[2], P[2, 2] = height_m - self._lever_arm[2], variance_m2
 
     def confine(self, area: Area) -> None:
         """Project the antenna onto a box."""
@@ -166,7 +160,6 @@ class OdometryFilter:
         covariance[:3, :3] = pose[:3, :3]
         speed_variance = odometry.twist_variance[0] + float(P[YAW, YAW]) * (vx * vx + vy * vy)
         covariance[[3, 4], [3, 4]] = speed_variance
-        covariance[5, 5] = SLOPE**2 * speed_variance
         position = x[:3] + np.array([arm_x, arm_y, self._lever_arm[2]])
         return Estimate(stamp_ns, position, velocity, covariance, Heading(yaw, pose[YAW]))
 

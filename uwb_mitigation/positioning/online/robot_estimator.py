@@ -117,8 +117,6 @@ class RobotEstimator:
         if not measurement.is_valid:
             return None
         if isinstance(measurement, TagHeight):
-            for hypothesis in self._yaws:
-                hypothesis.filter.update_height(*measurement)
             return self.tag.add(measurement)
         while self._recorded and self._recorded[0][0] <= measurement.stamp_ns:
             recorded_ns, add, values = self._recorded.popleft()
@@ -171,19 +169,27 @@ class RobotEstimator:
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
         delta = ranges_only.position - estimate.position
-        # The state of this method is new: it can be changed in place.
-        covariance = estimate.covariance
-        covariance[:3, :3] *= weight
-        covariance[:3, :3] += (1.0 - weight) * ranges_only.covariance[:3, :3]
-        covariance[:3, :3] += weight * (1.0 - weight) * np.multiply.outer(delta, delta)
-        position = estimate.position + (1.0 - weight) * delta
+        # The height and its velocity are those of the ranges-only estimate. Both estimates are new: they can be changed in place.
+        assert estimate.heading is not None
+        assert self.tag.filter is not None
+        covariance, mean = ranges_only.covariance, estimate.covariance[:2, :2]
+        spread = np.multiply.outer(delta[:2], delta[:2])
+        covariance[:2, :2] = weight * (mean + self.tag.filter.unseen[:2, :2] + (1.0 - weight) * spread) + (
+            (1.0 - weight) * covariance[:2, :2]
+        )
+        covariance[:2, 2] *= 1.0 - weight
+        covariance[2, :2] = covariance[:2, 2]
+        covariance[:3, 3:] = covariance[3:, :3] = 0.0
+        covariance[3:5, 3:5] = estimate.covariance[3:5, 3:5]
+        position = ranges_only.position - weight * delta * (1.0, 1.0, 0.0)
+        velocity = np.append(estimate.velocity[:2], ranges_only.velocity[2])
         if self._area is not None:
             position = self._area.clip(position)
-        assert estimate.heading is not None
         yaw_covariance = estimate.heading.covariance
-        yaw_covariance[:3] *= weight
+        yaw_covariance[:2] *= weight
+        yaw_covariance[2] = 0.0
         heading = Heading(estimate.heading.yaw, yaw_covariance)
-        return Estimate(estimate.stamp_ns, position, estimate.velocity, covariance, heading)
+        return Estimate(estimate.stamp_ns, position, velocity, covariance, heading)
 
     def _update_headings(self, measurement: TagRange) -> None:
         tag = self.tag
@@ -196,8 +202,11 @@ class RobotEstimator:
             self._start_yaws(point)
             return
         dt = time_s - self._yaws[0].filter.time_s
+        height = None if tag.filter is None else (float(tag.filter.x[2]), float(tag.filter.P[2, 2]))
         for hypothesis in self._yaws:
             hypothesis.filter.advance(time_s, point)
+            if height is not None:
+                hypothesis.filter.set_height(*height)
             z, sd = hypothesis.filter.update(*measurement[1:])
             if self._area is not None:
                 hypothesis.filter.confine(self._area)
@@ -211,7 +220,7 @@ class RobotEstimator:
         assert filter_ is not None
         x, y = heading_filter.antenna_xy
         dx, dy = x - float(filter_.x[0]), y - float(filter_.x[1])
-        (a, b), (_, c) = filter_.P[:2, :2].tolist()
+        (a, b), (_, c) = (filter_.P[:2, :2]).tolist()
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
         self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
         self._rejections *= math.exp(-max(dt, 0.0) / FORGIVEN_S)

@@ -3,7 +3,8 @@
 State: motion (0 to k - 1), the offset that the tag's ranges have in common (k), and the persisting error of each anchor's ranges
 (k + 1, ...). While the position is searched, offset and errors are only considered (S. F. Schmidt, 1966): they keep their
 uncertainty and their correlations, so that no candidate position explains its ranges by wrong offsets. Afterwards they are
-estimated. Covariances in Joseph's form, which is valid for any gain.
+estimated. Constant errors of anchors are no states: they would follow errors that change slowly. Their variance is
+estimated from residuals, see `persisting_variance`, and widens the published covariance.
 """
 
 from __future__ import annotations
@@ -30,6 +31,13 @@ SCALE, POWER, MIN_SCALE, MAX_SCALE = 2.2, 4.0, 0.2, 12.0
 """See `RobustUpdate.covariance_scale`."""
 
 
+RESIDUAL_RATE = 0.001
+"""As `CONSISTENCY_RATE`, for products of residuals: a thousand ranges, because most of their errors are constant."""
+
+PRIOR_SHARE = 0.05
+"""Weight of the modelled variance of persisting errors among these: that of ranges of which this share is redundant."""
+
+
 class RobustUpdate:
     """Mean, covariance and measurement updates.
 
@@ -43,9 +51,21 @@ class RobustUpdate:
         H: float64 (n,), derivatives of the next range with respect to the motion states, which the owner sets.
         estimates_errors: whether measurements change offset and errors, which are only considered otherwise.
         consistency: running mean of the second moments of the persisting errors, relative to the model; 1: they are as modelled.
+        residual_square: running mean of the products of two residuals of an anchor in a row, m^2: of their errors without noise.
     """
 
-    __slots__ = ("H", "P", "_error_variance", "_model", "_offset", "consistency", "estimates_errors", "x")
+    __slots__ = (
+        "H",
+        "P",
+        "_error_variance",
+        "_last_residual",
+        "_model",
+        "_offset",
+        "consistency",
+        "estimates_errors",
+        "residual_square",
+        "x",
+    )
 
     def __init__(self, anchors: AnchorMap, model: NoiseModel, motion: NDArray[np.float64]) -> None:
         self._model, self._offset = model, len(motion)
@@ -53,6 +73,7 @@ class RobustUpdate:
         # The unconditional variance of each anchor's persisting error: what its last ranges' variances claim.
         self._error_variance = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
         self.estimates_errors, self.consistency = False, 1.0
+        self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
         self.H, self.x, self.P = np.zeros(n), np.zeros(n), np.zeros((n, n))
         self.x[: len(motion)] = motion
         self.P[self._offset, self._offset] = model.offset_sd**2
@@ -62,14 +83,14 @@ class RobustUpdate:
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
         twin = copy.copy(self)
-        for name in ("H", "P", "_error_variance", "x"):
+        for name in ("H", "P", "_error_variance", "_last_residual", "x"):
             setattr(twin, name, getattr(self, name).copy())
         return twin
 
     def replace_motion(self, motion: NDArray[np.float64]) -> RobustUpdate:
         """Return a state with other motion states (k,), the same errors, and the covariance of position and errors."""
-        twin, k, old = copy.copy(self), len(motion), self._offset
-        twin._offset, twin._error_variance = k, self._error_variance.copy()
+        twin, k, old = self.copy(), len(motion), self._offset
+        twin._offset = k
         twin.x = np.concatenate([motion, self.x[old:]])
         n = len(twin.x)
         twin.H, twin.P = np.zeros(n), np.zeros((n, n))
@@ -100,13 +121,19 @@ class RobustUpdate:
         """
         model, x, H, k = self._model, self.x, self.H, self._offset
         row = k + 1 + anchor
-        variance, error_variance = model.variance(variance_m2), self._error_variance[anchor]
+        variance, error_variance = model.variance(variance_m2), float(self._error_variance[anchor])
         # The part of the variance that the persisting error does not explain is white noise.
         white = max(model.white * variance, variance - error_variance)
         self._error_variance[anchor] += 0.1 * ((1.0 - model.white) * variance - error_variance)
         H[k:] = 0.0
         H[k] = H[row] = 1.0
-        z, sd = self.update(H, float(residual_m - x[k] - x[row]), white)
+        residual = residual_m - float(x[k])
+        z, sd = self.update(H, residual - float(x[row]), white)
+        residual /= math.sqrt(model.inflation(z))
+        # White noise does not contribute to the mean of this product.
+        square = residual * self._last_residual[anchor]
+        self._last_residual[anchor] = residual
+        self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
         ratio = (self.x[row] ** 2 + self.P[row, row]) / error_variance
         self.consistency += CONSISTENCY_RATE * (min(float(ratio), MAX_RATIO) - self.consistency)
         return z, sd
@@ -115,20 +142,18 @@ class RobustUpdate:
         self, H: NDArray[np.float64], innovation: float, R: float, *, robust: bool = True
     ) -> tuple[float, float]:
         """Update with a measurement with Jacobian H (n,) and noise variance R; return as `update_range`."""
-        R = max(R, MIN_VARIANCE_M2)
-        PH = self.P @ H
-        HPH = float(H @ PH)
-        sd = math.sqrt(HPH + R)
+        P = self.P
+        PH = P @ H
+        S = float(H @ PH) + max(R, MIN_VARIANCE_M2)
+        sd = math.sqrt(S)
         z = innovation / sd
-        S = (HPH + R) * (self._model.inflation(z) if robust else 1.0)
-        K = PH / S
-        if not self.estimates_errors:
-            K[self._offset :] = 0.0
+        K = PH / (S * self._model.inflation(z) if robust else S)
+        considered = len(H) if self.estimates_errors else self._offset
+        K[considered:] = 0.0
         self.x += K * innovation
-        # Joseph's form (I - K H) P (I - K H)' + K R K', as updates of rank one.
-        P = self.P - np.multiply.outer(K, PH)
-        P -= np.multiply.outer(P @ H - (S - HPH) * K, K)
-        self.P = P
+        # This is Joseph's form for these gains. The covariance of errors that are only considered stays.
+        P -= np.multiply.outer(K, PH)
+        P[considered:] = P[:, considered:].T
         return z, sd
 
     def project(self, axis: int, value: float) -> None:
@@ -143,6 +168,16 @@ class RobustUpdate:
         if not self.estimates_errors:
             K[self._offset :] = 0.0
         self.x -= K * (self.x[axis] - value)
+
+    @property
+    def modelled_variance(self) -> float:
+        """Mean variance of the persisting errors in the model, m^2."""
+        return float(self._error_variance.mean())
+
+    def persisting_variance(self, redundancy: float) -> float:
+        """Return the variance of the errors that do not average out, m^2, for the share of redundant ranges."""
+        square = max(self.residual_square, 0.0) + PRIOR_SHARE * self.modelled_variance
+        return square / (redundancy + PRIOR_SHARE)
 
     def covariance_scale(self) -> float:
         """Return the factor of published covariances.

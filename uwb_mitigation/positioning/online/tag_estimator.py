@@ -1,12 +1,13 @@
 """The position of one tag from its first range: initialisation, tracking, and ambiguity of its position.
 
-While several positions explain the ranges, each is followed by a filter, and no position is published. If the anchors of the last
-second do not exclude a mirror image of the position, only the area does: then the position is published if the image is
-outside of it, and withheld close to the mirror.
+While several positions explain the ranges, each is followed by a filter, and no position is published, unless they differ in
+height only. If the anchors of the last second do not exclude a mirror image of the position, an area or the time before can do so.
+Otherwise the position is withheld if the image has another x and y, and else published with a variance that contains the image.
 """
 
 from __future__ import annotations
 
+import enum
 import math
 from collections import Counter, deque
 from collections.abc import Callable
@@ -15,9 +16,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.geometry import FLAT, Area, Dop, Height, dop
+from uwb_mitigation.positioning.geometry import (
+    Area,
+    Dop,
+    Height,
+    Symmetry,
+    constant_error_gain,
+    dop,
+    separation,
+)
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.filter import RangeFilter
+from uwb_mitigation.positioning.online.filter import OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import (
     IMPLAUSIBLE,
     CandidatePosition,
@@ -46,22 +55,44 @@ SURPRISE = 1.0
 HEIGHT_AGE_NS = 200_000_000
 
 MIRROR_SD, EXCLUDED_SD = 2.0, 3.0
-"""Within `MIRROR_SD` standard deviations of the mirror a position is withheld; an image that is outside the area by more than
-`EXCLUDED_SD` is excluded."""
+"""Within `MIRROR_SD` standard deviations of the mirror the side of a tag is unknown; an image that is outside the area by more
+than `EXCLUDED_SD`, or whose ranges differ by more than that, is excluded."""
+
+EVIDENCE_RATE, EVIDENCE = 0.01, 1.0
+"""The loss of each anchor's ranges is averaged over about a hundred ranges, in which persisting errors change a few times. The
+image is used if the sum over the anchors is smaller by `EVIDENCE`."""
 
 MAX_AMBIGUOUS_S = 2.0
 """For this time the velocity determines on which side of a mirror a tag continues; after it, the position is searched again."""
+
+RANGE_ERROR_M = 0.17
+"""Ranges of positions are compared with this standard deviation at least: also errors persist, and obstacles."""
+
+FEW_ANCHORS = 3.0
+"""Factor of a variance that is estimated from few anchors: that of Student's t-distribution with three degrees of freedom."""
 
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
 
 _SAME_M = 0.3
+_MAX_ARC_M = 0.5
+_LEVEL = 0.9
 _RETAINED_RANGES = 400
 _MAX_CANDIDATES = 12
 _RETRY_S = 0.25
 
-_Mirror = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""A point and the normal of a line or plane."""
+
+class Ambiguity(enum.Enum):
+    """Which other positions explain the ranges of a tag."""
+
+    NONE = "unique"
+    HEIGHT = "mirrored height"
+    ARC = "arc"
+    MIRROR = "mirrored position"
+    CIRCLE = "circle"
+
+
+_GEOMETRY_S = {Ambiguity.NONE: 1.0, Ambiguity.HEIGHT: 0.5}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +115,7 @@ class EstimatorConfig:
 
     Attributes:
         robot: motion of the robot that carries the tag, if it has odometry.
+        widens: published covariances contain constant errors of ranges, and other positions that explain the ranges.
     """
 
     anchors: AnchorMap
@@ -92,6 +124,7 @@ class EstimatorConfig:
     area: Area | None = None
     heights: Heights | None = None
     robot: RobotData | None = None
+    widens: bool = True
 
     @property
     def dims(self) -> int:
@@ -130,20 +163,25 @@ class TagEstimator:
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
             its square (1 is ideal).
         filter: the filter that follows the tag; None: its position is searched.
-        is_ambiguous: the position or its mirror image is correct; it is not published.
+        ambiguity: which other positions explain the ranges.
         undetermined: the ranges do not determine the horizontal position at all.
     """
 
     filter: RangeFilter | None
     _hypotheses: list[_PositionHypothesis]
     _origin_ns: int | None
-    _mirror: _Mirror | None
+    ambiguity: Ambiguity
+    _symmetry: Symmetry | None
+    _shift: NDArray[np.float64]
+    _is_side_known: bool
+    _evidence: float
+    _checked: list[int]
+    _checked_s: float
     _time_s: float
     _search_began_s: float
     _next_check_s: float
     _found_s: float
     _ambiguous_s: float
-    is_ambiguous: bool
     undetermined: bool
 
     def __init__(self, config: EstimatorConfig) -> None:
@@ -154,15 +192,19 @@ class TagEstimator:
         self._height, self._area = config.height, config.area
         self._states = [_AnchorState() for _ in range(len(self.anchors))]
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_RETAINED_RANGES)
+        self._symmetries: dict[tuple[int, ...], Symmetry] = {}
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_RETAINED_RANGES)
-        self._mirror_key: tuple[int, ...] | None = None
-        self._last_mirror: _Mirror | None = None
         self.restart()
 
     @property
     def is_initialized(self) -> bool:
         """Whether the position is known."""
         return self.filter is not None and not self.is_ambiguous
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether positions with another x and y explain the ranges: the position is not published."""
+        return self.ambiguity in (Ambiguity.MIRROR, Ambiguity.CIRCLE)
 
     @property
     def candidates(self) -> int:
@@ -208,7 +250,7 @@ class TagEstimator:
             self._follow(self.filter, measurement)
         if self.filter is None or self.is_ambiguous:
             return None
-        return self.filter.estimate(stamp_ns)
+        return self._estimate(self.filter, stamp_ns)
 
     def run(self, ranges: Ranges) -> Track:
         """Process recorded ranges, and the measured heights of the config; return an estimate for each range with one."""
@@ -221,7 +263,7 @@ class TagEstimator:
         predicted = self.filter.copy()
         predicted.predict(self.seconds(stamp_ns))
         self._confine(predicted)
-        return predicted.estimate(stamp_ns)
+        return self._estimate(predicted, stamp_ns)
 
     def restart(self, stamp_ns: int | None = None) -> None:
         """Reset the position, but not the statistics."""
@@ -274,6 +316,8 @@ class TagEstimator:
         filter_.predict(self._time_s)
         # The first position contains the errors of the ranges of its window.
         filter_.state.estimates_errors = self._time_s >= self._found_s + WINDOW_S
+        if self._symmetry is not None:
+            self._compare_image(filter_, self._symmetry, measurement)
         z, _ = filter_.update(*measurement[1:])
         self._confine(filter_)
         limited = max(-10.0, min(10.0, z))
@@ -284,65 +328,131 @@ class TagEstimator:
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
         if self._time_s >= self._next_check_s:
             self._next_check_s = self._time_s + _RETRY_S
-            received = self.received_anchors()
-            self._mirror = self._mirror_of(received)
+            received, was_ambiguous = self.received_anchors(), self.is_ambiguous
             num_contradicting = sum(self._states[row].outliers > LOST_SHARE for row in received)
             if 2 * num_contradicting >= len(received):
                 self.counts["lost"] += 1
                 self._restart_search(self._time_s - WINDOW_S)
-        self._check_mirror(filter_)
-
-    def _check_mirror(self, filter_: RangeFilter) -> None:
-        """Withhold positions from the mirror on, until the image is excluded again: the tag may have crossed it, or not."""
-        if self._mirror is None:
-            if self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
+                return
+            valid_s = _GEOMETRY_S.get(self.ambiguity, 0.0) if received == self._checked else 0.0
+            if self._time_s >= self._checked_s + valid_s:
+                self._checked, self._checked_s = received, self._time_s
+                self._check_ambiguity(filter_)
+            if self.is_ambiguous and not was_ambiguous:
+                self._ambiguous_s = self._time_s
+            if was_ambiguous and not self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
                 self._restart_search(self._time_s - WINDOW_S)
-            self.is_ambiguous = False
+
+    def _compare_image(self, filter_: RangeFilter, mirror: Symmetry, measurement: TagRange) -> None:
+        """Average how much better the position explains the ranges than its image, and swap both if the image is better."""
+        x, y, z = (filter_.position - self.anchors.position[measurement.anchor]).tolist()
+        a, b, c = mirror.axis.tolist()
+        twice = 2.0 * float((filter_.position - mirror.center) @ mirror.axis)
+        expected = measurement.range_m - float(filter_.x[OFFSET])
+        sd = math.sqrt(self._model.variance(measurement.variance_m2))
+        of_position = self._model.student_loss((expected - math.hypot(x, y, z)) / sd)
+        image_m = math.hypot(x - twice * a, y - twice * b, z - twice * c)
+        of_image = self._model.student_loss((expected - image_m) / sd)
+        difference = len(self.received_anchors()) * (of_image - of_position)
+        self._evidence += EVIDENCE_RATE * (difference - self._evidence)
+        if self._evidence < -EVIDENCE:
+            filter_.reflect(mirror)
+            self._evidence, self._next_check_s = -self._evidence, -math.inf
+
+    def _check_ambiguity(self, filter_: RangeFilter) -> None:
+        """Find other positions that explain the ranges."""
+        position, dims, rows = filter_.position, self._dims, self.received_anchors()
+        if not rows:
             return
-        center, normal = self._mirror
-        variance = float(normal @ filter_.P[:3, :3] @ normal) * filter_.state.covariance_scale()
-        distance = abs(float((filter_.position - center) @ normal))
-        is_near = distance < MIRROR_SD * math.sqrt(max(variance, 0.0))
-        if is_near and not self.is_ambiguous:
-            self._ambiguous_s = self._time_s
-        self.is_ambiguous = is_near or (self.is_ambiguous and not self._excludes_mirror(filter_))
+        anchors, state = self.anchors.position[rows], filter_.state
+        gain, redundancy = constant_error_gain(anchors, position, dims, self._model.offset_sd)
+        variance = state.persisting_variance(redundancy)
+        excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
+        filter_.unseen = excess * self._config.widens * gain
+        sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
+        offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))
+        covariance = scale * state.P[:3, :3] + excess * gain
+        key = dims, *rows
+        if key not in self._symmetries:
+            self._symmetries[key] = Symmetry.of(anchors, dims, RANGE_ERROR_M)
+        symmetry = self._symmetries[key]
+        self.ambiguity, self._symmetry, self._shift = Ambiguity.NONE, None, np.zeros(3)
+        if symmetry.is_rotation:
+            self._check_circle(filter_, symmetry, covariance)
+            return
+        if self._is_one_sided(symmetry):
+            self._is_side_known = True
+            return
+        # The image, and the position half-way.
+        others = (symmetry.images(position) - position) * [[1.0], [0.5]]
+        separations = separation(anchors, position, position + others, sd_m, offset_sd_m, dims)
+        is_other = (separations < EXCLUDED_SD) & self._area_contains(position + others, covariance)
+        same_m = max(_SAME_M, EXCLUDED_SD * math.sqrt(max(covariance[0, 0], covariance[1, 1])))
+        if dims == 3 and abs(symmetry.axis[2]) > _LEVEL and math.hypot(*others[0, :2]) < same_m:
+            self._is_side_known = not is_other[0]
+            others, weight = others[is_other], np.exp(-0.5 * separations[is_other] ** 2)
+            filter_.unseen += self._config.widens * (others.T @ others) / (len(others) + 1)
+            self._shift[:2] = (weight @ others)[:2] / (1.0 + weight.sum())
+            if len(others):
+                self.ambiguity, self._symmetry = Ambiguity.HEIGHT, symmetry
+        elif not is_other[0]:
+            self._is_side_known = True
+        elif separations[0] < separations[1] and not self._knows_side(others[:1], covariance):
+            # If the position half-way is better, all three are one solution with a large covariance.
+            self.ambiguity, self._symmetry = Ambiguity.MIRROR, symmetry
 
-    def _mirror_of(self, rows: list[int]) -> _Mirror | None:
-        """Return the line or plane in which anchors mirror positions; None: they exclude the image."""
-        key = self._dims, *rows
-        if key != self._mirror_key:
-            self._mirror_key, self._last_mirror = key, self._find_mirror(rows, self._dims)
-        return self._last_mirror
+    def _check_circle(self, filter_: RangeFilter, circle: Symmetry, covariance: NDArray[np.float64]) -> None:
+        position = filter_.position
+        others = circle.images(position) - position
+        is_other = self._area_contains(position + others, np.eye(3) * (_SAME_M / EXCLUDED_SD) ** 2)
+        others = others[is_other]
+        if not len(others):
+            self._is_side_known = True
+        elif not self._knows_side(others, covariance):
+            # From the position on, around the circle.
+            is_inside = np.append(True, is_other)
+            is_arc = np.count_nonzero(is_inside != np.roll(is_inside, 1)) == 2
+            spread = others.T @ others / (len(others) + 1)
+            filter_.unseen += self._config.widens * spread
+            is_short = np.trace(spread[:2, :2]) < _MAX_ARC_M**2
+            self.ambiguity = Ambiguity.ARC if is_arc and is_short else Ambiguity.CIRCLE
 
-    def _find_mirror(self, rows: list[int], dims: int) -> _Mirror | None:
-        if len(rows) == 0:
-            return None
-        position = self.anchors.position[rows]
-        center = position.mean(axis=0)
-        _, spread, axes = np.linalg.svd(
-            np.pad((position - center)[:, :dims], ((0, max(0, dims - len(rows))), (0, 0)))
-        )
-        if len(rows) > dims and spread[dims - 1] > FLAT * max(float(spread[0]), 1e-9):
-            return None
-        normal = np.zeros(3)
-        normal[:dims] = axes[dims - 1]
-        if self._area is not None:
-            corners = np.stack(np.meshgrid(*zip(self._area.low, self._area.high, strict=True)), axis=-1)
-            sides = (corners - center) @ normal
-            if sides.min() >= 0.0 or sides.max() <= 0.0:
-                return None
-        return center, normal
+    def _knows_side(self, others: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+        """Return whether the position was known before other ones at `others` (n, 3) relative to it appeared, and is far from them."""
+        squared = np.einsum("ni,ni->n", others, others)
+        variance = np.einsum("ni,ij,nj->n", others, covariance, others)
+        self._is_side_known &= bool((squared**2 > (2.0 * MIRROR_SD) ** 2 * variance).all())
+        return self._is_side_known
 
-    def _excludes_mirror(self, filter_: RangeFilter) -> bool:
-        """Whether the area excludes the mirror image of a position."""
-        if self._mirror is None:
-            return True
+    def _is_one_sided(self, mirror: Symmetry) -> bool:
+        """Whether the area is on one side of a mirror."""
         if self._area is None:
             return False
-        center, normal = self._mirror
-        image = filter_.position - 2.0 * float((filter_.position - center) @ normal) * normal
-        excess = float(np.linalg.norm(image - self._area.clip(image)))
-        return excess > EXCLUDED_SD * math.sqrt(float(np.linalg.eigvalsh(filter_.P[:3, :3])[-1]))
+        corners = np.stack(np.meshgrid(*zip(self._area.low, self._area.high, strict=True)), axis=-1)
+        sides = (corners - mirror.center) @ mirror.axis
+        return bool(sides.min() >= 0.0 or sides.max() <= 0.0)
+
+    def _area_contains(
+        self, images: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Return which images (n, 3) the area does not exclude in any axis, with the variance of this axis."""
+        if self._area is None:
+            return np.ones(len(images), np.bool_)
+        excess = np.abs(images - self._area.clip(images))
+        contains: NDArray[np.bool_] = np.all(excess <= EXCLUDED_SD * np.sqrt(np.diag(covariance)), axis=1)
+        return contains
+
+    def _estimate(self, filter_: RangeFilter, stamp_ns: int) -> Estimate:
+        """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
+        estimate = filter_.estimate(stamp_ns)
+        covariance = estimate.covariance
+        estimate.position[:] += self._shift
+        if self._height is not None:
+            # Constant errors of ranges would move it in the filter.
+            estimate.position[2] = self._height.value
+            covariance[2] = covariance[:, 2] = 0.0
+            covariance[2, 2] = self._height.sd**2
+        return estimate
 
     def _confine(self, filter_: RangeFilter) -> None:
         """Keep a filter inside the area."""
@@ -363,10 +473,13 @@ class TagEstimator:
         return 2 if self._recent_height() is not None else 3
 
     def _restart_search(self, time_s: float) -> None:
-        self.filter, self._hypotheses, self._mirror = None, [], None
+        self.filter, self._hypotheses = None, []
         for state in self._states:
             state.outliers = 0.0
-        self.is_ambiguous = self.undetermined = False
+        self.ambiguity, self._symmetry = Ambiguity.NONE, None
+        self._shift = np.zeros(3)
+        self._is_side_known, self._evidence, self.undetermined = False, 0.0, False
+        self._checked, self._checked_s = [], -math.inf
         self._search_began_s, self._next_check_s, self._found_s = time_s, -math.inf, math.inf
 
     def _search(self, measurement: TagRange) -> None:
@@ -439,9 +552,10 @@ class TagEstimator:
         self._hypotheses = plausible
         leader = plausible[0].filter
         self.undetermined = leader.horizontal_sd > _UNDETERMINED_M
-        if len(plausible) == 1 and not self.undetermined:
-            self._mirror = self._mirror_of(self.received_anchors())
-            self.is_ambiguous = not self._excludes_mirror(leader)
+        others = [hypothesis.filter.position - leader.position for hypothesis in plausible[1:]]
+        if not self.undetermined and all(math.hypot(x, y) < _SAME_M for x, y, _ in others):
+            self._is_side_known = False
+            self._check_ambiguity(leader)
             if not self.is_ambiguous:
                 self.filter, self._hypotheses, self._found_s = leader, [], self._time_s
                 self.counts["found"] += 1
