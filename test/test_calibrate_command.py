@@ -200,7 +200,9 @@ def test_errors_of_a_half_are_computed_with_the_offsets_of_the_other(truth):
     # Without ground truth, the error of one anchor also moves the positions that the others are compared with (by up to 0.16 m).
     tolerance_m = 0.1 if truth else 0.19
     for is_half, expected_m in ((is_late, 0.4), (~is_late, -0.4)):
-        assert np.nanmedian(errors[is_half & (ranges.anchor == 2)]) == pytest.approx(expected_m, abs=tolerance_m)
+        assert np.nanmedian(errors[is_half & (ranges.anchor == 2)]) == pytest.approx(
+            expected_m, abs=tolerance_m
+        )
         assert np.nanmedian(errors[is_half & (ranges.anchor == 0)]) == pytest.approx(0.0, abs=tolerance_m)
 
 
