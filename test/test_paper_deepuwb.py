@@ -20,7 +20,7 @@ from command_line import run, start, succeed
 from model_material import window_of
 
 from benchmarks.paper import data as experiment_data
-from benchmarks.paper import rooms
+from benchmarks.paper import published, rooms
 from benchmarks.paper.download import fetch_deepuwb
 from benchmarks.paper.environments import OBSTACLES as SIMULATED_OBSTACLES
 from benchmarks.paper.environments import ROOMS as SIMULATED_ROOMS
@@ -248,6 +248,19 @@ def test_simulated_rooms_and_obstacles_are_those_of_deepuwb(simulated: list[Reco
     assert rooms.has_rooms(names)
     assert not rooms.has_rooms([*names, "simulated survey seed 1/placement 3"])
     assert SimulatedDeepUwb().simulated
+
+
+def test_raw_errors_of_the_simulated_medium_room_have_the_published_mae_and_deviation() -> None:
+    source = SimulatedDeepUwb(seed=1, ranges=20_000, exchanges=1)
+    errors = np.array(
+        [
+            record.measurement.range_m - record.truth.range_m
+            for record in source
+            if record.truth and "/room2/" in record.truth.configuration
+        ]
+    )
+    assert np.abs(errors).mean() == pytest.approx(published.RAW_MAE_M, rel=0.1)
+    assert errors.std() == pytest.approx(published.RAW_SIGMA_M, rel=0.1)
 
 
 def test_simulated_configuration_is_one_placement(simulated: list[Record]) -> None:

@@ -11,7 +11,7 @@ from itertools import count as counting
 
 import numpy as np
 
-from benchmarks.paper.environments import OBSTACLES, ROOMS, draw_obstacles, obstruct
+from benchmarks.paper.environments import OBSTACLES, RANGE_OFFSET_M, ROOMS, draw_obstacles, obstruct
 from benchmarks.paper.rooms import ROOM_ROWS
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, place
@@ -62,8 +62,7 @@ class SimulatedDeepUwb(Simulated):
         check_seed(seed)
         check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
         check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
-        # The published raw errors are too small for uncalibrated antenna delays.
-        radio = Receiver(range_offset_m=0.0)
+        radio = Receiver(range_offset_m=RANGE_OFFSET_M)
         super().__init__(f"simulated like DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
         self._seed = seed
         self._exchanges = exchanges
