@@ -48,7 +48,7 @@ path-for-colcon:
 	  { echo "colcon: CMake's macros of ROS do not accept the path $(CURDIR): move the checkout to one of ASCII letters, digits and spaces" >&2; exit 1; }
 
 # Networks that an interrupted run has trained are used again. Other data and quick runs have separate folders.
-PAPER_QUICK = --windows 157,16 --seeds 1
+PAPER_QUICK = --windows 157,16 --seeds 1 --epochs 5 --trials 2
 PAPER = build/paper/$(if $(DATA),$(shell echo '$(DATA)' | tr '/ ' '__'),simulated)$(if $(QUICK),-quick)
 PAPER_DATA = $(or $(DATA),build/paper/deepuwb.mcap)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.paper.data import split_by_name
 from benchmarks.paper.experiment import Task
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.model.shipped import model_path
@@ -30,7 +29,6 @@ from uwb_mitigation.types.offsets import parse_offsets
         (partial(parse_offsets, "ancors: {1: 0.2}", "file"), "anchors"),
         (partial(parse_offsets, "pairs: [{anchor: 1, tagg: 2, offset: 0}]", "file"), "tag"),
         (partial(parse_anchors, "anchors: [{id: 1, x: 0, y: 0, z: 0, nmae: A}]", "file"), "name"),
-        (partial(split_by_name, None, "configuration"), "configurations"),
         (partial(Task, "remnt", 157, 1), "remnet"),
         (partial(check_topic, Path("bag"), {"/odom": "A", "/odo": "B"}, "/odon", ("A",)), "/odom"),
     ],

@@ -29,8 +29,8 @@ from uwb_mitigation.training.fit import linear_fit
 pytest.importorskip("torch", reason="run `make setup-training`")
 pytest.importorskip("sklearn", reason="run `make setup-training`")
 from benchmarks.paper import data as recordings
-from benchmarks.paper import experiment
-from benchmarks.paper.data import Parts
+from benchmarks.paper import experiment, training
+from benchmarks.paper.training import NetworkStack
 from uwb_mitigation.training import comparison, train
 from uwb_mitigation.training.fit import candidates, fitting, model_card, selection
 from uwb_mitigation.training.fit.candidates import Recipe
@@ -58,7 +58,8 @@ LEARNERS = {
     (baselines, "ridge"),
     (baselines, "gradient_boosting"),
     (model_card, "fit_intervals"),
-    (experiment, "calibrate_quantisation"),
+    (experiment, "card_of"),
+    (NetworkStack, "fit"),
     (experiment, "quantise_network"),
 }
 
@@ -193,39 +194,6 @@ def test_error_of_a_selection_is_from_folds_that_were_not_used_in_it(data, watch
     watch.called("linear_fit.fit_constant", "fitting.fit")
 
 
-def parts(data: Dataset) -> Parts:
-    is_test = in_room_2(data)
-    return Parts("made up", "by room", data.rows(~is_test), data.rows(is_test))
-
-
-@pytest.fixture
-def calibrated(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
-    """Record the configurations of each call of `model_card.fit_intervals`."""
-    calls: list[set[str]] = []
-    calibrate = model_card.fit_intervals
-
-    def recorded(left: Any, predicted: Any, names: NDArray[np.str_]) -> Any:
-        calls.append(set(names.tolist()))
-        return calibrate(left, predicted, names)
-
-    monkeypatch.setattr(model_card, "fit_intervals", recorded)
-    return calls
-
-
-def test_variances_of_the_protocol_are_from_held_out_configurations(data, watch, calibrated):
-    card = experiment.paper_card("made up", RECIPE.architecture, parts(data), QUICK)
-    fitted, (corrected, raw) = watch.seen["fitting.fit"], calibrated
-    assert fitted
-    assert corrected
-    assert not fitted & corrected
-    assert fitted | corrected == raw == set(parts(data).train.names)
-    far_off = replace(parts(data).test, error_m=parts(data).test.error_m + 7)
-    assert (
-        experiment.paper_card("made up", RECIPE.architecture, replace(parts(data), test=far_off), QUICK)
-        == card
-    )
-
-
 def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
     monkeypatch.setattr(recordings, "load_paper_data", lambda *_, **__: ("made up", True, data))
     result = CliRunner().invoke(app, [str(word) for word in words])
@@ -234,8 +202,9 @@ def typed(data: Dataset, monkeypatch: pytest.MonkeyPatch, *words: object) -> Non
 
 
 def test_command_trains_on_the_training_part(data, watch, monkeypatch, tmp_path):
-    quick = ("--networks", "remnet,mlp", "--windows", SAMPLES, "--seeds", 1, "--epochs", 1, "--workers", 1)
+    quick = f"--networks remnet,mlp --windows {SAMPLES} --seeds 1 --epochs 1 --trials 1 --workers 1"
+    monkeypatch.setattr(training, "RANGE_TEST_RATES", np.geomspace(1e-6, 1.0, 120))
     with watch.without(data.rows(in_room_2(data)).names):
-        typed(data, monkeypatch, "paper", "protocol", "--data", "x", "-o", tmp_path, *quick)
-    watch.called("experiment.calibrate_quantisation", "fitting.fit")
-    watch.called("baselines.los_median", "baselines.overall_median", "linear_fit.fit_linear_bias")
+        typed(data, monkeypatch, "paper", "protocol", "--data", "x", "-o", tmp_path, *quick.split())
+    watch.called("NetworkStack.fit", "experiment.quantise_network", "experiment.card_of")
+    watch.called("baselines.overall_median")

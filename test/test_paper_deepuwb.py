@@ -10,6 +10,7 @@ import os
 import pickle
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command_line import run, start, succeed
-from model_material import window_of
+from model_material import dataset, window_of
 
 from benchmarks.paper import data as experiment_data
 from benchmarks.paper import published, rooms
@@ -25,10 +26,11 @@ from benchmarks.paper.download import fetch_deepuwb
 from benchmarks.paper.environments import OBSTACLES as SIMULATED_OBSTACLES
 from benchmarks.paper.environments import ROOMS as SIMULATED_ROOMS
 from benchmarks.paper.simulated import SimulatedDeepUwb
-from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError
+from uwb_mitigation.errors import DatasetError, RecordingError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Preprocessing, Scaling
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.training.data import deepuwb
+from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.deepuwb import FULL_SCALE, NOMINAL_RANGE_M, DeepUwbRecording
 from uwb_mitigation.types.measurement import Encoding, Record
 
@@ -201,27 +203,27 @@ def test_other_files_are_rejected_by_name(tmp_path: Path, content: bytes) -> Non
 # --- rooms and splits ---
 
 
-def test_splits_have_the_published_sizes() -> None:
+def named(names: np.ndarray) -> Dataset:
+    """Return a dataset whose measurements have these configurations."""
+    plain = dataset(1, len(names), samples=4)
+    return replace(plain, configurations=names)
+
+
+def test_split_of_deepuwb_has_the_published_sizes() -> None:
     names = np.repeat([deepuwb.configuration_of(room, OBSTACLES[0]) for room in range(5)], rooms.ROOM_ROWS)
-    for split, sizes in (("paper", (36_023, 13_210)), ("all_but_room_2", (41_948, 13_210))):
-        name, rows = experiment_data.split_by_name(names, split)
-        assert (name, len(rows.train), len(rows.test)) == (split, *sizes)
-        assert not np.isin(rows.train, rows.test).any()
-    assert experiment_data.split_by_name(names, "auto")[0] == "paper"
+    parts = experiment_data.split_dataset("deepuwb", named(names))
+    assert (parts.split, len(parts.train), len(parts.test)) == ("paper", 36_023, 13_210)
+    trained, tested = ({name.split("/")[1] for name in part.names} for part in (parts.train, parts.test))
+    assert (trained, tested) == ({"room1", "room3"}, {"room2"})
 
 
 def test_other_data_is_split_by_configuration() -> None:
-    names = np.repeat([f"place {n}" for n in range(8)], 3)
-    name, rows = experiment_data.split_by_name(names, "auto")
-    assert name.startswith("configurations")
-    assert len(rows.test) == 6
-    assert not set(names[rows.train]) & set(names[rows.test])
+    parts = experiment_data.split_dataset("logs", named(np.repeat([f"place {n}" for n in range(8)], 3)))
+    assert parts.split.startswith("configurations")
+    assert len(parts.test) == 6
+    assert not set(parts.train.names) & set(parts.test.names)
     with pytest.raises(DatasetError):
-        experiment_data.split_by_name(names, "paper")
-    with pytest.raises(DatasetError):
-        experiment_data.split_by_name(np.array(["deepuwb/room1/clear"] * 3), "paper")
-    with pytest.raises(ParameterError):
-        experiment_data.split_by_name(names, "random")
+        experiment_data.split_dataset("deepuwb", named(np.array(["deepuwb/room1/clear"] * 3)))
 
 
 # --- simulated ---

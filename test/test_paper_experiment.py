@@ -5,26 +5,31 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from shutil import copytree
 
 import numpy as np
 import pytest
 from command_line import run, succeed
-from model_material import dataset, integer_network
+from model_material import dataset, integer_network, windows
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
+import torch
 
-from benchmarks.paper import experiment
+from benchmarks.paper import experiment, training
 from benchmarks.paper.data import Parts, shorten_windows
 from benchmarks.paper.results import RESULTS, ExperimentResults, read
+from benchmarks.paper.search import CHOICE, SPACE, search
+from benchmarks.paper.training import NetworkStack
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
+from uwb_mitigation.mitigation.model import floating
+from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.data.dataset import Dataset
+from uwb_mitigation.training.fit import fitting
 from uwb_mitigation.training.fit.options import FitOptions
 
 QUICK = FitOptions(epochs=2, learning_rate=1e-3, weight_decay=0.0)
+SHAPES = [Remnet(13, 3, 3, 4, 3), Remnet(16, 5, 5, 4, 2), Mlp(16, (8, 4))]
 
 
 def parts(seed: int = 0) -> Parts:
@@ -34,23 +39,123 @@ def parts(seed: int = 0) -> Parts:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("protocol")
-    wanted = experiment.list_tasks(["remnet", "mlp"], [32], seeds=1)
+    wanted = experiment.list_tasks(["remnet", "remnet_k5", "remnet_attention", "mlp"], [32], seeds=2)
     return folder, experiment.run_experiment(parts(), folder, wanted, QUICK)
+
+
+# --- networks that are trained together ---
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_stack_computes_each_of_its_networks(shape):
+    stack = NetworkStack(shape, 3, 0.5)
+    stack.fit(dataset(2, 20, samples=shape.samples), QUICK)
+    inputs = windows(20, shape.samples)
+    outputs = [floating.predict_m(stack.weights_of(seed), inputs) for seed in range(3)]
+    assert np.allclose(stack.predict_m(inputs), outputs, atol=1e-6)
+    assert len({output.tobytes() for output in outputs}) == 3
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_stack_is_trained_like_single_networks(shape):
+    data = dataset(2, 20, samples=shape.samples)
+    # With one batch per epoch, the order has no effect.
+    options = replace(QUICK, epochs=30, batch=len(data), dropout=0.0)
+    stack = NetworkStack(shape, 2, options.dropout)
+    single = [
+        fitting.fit(shape, data.inputs, data.error_m, options, start=stack.weights_of(seed))
+        for seed in range(2)
+    ]
+    losses = stack.fit(data, options)
+    for seed, expected in enumerate(single):
+        for name, weight in stack.weights_of(seed).weight.items():
+            assert weight == pytest.approx(expected.weight[name], abs=1e-4)
+    assert (losses[-1] < losses[0]).all()
+
+
+def test_weights_of_a_seed_do_not_depend_on_the_number_of_seeds():
+    one, three = (NetworkStack(SHAPES[0], seeds, 0.5).weights_of(0).weight for seeds in (1, 3))
+    for name, weight in one.items():
+        assert np.array_equal(weight, three[name])
+
+
+def test_self_attention_scales_channels_by_a_function_of_their_means():
+    plain, stack = (NetworkStack(SHAPES[0], 1, 0.0, attention=attention) for attention in (False, True))
+    inputs = windows(20, 13)
+    for network in (plain, stack):
+        torch.nn.init.constant_(network.head.weight, 0.1)
+    for block in stack.attention.values():
+        # A sigmoid of a large number is 1, which changes nothing; of 0, it is a half.
+        torch.nn.init.constant_(block[3].bias, 40.0)
+    assert stack.predict_m(inputs) == pytest.approx(plain.predict_m(inputs), abs=1e-5)
+    for block in stack.attention.values():
+        torch.nn.init.zeros_(block[3].weight)
+        torch.nn.init.zeros_(block[3].bias)
+    assert np.abs(stack.predict_m(inputs) - plain.predict_m(inputs)).max() > 0.01
+
+
+def test_pruned_weights_stay_zero_and_each_network_has_the_share():
+    data, stack = dataset(2, 20, samples=13), NetworkStack(SHAPES[0], 2, 0.0)
+    stack.fit(data, QUICK)
+    before = [stack.weights_of(seed).weight for seed in range(2)]
+    stack.mask_smallest(0.5)
+    stack.fit(data, QUICK)
+    removed = stack.fix_pruned()
+    for seed in range(2):
+        weights = stack.weights_of(seed).weight
+        zeros = np.concatenate([weight.ravel() == 0 for weight in weights.values()])
+        magnitudes = np.concatenate([np.abs(weight).ravel() for weight in before[seed].values()])
+        assert zeros.sum() == removed == pytest.approx(len(zeros) / 2, abs=1)
+        assert magnitudes[zeros].max() <= magnitudes[~zeros].min()
+
+
+# --- before the training ---
+
+
+def test_range_test_finds_the_rates_that_train(monkeypatch):
+    monkeypatch.setattr(training, "RANGE_TEST_RATES", np.geomspace(1e-6, 10.0, 300))
+    result = training.range_test(dataset(6, 20, samples=13), QUICK, seeds=2)
+    assert 1e-6 < result.falls_from < result.falls_to < 1.0
+    assert max(result.losses_m) > 2 * min(result.losses_m)  # the highest rates diverge
+    assert len(result.rates) == len(result.losses_m)
+
+
+def test_search_is_random_then_a_grid_around_the_best_network():
+    data = dataset(10, 10, samples=16)
+    found = search(data, 3, QUICK)
+    stages = [trial.stage for trial in found]
+    assert stages == ["random"] * 3 + ["grid"] * 3
+    assert found[0].shape == CHOICE
+    best = min(found[:3], key=lambda trial: trial.mae).shape
+    for trial in found[3:]:
+        assert trial.shape["modules"] == best["modules"]
+        for name, values in SPACE.items():
+            assert abs(values.index(trial.shape[name]) - values.index(best[name])) <= 1
+    for trial in found:
+        better = [
+            other
+            for other in found
+            if other.mae <= trial.mae
+            and other.multiply_accumulates <= trial.multiply_accumulates
+            and (other.mae, other.multiply_accumulates) != (trial.mae, trial.multiply_accumulates)
+        ]
+        assert trial.is_on_front == (not better)
+    assert search(data, 3, QUICK) == found
 
 
 # --- the experiment ---
 
 
-def test_tasks_are_every_window_and_seed_of_remnet_and_the_longest_of_the_rest():
-    names = [task.name for task in experiment.list_tasks(["remnet", "mlp"], [157, 8], seeds=2)]
-    assert names == [
-        "remnet_157_seed0",
-        "remnet_157_seed1",
-        "remnet_8_seed0",
-        "remnet_8_seed1",
-        "mlp_157_seed0",
-        "mlp_157_seed1",
+def test_tasks_are_every_window_of_remnet_and_the_longest_of_the_rest():
+    tasks = experiment.list_tasks(["remnet", "remnet_k5", "remnet_attention", "mlp"], [157, 8], seeds=2)
+    assert [(task.network, task.samples, task.prune) for task in tasks] == [
+        ("remnet", 157, True),
+        ("remnet", 8, False),
+        ("remnet_k5", 157, False),
+        ("remnet_attention", 157, False),
+        ("mlp", 157, False),
     ]
+    assert [task.architecture.parameters for task in tasks] == [5905, 5601, 5937, 5905, 54401]
     for networks, lengths, seeds in ((["cnn"], [8], 1), (["mlp"], [], 1), (["mlp"], [8], 0)):
         with pytest.raises(ParameterError):
             experiment.list_tasks(networks, lengths, seeds)
@@ -59,93 +164,69 @@ def test_tasks_are_every_window_and_seed_of_remnet_and_the_longest_of_the_rest()
 def test_every_form_of_a_network_is_measured(finished):
     folder, result = finished
     assert read(ExperimentResults, folder / RESULTS) == result
-    remnet, mlp = result.models
-    assert remnet.mae_optimised == pytest.approx(remnet.mae_float, abs=1e-6)
-    assert remnet.mae_int8 == pytest.approx(remnet.mae_float, abs=0.02)
-    assert remnet.float_errors.all.n == remnet.float_errors.los.n + remnet.float_errors.nlos.n
-    assert remnet.parameters == 5649
-    assert set(remnet.calibration_mae) == {"max", "p99.99", "p99.9", "p99", "mse"}
-    assert remnet.calibration_mae[remnet.calibration] == min(remnet.calibration_mae.values())
-    for model in (remnet, mlp):
-        name = folder / f"{model.network}_32_seed0"
-        assert Path(f"{name}_int8.onnx").stat().st_size == model.bytes_int8 < model.bytes_float
-        assert Path(f"{name}_optimised.onnx").stat().st_size == model.bytes_optimised
+    networks = ["remnet", *(f"remnet_pruned_{share}" for share in (25, 50, 75))]
+    networks += ["remnet_k5", "remnet_attention", "mlp"]
+    assert [model.network for model in result.models] == [name for name in networks for _ in range(2)]
+    for model in result.models:
+        errors = model.errors
+        assert errors["float"].all.n == errors["float"].los.n + errors["float"].nlos.n
+        if model.network == "remnet_attention":
+            assert list(errors) == ["float"]
+            continue
+        assert errors["optimised"].all.mae == pytest.approx(errors["float"].all.mae, abs=1e-6)
+        assert errors["int8"].all.mae == pytest.approx(errors["float"].all.mae, abs=0.02)
+        name = folder / f"{model.network}_32_seed{model.seed}"
+        assert Path(f"{name}_int8.onnx").stat().st_size == model.bytes["int8"] < model.bytes["float"]
+        assert Path(f"{name}_optimised.onnx").stat().st_size == model.bytes["optimised"]
         test = parts().test
         left = test.error_m - integer_network(load_bundle(Path(f"{name}_int8.onnx"))).predict_m(test.inputs)
-        assert np.abs(left).mean() == pytest.approx(model.mae_int8, abs=1e-9)
-        assert model.int8_errors.all.box == pytest.approx(np.percentile(left, (5, 25, 50, 75, 95)))
+        assert np.abs(left).mean() == pytest.approx(errors["int8"].all.mae, abs=1e-9)
+        assert errors["int8"].all.box == pytest.approx(np.percentile(left, (5, 25, 50, 75, 95)))
 
 
-def left(baselines, name: str) -> float:
-    (found,) = (baseline for baseline in baselines if baseline.name == name)
-    return found.errors.all.mae
+def test_pruned_networks_have_fewer_parameters_and_smaller_compressed_files(finished):
+    _, result = finished
+    networks = ["remnet", *(f"remnet_pruned_{share}" for share in (25, 50, 75))]
+    rows = [result.of(network, 32)[0] for network in networks]
+    weights = 5649 - 161  # without the biases of ten layers and the head
+    assert [row.parameters for row in rows] == pytest.approx(
+        [5649 - weights * n / 4 for n in range(4)], abs=2
+    )
+    assert np.diff([row.bytes["zipped"] for row in rows]).max() < 0
 
 
-def with_line(data: Dataset, gap_db: float = 5.0) -> Dataset:
-    """Return a dataset whose errors are linear in the received power, which differs between configurations."""
-    _, of = np.unique(data.configurations, return_inverse=True)
-    power = (-80.0 - of + 0.1 * np.arange(len(data)) % 1).astype(np.float32)
-    gap = (gap_db + of**2).astype(np.float32)
-    error_m = 0.5 - 0.02 * (power + 80) + gap / 9
-    return replace(data, rx_power_dbm=power, first_path_power_dbm=power - gap, error_m=error_m)
+def test_self_attention_of_the_paper_has_squeeze_and_excitation_in_each_module(finished):
+    _, result = finished
+    # Two dense layers with 2 hidden units in three modules.
+    assert result.of("remnet_attention", 32)[0].parameters == 5649 + 3 * (16 * 2 + 2 + 2 * 16 + 16)
 
 
-def test_baselines_are_fitted_on_the_training_part(finished):
+def test_median_of_the_training_part_is_the_baseline(finished):
     _, result = finished
     train, test = parts().train, parts().test
-    for name, rows in (("los_median", train.labels == "LOS"), ("overall_median", train.labels != "")):
-        expected = np.abs(test.error_m - np.median(train.error_m[rows])).mean()
-        assert left(result.baselines, name) == pytest.approx(expected)
-    train, test = with_line(dataset(8, 5)), with_line(dataset(4, 5, seed=1), gap_db=9.0)
-    baselines = experiment.baselines_of(train, test)
-    assert left(baselines, "line") < 0.02 < 0.2 < left(baselines, "overall_median")
-    test.first_path_power_dbm[0] = np.nan  # without levels, the range is unchanged
-    known = np.abs(test.error_m[0]) / len(test)
-    assert left(experiment.baselines_of(train, test), "line") == pytest.approx(known, abs=0.02)
+    expected = np.abs(test.error_m - np.median(train.error_m)).mean()
+    assert result.median.all.mae == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("case", ["train without power", "test without power", "few configurations"])
-def test_baseline_without_data_has_a_reason(case: str):
-    train = with_line(dataset(3 if case.startswith("few") else 8, 5))
-    test = with_line(dataset(4, 5, seed=1))
-    if not case.startswith("few"):
-        (train if case.startswith("train") else test).rx_power_dbm[:] = np.nan
-    line = experiment.baselines_of(train, test)[-1]
-    assert (line.name, line.errors) == ("line", None)
-    assert line.reason
-
-
-def test_finished_tasks_are_not_repeated_unless_damaged_or_of_other_data(finished, tmp_path, monkeypatch):
-    folder, first = finished
-    trained = []
-    train = experiment.train_task
-    monkeypatch.setattr(
-        experiment, "train_task", lambda task, *rest: trained.append(task) or train(task, *rest)
-    )
-    wanted = [experiment.Task(model.network, model.samples, model.seed) for model in first.models]
-    assert experiment.run_experiment(parts(), folder, wanted, QUICK) == first
-    assert not trained
-    copied = copytree(folder, tmp_path / "copy")
-    journal = copied / experiment.JOURNAL
-    lines = journal.read_text().splitlines()
-    torn = next(line for line in lines if '"mlp_32_seed0"' in line)
-    journal.write_text("\n".join(["[1]", "{}", *(line for line in lines if line != torn), torn[:90]]))
-    again = experiment.run_experiment(parts(), copied, wanted, QUICK)
-    assert trained == wanted[-1:]
-    assert again.models[-1].mae_int8 == first.models[-1].mae_int8
-    other = experiment.run_experiment(parts(seed=5), copied, wanted[-1:], QUICK)
-    assert other.models[0].mae_raw != first.models[-1].mae_raw
+def test_finished_tasks_are_not_repeated_unless_of_other_data(tmp_path):
+    wanted = experiment.list_tasks(["mlp"], [32], seeds=1)
+    first = experiment.run_experiment(parts(), tmp_path, wanted, QUICK)
+    written = (tmp_path / "mlp_32_seed0_float.onnx").stat().st_mtime_ns
+    assert experiment.run_experiment(parts(), tmp_path, wanted, QUICK) == first
+    assert (tmp_path / "mlp_32_seed0_float.onnx").stat().st_mtime_ns == written
+    other = experiment.run_experiment(parts(seed=5), tmp_path, wanted, QUICK)
+    assert other.models[0].errors != first.models[0].errors
 
 
 def test_two_processes_give_the_same_models(tmp_path):
-    wanted = experiment.list_tasks(["mlp"], [32], seeds=2)
+    wanted = experiment.list_tasks(["remnet", "mlp"], [32], seeds=1)
     shares: list[float] = []
     one_worker, together = (
-        experiment.run_experiment(parts(), tmp_path / str(workers), wanted, QUICK, workers, shares.append)
+        experiment.run_experiment(parts(), tmp_path / str(workers), wanted, QUICK, 0, workers, shares.append)
         for workers in (1, 2)
     )
-    assert [m.mae_int8 for m in one_worker.models] == [m.mae_int8 for m in together.models]
-    assert shares == pytest.approx([0.5, 1.0, 0.5, 1.0])
+    assert [model.errors for model in one_worker.models] == [model.errors for model in together.models]
+    assert shares == [0.5, 1.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -153,7 +234,9 @@ def test_loss_that_diverges_ends_the_run(tmp_path, workers: int):
     bad = parts()
     bad = replace(bad, train=replace(bad.train, error_m=bad.train.error_m + 3e38))
     with pytest.raises(DatasetError):
-        experiment.run_experiment(bad, tmp_path, experiment.list_tasks(["mlp"], [32], 2), QUICK, workers)
+        experiment.run_experiment(
+            bad, tmp_path, experiment.list_tasks(["mlp"], [32], 2), QUICK, workers=workers
+        )
 
 
 def test_shorter_windows_are_scaled_by_their_own_maximum():
@@ -180,8 +263,8 @@ def folder(tmp_path_factory) -> Path:
 
 
 def test_command_writes_its_results(folder):
-    quick = ("--networks", "remnet", "--windows", 8, "--seeds", 1, "--epochs", 1, "--workers", 1)
-    words = ("protocol", "--data", "rooms.mcap", "-o", "models", "--json", "out.json", *quick)
+    quick = "--networks mlp --windows 8 --seeds 1 --epochs 1 --trials 0 --workers 1"
+    words = f"protocol --data rooms.mcap -o models --json out.json {quick}".split()
     succeed("paper", *words, folder=folder)
     result = json.loads((folder / "out.json").read_text())
     assert json.loads((folder / "models" / RESULTS).read_text()) == result
@@ -196,8 +279,6 @@ def test_command_writes_its_results(folder):
         ("--windows", "a"),
         ("--windows", "0"),
         ("--networks", "cnn"),
-        ("--scaling", "none"),
-        ("--split", "random"),
         ("--workers", 0),
     ],
 )

@@ -7,18 +7,17 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import ScalingName, needs_torch
+from uwb_mitigation.commands.support.checks import needs_torch
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
 if TYPE_CHECKING:
     from benchmarks.paper.data import Parts
-    from benchmarks.paper.results import ExperimentResults
 
 app = typer.Typer(
     help="The paper's experiment, tables and figures; DeepUWB, downloaded or simulated.", no_args_is_help=True
@@ -27,16 +26,9 @@ app = typer.Typer(
 DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: DeepUWB's dataset.pkl, a bag, or a folder of logs.")
 ]
-SplitOption = Annotated[
-    Literal["auto", "paper", "all_but_room_2", "configurations"],
-    typer.Option(
-        help="paper, all_but_room_2: test in the medium room of DeepUWB; configurations: hold out a quarter; auto: paper for "
-        "DeepUWB, otherwise configurations."
-    ),
-]
-ScalingOption = Annotated[ScalingName, typer.Option(help="Scaling of the CIR.")]
 WorkersOption = Annotated[
-    int | None, typer.Option(help="Processes with one thread each; default: one per processor.")
+    int | None,
+    typer.Option(min=1, max=256, help="Processes with one thread each; default: one per processor."),
 ]
 FolderOption = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
 
@@ -99,28 +91,38 @@ def protocol(
     data: DataOption,
     output: FolderOption,
     networks: Annotated[
-        str, typer.Option(metavar="NAME,...", help="Networks, separated by commas: remnet, remnet_k5, mlp.")
-    ] = "remnet,mlp",
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help="Networks, separated by commas: remnet, remnet_k5, remnet_attention, mlp.",
+        ),
+    ] = "remnet,remnet_k5,remnet_attention,mlp",
     windows: Annotated[
         str, typer.Option(metavar="K,...", help="Window lengths K, separated by commas.")
     ] = "157,128,64,32,16,8",
     seeds: Annotated[int, typer.Option(help="Number of networks of each kind.")] = 5,
     epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 30,
     learning_rate: Annotated[float, typer.Option(help="Learning rate of Adam.")] = 3e-4,
-    split: SplitOption = "auto",
-    scaling: ScalingOption = "max",
+    trials: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Networks of the random search, and of the grid search; 0: no search and no range test.",
+        ),
+    ] = 12,
     workers: WorkersOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Train, quantise and test the paper's networks.
+    """Train, prune, quantise and test the paper's networks, after a range test of the learning rate and a search.
 
-    Baselines (medians, and a line in the received power) are fitted on the same training part.
+    The median error of the training part is the baseline.
 
     An interrupted run can be continued: networks that are already in DIR are not trained again.
     """
     lengths = _lengths(windows)
     with needs_torch():
         from benchmarks.paper import experiment
+    from benchmarks.paper.results import RESULTS
 
     tasks = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)
     options = replace(experiment.PAPER, epochs=epochs, learning_rate=learning_rate)
@@ -128,12 +130,12 @@ def protocol(
         raise ParameterError(
             "not a folder", where=str(output), valid="a folder; it is created if it does not exist"
         )
-    split_data = _split_data(data, max(lengths), scaling, split)
-    with console.share_bar(f"{len(tasks)} networks") as update:
+    split_data = _split_data(data, max(lengths))
+    with console.share_bar(f"{len(tasks)} kinds of networks") as update:
         result = experiment.run_experiment(
-            split_data, output, tasks, options, _workers(workers), update, _command()
+            split_data, output, tasks, options, trials, workers or os.cpu_count() or 1, update, _command()
         )
-    _show_experiment(result)
+    console.out.print(f"{output / RESULTS}: {len(result.models)} networks", markup=False, soft_wrap=True)
     console.write_json(json, result.model_dump(mode="json"))
 
 
@@ -185,15 +187,15 @@ def _command() -> str:
     return shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]])
 
 
-def _split_data(path: Path, samples: int, scaling: ScalingName, split: str) -> Parts:
+def _split_data(path: Path, samples: int) -> Parts:
     from benchmarks.paper import data as paper_data
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 
-    preprocessing = Preprocessing(samples, Scaling(scaling))
+    preprocessing = Preprocessing(samples, Scaling.MAX)
     with console.reading() as on_record:
         name, _, dataset = paper_data.load_paper_data(path, preprocessing, on_record)
     console.show_skipped(dataset.skipped)
-    return paper_data.split_dataset(name, dataset, split)
+    return paper_data.split_dataset(name, dataset)
 
 
 def _lengths(text: str) -> list[int]:
@@ -210,33 +212,8 @@ def _lengths(text: str) -> list[int]:
     return list(dict.fromkeys(lengths))
 
 
-def _workers(requested: int | None) -> int:
-    if requested is not None and not 1 <= requested <= 256:
-        raise ParameterError(f"{requested} workers", valid="1 to 256")
-    return requested or os.cpu_count() or 1
-
-
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UwbMitigationError(f"cannot be created: {error.strerror}", where=str(path)) from error
-
-
-def _show_experiment(result: ExperimentResults) -> None:
-    from benchmarks.paper import tables
-    from uwb_mitigation.commands.support.console import print_line, show_table
-
-    provenance = tables.Provenance(result.data, result.split, "", "")
-    table = tables.accuracy(result, provenance, "", "Measured")
-    # Omit the columns of the paper and networks that were not trained.
-    rows = [row for row in table.rows if tables.MISSING not in row]
-    show_table(
-        f"{result.data}, split {result.split}: {result.train} training and {result.test} test measurements, "
-        f"{result.options.epochs} epochs; MAE in m, mean and standard deviation over seeds",
-        (*table.columns[:2], *table.columns[6:]),
-        [[cell.text for cell in (*row[:2], *row[6:])] for row in rows],
-    )
-    for baseline in result.baselines:
-        if baseline.reason:
-            print_line(f"{baseline.name}: not available: {baseline.reason}")

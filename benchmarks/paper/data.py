@@ -2,58 +2,25 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.paper.rooms import has_rooms, parse_configuration
-from uwb_mitigation.errors import DatasetError, ParameterError, check_name
+from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.data.deepuwb import DeepUwbRecording
-from uwb_mitigation.training.data.splits import Split
-from uwb_mitigation.types.source import Source
 
-AUTO, PAPER, CONFIGURATIONS = "auto", "paper", "configurations"
-TRAINING_ROOMS = {PAPER: (1, 3), "all_but_room_2": (0, 1, 3, 4)}
-"""{split: rooms to train on}. Both are tested in the medium room. `paper` has 36,023 training and 13,210 test rows;
-`all_but_room_2` has 41,948 training rows and is used by later work."""
+TRAINING_ROOMS, TEST_ROOM = (1, 3), 2
+"""Rooms of the paper's split: 36,023 training and 13,210 test rows."""
 
-TEST_ROOM = 2
-SPLITS = (AUTO, CONFIGURATIONS, *TRAINING_ROOMS)
 FOLDS = 4
 """Number of folds of data without rooms; one fold is the test part."""
-
-
-def split_by_name(configurations: NDArray[np.str_], name: str) -> tuple[str, Split]:
-    """Return one of `SPLITS` and its description. AUTO is `paper` for DeepUWB, otherwise `configurations`.
-
-    Raises:
-        ParameterError: unknown split.
-        DatasetError: a part is empty, or the configurations have no rooms.
-    """
-    check_name("split", name, SPLITS)
-    if name == AUTO:
-        name = PAPER if has_rooms(configurations) else CONFIGURATIONS
-    if name == CONFIGURATIONS:
-        fold = splits.by_configuration(configurations, FOLDS, seed=0)[0]
-        return f"{CONFIGURATIONS}: 1 of {FOLDS} parts held out", fold
-    rooms = np.array(
-        [parse_configuration(str(configuration))[0] for configuration in configurations], np.intp
-    )
-    train, test = np.flatnonzero(np.isin(rooms, TRAINING_ROOMS[name])), np.flatnonzero(rooms == TEST_ROOM)
-    if not (len(train) and len(test)):
-        raise DatasetError(
-            f"split {name!r}: {len(train)} training rows and {len(test)} test rows",
-            valid=f"rows of room {TEST_ROOM} and of rooms {TRAINING_ROOMS[name]}",
-        )
-    return name, Split(train, test)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,11 +39,6 @@ class Parts:
         )
 
 
-def open_data(path: Path) -> Source:
-    """Open DeepUWB's pickle (`.pkl`) or any recording; raises as `open_recording`."""
-    return DeepUwbRecording(path) if path.suffix == ".pkl" else open_recording(path)
-
-
 def load_paper_data(
     path: Path, preprocessing: Preprocessing, on_record: Callable[[], None] = lambda: None
 ) -> tuple[str, bool, Dataset]:
@@ -85,16 +47,30 @@ def load_paper_data(
     Raises:
         RecordingError, DatasetError: it cannot be read, or no measurement is usable.
     """
-    with open_data(path) as source:
+    with (DeepUwbRecording if path.suffix == ".pkl" else open_recording)(path) as source:
         dataset = build_dataset(source, preprocessing, on_record)
         name, simulated = path.resolve().name, bool(source.simulated)
     return (f"{name} (simulated)" if simulated and "simulated" not in name else name), simulated, dataset
 
 
-def split_dataset(name: str, dataset: Dataset, split: str) -> Parts:
-    """Return training and test part by one of `SPLITS`; raises as `split_by_name`."""
-    description, rows = split_by_name(dataset.configurations, split)
-    return Parts(name, description, dataset.rows(rows.train), dataset.rows(rows.test))
+def split_dataset(name: str, dataset: Dataset) -> Parts:
+    """Return training and test part: the paper's rooms, or a quarter of the configurations if the data has no rooms.
+
+    Raises:
+        DatasetError: a part is empty.
+    """
+    if not has_rooms(dataset.configurations):
+        fold = splits.by_configuration(dataset.configurations, FOLDS, seed=0)[0]
+        description = f"configurations: 1 of {FOLDS} parts held out"
+        return Parts(name, description, dataset.rows(fold.train), dataset.rows(fold.test))
+    rooms = np.array([parse_configuration(str(configuration))[0] for configuration in dataset.configurations])
+    train, test = dataset.rows(np.isin(rooms, TRAINING_ROOMS)), dataset.rows(rooms == TEST_ROOM)
+    if not (len(train) and len(test)):
+        raise DatasetError(
+            f"the paper's split: {len(train)} training rows and {len(test)} test rows",
+            valid=f"rows of room {TEST_ROOM} and of rooms {TRAINING_ROOMS}",
+        )
+    return Parts(name, "paper", train, test)
 
 
 def shorten_windows(dataset: Dataset, samples: int) -> Dataset:
@@ -111,12 +87,3 @@ def shorten_windows(dataset: Dataset, samples: int) -> Dataset:
         inputs = inputs / np.where(peak > 0, peak, np.float32(1))
     preprocessing = Preprocessing(samples, dataset.preprocessing.scaling)
     return replace(dataset, preprocessing=preprocessing, inputs=np.ascontiguousarray(inputs))
-
-
-def fingerprint(text: str, *datasets: Dataset) -> int:
-    """Return a checksum of options and data, to recognise the results of an earlier run."""
-    checksum = zlib.crc32(text.encode())
-    for dataset in datasets:
-        for array in (dataset.inputs, dataset.error_m):
-            checksum = zlib.crc32(array.tobytes(), checksum)
-    return checksum

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.paper.results import Box, Spread
+from benchmarks.paper.results import Box, RangeTest, Spread
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S
@@ -116,6 +116,23 @@ def scatter(points: NDArray[np.floating], groups: NDArray[np.str_], title: str) 
         FigureCanvasAgg(figure)
         figure.savefig(image, format="png", metadata={"Software": None})
         return f"data:image/png;base64,{base64.b64encode(image.getvalue()).decode()}"
+
+
+def range_test(result: RangeTest, paper_rate: float) -> str:
+    """Draw the loss over the learning rate, and the paper's rate. Return a `data:` URI."""
+    with _drawing():
+        figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+        axes = figure.subplots()
+        axes.plot(result.rates, result.losses_m, color=_COLOURS[0], linewidth=1.4)
+        axes.axvspan(result.falls_from, result.falls_to, color="#dddddd", label="the loss falls")
+        axes.axvline(paper_rate, color=_COLOURS[1], linestyle="--", label=f"paper: {paper_rate:g}")
+        # Beyond the smallest loss, training diverges.
+        top = 2.0 * result.losses_m[0]
+        axes.set(xscale="log", xlabel="learning rate", ylabel="training MAE, m", ylim=(0, top))
+        # The default labels are math text, which is disabled.
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.legend(fontsize=8)
+        return _svg(figure)
 
 
 def over_k(

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from benchmarks.paper import figures, published, tables
 from benchmarks.paper.data import TEST_ROOM
-from benchmarks.paper.results import Box, ExperimentResults, FirmwareRow, PartErrors, Spread
+from benchmarks.paper.results import (
+    Box,
+    ExperimentResults,
+    FirmwareRow,
+    PartErrors,
+    RangeTest,
+    Spread,
+)
 from benchmarks.paper.rooms import ROOM_ROWS, has_rooms, parse_configuration
 from benchmarks.paper.tables import Cell, Provenance, ReportTable
 from uwb_mitigation.calibration.html import render_page
@@ -34,7 +41,6 @@ class Picture:
         alt: alternative text for screen readers.
         note: how to read it; `paper_note`: what the paper's figure shows.
         uri: the image as a `data:` URI.
-        numbers: plotted values, machine-readable.
     """
 
     id: str
@@ -43,7 +49,6 @@ class Picture:
     note: str
     paper_note: str
     uri: str
-    numbers: dict[str, Any]
     provenance: Provenance
 
 
@@ -54,6 +59,7 @@ class Report:
     Attributes:
         command: command that created this report.
         lacking: {missing parts: command that creates their results}.
+        statements: measured values of numbers in the paper's text.
     """
 
     data: str
@@ -61,6 +67,7 @@ class Report:
     command: str
     lacking: dict[str, str]
     notices: tuple[str, ...]
+    statements: dict[str, str]
     tables: tuple[ReportTable, ...]
     figures: tuple[Picture, ...]
 
@@ -152,18 +159,21 @@ def build_report(
         shown.append(tables.accuracy(trainings, trained, train, _measured(study)))
         shown.append(tables.sizes(trainings, trained, train))
         pictures.append(_over_k(trainings, trained))
+        if trainings.trials and trainings.range_test:
+            shown.append(tables.search(trainings, trained, _measured(study)))
+            pictures.append(_range_test(trainings.range_test, trained))
     if firmware:
         random = "fixed, for windows and random weights; the cost does not depend on them"
         windows, split = "windows that test every rounding", "none: no accuracy is measured"
         shown.append(tables.firmware(firmware, Provenance(windows, split, random, bench), bench))
     else:
         lacking["Table 3"] = bench
-    notices = _notices(study, trainings)
-    return Report(study.name, study.simulated, study.command, lacking, notices, tuple(shown), tuple(pictures))
+    texts = _notices(study, trainings), tables.statements(trainings) if trainings else {}
+    return Report(study.name, study.simulated, study.command, lacking, *texts, tuple(shown), tuple(pictures))
 
 
 def _measured(study: Study) -> str:
-    return "Measured on simulated data" if study.simulated else "Measured"
+    return "Simulated data, not comparable" if study.simulated else "Measured"
 
 
 def _notices(study: Study, trainings: ExperimentResults | None) -> tuple[str, ...]:
@@ -246,7 +256,6 @@ def _samples(study: Study) -> Picture:
         "one LOS and one NLOS sample with normalised amplitude; in NLOS the signal arrives over many paths, "
         "and the range is biased upward.",
         figures.samples(selected),
-        {"samples": [{"label": name, "error_m": error} for name, error, _ in selected]},
         study.provenance(),
     )
 
@@ -277,13 +286,11 @@ def _components(study: Study, letter: str) -> Picture:
         selected = np.sort(np.random.default_rng(0).choice(len(selected), figures.MAX_POINTS, replace=False))
     kinds = ("room", "material") if study.has_rooms else ("configuration", "label")
     kind, groups = kinds["ab".index(letter)], study.rooms if letter == "a" else study.materials
-    names, counts = np.unique(groups, return_counts=True)
-    numbers = dict(zip(names.tolist(), counts.tolist(), strict=True))
     return Picture(
         f"fig4{letter}",
         f"Fig. 4{letter}. Principal components, by {kind}",
         f"Three-dimensional scatter plot of {len(selected)} channel impulse responses along their first three principal "
-        f"components, from two sides, coloured by {kind} ({len(names)} groups).",
+        f"components, from two sides, coloured by {kind} ({len(np.unique(groups))} groups).",
         f"{len(selected):,} of {len(points):,} windows of {study.dataset.inputs.shape[1]} amplitudes. "
         f"The components contain {percentages} % of the variance.",
         "the three indoor rooms lie close together, apart from outdoor and through-the-wall measurements."
@@ -291,7 +298,6 @@ def _components(study: Study, letter: str) -> Picture:
         else "materials lie in different regions; heavier ones, such as metal, are concentrated and distant "
         "from plastic and wood.",
         figures.scatter(points[selected], groups[selected], f"By {kind}"),
-        {"explained": explained.tolist(), "groups": numbers, "points": len(selected)},
         study.provenance("0, for the choice of points" if len(selected) < len(points) else "none"),
     )
 
@@ -311,11 +317,8 @@ def _over_k(trainings: ExperimentResults, provenance: Provenance) -> Picture:
         }
         if models:
             spreads[samples] = {name: spread for name, spread in values.items() if spread is not None}
-        model_boxes = [
-            model.final_errors.all.box for model in models if model.final_errors.all.box is not None
-        ]
-        box = tuple(np.mean(model_boxes, axis=0).tolist()) if model_boxes else None
-        boxes[f"K = {samples}"] = box
+        model_boxes = [box for model in models if (box := model.final_errors.all.box)]
+        boxes[f"K = {samples}"] = tuple(np.mean(model_boxes, axis=0).tolist()) if model_boxes else None
     paper_mae = {k: row.mae_m[2] for (network, k), row in published.MODELS.items() if network == "remnet"}
     described = "; ".join(
         f"K = {samples}: " + ", ".join(f"{name} {spread.mean:.3f} m" for name, spread in spread_of.items())
@@ -330,13 +333,19 @@ def _over_k(trainings: ExperimentResults, provenance: Provenance) -> Picture:
         "Black: the paper's int8 MAE (Table 1).",
         "errors grow as K falls, and K = 8 is the smallest acceptable length; the paper prints no numbers for it.",
         figures.over_k(boxes, spreads, paper_mae, published.WINDOWS),
-        {
-            "boxes": {name.replace("\n", " "): box for name, box in boxes.items()},
-            "left": {
-                str(k): {name: asdict(spread) for name, spread in by_network.items()}
-                for k, by_network in spreads.items()
-            },
-            "paper_mae": {str(k): mae for k, mae in paper_mae.items()},
-        },
+        provenance,
+    )
+
+
+def _range_test(result: RangeTest, provenance: Provenance) -> Picture:
+    rate = published.LEARNING_RATE
+    return Picture(
+        "lr",
+        "Range test of the learning rate",
+        f"Line plot of the training loss over the learning rate: it falls from {result.falls_from:.1g} to {result.falls_to:.1g}.",
+        f"The rate increases with every batch (Smith 2017). The loss falls between {result.falls_from:.1g} and {result.falls_to:.1g}; "
+        "running mean of the MAE of five REMNets, K = 157.",
+        f"it reports the result, {rate:g}, without a figure.",
+        figures.range_test(result, rate),
         provenance,
     )

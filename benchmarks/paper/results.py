@@ -19,6 +19,9 @@ RESULTS, MAX_BYTES = "protocol.json", 64 * 2**20
 FORMS = ("float", "optimised", "int8")
 """Forms of a trained network, in the order of the paper's columns."""
 
+TRIAL_EPOCHS = 2
+"""Passes of each network of the search. More would change the order of networks with almost equal errors."""
+
 Count = Annotated[int, Field(ge=0)]
 Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Box = tuple[float, float, float, float, float]
@@ -78,56 +81,68 @@ class ErrorsByCondition(_Entry):
 
 
 class TrainedModel(_Entry):
-    """One network, trained with one seed. Forms that a network does not have are omitted (None).
+    """One network, trained with one seed. Forms that a network does not have are omitted.
 
     Attributes:
         samples: window length K.
-        mae_raw, mae_float, mae_optimised, mae_int8: Mean absolute error on the test part, m (Table 1).
-        bytes_float, bytes_optimised, bytes_int8: File sizes (Table 2).
-        float_errors, int8_errors: Errors on the test part (Fig. 5).
-        calibration_mae: {calibration: MAE of int8 on the training part, m}; `calibration` is the chosen one.
-        seconds: training time; `samples_per_s` during it.
+        parameters: without pruned weights.
+        errors: {form: errors on the test part} (Table 1, Fig. 5).
+        bytes: {form: file size}, and `zipped` of the int8 file (Table 2).
+        seconds: processor time of the training, shared by the seeds.
     """
 
     network: str
     samples: Count
     seed: Count
     parameters: Count
-    multiply_accumulates: Count
-    mae_raw: Number
-    mae_float: Number
-    mae_optimised: Number | None = None
-    mae_int8: Number | None = None
-    bytes_float: Count | None = None
-    bytes_optimised: Count | None = None
-    bytes_int8: Count | None = None
-    float_errors: ErrorsByCondition
-    int8_errors: ErrorsByCondition | None = None
-    calibration: str | None = None
-    calibration_mae: Mapping[str, Number] | None = None
+    errors: Mapping[str, ErrorsByCondition]
+    bytes: Mapping[str, Count]
     seconds: Number
-    samples_per_s: Number
 
-    def by_form(self, kind: str) -> list[float | None]:
-        """Return `mae` or `bytes` of each of `FORMS`."""
-        return [getattr(self, f"{kind}_{form}") for form in FORMS]
+    def maes(self) -> list[float | None]:
+        """Return the MAE of each of `FORMS`, m."""
+        return [self.errors[form].all.mae if form in self.errors else None for form in FORMS]
 
     @property
     def final_errors(self) -> ErrorsByCondition:
         """Errors of int8 if the network has this form, otherwise of float."""
-        return self.int8_errors or self.float_errors
+        return self.errors.get("int8", self.errors["float"])
 
 
-class Baseline(_Entry):
-    """A correction without a network, on the same split; `errors` is None if the data does not allow it, for this `reason`."""
+class RangeTest(_Entry):
+    """Learning-rate range test.
 
-    name: str
-    errors: ErrorsByCondition | None
-    reason: str = ""
+    Attributes:
+        rates, losses_m: of each step with a finite loss; running mean of the MAE.
+        falls_from, falls_to: rates at which the loss has fallen by a tenth and by nine tenths of its decrease.
+    """
+
+    rates: tuple[Number, ...]
+    losses_m: tuple[Number, ...]
+    falls_from: Number
+    falls_to: Number
+
+
+class Trial(_Entry):
+    """One network of the search: `stage` is `random` or `grid`, `shape` are the fields of `Remnet`; MAE on the validation part."""
+
+    stage: str
+    shape: Mapping[str, Count]
+    parameters: Count
+    multiply_accumulates: Count
+    mae: Number
+    is_on_front: bool
 
 
 class ExperimentResults(_Entry):
-    """Results of the paper's experiment; `train` and `test` are the numbers of measurements, `options` those of every fit."""
+    """Results of the paper's experiment.
+
+    Attributes:
+        train, test: numbers of measurements.
+        options: options of every fit.
+        median: errors after subtracting the median error of the training part.
+        trials: networks of the random search and of the grid search.
+    """
 
     data: str
     split: str
@@ -136,7 +151,9 @@ class ExperimentResults(_Entry):
     test: Count
     options: FitOptions
     models: tuple[TrainedModel, ...]
-    baselines: tuple[Baseline, ...] = ()
+    median: ErrorsByCondition | None = None
+    range_test: RangeTest | None = None
+    trials: tuple[Trial, ...] = ()
 
     def of(self, network: str, samples: int) -> tuple[TrainedModel, ...]:
         """Return the trained models of a network in the order of seeds."""
