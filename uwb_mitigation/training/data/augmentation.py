@@ -1,4 +1,4 @@
-"""Augmentation of simulated training inputs. docs/background/results.md shows its effect."""
+"""Augmentation of simulated training inputs; its selected values are part of the recipe in models/universal.md."""
 
 from __future__ import annotations
 
