@@ -67,17 +67,19 @@ class HeldOut:
     live_m: Mapping[str, NDArray[np.float64]]
     is_separate: bool
 
-    def merged(self, other: HeldOut, is_first: NDArray[np.bool_]) -> HeldOut:
+    def merged(self, second_part: HeldOut, is_first: NDArray[np.bool_]) -> HeldOut:
         """Return the errors of this and another part of a recording; `is_first` shows which ranges are of this part, bool (r,)."""
 
-        def both(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
+        def joined(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
             values = np.empty(len(is_first), first.dtype)
             values[is_first], values[~is_first] = first, second
             return values
 
-        residual_m = {name: both(value, other.residual_m[name]) for name, value in self.residual_m.items()}
-        live_m = {name: both(value, other.live_m[name]) for name, value in self.live_m.items()}
-        return HeldOut(both(self.block, other.block), residual_m, live_m, self.is_separate)
+        residual_m = {
+            name: joined(value, second_part.residual_m[name]) for name, value in self.residual_m.items()
+        }
+        live_m = {name: joined(value, second_part.live_m[name]) for name, value in self.live_m.items()}
+        return HeldOut(joined(self.block, second_part.block), residual_m, live_m, self.is_separate)
 
     def mae_m(self, name: str) -> float:
         """Return the mean absolute range error, m."""
@@ -101,7 +103,7 @@ class HeldOut:
         if name not in self.live_m:
             return Gain(math.nan, math.nan)
         gain = self._gain(self.live_m[base] ** 2, self.live_m[name] ** 2)
-        return Gain(*(1.0 - math.sqrt(max(1.0 - share, 0.0)) for share in (gain.mean, gain.low)))
+        return Gain(*(1.0 - math.sqrt(max(1.0 - decrease, 0.0)) for decrease in (gain.mean, gain.low)))
 
     def _gain(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> Gain:
         """Return the relative decrease of the mean of n values, with the scatter of the decrease between blocks."""
@@ -118,12 +120,12 @@ class HeldOut:
         return Gain(float(mean) / level, float(low) / level)
 
 
-def decisive(parts: Sequence[HeldOut]) -> list[HeldOut]:
+def decisive(error_sets: Sequence[HeldOut]) -> list[HeldOut]:
     """Return the separate drives, or if there are none, all parts."""
-    return [part for part in parts if part.is_separate] or list(parts)
+    return [errors for errors in error_sets if errors.is_separate] or list(error_sets)
 
 
-def select(parts: Sequence[HeldOut], names: Sequence[str], needs_separate: Sequence[str]) -> str:
+def select(error_sets: Sequence[HeldOut], names: Sequence[str], needs_separate: Sequence[str]) -> str:
     """Return the simplest correction that no more complex one improves.
 
     A more complex correction must improve significantly on each separate drive, and without any on the halves of the drive; the
@@ -131,16 +133,16 @@ def select(parts: Sequence[HeldOut], names: Sequence[str], needs_separate: Seque
     increasing the former: better ranges do not always give better positions.
 
     Args:
-        parts: errors.
+        error_sets: errors of each drive, or of its halves.
         names: corrections in order of complexity.
         needs_separate: corrections that must improve a separate drive.
     """
-    decisive_parts = decisive(parts)
-    has_separate = decisive_parts[0].is_separate
+    decisive_sets = decisive(error_sets)
+    has_separate = decisive_sets[0].is_separate
 
-    def improves(part: HeldOut, name: str, base: str) -> bool:
-        gain, live = part.range_gain(name, base), part.live_gain(name, base)
-        if part not in decisive_parts:
+    def improves(errors: HeldOut, name: str, base: str) -> bool:
+        gain, live = errors.range_gain(name, base), errors.live_gain(name, base)
+        if errors not in decisive_sets:
             return gain.mean > 0.0
         if math.isnan(live.mean):
             return gain.is_significant
@@ -149,6 +151,6 @@ def select(parts: Sequence[HeldOut], names: Sequence[str], needs_separate: Seque
     best = names[0]
     for name in names[1:]:
         has_evidence = has_separate or name not in needs_separate
-        if has_evidence and all(improves(part, name, best) for part in parts):
+        if has_evidence and all(improves(errors, name, best) for errors in error_sets):
             best = name
     return best

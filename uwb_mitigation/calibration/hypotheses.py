@@ -56,7 +56,7 @@ class HypothesisLimits:
 
     displacement_m: float = 0.3
     gain: float = 12.0
-    share: float = 0.65
+    explained_share: float = 0.65
     independent_share: float = 0.35
     swap_share: float = 0.35
     stands_out: float = 1.5
@@ -133,8 +133,8 @@ class AnchorHypotheses:
         if misfit is None or misfit.moved_m <= LIMITS.displacement_m:
             return 0.0
         gain = misfit.loss - misfit.loss_at(misfit.best)
-        share = LIMITS.independent_share if is_independent else LIMITS.share
-        return gain if gain > share * misfit.loss else 0.0
+        explained_share = LIMITS.independent_share if is_independent else LIMITS.explained_share
+        return gain if gain > explained_share * misfit.loss else 0.0
 
     def check(self, reference: str, *, is_independent: bool) -> None:
         """Refuse positions that the ranges contradict.
@@ -153,7 +153,7 @@ class AnchorHypotheses:
             (self._swap_gain(a, b), a, b)
             for a, b in itertools.combinations(suspects, 2)
             # Two free displacements always fit better than a swap, but only slightly better if the anchors are swapped.
-            if self._swap_gain(a, b) > LIMITS.share * (gains[a] + gains[b])
+            if self._swap_gain(a, b) > LIMITS.explained_share * (gains[a] + gains[b])
         ]
         if swaps:
             _, a, b = max(swaps)
@@ -173,10 +173,10 @@ class AnchorHypotheses:
         )
 
     def _swap_gain(self, a: int, b: int) -> float:
-        one, other = self._misfit(a), self._misfit(b)
-        if one is None or other is None:
+        first, second = self._misfit(a), self._misfit(b)
+        if first is None or second is None:
             return 0.0
-        return one.loss + other.loss - one.loss_at(other.position) - other.loss_at(one.position)
+        return first.loss + second.loss - first.loss_at(second.position) - second.loss_at(first.position)
 
     def mirror_image(self, row: int, axes: int) -> NDArray[np.float64] | None:
         """Return another position of an anchor that explains its ranges equally well, float64 (3,), m, or None.
@@ -264,14 +264,14 @@ def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64
     """
     observations, independent = fit.observations, fit.observations.independent
     is_misfit = np.abs(fit.residual_m) > LIMITS.misfit_m
-    share = float((independent * is_misfit).sum() / independent.sum())
-    if share > LIMITS.misfit_share:
+    ratio_of_misfits = float((independent * is_misfit).sum() / independent.sum())
+    if ratio_of_misfits > LIMITS.misfit_share:
         loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
         by_anchor = np.bincount(observations.anchor, loss * independent)
         check_swapped(fit.config, segments, fit.prior, fit.scale_m, np.argsort(by_anchor)[::-1])
-    if share > LIMITS.max_misfit_share:
+    if ratio_of_misfits > LIMITS.max_misfit_share:
         raise DatasetError(
-            f"{share:.0%} of the ranges contradict the estimated track by more than {LIMITS.misfit_m:g} m",
+            f"{ratio_of_misfits:.0%} of the ranges contradict the estimated track by more than {LIMITS.misfit_m:g} m",
             valid=f"a drive, or pauses of more than {GAP_S:g} s between the positions of a carried tag; the anchors file of this "
             "site",
         )

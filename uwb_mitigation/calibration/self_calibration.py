@@ -96,15 +96,15 @@ class SelfCalibration:
         self, pairs: Sequence[tuple[int, int]], factor: NDArray[np.float64] | float
     ) -> tuple[float, float]:
         """Return the mean of the offsets of pairs, each multiplied by its factor, and its standard deviation, m."""
-        share = np.broadcast_to(factor, len(pairs)) / len(pairs)
+        weights_of_pairs = np.broadcast_to(factor, len(pairs)) / len(pairs)
         weight = np.zeros(len(self.fit.parameters))
-        for (tag, row), share_of_pair in zip(pairs, share.tolist(), strict=True):
+        for (tag, row), share_of_pair in zip(pairs, weights_of_pairs.tolist(), strict=True):
             names = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
             weight += share_of_pair * np.array([name in names for name in self.fit.prior.names])
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
         placed = self.fit.config.anchors.sd[[row for _, row in pairs]] ** 2 / 2.0
-        variance = float(weight @ self.fit.covariance @ weight) + float(share**2 @ placed)
+        variance = float(weight @ self.fit.covariance @ weight) + float(weights_of_pairs**2 @ placed)
         return float(weight @ self.fit.parameters), float(np.sqrt(variance))
 
 

@@ -142,10 +142,10 @@ class SiteCalibration:
         It is the upper end of an interval. The locator estimates the common offset itself, so that the promise without ground
         truth is that of the other corrections.
         """
-        parts = decisive(self.held_out)
+        error_sets = decisive(self.held_out)
         if self.solution.truth is not None:
-            return -min(part.live_gain(self.chosen, RAW).low for part in parts)
-        gain = min(part.range_gain(self.chosen, COMMON).low for part in parts)
+            return -min(errors.live_gain(self.chosen, RAW).low for errors in error_sets)
+        gain = min(errors.range_gain(self.chosen, COMMON).low for errors in error_sets)
         return -PROMISED_SHARE * max(gain, 0.0)
 
     @property
@@ -161,11 +161,11 @@ class SiteCalibration:
                     f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is unknown: {value:.2f} m with a standard "
                     f"deviation of {sd:.2f} m"
                 )
-        for part in self.held_out:
-            drive = "on the drive of the check " if part is not self.held_out[0] else ""
-            if part.live_gain(self.chosen, RAW).mean < -MAX_INCREASE:
+        for errors in self.held_out:
+            drive = "on the drive of the check " if errors is not self.held_out[0] else ""
+            if errors.live_gain(self.chosen, RAW).mean < -MAX_INCREASE:
                 return f"{drive}the live position becomes worse"
-            if not part.range_gain(self.chosen, RAW).mean >= MIN_GAIN:
+            if not errors.range_gain(self.chosen, RAW).mean >= MIN_GAIN:
                 return f"{drive}the ranges do not improve"
         return ""
 
@@ -205,7 +205,7 @@ class SiteCalibration:
             "live_position_m": {name: halves.live_rmse_m(name) for name in halves.residual_m},
             "raw_mae_m": self.raw_mae_m,
             "calibrated_mae_m": self.calibrated_mae_m,
-            "check_mae_m": [[part.mae_m(RAW), part.mae_m(self.chosen)] for part in self.held_out[1:]],
+            "check_mae_m": [[errors.mae_m(RAW), errors.mae_m(self.chosen)] for errors in self.held_out[1:]],
             "truth": solution.truth or "none",
             "refused": None,
             "chosen": self.chosen,

@@ -109,7 +109,7 @@ class SiteData:
         if MIN_HALF <= counts[number] / counts[-1] <= 1.0 - MIN_HALF:
             return self.recording <= number, True
         stamps = np.sort(self.ranges.stamp_ns)
-        first, last = (round(share * (len(stamps) - 1)) for share in (MIN_HALF, 1.0 - MIN_HALF))
+        first, last = (round(fraction * (len(stamps) - 1)) for fraction in (MIN_HALF, 1.0 - MIN_HALF))
         pauses = first + np.flatnonzero(np.diff(stamps[first : last + 1]) > GAP_S * NS_PER_S)
         middle = len(stamps) // 2
         cut = int(pauses[np.argmin(np.abs(pauses - middle))]) if len(pauses) else middle

@@ -172,21 +172,21 @@ def solve_without_truth(
         DatasetError: the solution is not observable, or an anchor position in the file is wrong.
     """
 
-    def solve(part: SiteData, near_offset_m: float | None) -> _RangesOnly:
+    def solve(data: SiteData, near_offset_m: float | None) -> _RangesOnly:
         calibration = self_calibrate(
-            part.anchors,
-            part.tags,
-            regressors(part, has_truth=False),
+            data.anchors,
+            data.tags,
+            regressors(data, has_truth=False),
             height=height,
             area=area,
-            heights_m=part.height_m,
+            heights_m=data.height_m,
             height_sd_m=height_sd_m,
             near_offset_m=near_offset_m,
         )
-        return _RangesOnly(part, calibration)
+        return _RangesOnly(data, calibration)
 
-    def solve_part(part: SiteData) -> SiteSolution:
-        return solve(part, offset_m).solution(solve_part)
+    def solve_part(data: SiteData) -> SiteSolution:
+        return solve(data, offset_m).solution(solve_part)
 
     stage = "estimating track and offsets"
     on_progress(stage, 0.1)
@@ -342,7 +342,7 @@ def solve_with_truth(
         hypotheses = AnchorHypotheses(site.anchors, site.ranges, alignment.position, site.tag)
         hypotheses.check("the localisation", is_independent=True)
         on_progress(stage, 1.0)
-    given = replace(
+    aligned = replace(
         localisation,
         time_offset_s=alignment.time_offset_s,
         lever_arms_m=alignment.lever_arm_m,
@@ -362,7 +362,7 @@ def solve_with_truth(
         outliers=outliers,
         notes=(),
         errors_of=lambda range_m: np.where(is_used, range_m - alignment.distance_m, np.nan),
-        solve_part=functools.partial(solve_with_truth, localisation=given, height=level, is_part=True),
+        solve_part=functools.partial(solve_with_truth, localisation=aligned, height=level, is_part=True),
         truth=localisation.topic,
         alignment=alignment,
         height=level,

@@ -381,8 +381,8 @@ def _show(calibration: SiteCalibration) -> None:
     columns = {"range MAE, m": halves.mae_m}
     if solution.truth is not None:
         columns = {"live position RMSE, m": halves.live_rmse_m} | columns
-    for number, part in enumerate(checks, 1):
-        columns[f"MAE on check {number}, m"] = part.mae_m
+    for number, check in enumerate(checks, 1):
+        columns[f"MAE on check {number}, m"] = check.mae_m
     show_table(
         "On held-out halves of the drive",
         ("ranges", *columns, "chosen"),

@@ -303,19 +303,19 @@ class Locator(ManagedNode):
         tag, estimate = result
         outputs = self._outputs_of(tag)
         outputs.picture.statuses[estimator.anchors.index[key.anchor_id]] = corrected.status
-        held = None
+        held_estimate = None
         if estimate is None and self._robot is not None and outputs.robot is not None:
-            held = self._robot.without_estimate(stamp_ns)
-        known = estimate or held
-        if known is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
+            held_estimate = self._robot.without_estimate(stamp_ns)
+        base = estimate or held_estimate
+        if base is not None and not 0 <= stamp_ns - outputs.published_ns < self._period_ns:
             if stamp_ns < outputs.published_ns - NS_PER_S:
                 # A replay starts again.
                 self._transform_ns.clear()
             outputs.published_ns = stamp_ns
-            if held is None:
-                self._publish_estimate(outputs, known)
+            if held_estimate is None:
+                self._publish_estimate(outputs, base)
             else:
-                self._publish_base(outputs, held)
+                self._publish_base(outputs, held_estimate)
         now_ns = time.perf_counter_ns()
         if len(self._processing_ns) < 20_000:
             self._processing_ns.append(now_ns - began_ns)

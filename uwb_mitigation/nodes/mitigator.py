@@ -184,7 +184,7 @@ class Mitigator(ManagedNode):
         if (mitigation := self._mitigation) is not None:
             bundles, rejected = mitigation.bundles, self.health.rejected
             if diagnostics.ALL_REJECTED.text in warnings and len(bundles) == 1 and rejected is not None:
-                warnings.append(self._advice(bundles[0], rejected))
+                warnings.append(self._advice(bundles[0], CirKind.of(rejected)))
             entries |= {
                 "model": ", ".join(bundle.card.label for bundle in bundles),
                 "model id": ", ".join(diagnostics.model_id(bundle.model_id) for bundle in bundles),

@@ -130,7 +130,7 @@ class OdometryInput:
             )
         self._uses_orientation = node.value("imu_orientation")
         self._is_resuming, self._resumed_ns = False, 0
-        self._held: _Held | None = None
+        self._held_pose: _Held | None = None
         self._replace_ns: int | None = None
         self._antenna_frame: str | None = None
         self._static_topic = node.resolve_topic_name(relative(TF_STATIC))
@@ -195,16 +195,23 @@ class OdometryInput:
     def is_resuming(self, stamp_ns: int) -> bool:
         """Return whether an estimate after a crash is older than the odometry, which may still arrive."""
         if not self._is_resuming:
-            return self._held is not None and 0 < self._held.begin_ns - stamp_ns < MAX_GAP_S * NS_PER_S
+            return (
+                self._held_pose is not None and 0 < self._held_pose.begin_ns - stamp_ns < MAX_GAP_S * NS_PER_S
+            )
         self._resumed_ns = self._resumed_ns or stamp_ns
         return 0 <= stamp_ns - self._resumed_ns < MAX_GAP_S * NS_PER_S
 
     def carried_on(self, stamp_ns: int) -> Estimate | None:
         """Return the pose before a crash or gap, moved on by the odometry; None: there was none, or it was replaced."""
         point, pose = self.path.point_at(stamp_ns), self.path.pose_at(stamp_ns)
-        if self._held is None or point is None or pose is None or point.segment != self._held.begin.segment:
+        if (
+            self._held_pose is None
+            or point is None
+            or pose is None
+            or point.segment != self._held_pose.begin.segment
+        ):
             return None
-        (x, y, z, yaw), variance, begin, _, gap_m = self._held
+        (x, y, z, yaw), variance, begin, _, gap_m = self._held_pose
         cosine, sine = math.cos(yaw), math.sin(yaw)
         position = np.array([x + cosine * pose[0] - sine * pose[1], y + sine * pose[0] + cosine * pose[1], z])
         drift, turn, distance = (
@@ -221,7 +228,7 @@ class OdometryInput:
 
     def without_estimate(self, stamp_ns: int) -> Estimate | None:
         """Return the pose that is moved on while there is no position."""
-        if self._held is None:
+        if self._held_pose is None:
             return None
         self._hold_latest(stamp_ns)
         return self.carried_on(stamp_ns)
@@ -229,37 +236,43 @@ class OdometryInput:
     def mixed(self, base: Estimate, *, trusts_odometry: bool) -> Estimate:
         """Return an estimate of the base, mixed with `carried_on` by their variances: the transform does not step."""
         if not trusts_odometry:
-            self._held = None
+            self._held_pose = None
         elif base.heading is None:
             self._hold_latest(base.stamp_ns)
-        held, new = self.carried_on(base.stamp_ns), base.heading
-        if held is None or held.heading is None:
+        held_estimate, new = self.carried_on(base.stamp_ns), base.heading
+        if held_estimate is None or held_estimate.heading is None:
             return base
-        delta, of_held, of_new = base.position - held.position, held.covariance, base.covariance
+        delta, of_held, of_new = (
+            base.position - held_estimate.position,
+            held_estimate.covariance,
+            base.covariance,
+        )
         error = float(delta[:2] @ np.linalg.solve((of_held + of_new)[:2, :2], delta[:2]))
         turn, of_turn = 0.0, math.inf
         if new is not None:
-            turn = math.remainder(new.yaw - held.heading.yaw, math.tau)
+            turn = math.remainder(new.yaw - held_estimate.heading.yaw, math.tau)
             of_turn = float(new.covariance[3])
-        of_yaw = float(held.heading.covariance[3])
+        of_yaw = float(held_estimate.heading.covariance[3])
         # The estimates may be right: the robot was moved, or the saved pose was wrong.
         if not max(error, turn**2 / (of_yaw + of_turn)) <= CONTRADICTION:
-            self._held = self.state.map_to_odom = None
+            self._held_pose = self.state.map_to_odom = None
             return base
         if new is None:
-            return held
+            return held_estimate
         self._replace_ns = base.stamp_ns if self._replace_ns is None else self._replace_ns
         limit = (base.stamp_ns - self._replace_ns) / (REPLACE_S * NS_PER_S)
-        share = min(float(np.trace(of_held[:2, :2]) / np.trace((of_held + of_new)[:2, :2])), limit)
+        weight = min(float(np.trace(of_held[:2, :2]) / np.trace((of_held + of_new)[:2, :2])), limit)
         of_heading = min(of_yaw / (of_yaw + of_turn), limit)
-        if min(share, of_heading) > REPLACED_SHARE:
-            self._held = None
+        if min(weight, of_heading) > REPLACED_SHARE:
+            self._held_pose = None
         # Their errors are correlated: the variance of the mixture is not smaller.
         covariance = of_new.copy()
-        covariance[:3, :3] = share * of_new[:3, :3] + (1.0 - share) * of_held[:3, :3]
-        yaw_covariance = of_heading * new.covariance + (1.0 - of_heading) * held.heading.covariance
-        heading = Heading(held.heading.yaw + of_heading * turn, yaw_covariance)
-        return replace(base, position=held.position + share * delta, covariance=covariance, heading=heading)
+        covariance[:3, :3] = weight * of_new[:3, :3] + (1.0 - weight) * of_held[:3, :3]
+        yaw_covariance = of_heading * new.covariance + (1.0 - of_heading) * held_estimate.heading.covariance
+        heading = Heading(held_estimate.heading.yaw + of_heading * turn, yaw_covariance)
+        return replace(
+            base, position=held_estimate.position + weight * delta, covariance=covariance, heading=heading
+        )
 
     def last_map_to_odom(self, stamp_ns: int, tolerance_ns: int) -> TransformStamped | None:
         """Return the last transform with a new stamp, for `HOLD_S`; None: later, or no heading was known yet."""
@@ -326,9 +339,9 @@ class OdometryInput:
         """Hold the latest transform if it was current until now: the filter starts again if odometry arrives late."""
         state, point = self.state, self.path.point_at(stamp_ns)
         is_current = 0 <= stamp_ns - state.map_to_odom_ns <= CURRENT_S * NS_PER_S
-        is_newer = self._held is None or self._replace_ns is not None
+        is_newer = self._held_pose is None or self._replace_ns is not None
         if state.map_to_odom is not None and point is not None and is_current and is_newer:
-            self._held, self._replace_ns = (
+            self._held_pose, self._replace_ns = (
                 _Held(state.map_to_odom, state.variance, point, stamp_ns, 0.0),
                 None,
             )
@@ -336,7 +349,7 @@ class OdometryInput:
     def _hold(self, stamp_ns: int, pose: Vector, speed: float, begin: PathPoint) -> None:
         """Hold the transform from before a crash or gap, unless it was old, or the odometry was reset meanwhile."""
         state, is_resuming = self.state, self._is_resuming
-        self._is_resuming, self._held, self._replace_ns = False, None, None
+        self._is_resuming, self._held_pose, self._replace_ns = False, None, None
         before, last, gap_s = state.pose, state.map_to_odom, (stamp_ns - state.pose_ns) / NS_PER_S
         if before is None or last is None:
             return
@@ -347,7 +360,7 @@ class OdometryInput:
         elif (
             is_resuming or gap_s <= MAX_GAP_S
         ) and state.pose_ns - state.map_to_odom_ns <= CURRENT_S * NS_PER_S:
-            self._held = _Held(last, state.variance, begin, stamp_ns, gap_m)
+            self._held_pose = _Held(last, state.variance, begin, stamp_ns, gap_m)
 
     def _on_imu(self, message: Imu) -> None:
         # A -1 in front of the covariance marks rates that are not measured.

@@ -15,10 +15,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.source import Source
-from uwb_mitigation.types.stamps import NS_PER_S
-
-FIRST_DATE_NS = 946_684_800 * NS_PER_S
-"""2000-01-01T00:00:00Z: earlier stamps come from a clock without a date."""
+from uwb_mitigation.types.stamps import FIRST_DATE_NS, NS_PER_S
 
 
 class RecordingSummary:

@@ -52,7 +52,7 @@ def bundle_for(named: Path | None, recording: Path, *, may_be_experimental: bool
     models = load_model(named)
     if isinstance(models, Bundle):
         return models
-    models = tuple(each for each in models if may_be_experimental or each.card.label == each.name)
+    models = tuple(model for model in models if may_be_experimental or model.card.label == model.name)
     # The command reports the errors of reading.
     with suppress(UwbMitigationError, StopIteration), open_recording(recording) as source:
         cirs = (record.measurement.cir for record in islice(source, MAX_RECORDS_READ))

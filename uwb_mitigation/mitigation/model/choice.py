@@ -39,9 +39,9 @@ class CirKind(NamedTuple):
             return f"{self.radio.name} without CIR"
         radio, segment = self.source
         text = f"{radio.name} {segment.name}" + (" (assumed)" if radio is not self.radio else "")
-        known = {"preamble count": self.has_preamble_count, "levels": self.has_levels}
-        missing = [name for name, is_known in known.items() if not is_known]
-        return f"{text} {'without' if missing else 'with'} {' and '.join(missing or known)}"
+        available = {"preamble count": self.has_preamble_count, "levels": self.has_levels}
+        missing = [name for name, is_known in available.items() if not is_known]
+        return f"{text} {'without' if missing else 'with'} {' and '.join(missing or available)}"
 
 
 def kinds_of(ranges: RangeColumns) -> dict[CirKind, list[int]]:
@@ -53,7 +53,8 @@ def kinds_of(ranges: RangeColumns) -> dict[CirKind, list[int]]:
     for row, (count, rx, first_path) in enumerate(zip(ranges.preamble_count.tolist(), *levels, strict=True)):
         rows.setdefault((count > 0, math.isfinite(rx - first_path)), []).append(row)
     return {
-        CirKind(ranges.radio, ranges.segment, samples, *known): indices for known, indices in rows.items()
+        CirKind(ranges.radio, ranges.segment, samples, *available): indices
+        for available, indices in rows.items()
     }
 
 

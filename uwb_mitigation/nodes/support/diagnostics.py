@@ -8,14 +8,17 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from uwb_mitigation.mitigation.model.choice import Choice, CirKind
-from uwb_mitigation.types.measurement import RangeMeasurement, Status
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Status
 from uwb_mitigation.types.stamps import NS_PER_S
+
+if TYPE_CHECKING:
+    from uwb_mitigation.mitigation.model.choice import Choice
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -153,7 +156,7 @@ class MitigatorHealth:
         self.malformed = 0
         self.pairs: dict[Choice, set[tuple[int, int]]] = {}
         self.misfit = ""
-        self.rejected: CirKind | None = None
+        self.rejected: Cir | None = None
         self.los_m: deque[float] = deque(maxlen=MAX_LOS)
         self.excludes_offset = False
         self._processing_ns: deque[int] = deque(maxlen=MAX_LATENCIES)
@@ -180,7 +183,7 @@ class MitigatorHealth:
         else:
             self._rejected_since_s = min(self._rejected_since_s, self._last_s)
             if len(measurement.cir):
-                self.rejected = CirKind.of(measurement.cir)
+                self.rejected = measurement.cir
                 self.misfit = self.misfit if choice.fits else str(choice)
         is_first = choice not in self.pairs
         pairs = self.pairs.setdefault(choice, set())

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.recordings.mapping.conversion import UNKNOWN_ID, UNKNOWN_STAMP, ColumnDict
 from uwb_mitigation.recordings.mapping.mapping import LENGTHS, TIME, FieldRule
-from uwb_mitigation.recordings.summary import FIRST_DATE_NS
-from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.types.stamps import FIRST_DATE_NS, NS_PER_S
 
 MAX_PLAUSIBLE_M, MIN_PLAUSIBLE_M = 300.0, 0.03
 """A median range outside of these limits shows a wrong unit: UWB reaches 300 m."""
@@ -74,9 +73,9 @@ def no_measurements(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     rules = {}
     for number in _NO_RANGE_M:
         same = np.abs(values["range"] - number) < 1e-4
-        near = np.abs(values["range"] - number) < max(0.05, 0.2 * number)
+        similar = np.abs(values["range"] - number) < max(0.05, 0.2 * number)
         error = np.abs(values["true range"] - number)
-        is_alone = np.array_equal(same, near) and not (same & (error < 1.0)).any()
+        is_alone = np.array_equal(same, similar) and not (same & (error < 1.0)).any()
         bad = same if is_alone else same & (error > max(1.0, 0.2 * number))
         if bad.any():
             rules[f"range is {number:g}, which means no measurement"] = bad
@@ -117,16 +116,16 @@ def continue_clocks(values: ColumnDict, stamp: FieldRule, files: Sequence[Path])
     if unwrapped is not None:
         values["stamp"] = unwrapped
         return "the stamps overflow or pass midnight; they were continued"
-    if (part := _parts(values)) is None:
+    if (boot := _boots(values)) is None:
         return ""
     stamps, end = values["stamp"].copy(), 0
-    for number in range(int(part.max()) + 1):
-        rows = part == number
+    for number in range(int(boot.max()) + 1):
+        rows = boot == number
         shift = end - stamps[rows].min() if number else 0
         stamps[rows] += shift
         end = stamps[rows].max() + round(PAUSE_S * NS_PER_S)
     values["stamp"] = stamps
-    row = int(np.flatnonzero(part)[0])
+    row = int(np.flatnonzero(boot)[0])
     where = f"row {values['row'][row] + 1} of {files[values['file'][row]].name}"
     return f"the clock starts again at {where}: {number + 1} parts, with pauses of {PAUSE_S:g} s between them"
 
@@ -138,18 +137,18 @@ def _without_overflow(values: ColumnDict, rule: FieldRule) -> NDArray[np.int64] 
     stamps, has_overflow = values["stamp"].copy(), False
     for number in range(int(values["file"].max()) + 1):
         rows = np.flatnonzero(values["file"] == number)
-        one = (stamps[rows] - round(rule.offset * NS_PER_S)) / period
-        back, forward = np.diff(one) < -0.96, np.diff(one) > 0.96
+        periods = (stamps[rows] - round(rule.offset * NS_PER_S)) / period
+        back, forward = np.diff(periods) < -0.96, np.diff(periods) > 0.96
         # Unsigned counters overflow at the period, signed ones at half of it.
         for start in (0.0, 0.5):
-            before, after = one[:-1][back] + start, one[1:][back] + start
+            before, after = periods[:-1][back] + start, periods[1:][back] + start
             if back.any() and (np.abs(before - 0.99) <= 0.01).all() and (np.abs(after - 0.01) <= 0.01).all():
                 stamps[rows[1:]] += np.cumsum(back.astype(np.int64) - forward) * period
                 has_overflow = True
     return stamps if has_overflow else None
 
 
-def _parts(values: ColumnDict) -> NDArray[np.int64] | None:
+def _boots(values: ColumnDict) -> NDArray[np.int64] | None:
     """Return the number of the part of each row, if a clock without a date starts again; None: it does not.
 
     Rows that are sorted by pairs, and files of different pairs, have one clock.
@@ -171,10 +170,10 @@ def _parts(values: ColumnDict) -> NDArray[np.int64] | None:
         return None
     # A device that logs all pairs starts them again together, also pairs that it has not measured before.
     of_file: NDArray[np.int64] = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < limit)
-    part = of_file if of_file[-1] == count else of_pair
+    boot = of_file if of_file[-1] == count else of_pair
     # A copy of the rows is no second part.
     is_copy = repeated_rows(values)[1]
-    return None if is_copy[part > 0].mean() > 0.9 else part
+    return None if is_copy[boot > 0].mean() > 0.9 else boot
 
 
 # Errors ----------------------------------------------------------------------------------------------------------
@@ -259,7 +258,7 @@ def _unit_of_length(factor: float, unit: str) -> tuple[str, float]:
     """Return the unit that explains a factor of lengths in `unit` best, and the logarithm of the rest of the factor."""
     now_m = LENGTHS[unit or "m"]
     ratio = factor / now_m if factor > 0 else np.inf
-    misfits = {other: float(abs(np.log(ratio * m))) for other, m in LENGTHS.items()}
+    misfits = {name: float(abs(np.log(ratio * m))) for name, m in LENGTHS.items()}
     return min(misfits.items(), key=lambda item: item[1])
 
 

@@ -168,8 +168,8 @@ class MappedRecording(Source):
         rows = conversion.concat(tables)
         mask = np.ones(len(rows["row"]), bool)
         for name, rule in medians.items():
-            far = np.abs(rows[name] - median(rows.pop(name))) > rule.from_median
-            mask &= ~conversion.count_bad(far, self.dropped, name)
+            is_outlier = np.abs(rows[name] - median(rows.pop(name))) > rule.from_median
+            mask &= ~conversion.count_bad(is_outlier, self.dropped, name)
         return take(rows, mask)
 
     def _read_complete(self, table: TableFormat, paths: _Paths, rules: _Rules, what: str) -> ColumnDict:
@@ -315,14 +315,14 @@ class MappedRecording(Source):
         for paths, mask in self._by_files(source):
             rows = self._read_complete(source, paths, rules, "true range ")
             for tag, anchor in set(zip(rows["tag"].tolist(), rows["anchor"].tolist(), strict=True)):
-                at = (rows["tag"] == tag) & (rows["anchor"] == anchor)
-                to = mask & (values["tag"] == tag) & (values["anchor"] == anchor)
-                if not source.stamp and np.ptp(rows["range"][at]) > 0:
+                is_pair = (rows["tag"] == tag) & (rows["anchor"] == anchor)
+                is_target = mask & (values["tag"] == tag) & (values["anchor"] == anchor)
+                if not source.stamp and np.ptp(rows["range"][is_pair]) > 0:
                     what = f"tag {format_id(tag)} and anchor {format_id(anchor)} have several true ranges"
                     raise RecordingError(what, where=str(paths[0]), valid="truth.range.stamp: their times")
-                stamps = values["stamp"][to] if source.stamp else np.zeros(to.sum(), np.int64)
-                path = TruePath(rows["stamp"][at], rows["range"][at][:, np.newaxis])
-                true[to] = path.position_at(stamps)[:, 0]
+                stamps = values["stamp"][is_target] if source.stamp else np.zeros(is_target.sum(), np.int64)
+                path = TruePath(rows["stamp"][is_pair], rows["range"][is_pair][:, np.newaxis])
+                true[is_target] = path.position_at(stamps)[:, 0]
         values["true range"] = true
         self.notes.append(f"true ranges joined: {np.isfinite(true).sum()} of {len(true)}")
 

@@ -315,7 +315,7 @@ def _lines(path: Path, on_warning: OnWarning | None) -> Iterator[tuple[dict[str,
         yield from (({}, line) for line in block.removesuffix("\n").split("\n"))
     if blocks.damage:
         raise DamagedRecordingError(f"truncated or corrupt: {blocks.damage}", where=str(path))
-    if blocks.rest.strip() and on_warning:
+    if blocks.unread.strip() and on_warning:
         on_warning(f"{path.name}: the file does not end with a line break; the last line is not used")
 
 

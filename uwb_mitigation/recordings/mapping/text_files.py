@@ -73,7 +73,7 @@ class TextBlocks:
     """
 
     def __init__(self, path: Path, quote: str = "", *, keep_rest: bool = False) -> None:
-        self._path, self._quote, self._keep_rest, self.rest = path, quote, keep_rest, ""
+        self._path, self._quote, self._keep_rest, self.unread = path, quote, keep_rest, ""
         self.damage: Exception | None = None
 
     def __iter__(self) -> Iterator[str]:
@@ -82,24 +82,24 @@ class TextBlocks:
             source = _UpToDamage(packed)
             buffered = io.BufferedReader(source)
             text = io.TextIOWrapper(buffered, _encoding(buffered.peek(4096)), errors="replace")
-            while len(self.rest) < MAX_ROW_CHARS and (data := text.read(BLOCK_CHARS)):
-                total, self.rest = total + len(data), self.rest + data
+            while len(self.unread) < MAX_ROW_CHARS and (data := text.read(BLOCK_CHARS)):
+                total, self.unread = total + len(data), self.unread + data
                 if total > limit:
                     what = f"the file expands to more than {MAX_EXPANSION} times its size"
                     raise RecordingError(what, where=str(self._path), valid="no decompression bomb")
-                end = self.rest.rfind("\n") + 1
-                if self._quote and self.rest.count(self._quote, 0, end) % 2:
-                    end = self.rest.rfind("\n", 0, self.rest.rfind(self._quote, 0, end)) + 1
+                end = self.unread.rfind("\n") + 1
+                if self._quote and self.unread.count(self._quote, 0, end) % 2:
+                    end = self.unread.rfind("\n", 0, self.unread.rfind(self._quote, 0, end)) + 1
                 if end:
-                    yield self.rest[:end]
-                    self.rest, yielded = self.rest[end:], True
+                    yield self.unread[:end]
+                    self.unread, yielded = self.unread[end:], True
             self.damage = source.damage
-        if len(self.rest) >= MAX_ROW_CHARS or ("\n" in self.rest and not self.damage):
-            what = f"a closing quote or a line break is missing after {self.rest[:60]!r}"
+        if len(self.unread) >= MAX_ROW_CHARS or ("\n" in self.unread and not self.damage):
+            what = f"a closing quote or a line break is missing after {self.unread[:60]!r}"
             raise RecordingError(what, where=str(self._path))
-        if self.rest and not self.damage and (self._keep_rest or not yielded):
-            yield self.rest
-            self.rest = ""
+        if self.unread and not self.damage and (self._keep_rest or not yielded):
+            yield self.unread
+            self.unread = ""
 
 
 def _encoding(head: bytes) -> str:
@@ -159,7 +159,7 @@ class CsvRows:
         if not self._chosen and not blocks.damage:
             raise RecordingError("the file is empty", where=str(self._path))
         if previous and self._on_warning and not blocks.damage:
-            fault = "the file does not end with a line break" if blocks.rest else ""
+            fault = "the file does not end with a line break" if blocks.unread else ""
             widths = [self._count(line) for line in lines if line.strip()][-2:]
             if not fault and widths[-1:] < [self._width] and widths[-1:] < widths[:1]:
                 fault = "the last row is short"
