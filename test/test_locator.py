@@ -121,6 +121,7 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     assert reported["ranges not valid"] == "3"
     assert reported["ranges of unknown anchors"] == "3"
     assert float(reported["tag 7 HDOP"]) < 3
+    assert reported["tag 7 determination"].startswith("unique: HDOP")
     assert "anchor 4711 are left out" in locator.output
     late = ros.node.create_subscription(
         MarkerArray,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from benchmarks.position_data import simulated_runs
 from benchmarks.positions import ambiguous_drives, evaluate
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.batch.smoother import smooth
+from uwb_mitigation.positioning.determination import current_determination, determination, drive_determination
 from uwb_mitigation.positioning.geometry import (
     AnchorRank,
     Area,
@@ -163,6 +165,80 @@ def test_level_anchors_give_x_and_y_and_a_variance_of_the_height_that_contains_t
         assert errors.height_exceeded < 0.01
 
 
+UPRIGHT = np.array([[0, 0, 0.5], [0, 0, 1.5], [0, 0.05, 2.5], [0, 0, 3]])
+LINE = UPRIGHT[:, [2, 0, 1]] + (0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("anchors", "position", "ambiguity", "dims", "state", "remedy"),
+    [
+        (HALL.position, (6, 4, 1), Ambiguity.NONE, 3, "unique", "$"),
+        (
+            SQUARE.position,
+            (1, 0, 2.5),
+            Ambiguity.HEIGHT,
+            3,
+            "mirrored height",
+            "the height.* above z = 1.5.*another",
+        ),
+        (
+            FLAT.position[:, [2, 1, 0]],
+            (5, 1, 1),
+            Ambiguity.MIRROR,
+            3,
+            "mirrored position",
+            "an area on one side",
+        ),
+        (
+            LINE,
+            (1, 2, 1),
+            Ambiguity.MIRROR,
+            2,
+            "mirrored position",
+            "an area on one side of this line.*another",
+        ),
+        (LINE, (1, 2, 1), Ambiguity.ARC, 3, "arc", "the height of the tag and an area on one side"),
+        (LINE, (1, 2, 1), Ambiguity.CIRCLE, 3, "circle", "the height of the tag and an area on one side"),
+        (UPRIGHT, (1, 2, 1), Ambiguity.CIRCLE, 3, "circle", "two more anchors"),
+        (
+            HALL.position,
+            (200, 4, 1),
+            Ambiguity.NONE,
+            2,
+            "weak direction",
+            r"another anchor in the direction \(0.0, 1.0\)",
+        ),
+        (HALL.position[:2], None, Ambiguity.NONE, 3, "unknown", "more anchors"),
+        (HALL.position, None, Ambiguity.NONE, 3, "unknown", "check the anchors file"),
+    ],
+)
+def test_statement_of_each_state_names_remedies_for_its_layout(
+    anchors, position, ambiguity, dims, state, remedy
+):
+    place = None if position is None else np.array(position, float)
+    found = determination(anchors, place, ambiguity, dims)
+    assert found.state == state
+    assert re.match(remedy, found.remedy), found.remedy
+    assert found.is_unique == (not found.remedy)
+
+
+def test_remedies_for_a_mirrored_height_work():
+    ranges, _ = drive(SQUARE, path=around, seconds=30)
+    locator = TagEstimator(EstimatorConfig(SQUARE))
+    found = drive_determination(locator, ranges, locator.run(ranges))
+    assert found.state == "mirrored height"
+    floor_m, distance_m = (
+        float(re.search(text + " ([0-9.]+) m", found.remedy)[1]) for text in ("z =", "another anchor")
+    )
+    places = enumerate([*SQUARE.position.tolist(), (4, 3, 1.5 + distance_m)], 1)
+    more = AnchorMap([Anchor(number, tuple(place)) for number, place in places])
+    for anchors, area in ((SQUARE, Area((-9, -9, floor_m), (9, 9, 4))), (more, None)):
+        locator = TagEstimator(EstimatorConfig(anchors, area=area))
+        ranges, _ = drive(anchors, path=around, seconds=30)
+        locator.run(ranges)
+        assert current_determination(locator).state in ("unique", "weak direction")
+
+
 def test_area_excludes_the_image_of_a_height():
     ranges, truth = drive(SQUARE, path=around, seconds=30)
     locator = TagEstimator(EstimatorConfig(SQUARE, area=Area((-9, -9, 1.7), (9, 9, 3.5))))
@@ -292,7 +368,7 @@ def test_anchors_almost_on_a_line_never_decide_by_chance(seed: int, height: Heig
         assert found is not None
         assert found[1] is None
     (warning,) = fleet.warnings()
-    assert "all on a line" in warning
+    assert re.search("within 0.0. m of a line", warning)
 
 
 def test_covariance_grows_in_a_gap_and_the_tag_is_found_within_two_seconds_after_it():

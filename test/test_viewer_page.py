@@ -14,6 +14,7 @@ from functools import partial
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 from threading import Lock
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, Tag
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer import health
+from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.headline import live_cards
 from uwb_mitigation.viewer.page import Page, View
@@ -130,11 +132,20 @@ def test_pairs_tags_and_nodes_without_data_are_grey(
     browser: Browser, view: View, server: ViewerServer, clock: Clock
 ) -> None:
     fill_scene(view)
+    entries = [
+        SimpleNamespace(key=f"tag {n} determination", value=f"{state}: R")
+        for n, state in ((7, "circle"), (8, "unique"))
+    ]
+    diagnosis = SimpleNamespace(status=[SimpleNamespace(name="locator", level=1, message="", values=entries)])
     with view.lock:
         view.scene.set_node_status("driver", NodeStatus(0, "10.0 Hz", clock()))
         view.scene.set_node_status("recording", NodeStatus(2, "damaged"))
+    SceneUpdater(view.scene, view.lock).add("/diagnostics", diagnosis)
     open_page(browser, server)
     assert "10.0 Hz" in browser.text()
+    assert "tag 7 determination: circle: R" in browser.run(
+        "return document.getElementById('notice').innerText"
+    )
     assert "STALE" not in browser.text()
     assert browser.column("pairs", "no_data") == [False, False]
     clock.now_s = 12.0
@@ -147,6 +158,7 @@ def test_pairs_tags_and_nodes_without_data_are_grey(
     assert "no diagnostics for 12 s; last: 10.0 Hz" in browser.text()
     assert "damaged" in browser.text(), "it is not of a node"
     assert "No ranges for 12 s." in browser.text()
+    assert "circle: R" not in browser.text()
     assert browser.cards()["Position error, now"] == ("-", "no position of tag 7 in the last 3 s")
     browser.wait(
         "the state of the page", lambda: "NO RANGES" in browser.text() and "LIVE" not in browser.text()

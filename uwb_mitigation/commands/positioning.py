@@ -324,6 +324,8 @@ def _show_tracks(tracks: list[TagTracks]) -> None:
         name = f"tag {format_id(tag.recording.tag_id)}"
         if not tag.errors["live"].epochs:
             print_line(f"{name}: no truth in the bag, so no errors")
+        if tag.determination.is_unique:
+            print_line(f"{name}: position {tag.determination}")
         for warning in tag.warnings:
             warn(f"{name}: {warning}.")
 

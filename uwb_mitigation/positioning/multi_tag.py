@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, protection_levels
+from uwb_mitigation.positioning.determination import current_determination
+from uwb_mitigation.positioning.geometry import protection_levels
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
-from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track
 
@@ -226,8 +227,9 @@ class MultiTagEstimator:
             warnings.append(f"ranges of anchors that are not in the anchors file: {names}")
         for tag in self.tags.values():
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
-            if not estimator.is_initialized:
-                warnings.append(f"{name}: {self._unknown_reason(estimator)}")
+            determination = current_determination(estimator)
+            if not determination.is_unique:
+                warnings.append(f"{name}: {determination}")
             if tag.robot is not None:
                 if tag.robot.odometry.point_at(tag.latest_ns) is None:
                     warnings.append(
@@ -242,21 +244,7 @@ class MultiTagEstimator:
                 f"{name}: ranges of anchor {anchor} do not fit: blocked, or wrong in the anchors file"
                 for anchor in contradicting
             ]
-            dop = estimator.dop()
-            if dop is not None and dop.hdop > 10.0:
-                warnings.append(f"{name}: poor geometry, HDOP {dop.hdop:.0f}")
         return warnings
-
-    def _unknown_reason(self, estimator: TagEstimator) -> str:
-        rows = estimator.received_anchors(RANGE_TIMEOUT_S)
-        needed = self._config.dims
-        if len(rows) < needed:
-            return f"position unknown: {len(rows)} anchors received, {needed} or more needed"
-        kind, count = anchor_rank(self.anchors.position[rows]), estimator.candidates
-        text = f"position ambiguous: {count} candidates" if count > 1 else "position unknown"
-        if kind is AnchorRank.LINE or (kind is AnchorRank.PLANE and self._config.height is None):
-            text += f"; the received anchors are {kind.value}: set height, or an area that contains one candidate only"
-        return text
 
     def diagnostics(self) -> dict[str, object]:
         """Return the values for the diagnostics."""
@@ -270,6 +258,7 @@ class MultiTagEstimator:
             estimator, name = tag.estimator, f"tag {format_id(tag.tag_id)}"
             counts, range_filter = estimator.counts, estimator.filter
             values |= {
+                f"{name} determination": str(current_determination(estimator)),
                 f"{name} candidates": estimator.candidates,
                 f"{name} anchors used": len(estimator.received_anchors()),
                 f"{name} found, lost, silent": f"{counts['found']}, {counts['lost']}, {counts['silent']}",

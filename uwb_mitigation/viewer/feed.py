@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.positioning.determination import UNIQUE
 from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_ellipse
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
 from uwb_mitigation.types.anchors import AnchorMap
@@ -172,7 +173,13 @@ class SceneUpdater:
         for status in message.status:
             # An octet is bytes in rclpy and int in rosbags.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            self.report(str(status.name), NodeStatus(level, str(status.message), self.scene.clock()))
+            determinations = tuple(
+                f"{entry.key}: {entry.value}"
+                for entry in status.values
+                if entry.key.endswith(" determination") and not entry.value.startswith(UNIQUE)
+            )
+            report = NodeStatus(level, str(status.message), self.scene.clock(), determinations)
+            self.report(str(status.name), report)
 
 
 def _horizontal_sd_m(covariance: Any) -> float:

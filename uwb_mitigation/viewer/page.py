@@ -324,6 +324,11 @@ class Page:
             "" if scene.anchors else missing.anchors,
             "" if scene.tags or scene.tracks else missing.positions,
             *(() if timeline is None else timeline.notices),
+            *(
+                line
+                for status in scene.node_statuses.values()
+                for line in status.aged(scene.clock()).determinations
+            ),
         )
         self._set(summary=" \u00b7 ".join(texts), notice=[line for line in lines if line])
 

@@ -298,18 +298,25 @@ class NodeStatus:
 
     Attributes:
         received_s: time of reception on the scene's clock; NaN: the report never becomes stale.
+        determinations: how well the positions of its tags are determined, if they are not unique.
     """
 
     level: int
     message: str
     received_s: float = math.nan
+    determinations: tuple[str, ...] = ()
 
     def aged(self, now_s: float) -> NodeStatus:
         """Return the report at a time: STALE with the age if the node has stopped reporting."""
         age_s = now_s - self.received_s
         if not age_s > STALE_S:
             return self
-        return replace(self, level=STALE, message=f"no diagnostics for {age_s:.0f} s; last: {self.message}")
+        return replace(
+            self,
+            level=STALE,
+            message=f"no diagnostics for {age_s:.0f} s; last: {self.message}",
+            determinations=(),
+        )
 
 
 @dataclass(slots=True)

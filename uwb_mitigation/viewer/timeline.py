@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, RecordingError, format_id
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.batch.smoother import smooth
+from uwb_mitigation.positioning.determination import drive_determination
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
@@ -339,8 +340,12 @@ def _estimate_tracks(
             tracks[TrackKind.RAW] = TagEstimator(config).run(_ranges(*selected, "raw_m"))
             if not has_positions:
                 corrected = _ranges(*selected, "corrected_m")
-                tracks[TrackKind.CORRECTED] = live = TagEstimator(config).run(corrected)
+                estimator = TagEstimator(config)
+                tracks[TrackKind.CORRECTED] = live = estimator.run(corrected)
                 timeline.estimates[name] = live
+                determination = drive_determination(estimator, corrected, live)
+                if not determination.is_unique:
+                    timeline.notices.append(f"tag {format_id(int(tag_id))} determination: {determination}")
                 tracks[TrackKind.SMOOTHED] = smooth(config, corrected, live)
         for kind, track in tracks.items():
             if len(track):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from uwb_mitigation.calibration.hypotheses import LIMITS, AnchorHypotheses
 from uwb_mitigation.errors import DatasetError, format_id
 from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
-from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank, dop
+from uwb_mitigation.positioning.determination import Determination, current_determination, drive_determination
+from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.positioning.online.initialization import snapshot
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator, live_track
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
@@ -32,7 +33,6 @@ from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Ranges, Track, TruePath
 
 KINDS = ("snapshot", "raw_live", "live", "smoothed")
-POOR_HDOP = 10.0
 MAX_WITHOUT_POSITION = 0.1
 MIN_OTHERS = 3
 """Other anchors that a track without an anchor needs."""
@@ -55,6 +55,7 @@ class TagTracks:
         smoothed: ten per second, from all ranges. snapshot: least squares on raw ranges.
         errors: errors of each of the `KINDS`.
         hdop: median horizontal dilution of precision along the track.
+        determination: how well the position is determined, most of the time.
         warnings: reasons why the tracks may be unreliable; empty = none.
     """
 
@@ -65,6 +66,7 @@ class TagTracks:
     snapshot: Track
     errors: dict[str, TrackErrors]
     hdop: float
+    determination: Determination
     warnings: list[str]
 
     def as_json(self) -> dict[str, object]:
@@ -75,6 +77,7 @@ class TagTracks:
             "ranges": len(self.recording.ranges),
             **errors["smoothed"],
             "epochs": self.errors["smoothed"].epochs or len(self.smoothed),
+            "determination": asdict(self.determination),
             "warnings": self.warnings,
             **(errors if self.errors["live"].epochs else {}),
         }
@@ -91,7 +94,10 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     locator = TagEstimator(config) if robot is None else robot.tag
     live = (robot or locator).run(ranges)
     if len(live) < 2:
-        raise _no_position(recording, config, locator)
+        raise DatasetError(
+            f"tag {format_id(recording.tag_id)}: no position can be determined from {len(ranges)} ranges: "
+            f"{current_determination(locator)}"
+        )
     tracks = {
         "snapshot": snapshot(anchors, recording.raw, config.height),
         "raw_live": live_track(config, recording.raw) if recording.corrected else live,
@@ -103,17 +109,13 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     used = anchors.position[np.unique(ranges.anchor)]
     level = config.height is not None or config.heights is not None
     hdop = float(np.median([dop(used, position, level=level).hdop for position in sample]))
-    warnings = []
-    if not hdop <= POOR_HDOP:
-        warnings.append(
-            f"poor geometry: median HDOP {hdop:.0f}. The anchors are {anchor_rank(used).value}. "
-            "Place anchors on more sides of the tag"
-        )
+    determined = drive_determination(locator, ranges, tracks["smoothed"])
+    warnings = [] if determined.is_unique else [str(determined)]
     without_position = 1.0 - len(live) / len(ranges)
     if without_position > MAX_WITHOUT_POSITION:
         warnings.append(
             f"no position for {without_position:.0%} of the ranges, because several positions explain them or too few anchors "
-            "were received. Give a height or an area"
+            "were received"
         )
     if robot is not None and (times := robot.tag.counts["odometry wrong"]):
         warnings.append(
@@ -121,7 +123,9 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
             "wrong axes, scale or signs"
         )
     warnings += _smoothing_warnings(errors["live"], errors["smoothed"])
-    return TagTracks(recording, **tracks, errors=errors, hdop=hdop, warnings=warnings)
+    return TagTracks(
+        recording, **tracks, errors=errors, hdop=hdop, determination=determined, warnings=warnings
+    )
 
 
 def _smoothing_warnings(live: TrackErrors, smoothed: TrackErrors) -> list[str]:
@@ -141,22 +145,6 @@ def _smoothing_warnings(live: TrackErrors, smoothed: TrackErrors) -> list[str]:
             "true positions"
         )
     return warnings
-
-
-def _no_position(recording: TagRecording, config: EstimatorConfig, locator: TagEstimator) -> DatasetError:
-    used = config.anchors.position[np.unique(recording.ranges.anchor)]
-    what = f"tag {format_id(recording.tag_id)}: no position can be determined from {len(recording.ranges)} ranges"
-    if locator.candidates > 1:
-        what += f": {locator.candidates} positions explain them equally well"
-    level = config.height is not None or config.heights is not None
-    needed, kind = 3 if level else 4, anchor_rank(used)
-    if locator.undetermined:
-        what += ": the geometry is too weak"
-    if len(used) < needed:
-        what += f"; {len(used)} anchors were received, {needed} are needed"
-    if kind in (AnchorRank.LINE, AnchorRank.POINT) or (kind is AnchorRank.PLANE and not level):
-        what += f"; the anchors are {kind.value}: give a height or an area that contains only one position"
-    return DatasetError(what)
 
 
 @dataclass(frozen=True, slots=True)

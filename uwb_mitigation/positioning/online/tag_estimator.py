@@ -74,25 +74,28 @@ FEW_ANCHORS = 3.0
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
 
+LEVEL = 0.9
+"""A mirror with a larger vertical component of its normal reflects heights."""
+
 _SAME_M = 0.3
 _MAX_ARC_M = 0.5
-_LEVEL = 0.9
 _RETAINED_RANGES = 400
 _MAX_CANDIDATES = 12
 _RETRY_S = 0.25
 
 
 class Ambiguity(enum.Enum):
-    """Which other positions explain the ranges of a tag."""
+    """Which other positions explain the ranges of a tag; `WEAK`: nearby ones in one direction."""
 
     NONE = "unique"
+    WEAK = "weak direction"
     HEIGHT = "mirrored height"
     ARC = "arc"
     MIRROR = "mirrored position"
     CIRCLE = "circle"
 
 
-_GEOMETRY_S = {Ambiguity.NONE: 1.0, Ambiguity.HEIGHT: 0.5}
+_GEOMETRY_S = {Ambiguity.NONE: 1.0, Ambiguity.WEAK: 0.5, Ambiguity.HEIGHT: 0.5}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,13 +160,14 @@ class TagEstimator:
     """Locates one tag.
 
     Attributes:
-        anchors: those of the config.
+        config, anchors: as given, and those of the config.
         counts: numbers of ranges out of order (`backwards`), and of times the tag was `found`, `lost`, and without ranges
             (`silent`).
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
             its square (1 is ideal).
         filter: the filter that follows the tag; None: its position is searched.
-        ambiguity: which other positions explain the ranges.
+        ambiguity: which other positions explain the ranges. ambiguities: how often it was found, four times per second.
+        error_sd_m: standard deviation with which the ranges of positions were compared.
         undetermined: the ranges do not determine the horizontal position at all.
     """
 
@@ -188,7 +192,8 @@ class TagEstimator:
         self.anchors = config.anchors
         self.counts: Counter[str] = Counter()
         self.innovation_mean, self.innovation_square = 0.0, 1.0
-        self._config, self._model = config, config.model
+        self.config, self._model = config, config.model
+        self.ambiguities, self.error_sd_m = Counter[Ambiguity](), RANGE_ERROR_M
         self._height, self._area = config.height, config.area
         self._states = [_AnchorState() for _ in range(len(self.anchors))]
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_RETAINED_RANGES)
@@ -210,6 +215,13 @@ class TagEstimator:
     def candidates(self) -> int:
         """The number of plausible positions; 1: the tag is followed, 0: there are too few ranges."""
         return (1 if self.filter is not None else len(self._hypotheses)) + self.is_ambiguous
+
+    @property
+    def likely_position(self) -> NDArray[np.float64] | None:
+        """The position that explains the ranges best, float64 (3,), even if it is not published; None: no position does."""
+        if self.filter is None:
+            return self._hypotheses[0].filter.position if self._hypotheses else None
+        return self.filter.position
 
     def add(self, measurement: TagRange | TagHeight) -> Estimate | None:
         """Update with a measurement; an invalid one is skipped.
@@ -254,7 +266,7 @@ class TagEstimator:
 
     def run(self, ranges: Ranges) -> Track:
         """Process recorded ranges, and the measured heights of the config; return an estimate for each range with one."""
-        return run_estimator(self.add, self._config.heights, ranges)
+        return run_estimator(self.add, self.config.heights, ranges)
 
     def predict_at(self, stamp_ns: int) -> Estimate | None:
         """Predict the position at a time after the latest range; None: not known."""
@@ -290,7 +302,7 @@ class TagEstimator:
         if self.filter is None:
             return None
         rows = self.received_anchors()
-        return dop(self.anchors.position[rows], self.filter.position, level=self._dims == 2)
+        return dop(self.anchors.position[rows], self.filter.position, level=self.dims == 2)
 
     def seconds(self, stamp_ns: int) -> float:
         """Return the time since the first range, s."""
@@ -338,6 +350,7 @@ class TagEstimator:
             if self._time_s >= self._checked_s + valid_s:
                 self._checked, self._checked_s = received, self._time_s
                 self._check_ambiguity(filter_)
+            self.ambiguities[self.ambiguity] += 1
             if self.is_ambiguous and not was_ambiguous:
                 self._ambiguous_s = self._time_s
             if was_ambiguous and not self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
@@ -361,15 +374,16 @@ class TagEstimator:
 
     def _check_ambiguity(self, filter_: RangeFilter) -> None:
         """Find other positions that explain the ranges."""
-        position, dims, rows = filter_.position, self._dims, self.received_anchors()
+        position, dims, rows = filter_.position, self.dims, self.received_anchors()
         if not rows:
             return
         anchors, state = self.anchors.position[rows], filter_.state
         gain, redundancy = constant_error_gain(anchors, position, dims, self._model.offset_sd)
         variance = state.persisting_variance(redundancy)
         excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
-        filter_.unseen = excess * self._config.widens * gain
+        filter_.unseen = excess * self.config.widens * gain
         sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
+        self.error_sd_m = sd_m
         offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))
         covariance = scale * state.P[:3, :3] + excess * gain
         key = dims, *rows
@@ -388,13 +402,15 @@ class TagEstimator:
         separations = separation(anchors, position, position + others, sd_m, offset_sd_m, dims)
         is_other = (separations < EXCLUDED_SD) & self._area_contains(position + others, covariance)
         same_m = max(_SAME_M, EXCLUDED_SD * math.sqrt(max(covariance[0, 0], covariance[1, 1])))
-        if dims == 3 and abs(symmetry.axis[2]) > _LEVEL and math.hypot(*others[0, :2]) < same_m:
+        if dims == 3 and abs(symmetry.axis[2]) > LEVEL and math.hypot(*others[0, :2]) < same_m:
             self._is_side_known = not is_other[0]
             others, weight = others[is_other], np.exp(-0.5 * separations[is_other] ** 2)
-            filter_.unseen += self._config.widens * (others.T @ others) / (len(others) + 1)
+            filter_.unseen += self.config.widens * (others.T @ others) / (len(others) + 1)
             self._shift[:2] = (weight @ others)[:2] / (1.0 + weight.sum())
             if len(others):
-                self.ambiguity, self._symmetry = Ambiguity.HEIGHT, symmetry
+                is_apart = is_other[0] and separations[0] < separations[1]
+                self.ambiguity = Ambiguity.HEIGHT if is_apart else Ambiguity.WEAK
+                self._symmetry = symmetry
         elif not is_other[0]:
             self._is_side_known = True
         elif separations[0] < separations[1] and not self._knows_side(others[:1], covariance):
@@ -413,7 +429,7 @@ class TagEstimator:
             is_inside = np.append(True, is_other)
             is_arc = np.count_nonzero(is_inside != np.roll(is_inside, 1)) == 2
             spread = others.T @ others / (len(others) + 1)
-            filter_.unseen += self._config.widens * spread
+            filter_.unseen += self.config.widens * spread
             is_short = np.trace(spread[:2, :2]) < _MAX_ARC_M**2
             self.ambiguity = Ambiguity.ARC if is_arc and is_short else Ambiguity.CIRCLE
 
@@ -469,7 +485,8 @@ class TagEstimator:
         return Height(float(np.median(heights)), max(math.sqrt(float(np.median(variances))), 0.02))
 
     @property
-    def _dims(self) -> int:
+    def dims(self) -> int:
+        """The number of unknown coordinates: 2 if the height is known or measured."""
         return 2 if self._recent_height() is not None else 3
 
     def _restart_search(self, time_s: float) -> None:
@@ -496,7 +513,7 @@ class TagEstimator:
             return
         # Wait until every anchor had its turn, or enough were received.
         is_early = time_s - self._search_began_s < WINDOW_S / 2
-        if time_s < self._next_check_s or (is_early and len(self.received_anchors()) < self._dims + 2):
+        if time_s < self._next_check_s or (is_early and len(self.received_anchors()) < self.dims + 2):
             return
         self._next_check_s = time_s + _RETRY_S
         rows, range_m, sd_m = self._window()
