@@ -193,16 +193,16 @@ def separation(
     The first `dims` coordinates of an image and the common offset of the ranges are changed so that the difference becomes as
     small as possible.
     """
-    unit, distance = unit_vectors(images[:, None], anchors)
-    difference = distance - unit_vectors(position[None], anchors)[1]
-    rows = np.concatenate([unit[..., :dims], np.ones((*distance.shape, 1))], axis=2)
-    normal = np.einsum("nki,nkj->nij", rows, rows) / sd_m**2
-    prior_sd = np.array([*[IMAGE_SHIFT_M] * dims, max(offset_sd_m, 1e-3)])
-    normal[:, range(dims + 1), range(dims + 1)] += 1.0 / prior_sd**2
-    right = np.einsum("nki,nk->ni", rows, difference) / sd_m**2
-    explained = np.einsum("ni,ni->n", right, np.linalg.solve(normal, right[..., None])[..., 0])
-    squared = np.einsum("nk,nk->n", difference, difference) / sd_m**2 - explained
-    separations: NDArray[np.float64] = np.sqrt(np.maximum(squared, 0.0))
+    unit, distance = unit_vectors(np.concatenate([images, position[None]])[:, None], anchors)
+    difference = (distance[:-1] - distance[-1])[..., None] / sd_m
+    rows = np.full((*distance[:-1].shape, dims + 1), 1.0 / sd_m)
+    rows[..., :dims] = unit[:-1, :, :dims] / sd_m
+    columns = rows.transpose(0, 2, 1)
+    normal, right = columns @ rows, columns @ difference
+    diagonal = normal.reshape(len(images), -1)[:, :: dims + 2]
+    diagonal += [*[IMAGE_SHIFT_M**-2] * dims, max(offset_sd_m, 1e-3) ** -2]
+    squared = (difference**2).sum(axis=1) - (right * np.linalg.solve(normal, right)).sum(axis=1)
+    separations: NDArray[np.float64] = np.sqrt(np.maximum(squared[:, 0], 0.0))
     return separations
 
 
@@ -221,12 +221,15 @@ def constant_error_gain(
     """
     rows = np.ones((len(anchors), dims + 1))
     rows[:, :dims] = unit_vectors(position, anchors)[0][:, :dims]
-    prior = np.diag([(CONSTANT_ERROR_M / sd) ** 2 for sd in (*POSITION_SD_M[:dims], max(offset_sd_m, 1e-3))])
-    gain = np.linalg.solve(rows.T @ rows + prior, rows.T)
-    residual = np.eye(len(anchors)) - rows @ gain
+    normal = rows.T @ rows
+    prior = [(CONSTANT_ERROR_M / sd) ** 2 for sd in (*POSITION_SD_M[:dims], max(offset_sd_m, 1e-3))]
+    normal.reshape(-1)[:: dims + 2] += prior
+    gain = np.linalg.solve(normal, rows.T)
+    residual = rows @ gain
+    residual.reshape(-1)[:: len(anchors) + 1] -= 1.0
     covariance = np.zeros((3, 3))
     covariance[:dims, :dims] = gain[:dims] @ gain[:dims].T
-    return covariance, float(np.einsum("ij,ij->", residual, residual)) / len(anchors)
+    return covariance, float(np.vdot(residual, residual)) / len(anchors)
 
 
 def dop(anchors: NDArray[np.float64], position: NDArray[np.float64], *, level: bool = False) -> Dop:

@@ -42,7 +42,7 @@ class RangeFilter:
         unseen: float64 (3, 3), m^2, covariance of the position for what the state does not contain: constant errors, other solutions.
     """
 
-    __slots__ = ("_anchors", "_level", "_model", "state", "time_s", "unseen")
+    __slots__ = ("_anchors", "_level", "_model", "_views", "state", "time_s", "unseen")
 
     def __init__(
         self,
@@ -56,6 +56,7 @@ class RangeFilter:
     ) -> None:
         self._anchors, self._model, self._level, self.time_s = anchors.position, model, level, time_s
         self.state = RobustUpdate(anchors, model, np.concatenate([position, np.zeros(3)]))
+        self._views: tuple[NDArray[np.float64], ...] = ()
         self.P[:3, :3], self.unseen = covariance, np.zeros((3, 3))
         for axis in range(2 if level else 3):
             self.P[3 + axis, 3 + axis] = model.speed**2
@@ -78,7 +79,7 @@ class RangeFilter:
     def copy(self) -> RangeFilter:
         """Return an independent copy."""
         twin = copy.copy(self)
-        twin.state = self.state.copy()
+        twin.state, twin._views = self.state.copy(), ()
         return twin
 
     def predict(self, time_s: float) -> None:
@@ -87,25 +88,40 @@ class RangeFilter:
         if dt <= 0.0:
             return
         self.time_s = time_s
-        x, P, model = self.state.x, self.state.P, self._model
-        x[:3] += dt * x[3:6]
-        P[:3] += dt * P[3:6]
-        P[:, :3] += dt * P[:, 3:6]
-        self.state.predict_errors(dt / model.persistence_s)
-        q = model.acceleration**2 * dt
-        for axis in range(2 if self._level else 3):
-            P[axis, axis] += q * dt * dt / 3.0
-            cross = q * dt / 2.0
-            P[axis, axis + 3] += cross
-            P[axis + 3, axis] += cross
-            P[axis + 3, axis + 3] += q
+        if not self._views:
+            # They are made once: new ones would take much of the time.
+            x, P = self.state.x, self.state.P
+            positions, velocities = slice(2 if self._level else 3), slice(3, 5 if self._level else 6)
+            self._views = (
+                *(x[:3], x[3:6], P[:3], P[3:6], P[:, :3], P[:, 3:6]),
+                *(
+                    np.einsum("ii->i", P[i, j])
+                    for i in (positions, velocities)
+                    for j in (positions, velocities)
+                ),
+            )
+        x, v, x_rows, v_rows, x_columns, v_columns, xx, xv, vx, vv = self._views
+        x += dt * v
+        x_rows += dt * v_rows
+        x_columns += dt * v_columns
+        self.state.predict_errors(dt / self._model.persistence_s)
+        q = self._model.acceleration**2 * dt
+        cross = q * dt / 2.0
+        xx += q * dt * dt / 3.0
+        xv += cross
+        vx += cross
+        vv += q
 
     def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
-        vector = self.state.x[:3] - self._anchors[anchor]
-        distance = math.sqrt(vector @ vector)
-        self.state.H[:3] = vector / max(distance, SHORTEST_M)
-        return self.state.update_range(anchor, range_m - distance, variance_m2)
+        # Python numbers are faster here than NumPy.
+        state, (u, v, w) = self.state, self._anchors[anchor].tolist()
+        x, y, z = state.x[:3].tolist()
+        x, y, z = x - u, y - v, z - w
+        distance = math.sqrt(x * x + y * y + z * z)
+        divisor, H = max(distance, SHORTEST_M), state.H
+        H[0], H[1], H[2] = x / divisor, y / divisor, z / divisor
+        return state.update_range(anchor, range_m - distance, variance_m2)
 
     def update_height(self, height_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with the height of the tag; return as `RobustUpdate.update_range`."""
@@ -136,7 +152,8 @@ class RangeFilter:
 
     def estimate(self, stamp_ns: int) -> Estimate:
         """Return position and velocity, at the stamp that the state is for."""
-        x, covariance = self.x, self.P[:6, :6] * self.state.covariance_scale()
+        state = self.state
+        x, covariance = state.x, state.P[:6, :6] * state.covariance_scale()
         covariance[:3, :3] += self.unseen
         return Estimate(stamp_ns, x[:3].copy(), x[3:6].copy(), covariance)
 

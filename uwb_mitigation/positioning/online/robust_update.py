@@ -58,6 +58,7 @@ class RobustUpdate:
         "H",
         "P",
         "_error_variance",
+        "_errors",
         "_last_residual",
         "_model",
         "_offset",
@@ -79,12 +80,19 @@ class RobustUpdate:
         self.P[self._offset, self._offset] = model.offset_sd**2
         errors = np.arange(self._offset + 1, n)
         self.P[errors, errors] = self._error_variance
+        self._bind()
+
+    def _bind(self) -> None:
+        """Set views of the errors in state and covariance: new ones for every prediction would take much of its time."""
+        x, P, first = self.x, self.P, self._offset + 1
+        self._errors = x[first:], P[first:], P[:, first:], P.reshape(-1)[first * (len(P) + 1) :: len(P) + 1]
 
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
         twin = copy.copy(self)
         for name in ("H", "P", "_error_variance", "_last_residual", "x"):
             setattr(twin, name, getattr(self, name).copy())
+        twin._bind()
         return twin
 
     def replace_motion(self, motion: NDArray[np.float64]) -> RobustUpdate:
@@ -97,16 +105,16 @@ class RobustUpdate:
         retained = np.r_[0:3, k:n]
         before = np.r_[0:3, old : len(self.x)]
         twin.P[np.ix_(retained, retained)] = self.P[np.ix_(before, before)]
+        twin._bind()
         return twin
 
     def predict_errors(self, elapsed: float) -> None:
         """Predict the persisting errors after `elapsed` time constants."""
-        decay, first, P = math.exp(-elapsed), self._offset + 1, self.P
-        self.x[first:] *= decay
-        P[first:] *= decay
-        P[:, first:] *= decay
-        diagonal = P.reshape(-1)[:: len(P) + 1]
-        diagonal[first:] += (1.0 - decay * decay) * self._error_variance
+        decay, (x, rows, columns, variances) = math.exp(-elapsed), self._errors
+        x *= decay
+        rows *= decay
+        columns *= decay
+        variances += (1.0 - decay * decay) * self._error_variance
 
     def update_range(self, anchor: int, residual_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with a range; `H` is set.
@@ -124,18 +132,20 @@ class RobustUpdate:
         variance, error_variance = model.variance(variance_m2), float(self._error_variance[anchor])
         # The part of the variance that the persisting error does not explain is white noise.
         white = max(model.white * variance, variance - error_variance)
-        self._error_variance[anchor] += 0.1 * ((1.0 - model.white) * variance - error_variance)
+        self._error_variance[anchor] = error_variance + 0.1 * (
+            (1.0 - model.white) * variance - error_variance
+        )
         H[k:] = 0.0
         H[k] = H[row] = 1.0
-        residual = residual_m - float(x[k])
-        z, sd = self.update(H, residual - float(x[row]), white)
+        residual = residual_m - x.item(k)
+        z, sd = self.update(H, residual - x.item(row), white)
         residual /= math.sqrt(model.inflation(z))
         # White noise does not contribute to the mean of this product.
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
         self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
-        ratio = (self.x[row] ** 2 + self.P[row, row]) / error_variance
-        self.consistency += CONSISTENCY_RATE * (min(float(ratio), MAX_RATIO) - self.consistency)
+        ratio = (x.item(row) ** 2 + self.P.item(row, row)) / error_variance
+        self.consistency += CONSISTENCY_RATE * (min(ratio, MAX_RATIO) - self.consistency)
         return z, sd
 
     def update(
@@ -148,12 +158,13 @@ class RobustUpdate:
         sd = math.sqrt(S)
         z = innovation / sd
         K = PH / (S * self._model.inflation(z) if robust else S)
-        considered = len(H) if self.estimates_errors else self._offset
-        K[considered:] = 0.0
+        if not self.estimates_errors:
+            K[self._offset :] = 0.0
         self.x += K * innovation
         # This is Joseph's form for these gains. The covariance of errors that are only considered stays.
-        P -= np.multiply.outer(K, PH)
-        P[considered:] = P[:, considered:].T
+        P -= K[:, None] * PH
+        if not self.estimates_errors:
+            P[self._offset :] = P[:, self._offset :].T
         return z, sd
 
     def project(self, axis: int, value: float) -> None:
@@ -172,7 +183,7 @@ class RobustUpdate:
     @property
     def modelled_variance(self) -> float:
         """Mean variance of the persisting errors in the model, m^2."""
-        return float(self._error_variance.mean())
+        return float(np.add.reduce(self._error_variance)) / len(self._error_variance)
 
     def persisting_variance(self, redundancy: float) -> float:
         """Return the variance of the errors that do not average out, m^2, for the share of redundant ranges."""

@@ -77,6 +77,7 @@ _UNDETERMINED_M = 5.0
 LEVEL = 0.9
 """A mirror with a larger vertical component of its normal reflects heights."""
 
+_HALF_WAY = np.array([[1.0], [0.5]])
 _SAME_M = 0.3
 _MAX_ARC_M = 0.5
 _RETAINED_RANGES = 400
@@ -197,7 +198,7 @@ class TagEstimator:
         self._height, self._area = config.height, config.area
         self._states = [_AnchorState() for _ in range(len(self.anchors))]
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_RETAINED_RANGES)
-        self._symmetries: dict[tuple[int, ...], Symmetry] = {}
+        self._symmetries: dict[tuple[int, ...], tuple[Symmetry, bool]] = {}
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_RETAINED_RANGES)
         self.restart()
 
@@ -289,7 +290,8 @@ class TagEstimator:
 
     def received_anchors(self, within_s: float = WINDOW_S) -> list[int]:
         """Return the rows of the anchors that were received within that time before the latest range."""
-        return [i for i, s in enumerate(self._states) if s.received_s >= self._time_s - within_s]
+        since_s = self._time_s - within_s
+        return [i for i, s in enumerate(self._states) if s.received_s >= since_s]
 
     def disagreeing(self) -> list[int]:
         """Return the rows of anchors whose ranges contradict those of most others."""
@@ -358,14 +360,17 @@ class TagEstimator:
 
     def _compare_image(self, filter_: RangeFilter, mirror: Symmetry, measurement: TagRange) -> None:
         """Average how much better the position explains the ranges than its image, and swap both if the image is better."""
-        x, y, z = (filter_.position - self.anchors.position[measurement.anchor]).tolist()
-        a, b, c = mirror.axis.tolist()
-        twice = 2.0 * float((filter_.position - mirror.center) @ mirror.axis)
-        expected = measurement.range_m - float(filter_.x[OFFSET])
-        sd = math.sqrt(self._model.variance(measurement.variance_m2))
-        of_position = self._model.student_loss((expected - math.hypot(x, y, z)) / sd)
+        # Python numbers are faster here than NumPy.
+        x, y, z, _, _, _, offset = filter_.state.x[: OFFSET + 1].tolist()
+        (a, b, c), (u, v, w) = mirror.axis.tolist(), mirror.center.tolist()
+        twice = 2.0 * (a * (x - u) + b * (y - v) + c * (z - w))
+        u, v, w = self.anchors.position[measurement.anchor].tolist()
+        x, y, z = x - u, y - v, z - w
+        expected, model = measurement.range_m - offset, self._model
+        sd = math.sqrt(model.variance(measurement.variance_m2))
+        of_position = model.student_loss((expected - math.hypot(x, y, z)) / sd)
         image_m = math.hypot(x - twice * a, y - twice * b, z - twice * c)
-        of_image = self._model.student_loss((expected - image_m) / sd)
+        of_image = model.student_loss((expected - image_m) / sd)
         difference = len(self.received_anchors()) * (of_image - of_position)
         self._evidence += EVIDENCE_RATE * (difference - self._evidence)
         if self._evidence < -EVIDENCE:
@@ -388,19 +393,21 @@ class TagEstimator:
         covariance = scale * state.P[:3, :3] + excess * gain
         key = dims, *rows
         if key not in self._symmetries:
-            self._symmetries[key] = Symmetry.of(anchors, dims, RANGE_ERROR_M)
-        symmetry = self._symmetries[key]
+            symmetry = Symmetry.of(anchors, dims, RANGE_ERROR_M)
+            self._symmetries[key] = symmetry, self._is_one_sided(symmetry)
+        symmetry, is_one_sided = self._symmetries[key]
         self.ambiguity, self._symmetry, self._shift = Ambiguity.NONE, None, np.zeros(3)
         if symmetry.is_rotation:
             self._check_circle(filter_, symmetry, covariance)
             return
-        if self._is_one_sided(symmetry):
+        if is_one_sided:
             self._is_side_known = True
             return
         # The image, and the position half-way.
-        others = (symmetry.images(position) - position) * [[1.0], [0.5]]
-        separations = separation(anchors, position, position + others, sd_m, offset_sd_m, dims)
-        is_other = (separations < EXCLUDED_SD) & self._area_contains(position + others, covariance)
+        others = (symmetry.images(position) - position) * _HALF_WAY
+        places = position + others
+        separations = separation(anchors, position, places, sd_m, offset_sd_m, dims)
+        is_other = (separations < EXCLUDED_SD) & self._area_contains(places, covariance)
         same_m = max(_SAME_M, EXCLUDED_SD * math.sqrt(max(covariance[0, 0], covariance[1, 1])))
         if dims == 3 and abs(symmetry.axis[2]) > LEVEL and math.hypot(*others[0, :2]) < same_m:
             self._is_side_known = not is_other[0]
@@ -461,11 +468,12 @@ class TagEstimator:
     def _estimate(self, filter_: RangeFilter, stamp_ns: int) -> Estimate:
         """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
         estimate = filter_.estimate(stamp_ns)
-        covariance = estimate.covariance
-        estimate.position[:] += self._shift
+        covariance, position = estimate.covariance, estimate.position
+        if self._symmetry is not None:
+            position += self._shift
         if self._height is not None:
             # Constant errors of ranges would move it in the filter.
-            estimate.position[2] = self._height.value
+            position[2] = self._height.value
             covariance[2] = covariance[:, 2] = 0.0
             covariance[2, 2] = self._height.sd**2
         return estimate
