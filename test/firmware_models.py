@@ -28,6 +28,8 @@ from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 
 MODEL_ID = 0x1234ABCD
+SCALE = ((0.0, 0.25), (32.0, 0.375), (64.0, 1.5), (256.0, 40.0))
+"""For the random networks, whose outputs are large."""
 
 
 def bits(values: ArrayLike) -> NDArray[np.uint32]:
@@ -54,7 +56,7 @@ def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
 def mlp_bundle(folder: Path) -> Bundle:
     """Return the MLP of the paper with random weights."""
     weights = random_networks.mlp()
-    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0))
+    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), scale=SCALE)
     return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
 
 
@@ -65,7 +67,7 @@ def strict_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PR
         return exact_bundle(
             folder,
             samples,
-            variance_per_m2=0.0078125,
+            scale=SCALE,
             ood_bands=OodBands(0.125, Band(0.5, 3.0, 2.0), lead_level_db=lead),
             preprocessing=Preprocessing(samples, scaling),
         )
@@ -78,7 +80,7 @@ def strict_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PR
         Band(20.0, 101.0, 70.0),
         lead,
     )
-    return exact_bundle(folder, samples, variance_per_m2=0.0078125, ood_bands=ood_bands)
+    return exact_bundle(folder, samples, scale=SCALE, ood_bands=ood_bands)
 
 
 def random_cir(random: np.random.Generator) -> Cir:

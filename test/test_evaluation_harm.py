@@ -111,7 +111,7 @@ def test_training_logs_are_in_distribution(mitigation, records):
 def test_model_still_improves_the_simulated_flat(mitigation):
     outcome = evaluate_accuracy(mitigation, SimulatedSource(seed=1, count=600, rate_hz=40.0))
     assert outcome.corrected.mae < 0.75 * outcome.raw.mae
-    assert set(outcome.statuses) == {"OK"}
+    assert set(outcome.statuses) == {"OK", "UNRELIABLE"}
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.splits import GroupKey
 from uwb_mitigation.training.evaluation import baselines
-from uwb_mitigation.training.evaluation.intervals import fit_intervals
+from uwb_mitigation.training.evaluation.intervals import MIN_DEVIATION_M, fit_intervals, fit_scale
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, mae_after_rejection
 
 NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
@@ -90,6 +90,18 @@ def test_configurations_have_equal_weight():
     names = np.concatenate([NAMES, np.full(2000, "c0")])
     assert fit_intervals(long, np.zeros(2200), names).sigmas95 < 100
     assert once.variance_m2 == pytest.approx(0.01, rel=1e-3)
+
+
+def test_scale_follows_the_size_of_the_predicted_error():
+    generator = np.random.default_rng(1)
+    predicted = generator.uniform(-1.0, 1.0, 20_000)
+    # The upper half has no weight.
+    deviation = np.where(predicted > 0.0, 9.0, np.maximum(np.abs(predicted) / 2.0, 0.01))
+    residual = generator.laplace(0.0, deviation / np.sqrt(2.0))
+    sizes, scale = np.transpose(fit_scale(residual, predicted, (predicted < 0.0).astype(float)))
+    assert scale[0] == pytest.approx(MIN_DEVIATION_M, abs=1e-3)
+    assert np.interp([0.5, 0.8], sizes, scale) == pytest.approx([0.25, 0.4], rel=0.1)
+    assert (np.diff(scale) >= 0.0).all()
 
 
 def test_intervals_without_data_are_refused():

@@ -18,6 +18,7 @@ from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.types.measurement import Status
 
 WIDE = Band(-1000.0, 1000.0, 1.0)
+SCALE = ((0.0, 0.25), (0.5, 0.375), (1.0, 0.75), (4.0, 4.5))
 SHAPE = Remnet(samples=157)
 
 
@@ -36,8 +37,8 @@ def bands(**changes: Band) -> OodBands:
     return OodBands(0.25, **(every | changes))
 
 
-def mitigation(folder, **changes: Band) -> Mitigation:
-    return Mitigation(bundle(folder, SHAPE, ood_bands=bands(**changes), variance_per_m2=0.5))
+def mitigation(folder, scale=((0.0, 0.25),), **changes: Band) -> Mitigation:
+    return Mitigation(bundle(folder, SHAPE, ood_bands=bands(**changes), scale=scale))
 
 
 @pytest.fixture(autouse=True)
@@ -54,9 +55,9 @@ def test_energy_before_the_first_path_needs_no_level(scaling):
     window = np.sqrt(amplitude) if scaling is Scaling.PREAMBLE else amplitude
     unknown = np.float32([math.nan])
     found = ood_features(window, scaling, np.float32([3.0]), unknown, unknown)
-    assert found[0, 5] == pytest.approx(10 * math.log10(0.2), abs=0.06)
+    assert found[5] == pytest.approx(10 * math.log10(0.2), abs=0.06)
     only = OodBands(0.0, None, lead_level_db=Band(-50.0, -10.0, 6.0))
-    assert OodDetector(only.bands).score(found) == pytest.approx([0.5], abs=0.02)
+    assert OodDetector(only.bands).score(found) == pytest.approx(0.5, abs=0.02)
 
 
 def test_weaker_radio_is_out_of_distribution_but_a_larger_distance_is_not(tmp_path):
@@ -68,10 +69,13 @@ def test_weaker_radio_is_out_of_distribution_but_a_larger_distance_is_not(tmp_pa
     assert (near, far, weak) == (Status.OK, Status.OK, Status.OUT_OF_DISTRIBUTION)
 
 
-def test_variance_grows_with_the_predicted_error(tmp_path):
-    result = mitigation(tmp_path).correct([measurement()])[0]
-    squared = np.float32(result.correction_m) * np.float32(result.correction_m)
-    assert result.variance_m2 == float(np.float32(0.0625) + np.float32(0.5) * squared)
+def test_scale_gives_variance_and_status(tmp_path):
+    one = mitigation(tmp_path, SCALE)
+    for result in one.correct([measurement(seed=seed, rx_power_dbm=-82.0 - seed) for seed in range(20)]):
+        deviation_m = np.interp(abs(result.correction_m), *np.transpose(SCALE))
+        assert result.variance_m2 == pytest.approx(deviation_m**2, rel=1e-6)
+        assert result.status is (Status.UNRELIABLE if deviation_m > 0.5 else Status.OK)
+        assert result.range_m == pytest.approx(3.0 - result.correction_m)
 
 
 def test_out_of_distribution_measurement_is_corrected_less_with_larger_variance(tmp_path):
@@ -110,7 +114,15 @@ def test_invalid_band_is_refused(band):
         Band(*band)
 
 
-@pytest.mark.parametrize("change", [{"variance_per_m2": -1.0}, {"interval95_sigmas": 0.5}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scale": ((0.0, 0.0),)},
+        {"scale": ((0.5, 1.0),)},
+        {"scale": ((0.0, 1.0), (0.0, 2.0))},
+        {"interval95_sigmas": 0.5},
+    ],
+)
 def test_card_with_an_impossible_variance_is_refused(tmp_path, change):
     with pytest.raises(ModelError, match=next(iter(change))):
         bundle(tmp_path, SHAPE, **change)
@@ -122,6 +134,6 @@ def test_bands_contain_the_measurements_they_are_computed_from():
     range_m = np.linspace(1, 6, 50, dtype=np.float32)
     windows[:, :3] /= 16
     values = ood_features(windows, Scaling.PREAMBLE, range_m, power, power - np.float32(5))
-    found = OodBands.of(0.3, values)
+    found = OodBands.of(0.3, np.column_stack(values))
     assert (OodDetector(found.bands).score(values) <= 0).all()
     assert replace(found, known_offset_m=0.0).bands == found.bands

@@ -109,7 +109,7 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
 
     succeed("evaluate --data bare.mcap --model line.onnx --json e.json", folder=tmp_path)
     result = json.loads((tmp_path / "e.json").read_text())
-    assert result["statuses"] == {"OK": result["n"]}
+    assert set(result["statuses"]) <= {"OK", "UNRELIABLE"}
     assert result["corrected"]["mae"] < 0.7 * result["raw"]["mae"]
     los = result["by_label"]["LOS"]
     assert los["corrected_mae"] < los["raw_mae"] + 0.03

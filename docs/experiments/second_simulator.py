@@ -23,7 +23,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
-from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, Encoding, RangeColumns, Status
+from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, Encoding, RangeColumns
 
 LIGHT_M_PER_TAP = 299_792_458.0 * SAMPLE_PERIOD_S
 WAVELENGTH_M = 299_792_458.0 / 6489.6e6
@@ -250,8 +250,7 @@ _EDGE_LEAD_TAPS = float(np.interp(-0.4, -_pulse(_LEAD), _LEAD))
 
 def relative_mae(model: Mitigation, columns: RangeColumns, error: Array, nlos: NDArray[np.bool_]) -> float:
     """Return the MAE of corrected ranges divided by that of a constant offset."""
-    corrected = model.correct_columns(columns)
-    correction = np.where(corrected.status == Status.OK, corrected.correction_m, 0.0)
+    correction = model.correct_columns(columns).correction_m
     remaining, constant = (
         np.abs(values - np.median(values[~nlos])).mean() for values in (error - correction, error)
     )

@@ -86,6 +86,9 @@ static float ood_score(const uwb_model *model, const float *window, float range_
 
 static const float MAX_RANGE_M = 1.0e6f;
 
+/* As in uwb_mitigation/mitigation/correction.py. */
+static const float UNRELIABLE_VARIANCE_M2 = 0.25f;
+
 /* As in uwb_mitigation/mitigation/early_path.py. */
 static const float MIN_EARLY_RANGE_M = 0.3f;
 
@@ -156,14 +159,25 @@ static uwb_status predict(const uwb_model *model, float range_m, const uwb_cir *
     return accepted ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
 }
 
+/* Variance of a corrected range, m^2, by the size of its predicted error. */
+static float corrected_variance_m2(const uwb_model *model, float error_m) {
+    const float size_m = fabsf(error_m);
+    const uwb_scale_line *line = model->scale;
+    for (size_t i = 1; i < model->scale_count && model->scale[i].begin_m <= size_m; i++) {
+        line++;
+    }
+    const volatile float growth_m = line->slope * size_m;
+    const volatile float deviation_m = line->intercept_m + growth_m;
+    const volatile float variance_m2 = deviation_m * deviation_m;
+    return variance_m2;
+}
+
 /* Subtract the predicted error, weighted by the OOD score: the higher the score, the smaller the weight. As in
  * mitigation.py, every product and every sum is rounded: volatile prevents the compiler from fusing them. */
 static void write_corrected(const uwb_model *model, float range_m, float offset_m, float error_m, float score,
                   uwb_corrected *corrected) {
-    const volatile float square = error_m * error_m;
-    const volatile float growth = model->variance_per_m2 * square;
     float correction_m = error_m;
-    float variance_m2 = model->variance_m2 + growth;
+    float variance_m2 = corrected_variance_m2(model, error_m);
     if (score > 0.0f) {
         const float known_m = model->ood_bands->known_offset_m;
         const volatile float shrunk = (1.0f - score) * (error_m - known_m);
@@ -191,6 +205,9 @@ uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, co
         status = corrected->range_m >= 0.0f ? UWB_OK : UWB_OUT_OF_DISTRIBUTION;
     }
     corrected->status = range_status(status);
+    if (status == UWB_OK && corrected->variance_m2 > UNRELIABLE_VARIANCE_M2) {
+        corrected->status = UWB_RANGE_UNRELIABLE;
+    }
     if (status != UWB_OK) {
         const int valid = model != NULL && in_limits(offset_range_m, 0.0f, MAX_RANGE_M);
         corrected->range_m = offset_range_m;

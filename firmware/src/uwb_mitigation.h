@@ -99,6 +99,13 @@ typedef struct {
     uwb_band bands[UWB_FEATURES];
 } uwb_ood_bands;
 
+/* Standard deviation of a corrected range whose predicted error has a size of `begin_m` or more. */
+typedef struct {
+    float begin_m;
+    float intercept_m;
+    float slope;
+} uwb_scale_line;
+
 /* Either a REMNet (modules > 0) or dense layers, then a head with one output. */
 typedef struct {
     uint32_t model_id;
@@ -125,9 +132,10 @@ typedef struct {
     float linear_bias_per_power_gap;
     float correction_low_m; /* with a predicted error outside, the input is out of distribution */
     float correction_high_m;
-    float variance_m2;
-    float variance_per_m2; /* times the square of the predicted error */
+    float variance_m2; /* of a range without CIR from which an offset was subtracted */
     float variance_uncorrected_m2;
+    const uwb_scale_line *scale; /* ascending, the first one from 0 on */
+    uint16_t scale_count;
     const uwb_ood_bands *ood_bands; /* NULL = unknown: no OOD score */
     int early_path; /* 1: a missed direct path replaces the output of the network */
 } uwb_model;
@@ -152,10 +160,11 @@ typedef enum {
     UWB_RANGE_NO_CIR = 1,
     UWB_RANGE_BAD_CIR = 2,
     UWB_RANGE_OUT_OF_DISTRIBUTION = 3,
-    UWB_RANGE_MODEL_ERROR = 4
+    UWB_RANGE_MODEL_ERROR = 4,
+    UWB_RANGE_UNRELIABLE = 5 /* corrected, but the standard deviation exceeds 0.5 m */
 } uwb_range_status;
 
-/* With any status except OK, the raw range minus the offset is passed through, with a larger variance. */
+/* With any status except OK and UNRELIABLE, the raw range minus the offset is passed through, with a larger variance. */
 typedef struct {
     float range_m;
     float correction_m; /* offset + predicted error (linear bias + network); only the offset if passed through */

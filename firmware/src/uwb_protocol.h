@@ -141,7 +141,7 @@ typedef struct {
     float correction; /* m, offset + predicted error; only the offset if the range is passed through */
     float variance; /* m^2; infinite if the range is invalid */
     uint32_t compute_us; /* time that the correction took on the board */
-    uint8_t status; /* 0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR */
+    uint8_t status; /* 0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR, 5 UNRELIABLE */
     uint8_t reserved[3];
 } uwb_range_corrected_t;
 UWB_STATIC_ASSERT(sizeof(uwb_range_corrected_t) == 56);

@@ -238,7 +238,7 @@ def _predicted_m(mitigation: Mitigation, measured: RangeMeasurement, result: Cor
     if is_foreign or (len(cir) == 0 and result.status is Status.NO_CIR):
         # Without a CIR, or with that of another radio, the whole error is the offset.
         return 0.0
-    if result.status is not Status.OK:
+    if not result.status.is_corrected:
         return math.nan
     return result.correction_m - float(mitigation.offsets.lookup([measured.tag_id], [measured.anchor_id])[0])
 
@@ -291,7 +291,7 @@ def _placement_offset(
                 f"(line of sight: less than {LINE_OF_SIGHT_DB:g} dB)"
             )
     elif not len(used) or 2 * is_predicted.sum() < n:
-        counts = Counter(status for *_, status in samples if status != Status.OK.name).most_common()
+        counts = Counter(status for *_, status in samples if not Status[status].is_corrected).most_common()
         statuses = ", ".join(f"{count} {name}" for name, count in counts)
         refused = f"the model corrects only {is_predicted.sum()} of {n} ranges ({statuses})"
     elif median_predicted > limit_m:

@@ -271,10 +271,11 @@ class SiteCalibration:
 def _with_limited_sd(card: ModelCard) -> ModelCard:
     """Return the card with a standard deviation of at most `MAX_SD_M`; its 95 % interval is unchanged."""
     factor = min(MAX_SD_M / math.sqrt(card.variance_m2), 1.0)
+    variance_m2 = float(np.float32(card.variance_m2 * factor**2))
     return replace(
         card,
-        variance_m2=float(np.float32(card.variance_m2 * factor**2)),
-        variance_per_m2=0.0,
+        variance_m2=variance_m2,
+        scale=((0.0, float(np.float32(math.sqrt(variance_m2)))),),
         interval95_sigmas=min(card.interval95_sigmas / factor, 1e3),
     )
 

@@ -133,7 +133,7 @@ def _result(outcomes: list[Outcome], seconds: float, model_id: int | None) -> di
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
-    ok, error = outcome.statuses["OK"], outcome.error
+    ok, unreliable, error = outcome.statuses["OK"], outcome.statuses["UNRELIABLE"], outcome.error
     names = ("messages", "ranges", "replaced", "seconds", "statuses", "skipped", "error")
     return {name: getattr(outcome, name) for name in names} | {
         "models": {str(choice): count for choice, count in outcome.models.items() if choice.fits},
@@ -142,7 +142,8 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         "source": str(outcome.job.source),
         "output": str(outcome.job.output) if outcome.written else None,
         "ok": ok,
-        "passed_through": outcome.ranges - ok,
+        "unreliable": unreliable,
+        "passed_through": outcome.ranges - ok - unreliable,
         "warnings": outcome.skipped.total(),
         "state": "corrected" if error is None else "damaged" if outcome.written else "failed",
     }
@@ -153,6 +154,7 @@ def _show(result: dict[str, Any]) -> None:
         "bag": "bag",
         "ranges": "ranges:d",
         "OK": "ok:d",
+        "unreliable": "unreliable:d",
         "passed through": "passed_through:d",
         "warnings": "warnings:d",
         "state": "state",
@@ -164,7 +166,7 @@ def _show(result: dict[str, Any]) -> None:
         columns,
         result["bags"],
         max_rows=len(result["bags"]),
-        optional=("warnings", "messages", "replaced") if result["failed"] else tuple(columns)[4:],
+        optional=("warnings", "messages", "replaced") if result["failed"] else tuple(columns)[5:],
     )
     console.print_line(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s")
     for row in result["bags"]:

@@ -31,6 +31,10 @@ from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
 MAX_RANGE_M = 1e6
 """Upper limit of valid ranges: the radio reaches a few hundred metres."""
 
+UNRELIABLE_VARIANCE_M2 = 0.25
+"""A corrected range with a larger variance is UNRELIABLE. At simulated sites these are 10 % of the ranges, and half of those
+with an error of more than 0.5 m."""
+
 BATCH = 256
 """Number of records that `Corrector.correct_records` reads ahead."""
 
@@ -42,26 +46,27 @@ _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
 _INFINITE_VARIANCE = np.float32(np.inf)
 _ALL_ROWS = slice(None)
-_OK, _NO_CIR, _BAD_CIR, _OUT_OF_DISTRIBUTION, _MODEL_ERROR = _STATUSES
+_OK, _NO_CIR, _BAD_CIR, _OUT_OF_DISTRIBUTION, _MODEL_ERROR, _UNRELIABLE = _STATUSES
 
 
 class CorrectionRule:
     """Computes corrections and variances from predicted errors, as the card of a bundle specifies."""
 
     def __init__(self, card: ModelCard) -> None:
-        self._low, self._high = (np.float32(limit) for limit in card.correction_limits_m)
-        self._variance = np.float32(card.variance_m2)
-        self._variance_per_m2 = np.float32(card.variance_per_m2)
+        self._low, self._high = card.correction_limits_m
+        lines = card.scale_lines
+        self._begins, self._lines = lines[1:, 0].copy(), lines[:, 1:].copy()
         self._variance_uncorrected = np.float32(card.variance_uncorrected_m2)
         ood_bands = card.ood_bands
         self._ood_detector = None if ood_bands is None else OodDetector(ood_bands.bands)
         self._scaling = card.preprocessing.scaling
         self._known_offset = np.float32(0.0 if ood_bands is None else ood_bands.known_offset_m)
 
-    def accepts(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Return which predicted errors are within the limits and have an OOD score below 1, bool (n,)."""
-        accepted: NDArray[np.bool_] = (predicted >= self._low) & (predicted <= self._high) & (score < 1.0)
-        return accepted
+    def accepts(self, predicted: NDArray[np.float32], score: NDArray[np.float32]) -> list[bool]:
+        """Return which predicted errors are within the limits and have an OOD score below 1."""
+        low, high = self._low, self._high
+        pairs = zip(predicted.tolist(), score.tolist(), strict=True)
+        return [low <= error_m <= high and value < 1.0 for error_m, value in pairs]
 
     def score(
         self,
@@ -73,15 +78,20 @@ class CorrectionRule:
         """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
         if self._ood_detector is None:
             return np.zeros(len(windows), np.float32)
-        values = ood_features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
-        return self._ood_detector.score(values)
+        with np.errstate(over="ignore", invalid="ignore"):
+            features = ood_features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
+            score = self._ood_detector.score(features)
+        return score if isinstance(score, np.ndarray) else np.array([score], np.float32)
 
     def apply(
         self, predicted: NDArray[np.float32], score: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return corrections (m) and variances (m^2) of predicted errors that `accepts` accepts, float32 (n,)."""
         correction: NDArray[np.float32] = predicted
-        variance: NDArray[np.float32] = self._variance + self._variance_per_m2 * (predicted * predicted)
+        size = np.abs(predicted)
+        lines = self._lines[self._begins.searchsorted(size, "right")]
+        deviation = lines[:, 0] + lines[:, 1] * size
+        variance: NDArray[np.float32] = deviation * deviation
         if self._ood_detector is not None and np.count_nonzero(score > 0.0):
             shrunk = self._known_offset + (np.float32(1.0) - score) * (predicted - self._known_offset)
             correction = np.where(score > 0.0, shrunk, predicted)
@@ -232,7 +242,7 @@ def pass_through(
         n ranges; `status` is not copied.
     """
     card = bundle.card
-    range_m = _subtract_offset(ranges.range_m, offset_m)
+    range_m = _subtract_offset(ranges.range_m, offset_m).copy()
     variance = np.where(
         _is_valid_range(range_m), np.float32(card.variance_uncorrected_m2), _INFINITE_VARIANCE
     )
@@ -252,81 +262,92 @@ class OnnxBackend:
 
     def correct(self, ranges: RangeColumns, offset_m: NDArray[np.float32]) -> CorrectedColumns:
         """See `Backend`."""
+        # For a live range, a batch of one, loops over Python numbers are faster than operations on arrays.
         linear_bias, n = self.bundle.linear_bias, len(ranges)
         range_m = _subtract_offset(ranges.range_m, offset_m)
-        valid = _is_valid_range(range_m)
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         predicted = linear_bias.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
-        has_window, has_bias = faults == 0, np.isfinite(predicted)
-        is_predictable = has_window & has_bias & valid
-        rows = _row_index(is_predictable)
         status, score = np.zeros(n, np.uint8), np.zeros(n, np.float32)
-        if rows is not _ALL_ROWS:
+        has_bias, valid = np.isfinite(predicted), _is_valid_range(range_m)
+        if np.count_nonzero(faults) == 0 and np.count_nonzero(has_bias & valid) == n:
+            predicted, score = self._predict(ranges, _ALL_ROWS, range_m, windows, predicted)
+        else:
             # CirFault.NO_POWER, which the preprocessing does not check
             status[~has_bias] = _BAD_CIR
             status[~valid] = _OUT_OF_DISTRIBUTION
-            status[~has_window] = _BAD_CIR if ranges.samples.shape[1] else _NO_CIR
-            windows = windows[is_predictable[has_window]]
-            predicted[~is_predictable] = np.nan
-        if len(windows):
-            try:
-                predicted[rows] += self._network_m(ranges, rows, windows, range_m[rows], predicted[rows])
-            except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
-                predicted[rows] = np.nan
-            score[rows] = self._rule.score(windows, range_m[rows], *(power[rows] for power in powers))
-        if not self.bundle.card.needs_cir and len(windows) < n:
-            # The first-path power may be unknown if the linear bias model has no weight for it.
-            first_path = powers[1] if linear_bias.per_power_gap != 0.0 else powers[0]
-            bias_only = linear_bias.predict_m(powers[0], first_path)
-            uses_bias_only = valid & ~is_predictable & np.isfinite(bias_only)
-            predicted[uses_bias_only], status[uses_bias_only] = bias_only[uses_bias_only], _OK
+            status[faults != 0] = _BAD_CIR if ranges.samples.shape[1] else _NO_CIR
+            rows, bias_only = status == _OK, predicted
+            predicted = np.full(n, np.nan, np.float32)
+            if rows.any():
+                windows = windows[rows[faults == 0]]
+                predicted[rows], score[rows] = self._predict(ranges, rows, range_m, windows, bias_only)
+            if not self.bundle.card.needs_cir:
+                if linear_bias.per_power_gap == 0.0:  # The first-path power may be unknown.
+                    bias_only = linear_bias.predict_m(powers[0], powers[0])
+                uses_bias_only = valid & ~rows & np.isfinite(bias_only)
+                predicted[uses_bias_only], status[uses_bias_only] = bias_only[uses_bias_only], _OK
 
-        accepted = self._rule.accepts(predicted, score)
-        rows = _row_index(accepted)
-        excess, variance = self._rule.apply(predicted[rows], score[rows])
-        correction = offset_m[rows] + excess
-        corrected_m = ranges.range_m[rows].astype(np.float32, copy=False) - correction
-        if np.count_nonzero(corrected_m < 0.0):
-            kept = corrected_m >= 0.0
-            accepted[accepted] = kept
-            rows = accepted
+        is_accepted = self._rule.accepts(predicted, score)
+        accepted = _ALL_ROWS if all(is_accepted) else np.array(is_accepted)
+        excess, variance = self._rule.apply(predicted[accepted], score[accepted])
+        correction = offset_m[accepted] + excess
+        corrected_m = ranges.range_m[accepted].astype(np.float32, copy=False) - correction
+        is_kept = [value >= 0.0 for value in corrected_m.tolist()]
+        if not all(is_kept):
+            accepted = np.array(is_accepted)
+            accepted[accepted] = is_kept
             corrected_m, correction, variance = (
-                values[kept] for values in (corrected_m, correction, variance)
+                values[is_kept] for values in (corrected_m, correction, variance)
             )
-        if rows is _ALL_ROWS:
+        status[accepted] = [
+            _UNRELIABLE if value > UNRELIABLE_VARIANCE_M2 else _OK for value in variance.tolist()
+        ]
+        if accepted is _ALL_ROWS:
             model_id = np.array([self.bundle.model_id] * n, np.uint32)
             return CorrectedColumns(corrected_m, correction, variance, status, CorrectedBy.HOST, model_id)
-        rejected = (status == _OK) & ~accepted
+        rejected = status == _OK
+        rejected[accepted] = False
         status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
         corrected = pass_through(self.bundle, ranges, offset_m, status)
-        corrected.range_m[rows], corrected.correction_m[rows], corrected.variance_m2[rows] = (
+        corrected.range_m[accepted], corrected.correction_m[accepted], corrected.variance_m2[accepted] = (
             corrected_m,
             correction,
             variance,
         )
         return corrected
 
-    def _network_m(
+    def _predict(
         self,
         ranges: RangeColumns,
         rows: slice | NDArray[np.bool_],
-        windows: NDArray[np.float32],
         range_m: NDArray[np.floating],
+        windows: NDArray[np.float32],
         bias_m: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """Return the output of the network for `rows`, or the error of a missed direct path, m, float32 (m,).
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return predicted errors (m) and OOD scores of the m ranges in `rows`, float32 (m,).
 
-        `range_m` and `bias_m`: their ranges minus offsets and their linear biases, (m,).
+        Args:
+            ranges: n measured ranges.
+            rows: those with a window, bool (n,) or all.
+            range_m: their ranges minus offsets, m, (n,).
+            windows: inputs of the network, (m, K).
+            bias_m: linear biases, m, (n,).
         """
-        network_m = self._session.predict_m(windows)
+        range_m, bias_m = range_m[rows], bias_m[rows]
+        powers = ranges.rx_power_dbm[rows], ranges.first_path_power_dbm[rows]
+        try:
+            network_m = self._session.predict_m(windows)
+        except Exception:  # After any error of ONNX Runtime, consumers must still receive the range.
+            return np.full(len(windows), np.nan, np.float32), np.zeros(len(windows), np.float32)
         if self.bundle.card.early_path:
-            indices = np.arange(len(ranges))[rows]
-            early_m = find_early_paths(ranges, indices, self.bundle.preprocessing.samples)
+            early_m = find_early_paths(ranges, rows, self.bundle.preprocessing.samples)
             for index, error_m in early_m.items():
                 if (np.float32(range_m[index]) - bias_m[index]) - error_m >= MIN_RANGE_M:
                     network_m[index] = error_m
-        return network_m
+        predicted = bias_m + network_m
+        score = self._rule.score(windows, range_m, *powers)
+        return predicted, score
 
 
 class Mitigation(Corrector):
@@ -334,15 +355,16 @@ class Mitigation(Corrector):
 
     Predicted error = linear bias + network (or a missed direct path, see `early_path`), correction = offset of the radios + predicted error, and corrected = range -
     correction, each one float32 operation, so that a microcontroller computes the same bits. The model uses the range
-    minus the offset. No measurement is rejected: if a range cannot be corrected, the raw range minus the offset is passed
-    through with a status that gives the reason and a larger variance:
+    minus the offset. A corrected range whose variance exceeds `UNRELIABLE_VARIANCE_M2` is UNRELIABLE. No measurement is
+    rejected: if a range cannot be corrected, the raw range minus the offset is passed through with a status that gives the
+    reason and a larger variance:
 
     NO_CIR, BAD_CIR: see `CirFault`; a bundle that needs no CIR corrects these, too. OUT_OF_DISTRIBUTION: no model was
     trained for this radio or segment, the range minus offset or the corrected range is negative or not finite, the
     predicted error is outside the model's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
 
     The further a measurement is outside the model's training data (`Card.ood_bands`), the more its correction shrinks
-    from the predicted error to the overall offset of the training data, and the larger its variance is, with status OK.
+    from the predicted error to the overall offset of the training data, and the larger its variance is.
 
     Args:
         model: the model, or several, of which `choose_model` selects one for each range.
@@ -362,18 +384,12 @@ class Mitigation(Corrector):
     _backend = OnnxBackend
 
 
-def _row_index(mask: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
-    """Return an index of the selected rows: a slice, which is faster, if all are selected."""
-    return _ALL_ROWS if np.count_nonzero(mask) == len(mask) else mask
-
-
 def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:
     """Return ranges minus offsets in float32, as on boards; without an offset the unchanged range."""
-    corrected: NDArray[np.floating] = range_m.copy()
-    if np.count_nonzero(offset_m):
-        with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.
-            corrected = np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
-    return corrected
+    if not np.count_nonzero(offset_m):
+        return range_m
+    with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.
+        return np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
 
 
 def _is_valid_range(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:

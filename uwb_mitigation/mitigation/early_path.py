@@ -31,38 +31,43 @@ MIN_RANGE_M = np.float32(0.3)
 TAP_M = np.float32(299_792_458.0 * SAMPLE_PERIOD_S)
 
 
-def find_early_paths(ranges: RangeColumns, rows: NDArray[np.intp], samples: int) -> dict[int, np.float32]:
+def find_early_paths(
+    ranges: RangeColumns, rows: NDArray[np.generic] | slice, samples: int
+) -> dict[int, np.float32]:
     """Return the range errors that missed direct paths cause, {index in `rows`: m}, for the ranges that have one.
 
     Args:
         ranges: measured ranges.
-        rows: rows whose window is inside the CIR. If fewer than `SEARCH_TAPS + NOISE_TAPS` taps precede the first path,
-            no early path is detected.
+        rows: index of the rows whose window is inside the CIR. If fewer than `SEARCH_TAPS + NOISE_TAPS` taps precede the
+            first path, no early path is detected.
         samples: window length K.
     """
     lead = NOISE_TAPS + SEARCH_TAPS
     width = 2 if ranges.encoding == Encoding.COMPLEX_INT16 else 1
     size = width * (lead - EDGE_TAPS + 1)
-    numbers = (ranges.first_path_index, ranges.start_index)
-    columns = zip(rows.tolist(), *(column[rows].tolist() for column in numbers), strict=True)
+    columns = (
+        ranges.first_path_index[rows].tolist(),
+        ranges.start_index[rows].tolist(),
+        ranges.samples[rows],
+    )
     places, blocks = [], []
     # As in the preprocessing: for a batch of one, a loop is faster than operations on arrays.
-    for index, (row, first_path, start_index) in enumerate(columns):
+    for index, (first_path, start_index, cir) in enumerate(zip(*columns, strict=True)):
         start = width * (int(math.floor(first_path) - start_index) - lead)
         if start >= 0:
-            places.append((index, row, start, first_path))
-            blocks.append(ranges.samples[row, start : start + size])
+            places.append((index, cir, start, first_path))
+            blocks.append(cir[start : start + size])
     errors: dict[int, np.float32] = {}
     if not blocks:
         return errors
     # The magnitude of -32768 needs an unsigned integer.
     components = np.abs(np.array(blocks)).view(np.uint16)
     strongest = np.maximum.reduceat(components, (0, width * NOISE_TAPS), axis=1).tolist()
-    for (index, row, start, first_path), (noise, search) in zip(places, strongest, strict=True):
+    for (index, cir, start, first_path), (noise, search) in zip(places, strongest, strict=True):
         # The power of a tap is at most `width` times the square of its larger component.
         if width * search * search > MIN_NOISE_RATIO * noise * noise:
             stop = start + width * (lead - WINDOW_LEAD + samples)
-            power = np.square(ranges.samples[row, start:stop], dtype=np.int64)
+            power = np.square(cir[start:stop], dtype=np.int64)
             error_m = _error_m(power[0::2] + power[1::2] if width == 2 else power, first_path)
             if error_m is not None:
                 errors[index] = error_m

@@ -140,8 +140,7 @@ class Preprocessing:
             scales, symbols = ([values[row] for row in rows] for values in (scales, symbols))
 
         if is_complex:
-            power = stacked.astype(np.int32)
-            np.multiply(power, power, out=power)
+            power = np.multiply(stacked, stacked, dtype=np.int32)
             inputs = (power[:, 0::2] + power[:, 1::2]).astype(np.float32)
             np.sqrt(inputs, out=inputs)
         else:
@@ -170,7 +169,7 @@ def _are_usable(windows: NDArray[np.int16], total: int, is_complex: bool) -> boo
     """Return whether no window has a `_content_fault`; checks all windows at once."""
     lowest, highest = int(np.minimum.reduce(windows, axis=None)), int(np.maximum.reduce(windows, axis=None))
     in_range = lowest > -SATURATED and highest < SATURATED and (total % 2 == 0 if is_complex else lowest >= 0)
-    return in_range and bool(np.logical_or.reduce(windows, axis=1).all())
+    return in_range and all(np.logical_or.reduce(windows, axis=1).tolist())
 
 
 def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:

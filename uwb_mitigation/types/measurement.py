@@ -59,7 +59,8 @@ class Segment(enum.IntEnum):
 class Status(enum.IntEnum):
     """Status of a corrected range; the values of `RangeCorrected.msg`.
 
-    If the status is not OK, the raw range minus the offset of its radios is passed through with a larger variance.
+    UNRELIABLE: corrected, but the standard deviation exceeds half a metre; the direct path was probably lost. With NO_CIR,
+    BAD_CIR, OUT_OF_DISTRIBUTION and MODEL_ERROR, the raw range minus the offset of its radios is passed through.
     """
 
     OK = 0
@@ -67,6 +68,12 @@ class Status(enum.IntEnum):
     BAD_CIR = 2
     OUT_OF_DISTRIBUTION = 3
     MODEL_ERROR = 4
+    UNRELIABLE = 5
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether a model corrected the range."""
+        return self in (Status.OK, Status.UNRELIABLE)
 
 
 class CorrectedBy(enum.IntEnum):
@@ -187,7 +194,7 @@ class CorrectedRange:
     Attributes:
         range_m: corrected range.
         range_raw_m: measured range, including the offset of its radios.
-        correction_m: offset of the two radios + predicted error; only the offset if the status is not OK.
+        correction_m: offset of the two radios + predicted error; only the offset if the range is passed through.
         variance_m2: variance of `range_m`; infinite if the range is invalid.
         status: status of the correction.
         origin: source of the correction.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from uwb_mitigation.types.measurement import Status
 
-BLUE, VERMILLION, GREEN, PURPLE = "#0072b2", "#d55e00", "#14a46c", "#c080a2"
+BLUE, VERMILLION, GREEN, PURPLE, ORANGE = "#0072b2", "#d55e00", "#14a46c", "#c080a2", "#b87f00"
 GREY = "#6c6c6c"
 PAPER, NIGHT = "#ffffff", "#111827"
 """Backgrounds of the light and of the dark page; each is also the ink on the other one."""
@@ -36,6 +36,7 @@ class StatusStyle(NamedTuple):
 _SQUARE = ((-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, -0.8), (0.8, 0.8), (-0.8, 0.8))
 _DIAMOND = ((-1.0, 0.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 _TRIANGLE = ((-1.0, 0.8), (0.0, -1.0), (1.0, 0.8))
+_UP = tuple((x, -y) for x, y in _TRIANGLE)
 _CROSS = (
     (-1.0, -0.7), (-0.7, -1.0), (1.0, 0.7), (-1.0, -0.7), (1.0, 0.7), (0.7, 1.0),
     (-1.0, 0.7), (0.7, -1.0), (1.0, -0.7), (-1.0, 0.7), (1.0, -0.7), (-0.7, 1.0),
@@ -52,6 +53,9 @@ STATUS_LOOKS = {
         VERMILLION, "inverted_triangle", "\u25bc", "unlike the training data of the model" + _RAW, _TRIANGLE
     ),
     Status.MODEL_ERROR: StatusStyle(None, "x", "\u2716", "the network failed" + _RAW, _CROSS),
+    Status.UNRELIABLE: StatusStyle(
+        ORANGE, "triangle", "\u25b2", "corrected, but uncertain by more than 0.5 m", _UP
+    ),
 }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import SATURATED, WINDOW_LEAD
-from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, CorrectedRange, RangeMeasurement
 
 
 class Verdict(str, enum.Enum):
@@ -244,6 +244,6 @@ def _model(o: Observation) -> Iterator[Check]:
     residual_m = abs(float(np.median([corrected.range_m for corrected in o.corrected])) - o.distance_m)
     remedy = "calibrate the offset of the pair"
     yield _judge("error of the median corrected range", residual_m, 0.15, 0.3, "m", remedy)
-    refused = sum(corrected.status is not Status.OK for corrected in o.corrected) / len(o.corrected)
+    refused = sum(not corrected.status.is_corrected for corrected in o.corrected) / len(o.corrected)
     remedy = "the model does not fit this radio or site"
     yield _judge("share of ranges without correction", refused, 0.2, 0.8, "%", remedy)

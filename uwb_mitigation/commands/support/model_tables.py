@@ -137,7 +137,7 @@ def show_accuracy(result: Accuracy) -> None:
     show_table(f"{result.n} ranges, model {result.model_id:08x}", columns, rows, optional=columns[4:])
     for status, count in result.statuses.items():
         if status != "OK":
-            print_line(f"{status}: {count} ranges not corrected")
+            print_line(f"{status}: {count} ranges" + " not corrected" * (status != "UNRELIABLE"))
     if result.trained_on:
         print_line(
             f"The result is optimistic: {len(result.trained_on)} of {len(result.by_configuration)} configurations are in the "

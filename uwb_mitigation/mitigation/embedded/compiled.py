@@ -162,7 +162,7 @@ class FirmwareBackend:
             strict=True,
         )
         corrected = pass_through(self.bundle, ranges, offset_m, np.array(status, np.uint8))
-        is_corrected = corrected.status == Status.OK
+        is_corrected = np.isin(corrected.status, (Status.OK, Status.UNRELIABLE))
         for column, computed in zip(
             (corrected.range_m, corrected.correction_m, corrected.variance_m2), values, strict=True
         ):

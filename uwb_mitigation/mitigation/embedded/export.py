@@ -105,6 +105,7 @@ def render(network: PackedNetwork, card: ModelCard, model_id: int, golden: Golde
     sections.append(_array("int16_t", "uwb_head_weights", network.head_weights))
     if card.ood_bands is not None:
         sections.append(_ood_bands(card.ood_bands))
+    sections.append(_scale(card))
     sections.append(_model(network, card, model_id))
     sections.append(_golden(golden))
     sections.append("#endif")
@@ -151,6 +152,11 @@ def _ood_bands(ood_bands: OodBands) -> str:
     return f"static const uwb_ood_bands uwb_model_ood_bands = {{{offset}, {{\n{bands}}}}};\n"
 
 
+def _scale(card: ModelCard) -> str:
+    rows = (f"{{{', '.join(map(format_number, line.tolist()))}}}" for line in card.scale_lines)
+    return f"static const uwb_scale_line uwb_model_scale[] = {{\n{_wrapped(rows)}}};\n"
+
+
 def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
     remnet = bool(network.modules)
     linear_bias, (low, high) = card.linear_bias, card.correction_limits_m
@@ -176,8 +182,9 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
         format_number(low),
         format_number(high),
         format_number(card.variance_m2),
-        format_number(card.variance_per_m2),
         format_number(card.variance_uncorrected_m2),
+        "uwb_model_scale",
+        f"{len(card.scale)}u",
         "NULL" if card.ood_bands is None else "&uwb_model_ood_bands",
         f"{int(card.early_path)}",
     ]

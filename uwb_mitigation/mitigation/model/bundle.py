@@ -13,6 +13,7 @@ import re
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,12 +50,12 @@ class ModelCard:
         preprocessing: preprocessing of the input; its window length is K of the architecture.
         linear_bias: linear model whose residuals the network predicts.
         quantised: True: int8; False: float32.
-        variance_m2: variance of a corrected range whose predicted error is 0, m^2: one standard deviation covers
-            68 % of the errors on unseen configurations.
+        variance_m2: variance of a range without CIR from which an offset was subtracted, m^2.
         variance_uncorrected_m2: variance of a range that is passed through, m^2.
         correction_limits_m: predicted errors outside of these limits mean that the input is out of distribution.
         training: data, split, seed, recipe and metrics; human-readable, JSON values only.
-        variance_per_m2: increase of the variance per squared predicted error, without unit.
+        scale: standard deviation of a corrected range by the size of its predicted error, pairs (m, m) that begin at
+            size 0: linear between them, and constant beyond the last one.
         interval95_sigmas: number of standard deviations that cover 95 % of the errors on unseen configurations.
         ood_bands: bands outside of which a measurement is out of distribution; None = unknown.
         radios, segments: sources of the CIRs that the network was trained for.
@@ -71,13 +72,20 @@ class ModelCard:
     variance_uncorrected_m2: float
     correction_limits_m: tuple[float, float]
     training: Mapping[str, Any] = field(default_factory=dict)
-    variance_per_m2: float = 0.0
+    scale: tuple[tuple[float, float], ...] = ((0.0, 0.25),)
     interval95_sigmas: float = 1.96
     ood_bands: OodBands | None = None
     needs_cir: bool = True
     early_path: bool = False
     radios: tuple[RadioType, ...] = (RadioType.DW1000,)
     segments: tuple[Segment, ...] = (Segment.IPATOV,)
+
+    @property
+    def scale_lines(self) -> NDArray[np.float32]:
+        """Begin (m), intercept (m) and slope of each line of `scale`, float32 (n, 3)."""
+        sizes, deviations = np.array(self.scale).T
+        slopes = np.append(np.diff(deviations) / np.diff(sizes), 0.0)
+        return np.stack([sizes, deviations - slopes * sizes, slopes], axis=1).astype(np.float32)
 
     @property
     def source(self) -> str:
@@ -111,7 +119,7 @@ class ModelCard:
             "correction_limits_m[1]": self.correction_limits_m[1],
             "variance_m2": self.variance_m2,
             "variance_uncorrected_m2": self.variance_uncorrected_m2,
-            "variance_per_m2": self.variance_per_m2,
+            **{f"scale[{n}]": value for n, value in enumerate(chain.from_iterable(self.scale))},
         }
         for name, value in numbers.items():
             if not math.isfinite(value):
@@ -122,8 +130,11 @@ class ModelCard:
         for name in ("variance_m2", "variance_uncorrected_m2"):
             if numbers[name] <= 0:
                 raise ModelError(f"{name} = {numbers[name]}", valid="a positive number")
-        if self.variance_per_m2 < 0:
-            raise ModelError(f"variance_per_m2 = {self.variance_per_m2}", valid="0 or more")
+        sizes, deviations = np.array(self.scale).T
+        if sizes[0] != 0.0 or (np.diff(sizes) <= 0.0).any() or (deviations <= 0.0).any():
+            raise ModelError(
+                f"scale = {self.scale}", valid="increasing sizes from 0, and positive deviations"
+            )
         if not 1.0 <= self.interval95_sigmas <= 1e3:
             raise ModelError(f"interval95_sigmas = {self.interval95_sigmas}", valid="1 to 1000")
         if (
@@ -346,7 +357,7 @@ def _card(metadata: dict[str, Any]) -> ModelCard:
         variance_uncorrected_m2=float(metadata["variance_uncorrected_m2"]),
         correction_limits_m=(float(low), float(high)),
         training=dict(metadata["training"]),
-        variance_per_m2=float(metadata["variance_per_m2"]),
+        scale=tuple((float(size), float(sd)) for size, sd in metadata["scale"]),
         interval95_sigmas=float(metadata["interval95_sigmas"]),
         ood_bands=_ood_bands(metadata["ood"]),
         needs_cir=metadata["needs_cir"] is True,

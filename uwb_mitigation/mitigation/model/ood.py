@@ -31,6 +31,8 @@ LEAD_TAPS = 3
 MIN_POWER, MAX_POWER = np.float32(1e-30), np.float32(1e30)
 """Bounds of powers before conversion to levels, so that levels are finite."""
 
+Values = NDArray[np.float32] | np.float32
+
 _DB_PER_OCTAVE = np.float32(10 * math.log10(2))
 _SQUARE, _LINEAR, _CONSTANT = np.float32(-4 / 3), np.float32(4), np.float32(8 / 3)
 
@@ -123,7 +125,7 @@ class OodBands:
 
     @property
     def bands(self) -> tuple[Band | None, ...]:
-        """Bands in the order of the columns of `ood_features`."""
+        """Bands in the order of `ood_features`."""
         return tuple(getattr(self, field.name) for field in fields(self)[1:])
 
     @property
@@ -162,8 +164,8 @@ def ood_features(
     windows: NDArray[np.float32],
     scaling: Scaling,
     *reported: NDArray[np.floating],
-) -> NDArray[np.float32]:
-    """Return the features of n measurements, float32 (n, 6).
+) -> tuple[Values, ...]:
+    """Return the six features of n measurements, each float32 (n,); of one measurement float32 numbers, which are faster.
 
     Args:
         windows: inputs of the network, (n, K). Energy is their square; with the scaling PREAMBLE, which takes a
@@ -172,58 +174,63 @@ def ood_features(
         reported: range (m), receive power and first-path power (dBm), each (n,); converted to float32. If one is
             not finite or exceeds float32, the features that depend on it are not finite.
 
-    Every step is one float32 operation, and sums run from the first tap to the last.
+    Every step is one float32 operation, and sums run from the first tap to the last. NumPy warns of overflows.
     """
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        energy = windows * windows
-        if scaling is Scaling.PREAMBLE:
-            np.multiply(energy, energy, out=energy)
-        numbers: NDArray[np.float32] = np.array(reported, np.float32)
-        range_m, rx_power_dbm, first_path_power_dbm = numbers
-        sums = np.empty((4, len(windows)), np.float32)
-        total = np.add.accumulate(energy, axis=1)
-        sums[0], sums[1] = total[:, -1], np.add.accumulate(energy[:, FIRST_PATH_TAPS], axis=1)[:, -1]
-        sums[2], sums[3] = range_m * range_m, total[:, LEAD_TAPS - 1]
-        level = _level_db(sums)
-        result = np.empty((6, len(windows)), np.float32)
-        result[0] = range_m
-        np.add(rx_power_dbm, level[2], out=result[1])
-        np.subtract(rx_power_dbm, first_path_power_dbm, out=result[2])
-        np.subtract(level[:2], numbers[1:], out=result[3:5])
-        np.subtract(level[3], level[0], out=result[5])
-    by_measurement: NDArray[np.float32] = result.T
-    return by_measurement
+    energy = windows * windows
+    if scaling is Scaling.PREAMBLE:
+        np.multiply(energy, energy, out=energy)
+    if len(windows) == 1:
+        taps, (range_m, rx_power_dbm, first_path_power_dbm) = energy[0], np.array(reported, np.float32)[:, 0]
+    else:
+        taps, (range_m, rx_power_dbm, first_path_power_dbm) = energy.T, np.array(reported, np.float32)
+    total = np.add.accumulate(taps)
+    level = _level_db(total[-1])
+    return (
+        range_m,
+        rx_power_dbm + _level_db(range_m * range_m),
+        rx_power_dbm - first_path_power_dbm,
+        level - rx_power_dbm,
+        _level_db(np.add.accumulate(taps[FIRST_PATH_TAPS])[-1]) - first_path_power_dbm,
+        _level_db(total[LEAD_TAPS - 1]) - level,
+    )
 
 
 class OodDetector:
     """Computes OOD scores of features with the bands of an `OodBands`."""
 
     def __init__(self, bands: Iterable[Band | None]) -> None:
-        bands_of_columns = {column: astuple(band) for column, band in enumerate(bands) if band is not None}
-        # A slice is faster than a list of all columns.
-        self._columns = (
-            slice(None) if len(bands_of_columns) == len(fields(OodBands)) - 1 else list(bands_of_columns)
-        )
-        table = np.array(list(bands_of_columns.values()), np.float32)
-        self._low, self._high = table[:, 0], table[:, 1]
-        self._per_unit = np.float32(1) / table[:, 2]
+        table = (None if band is None else np.array(astuple(band), np.float32) for band in bands)
+        self._bands = [
+            band if band is None else (band[0], band[1], np.float32(1) / band[2]) for band in table
+        ]
 
-    def score(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the largest excess over a band, in margins, of `ood_features` (n, 6): float32 (n,).
+    def score(self, features: Iterable[Values]) -> Values:
+        """Return the largest excess over a band, in margins, of `ood_features`: float32 (n,), or a number.
 
         0 or less: in distribution; 1 or more, or NaN: out of distribution.
         """
-        values = values[:, self._columns]
-        with np.errstate(over="ignore", invalid="ignore"):
-            excess = np.maximum(self._low - values, values - self._high)
-            np.multiply(excess, self._per_unit, out=excess)
-            score: NDArray[np.float32] = np.maximum.reduce(excess, axis=1)
+        score: Values = np.float32(-np.inf)
+        for value, band in zip(features, self._bands, strict=True):
+            if band is not None:
+                low, high, per_unit = band
+                score = _maximum(score, _maximum(low - value, value - high) * per_unit)
         return score
 
 
-def _level_db(power: NDArray[np.float32]) -> NDArray[np.float32]:
+def _maximum(a: Values, b: Values) -> Values:
+    """Return the larger value, or NaN if one is NaN."""
+    if isinstance(b, np.ndarray):
+        return np.maximum(a, b)
+    return a if a >= b or a != a else b
+
+
+def _level_db(power: Values) -> Values:
     """Return 10 log10 of a power within 0.03 dB: exact exponent, parabola for the logarithm of the mantissa."""
-    mantissa, exponent = np.frexp(np.minimum(np.maximum(power, MIN_POWER), MAX_POWER))
+    if isinstance(power, np.ndarray):
+        mantissa, exponents = np.frexp(np.minimum(np.maximum(power, MIN_POWER), MAX_POWER))
+        exponent = exponents.astype(np.float32)
+    else:
+        mantissa, exponent = map(np.float32, math.frexp(min(max(power, MIN_POWER), MAX_POWER)))
     octaves = (_SQUARE * mantissa + _LINEAR) * mantissa - _CONSTANT
-    level: NDArray[np.float32] = (exponent.astype(np.float32) + octaves) * _DB_PER_OCTAVE
+    level: Values = (exponent + octaves) * _DB_PER_OCTAVE
     return level

@@ -178,7 +178,7 @@ class MitigatorHealth:
     def add(self, choice: Choice, measurement: RangeMeasurement, status: Status) -> bool:
         """Count a range; return whether it is the first one with this choice of a model."""
         self.statuses[status] += 1
-        if status is Status.OK:
+        if status.is_corrected:
             self._rejected_since_s = math.inf
         else:
             self._rejected_since_s = min(self._rejected_since_s, self._last_s)

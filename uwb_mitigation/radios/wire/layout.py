@@ -237,7 +237,7 @@ _TABLES = (
         ),
         Field("variance", "f", "m^2; infinite if the range is invalid"),
         Field("compute_us", "I", "time that the correction took on the board"),
-        Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR"),
+        Field("status", "B", "0 OK, 1 NO_CIR, 2 BAD_CIR, 3 OUT_OF_DISTRIBUTION, 4 MODEL_ERROR, 5 UNRELIABLE"),
         Field("reserved", "3x", ""),
     ),
     Layout(

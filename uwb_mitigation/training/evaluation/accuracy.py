@@ -27,7 +27,7 @@ class Accuracy:
         coverage68, coverage95: shares of corrected errors within the predicted intervals: 1 and
             `interval95_sigmas` reported standard deviations.
         by_label, by_configuration: {name: (n, MAE before, MAE after)}.
-        statuses: {status: number of measurements}; unless the status is OK, the corrected range is the raw range.
+        statuses: {status: number of measurements}.
         model_id: id of the model of most ranges.
         trained_on: configurations that are also in its training data according to the card. If not empty, the
             result is optimistic.

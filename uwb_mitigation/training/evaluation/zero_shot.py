@@ -55,7 +55,7 @@ def correct_with_card(dataset: Dataset, card: ModelCard, predicted_m: NDArray[np
         dataset.rx_power_dbm,
         dataset.first_path_power_dbm,
     )
-    accepted = rule.accepts(predicted_m, score)
+    accepted = np.array(rule.accepts(predicted_m, score))
     with np.errstate(invalid="ignore"):
         correction, variance = rule.apply(predicted_m, score)
     uncorrected = np.float32(card.variance_uncorrected_m2)

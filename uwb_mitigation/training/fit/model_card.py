@@ -59,7 +59,7 @@ def card_of(
         variance_uncorrected_m2=uncorrected.variance_m2,
         correction_limits_m=(float(np.float32(low - margin)), float(np.float32(high + margin))),
         training=training,
-        variance_per_m2=corrected.variance_per_m2,
+        scale=corrected.scale,
         interval95_sigmas=corrected.sigmas95,
         ood_bands=ood_bands,
         radios=dataset.radios,
@@ -76,13 +76,14 @@ def ood_bands_of(dataset: Dataset, known_offset_m: float | None = None) -> OodBa
     scaling = dataset.preprocessing.scaling
     with_levels = scaling is Scaling.PREAMBLE
     unknown = np.full(len(dataset), np.nan, np.float32)
-    values = ood_features(
+    features = ood_features(
         dataset.inputs,
         scaling,
         dataset.range_m.astype(np.float32),
         dataset.rx_power_dbm if with_levels else unknown,
         dataset.first_path_power_dbm if with_levels else unknown,
     )
+    values = np.column_stack(features)
     if with_levels and not np.isfinite(values).all(axis=1).any():
         return None
     if known_offset_m is not None:
