@@ -72,7 +72,9 @@ def corrected_of(path: Path) -> list[bytes]:
 
 
 def one_by_one(measurements: list[RangeMeasurement], offsets: Offsets = NO_OFFSETS) -> list[bytes]:
-    mitigation = Mitigation(load_bundle(shipped_model_path("evk1000_apartment")), offsets)
+    mitigation = Mitigation(
+        load_bundle(shipped_model_path("evk1000_apartment")), offsets, median_at_rest=True
+    )
     return [codec.encode_corrected(m, mitigation.correct([m])[0]) for m in measurements]
 
 

@@ -129,7 +129,7 @@ def track(
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
     from uwb_mitigation.types.offsets import NO_OFFSETS
 
-    mitigation = Mitigation(load_model(model), offsets or NO_OFFSETS)
+    mitigation = Mitigation(load_model(model), offsets or NO_OFFSETS, median_at_rest=True)
     options = height, height_sd, height_topic, area, stamp_offset, acceleration
     config, recorded = _read(bag, anchors, *options, mitigation)
     if not mitigation.used and (model or offsets):

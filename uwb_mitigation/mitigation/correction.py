@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.mitigation.at_rest import PairsAtRest
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.choice import Choice, CirKind, choose_model, kinds_of
@@ -253,12 +254,12 @@ def pass_through(
 
 
 class OnnxBackend:
-    """Runs a model with ONNX Runtime."""
+    """Runs a model with ONNX Runtime; `pairs_at_rest`: None = each range is corrected by itself."""
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: Bundle, pairs_at_rest: PairsAtRest | None = None) -> None:
         self.bundle = bundle
         self._session = Session(bundle)
-        self._rule = CorrectionRule(bundle.card)
+        self._rule, self._pairs_at_rest = CorrectionRule(bundle.card), pairs_at_rest
 
     def correct(self, ranges: RangeColumns, offset_m: NDArray[np.float32]) -> CorrectedColumns:
         """See `Backend`."""
@@ -347,6 +348,10 @@ class OnnxBackend:
                     network_m[index] = error_m
         predicted = bias_m + network_m
         score = self._rule.score(windows, range_m, *powers)
+        if self._pairs_at_rest is not None:
+            ids = ranges.tag_id[rows], ranges.anchor_id[rows]
+            scaling = self.bundle.preprocessing.scaling
+            self._pairs_at_rest.apply(ids, range_m, windows, scaling, predicted)
         return predicted, score
 
 
@@ -370,6 +375,8 @@ class Mitigation(Corrector):
         model: the model, or several, of which `choose_model` selects one for each range.
         offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, or a
             file written by `uwb-mitigation offset` or `calibrate`.
+        median_at_rest: replace predicted errors by their median while a pair of radios is at rest (`PairsAtRest`). The result
+            then depends on the ranges before, which must be in the order of time.
 
     Attributes:
         bundles: the models. bundle: the first one.
@@ -381,7 +388,18 @@ class Mitigation(Corrector):
         ParameterError: the offset is not finite, too large, or no such file exists.
     """
 
-    _backend = OnnxBackend
+    def __init__(
+        self,
+        model: Bundle | Sequence[Bundle],
+        offsets: Offsets | float | str | Path = NO_OFFSETS,
+        *,
+        median_at_rest: bool = False,
+    ) -> None:
+        self._median_at_rest = median_at_rest
+        super().__init__(model, offsets)
+
+    def _backend(self, bundle: Bundle) -> Backend:
+        return OnnxBackend(bundle, PairsAtRest() if self._median_at_rest else None)
 
 
 def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:

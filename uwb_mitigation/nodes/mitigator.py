@@ -64,7 +64,7 @@ def load_corrector(model: str, backend: str = "onnxruntime") -> Corrector:
 
         corrector: Corrector = FirmwareMitigation(bundles)
     else:
-        corrector = Mitigation(bundles)
+        corrector = Mitigation(bundles, median_at_rest=True)
     _warm_up(corrector)
     return corrector
 

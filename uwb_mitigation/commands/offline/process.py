@@ -114,7 +114,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         ParameterError: the output exists, or its folder does not.
         ModelError: the model cannot be used.
     """
-    mitigation = Mitigation(load_model(job.model), job.offsets)
+    mitigation = Mitigation(load_model(job.model), job.offsets, median_at_rest=True)
     # Loading the models takes as long as thousands of ranges: do not count it in the bag's time.
     schemas.typestore()
     started = time.perf_counter()
