@@ -150,8 +150,13 @@ def test_rates_and_losses_are_correct_at_1000_ranges_per_second(ros: ros_harness
     thread = threading.Thread(target=publish)
     thread.start()
     try:
-        browser.wait("all pairs", lambda: len(browser.column("pairs", "rate")) == 150)
-        ros.spin_for(10.0)
+
+        def received() -> int:
+            found = re.search(r"(\d+) corrected ranges", browser.text())
+            return int(found[1]) if found else 0
+
+        # On a busy machine, the viewer drops many.
+        browser.wait("60 ranges of each pair", lambda: received() > 60 * 150)
         rates, lost = browser.column("pairs", "rate"), browser.column("pairs", "lost")
     finally:
         stop.set()
