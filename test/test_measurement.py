@@ -10,7 +10,7 @@ from uwb_mitigation.types.ros.poses import tag_frame, tag_of_frame
 
 
 def test_constants_equal_those_of_the_messages():
-    assert [status.value for status in Status] == [0, 1, 2, 3, 4]
+    assert [status.value for status in Status] == [0, 1, 2, 3, 4, 5]
     assert (CorrectedBy.HOST, CorrectedBy.DEVICE) == (0, 1)
     assert (Encoding.COMPLEX_INT16, Encoding.MAGNITUDE) == (0, 1)
 
