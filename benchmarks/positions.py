@@ -158,7 +158,7 @@ def calibrated(run: Run, donor: Run) -> Ranges:
     site = read_site([donor.read_records()], donor.anchors, universal, heights=heights)
     solution = solve_without_truth(site, height=donor.height, area=donor.area)
     calibration = calibrate_site(site, universal, solution)
-    if calibration.lacks_gain:
+    if calibration.refusal:
         raise DatasetError(f"refused: {calibration.summary()}")
     with tempfile.TemporaryDirectory() as folder:
         bundle, _ = calibration.write(Path(folder) / "site.onnx", universal, "drive")

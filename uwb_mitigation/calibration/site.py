@@ -169,11 +169,6 @@ class SiteCalibration:
                 return f"{drive}the ranges do not improve"
         return ""
 
-    @property
-    def lacks_gain(self) -> bool:
-        """Whether the calibration does not help."""
-        return bool(self.refusal)
-
     def summary(self) -> str:
         """Return the result in a few sentences."""
         truth, change = self.solution.truth, self.live_position_change

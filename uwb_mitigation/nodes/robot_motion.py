@@ -55,10 +55,10 @@ class MotionState:
     Attributes:
         odom_frame: frame of the odometry; empty before its first message.
         base_frame: the parameter, or else the child frame of the odometry.
-        map_to_odom: x, y, z (m) and yaw (rad) of the last transform; None: there was none.
+        map_to_odom: x, y, z (m) and yaw (rad) of the last transform; None: unknown.
         map_to_odom_ns: stamp of its estimate.
         variance: of the x, y and z of the base (m^2) and of its yaw (rad^2) in this estimate.
-        pose: x, y (m) and yaw (rad) of the latest odometry; None: there was none.
+        pose: x, y (m) and yaw (rad) of the latest odometry; None: unknown.
         pose_ns, speed: its stamp, and its speed in m/s.
     """
 
@@ -202,7 +202,7 @@ class OdometryInput:
         return 0 <= stamp_ns - self._resumed_ns < MAX_GAP_S * NS_PER_S
 
     def carried_on(self, stamp_ns: int) -> Estimate | None:
-        """Return the pose before a crash or gap, moved on by the odometry; None: there was none, or it was replaced."""
+        """Return the pose before a crash or gap, moved on by the odometry; None: unknown, or replaced."""
         point, pose = self.path.point_at(stamp_ns), self.path.pose_at(stamp_ns)
         if (
             self._held_pose is None
