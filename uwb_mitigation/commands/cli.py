@@ -154,4 +154,7 @@ def run(app: typer.Typer, program: str) -> NoReturn:
 
 
 if __name__ == "__main__":
-    main()
+    # As the installed command: a signal that arrives in a callback must not be lost.
+    from uwb_mitigation.commands.entry import command_line
+
+    command_line()
