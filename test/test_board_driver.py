@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tty
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +128,27 @@ def test_port_in_use_is_reported_with_the_program(exclusive: bool):
             with pytest.raises(LinkError, match=rf"in use by .*\(process {other.pid}\)"):
                 Evb1000Bus(PortAddress(name))
         other.stdin.close()
+    os.close(controller)
+    os.close(device)
+
+
+def test_an_old_answer_of_an_evb1000_is_not_taken_for_its_version():
+    controller, device = os.openpty()
+    tty.setraw(device)
+
+    def answer() -> None:
+        os.write(controller, b"yold\0")
+        received = b""
+        while b"deca?" not in received:
+            received += os.read(controller, 64)
+        os.write(controller, b"ynew\0\3")
+
+    with ThreadPoolExecutor() as pool:
+        answered = pool.submit(answer)
+        bus = Evb1000Bus(PortAddress(os.ttyname(device)))
+        answered.result()
+    assert bus.version == "new"
+    bus.close()
     os.close(controller)
     os.close(device)
 

@@ -16,7 +16,8 @@ from uwb_mitigation.errors import DamagedRecordingError, ParameterError, Recordi
 from uwb_mitigation.recordings.bag.odometry import read_odometry
 from uwb_mitigation.recordings.formats import open_mapped
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shipped_mappings
+from uwb_mitigation.recordings.mapping.mapping import Mapping, TableFormat, load_mapping, shipped_mappings
+from uwb_mitigation.recordings.mapping.messages import MessageRows
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.measurement import Encoding
 
@@ -321,6 +322,13 @@ def _write_bag(path: Path, store: Any, kind: str, count: int = 3) -> None:
 
 
 # Shipped mappings ------------------------------------------------------------------------------------------------
+
+
+def test_lists_in_a_line_of_text_keep_their_last_element():
+    rows = MessageRows(TableFormat(text="pairs"), {"id[]": False, "range[]": False}).rows(
+        "AT+RANGE=tid:4,id:(1, 2,3),range:[110,220,331]"
+    )
+    assert (rows["id[]"], rows["range[]"]) == (["1", "2", "3"], ["110", "220", "331"])
 
 
 def test_every_shipped_mapping_is_valid_and_names_its_source():

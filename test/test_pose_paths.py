@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import read_bodies, read_heights, read_lever_arm
+from uwb_mitigation.types.tracks import PosePath
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 SECONDS = 10
@@ -129,8 +130,18 @@ def test_missing_frames_are_reported(tmp_path):
         read_bodies(bag, "/tf", None)
     with pytest.raises(RecordingError, match="lidar"):
         read_bodies(bag, "/tf", ("map", "lidar"))
-    with pytest.raises(RecordingError, match="no topic /odom"):
-        read_bodies(bag, "/odom", None)
+    with pytest.raises(RecordingError, match="no topic /tg") as caught:
+        read_bodies(bag, "/tg", None)
+    assert caught.value.suggestion == "did you mean '/tf'?"
+
+
+def test_poses_are_interpolated_between_neighbours_of_unequal_distance_and_held_outside():
+    turned = np.array([[0, 0, 0, 1], [0, 0, 0, -1], [0, 0, 0.6, 0.8]], float)
+    path = PosePath(np.array([0, 10, 14]), np.array([[0.0, 0, 0], [10, 0, 0], [10, 4, 0]]), turned)
+    position, rotation = path.interpolated(np.array([-5, 5, 10, 11, 99]))
+    assert position.tolist() == [[0, 0, 0], [5, 0, 0], [10, 0, 0], [10, 1, 0], [10, 4, 0]]
+    assert rotation.as_rotvec()[1] == pytest.approx(0.0)
+    assert 0.0 < rotation.as_rotvec()[3, 2] < rotation.as_rotvec()[4, 2] == pytest.approx(2 * np.arcsin(0.6))
 
 
 def measured_range(second: int) -> Any:

@@ -438,6 +438,19 @@ def test_all_candidate_positions_are_found():
     assert sorted(round(float(place.position[1])) for place in found) == [-2, 2]
 
 
+def test_the_best_position_on_a_wall_is_found_if_the_optimum_is_outside():
+    anchors = np.array([[0.0, 8, 1], [1, 8, 1], [0, 7, 1], [8, -8, 1]])
+    ranges = np.linalg.norm(anchors - (6.0, -0.3, 1.0), axis=1)
+    area = Area((1, 0, 0), (9, 9, 2))
+    best, *_ = candidate_positions(
+        anchors, ranges, np.full(4, 0.1), NoiseModel(), height=Height(1.0), area=area
+    )
+    along = np.linspace(1, 9, 8001)
+    residuals = np.linalg.norm(anchors[:, :2] - np.stack([along, 0 * along], 1)[:, None], axis=2) - ranges
+    assert best.position[0] == pytest.approx(along[np.argmin((residuals**2).sum(axis=1))], abs=0.05)
+    assert best.position[1] == 0.0
+
+
 def test_shapes_of_anchors_and_dilution():
     square = np.array([[0.0, 0, 2], [4, 0, 2], [4, 4, 2], [0, 4, 2]])
     found = [anchor_rank(one) for one in (square[:1], square[:2], square, HALL.position)]

@@ -172,6 +172,16 @@ def test_the_first_path_is_checked_against_the_leading_edge(
     assert np.isfinite(reading.cir.first_path_index) == consistent
 
 
+@pytest.mark.parametrize(("peak", "consistent"), [(3, True), (-3, False)])
+def test_the_reported_peak_is_searched_after_the_first_path(peak: int, consistent: bool):
+    taps = np.full((16, 2), (5, 0), np.int32)
+    taps[[5, 8]] = (300, 0), (1000, 0)
+    metrics = messages.SegmentMetrics(0, 1, True, -80.0, -84.0, 362, 362.5, 362 + peak)
+    block = messages.CirBlock(0, 1, True, -5, taps)
+    frame = messages.FrameReport(2, True, None, 0.0, (metrics,), (block,), False)
+    assert read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan).consistent is consistent
+
+
 def test_an_anchor_uses_the_final_frame_and_ranges_with_its_tag():
     run = Bench(role=Role.ANCHOR, address=2, peers=(1,)).start()
     run.exchange(1)
