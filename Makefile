@@ -5,7 +5,7 @@ IN_ROS = . $(VENV)/environment.sh;
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-training demo firmware-demo radio-demo paper test test-fast colcon path-for-colcon docs docs-links lint lock clean
+.PHONY: help setup setup-training demo firmware-demo radio-demo paper test test-fast colcon path-for-colcon figures docs docs-links lint lock clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -59,6 +59,9 @@ paper: setup-training  ## the paper's experiment, the firmware's cost and their 
 	@$(VENV)/bin/python -m benchmarks paper protocol --data '$(PAPER_DATA)' -o $(PAPER)/models $(if $(QUICK),$(PAPER_QUICK))
 	@$(VENV)/bin/python -m benchmarks paper report --data '$(PAPER_DATA)' -o $(PAPER) --models $(PAPER)/models --firmware $(PAPER)/firmware.json
 	@echo "$(CURDIR)/$(PAPER)/report.html"
+
+figures: setup-training  ## measure the figures of the pages again (about two hours), and print what differs (WORDS='results nodes')
+	@$(IN_ROS) $(VENV)/bin/python docs/figures.py $(WORDS)
 
 SPHINX = $(VENV)/bin/sphinx-build --fail-on-warning --keep-going --nitpicky --fresh-env --quiet --jobs auto -c docs -d build/doctrees .
 
