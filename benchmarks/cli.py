@@ -1,6 +1,6 @@
 """Measure nodes, positions, radios, firmware and links: `python -m benchmarks NAME [--json FILE]`, in a checkout.
 
-More commands: emulated boards (`emulate-board`, `emulate-evb1000`, `emulate-uci`), two demonstrations (`radio-demo`,
+More commands: emulated boards (`emulate-board`, `emulate-evb1000`, `emulate-lines`, `emulate-uci`), two demonstrations (`radio-demo`,
 `firmware-demo`), and the experiment of the paper (`paper`).
 """
 
@@ -16,6 +16,7 @@ import typer
 
 from benchmarks.equipment.emulate_board import emulate_board
 from benchmarks.equipment.emulate_evb1000 import emulate_evb1000
+from benchmarks.equipment.emulate_lines import emulate_lines
 from benchmarks.equipment.emulate_uci import emulate_uci
 from benchmarks.paper import cli as paper
 from uwb_mitigation.commands import cli
@@ -35,6 +36,7 @@ app = typer.Typer(
 )
 app.command("emulate-board")(emulate_board)
 app.command("emulate-evb1000")(emulate_evb1000)
+app.command("emulate-lines")(emulate_lines)
 app.command("emulate-uci")(emulate_uci)
 app.add_typer(paper.app, name="paper")
 

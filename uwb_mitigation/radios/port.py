@@ -278,6 +278,7 @@ class StreamPort(RadioPort):
         self._address, self._baud, self._dtr = address, baud, dtr
         self._stamp_clock = stamp_clock
         self._tick_s = tick_s
+        self._empty_read_is_loss = True
 
     @abstractmethod
     def _opened(self, now_ns: int) -> list[Any]:
@@ -331,7 +332,7 @@ class StreamPort(RadioPort):
         while not (self.closed and self._is_stopped(time.monotonic_ns())):
             readable, _, _ = select.select([fd], [], [], self._tick_s)
             data = os.read(fd, _READ_BYTES) if readable else b""
-            if readable and not data:
+            if readable and not data and self._empty_read_is_loss:
                 raise LinkError("was unplugged", where=str(self._address))
             now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
             with self._lock:

@@ -7,13 +7,13 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
+from uwb_mitigation.radios.capture import Capture, CaptureWriter
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
-from uwb_mitigation.radios.fira.capture import CaptureWriter
 from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import (
@@ -103,11 +103,22 @@ def open(
         ParameterError: the file of the capture cannot be written.
     """
     path = settings[0].capture
-    capture = CaptureWriter(path, boards=len(settings)) if path is not None else None
+    capture = CaptureWriter(path, "UCI", len(settings)) if path is not None else None
     ports = [UciPort(board, number, capture, on_event, stamp_clock) for number, board in enumerate(settings)]
     for port in ports:
         port.start()
     return ports
+
+
+def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
+    """Open a capture as a recording; raise RecordingError if it cannot be read."""
+
+    def session(settings: dict[str, Any]) -> UciSession:
+        settings.pop("identify", None)  # of earlier versions
+        role, peers = Role[settings["role"]], tuple(map(int, settings["peers"]))
+        return UciSession(UciSettings(**settings | {"role": role, "peers": peers}))
+
+    return Capture(path, "UCI", session)
 
 
 class UciPort(StreamPort):
@@ -221,7 +232,8 @@ class UciPort(StreamPort):
 
     def _opened(self, now_ns: int) -> list[Any]:
         if self._capture is not None:
-            self._capture.add_board(self._number, self.session.settings)
+            settings = self.session.settings
+            self._capture.add_board(self._number, asdict(settings) | {"role": settings.role.name})
         self._worked_ns = now_ns
         self.monitor.reset()
         self.session.opened(now_ns)
