@@ -264,6 +264,16 @@ VIEWER = (
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
+PX4 = (
+    Parameter("mode", "positions", "What is sent: positions (uwb/pose, as external vision), or ranges (uwb/range_corrected, which "
+              "EKF2 of PX4 1.18 fuses itself).", choices=("positions", "ranges")),
+    Parameter("anchors", "", "YAML file with the positions of the anchors (ranges)."),
+    Parameter("origin", "", "Latitude, longitude (degrees) and altitude above mean sea level (m) of the origin of the anchors' frame, "
+              "whose x is true east and y true north. Empty: the origin of PX4's local frame (ranges)."),
+    Parameter("tag", 0, "Number of the tag on the vehicle; 0: the first received tag (ranges).", low=0, high=2**63 - 1),
+    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
+)  # fmt: skip
+
 RESPAWN_FOLDER = "UWB_MITIGATION_RESPAWN_FOLDER"
 """Environment variable with a folder that exists while a launch file runs. A respawned node finds there the parameters
 that were set at run time, and the locator also its latest state."""
@@ -277,12 +287,15 @@ TABLES: dict[str, tuple[Parameter, ...]] = {
     "locator": LOCATOR,
     "viewer": VIEWER,
 }
+"""Tables of the nodes that launch files start."""
+
+ALL_TABLES = TABLES | {"px4": PX4}
 
 
 def help_text(name: str) -> str:
     """Return the text of `NODE --help`: usage and parameters of an executable."""
     nodes = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
-    rows = {row.name: row for node in nodes for row in TABLES.get(node, ())}
+    rows = {row.name: row for node in nodes for row in ALL_TABLES.get(node, ())}
     lines = [f"usage: {name} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]"]
     if rows:
         lines.append("parameters with their defaults (* = can be set while the node runs):")
