@@ -154,7 +154,7 @@ def test_a_log_and_a_live_port_give_the_same_ranges(tmp_path: Path):
 
 def test_settings():
     first, second = lines.read_settings(value_of(port="/dev/a,udp:10.0.0.1:8000", map="string_at"))
-    assert (first.address, first.number, first.baud) == (PortAddress("/dev/a"), 0, 0)
+    assert (first.address, first.number, first.baud) == (PortAddress("/dev/a"), 0, 115_200)
     assert (str(second.address), second.number) == ("udp:10.0.0.1:8000", 1)
     (board,) = lines.read_settings(value_of(source="pans", port="/dev/a"))
     assert board.mapping.name == "DWM1001 PANS"
@@ -168,6 +168,7 @@ def test_settings():
         ({"port": "udp:x", "map": "string_at"}, "udp:ADDRESS:PORT"),
         ({"port": "udp:70000", "map": "string_at"}, "udp:ADDRESS:PORT"),
         ({"port": "/dev/a", "map": "ewine"}, "is for recordings or topics"),
+        ({"port": "/dev/a", "map": "string_at", "baud": 3}, "parameter baud = 3"),
         ({"port": "/dev/a", "map": "string_aT"}, "did you mean 'string_at'"),
     ],
 )

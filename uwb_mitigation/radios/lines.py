@@ -17,7 +17,7 @@ from typing import Any
 from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
 from uwb_mitigation.radios.capture import Capture, CaptureWriter
 from uwb_mitigation.radios.port import ExchangeMonitor, OnEvent, PortAddress, PortReport, StreamPort
-from uwb_mitigation.radios.settings import ValueReader, read_ports
+from uwb_mitigation.radios.settings import ValueReader, read_baud, read_ports
 from uwb_mitigation.recordings.mapping.live import LiveConverter
 from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
 from uwb_mitigation.recordings.mapping.tables import UNREADABLE
@@ -102,7 +102,7 @@ def read_settings(value: ValueReader) -> list[LineSettings]:
     """Return the settings of the boards at `port`; raise ParameterError if a parameter is invalid."""
     addresses, mapping = [parse_address(port) for port in read_ports(value)], read_mapping(value)
     capture = Path(value("capture")).expanduser() if value("capture") else None
-    baud, dtr = value("baud"), value("dtr")
+    baud, dtr = read_baud(value, mapping.baud), value("dtr")
     return [
         LineSettings(address, mapping, number, baud, dtr, capture) for number, address in enumerate(addresses)
     ]
@@ -301,7 +301,7 @@ class LinePort(StreamPort):
         on_event: OnEvent,
         stamp_clock: Callable[[], int],
     ) -> None:
-        self._settings, self._capture = settings, capture
+        self._settings = settings
         self._baud = settings.baud or settings.mapping.baud
         self._is_udp = isinstance(settings.address, UdpAddress)
         self.session = LineSession(settings.mapping, settings.number, has_datagrams=self._is_udp)
@@ -312,19 +312,14 @@ class LinePort(StreamPort):
             stamp_clock=stamp_clock,
             baud=self._baud,
             dtr=settings.dtr,
+            capture=capture,
+            number=settings.number,
         )
         self._received_ns = 0
         self._empty_read_is_loss = not self._is_udp
 
     def apply(self, settings: LineSettings) -> None:
         """Change nothing: no parameter of this source is live."""
-
-    def close(self) -> None:
-        """Close the port and the capture."""
-        super().close()
-        capture, self._capture = self._capture, None
-        if capture is not None:
-            capture.close()
 
     def report(self) -> PortReport:
         """Return the present state."""
@@ -358,8 +353,8 @@ class LinePort(StreamPort):
     def _opened(self, now_ns: int) -> list[Any]:
         if self._capture is not None:
             mapping = self._settings.mapping.model_dump(mode="json", exclude_unset=True)
-            settings = {"number": self._settings.number, "datagrams": self._is_udp, "mapping": mapping}
-            self._capture.add_board(self._settings.number, settings)
+            settings = {"number": self._number, "datagrams": self._is_udp, "mapping": mapping}
+            self._capture.add_board(self._number, settings)
         self._received_ns = now_ns
         self.session.opened(now_ns)
         self.monitor.reset()
@@ -370,8 +365,6 @@ class LinePort(StreamPort):
             self._received_ns, self._was_connected = now_ns, True
         elif not self._is_udp and now_ns - self._received_ns > REOPEN_NS:
             raise LinkError("sends no data", where=str(self._address))
-        if self._capture is not None:
-            self._capture.add(self._settings.number, data, sent=False)
         return list(self.session.receive(data, now_ns, stamp_ns))
 
     def _outgoing(self) -> bytes:
@@ -380,7 +373,3 @@ class LinePort(StreamPort):
 
     def _closed(self, now_ns: int) -> list[Any]:
         return []
-
-    def _on_sent(self, data: bytes) -> None:
-        if self._capture is not None:
-            self._capture.add(self._settings.number, data, sent=True)

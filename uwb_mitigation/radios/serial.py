@@ -31,6 +31,7 @@ from uwb_mitigation.radios.settings import (
     ValueReader,
     count_failures,
     radio_values,
+    read_baud,
     read_radio,
     settings_text,
     status_warning,
@@ -85,7 +86,7 @@ def read_settings(value: ValueReader) -> list[SerialSettings]:
     radio = read_radio(value)
     settings = SerialSettings(
         PortAddress.parse(value("port")),
-        value("baud") or BAUD,
+        read_baud(value, BAUD),
         value("dtr"),
         Mode[value("mode").upper()],
         int(digits, 16) if digits else None,

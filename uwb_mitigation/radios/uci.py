@@ -145,10 +145,18 @@ class UciPort(StreamPort):
         remedies = {cause.name: cause.remedy for cause in EXCHANGE_CAUSES.values()}
         unexpected = [cause.name for cause in EXCHANGE_CAUSES.values() if cause.unexpected]
         monitor = ExchangeMonitor(remedies, unexpected)
-        super().__init__(settings.address, on_event, monitor, stamp_clock=stamp_clock, baud=BAUD, tick_s=0.01)
+        super().__init__(
+            settings.address,
+            on_event,
+            monitor,
+            stamp_clock=stamp_clock,
+            baud=BAUD,
+            capture=capture,
+            number=number,
+            tick_s=0.01,
+        )
         self._originals = OriginalsFile(str(settings.address))
         self.session = UciSession(settings.board, self._originals)
-        self._number, self._capture = number, capture
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
 
@@ -164,13 +172,6 @@ class UciPort(StreamPort):
                 self.session.ranging.settings = settings.board
                 if self.device:
                     self._opened(time.monotonic_ns())
-
-    def close(self) -> None:
-        """End the sessions, restore the calibration, and close the port."""
-        super().close()
-        capture, self._capture = self._capture, None
-        if capture is not None:
-            capture.close()
 
     @property
     def problem(self) -> str:
@@ -240,8 +241,6 @@ class UciPort(StreamPort):
         return []
 
     def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
-        if self._capture is not None:
-            self._capture.add(self._number, data, sent=False)
         session = self.session
         measurements = session.receive(data, now_ns, stamp_ns)
         messages: list[Any] = []
@@ -270,10 +269,6 @@ class UciPort(StreamPort):
                 self._stop_ns = now_ns
                 self.session.stop(now_ns)
             return self.session.stopped or now_ns - self._stop_ns > SHUTDOWN_NS
-
-    def _on_sent(self, data: bytes) -> None:
-        if self._capture is not None:
-            self._capture.add(self._number, data, sent=True)
 
     def _started_text(self) -> str:
         s, window = self.session.settings, self.session.window
