@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from uwb_mitigation_msgs.msg import RangeCir
 
 from benchmarks.equipment.emulated_board import PseudoTerminal
-from benchmarks.equipment.text_board import KINDS, TextBoards
+from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
@@ -216,6 +216,29 @@ def test_the_output_of_a_dwm1001_is_on_in_whatever_state_it_was(tmp_path: Path, 
             boards.reset(0)
             events.wait_for(RangeMeasurement, 400)
             assert boards.shells[0].output == "lec"
+
+
+def test_the_start_of_the_output_needs_neither_a_banner_nor_a_known_state():
+    """In virtual time: a shell without banner whose output someone turns off, after more than a minute."""
+    session, shell, now_ns = LineSession(load_mapping("dwm1001_pans")), PansShell(banner=""), 0
+    shell.receive(b"\r\r", 0.0)
+    session.opened(0)
+
+    def run(seconds: float) -> list[RangeMeasurement]:
+        nonlocal now_ns
+        ranges: list[RangeMeasurement] = []
+        for _ in range(round(seconds * 10)):
+            now_ns += S // 10
+            answer = shell.receive(session.outgoing(), now_ns / S)
+            ranges += session.receive(
+                answer + (f"{LEC}\r\n".encode() if shell.output else b""), now_ns, now_ns
+            )
+        return ranges
+
+    assert len(run(10.0)) > 100
+    shell.output = ""
+    assert len(run(40.0)) == 0
+    assert len(run(40.0)) > 20
 
 
 def test_a_dwm1001_that_is_silent_for_a_while_is_not_turned_off(tmp_path: Path):

@@ -23,7 +23,7 @@ KINDS = ("pans", "at", "json", "cli")
 _BANNER = (
     "\r\n DWM1001 TWR Real Time Location System\r\n\r\n Copyright :  2016-2019 LEAPS and Decawave\r\n"
     " License   :  Please visit https://decawave.com/dwm1001_license\r\n"
-    " Compiled  :  Mar 27 2019 03:35:59\r\n\r\n Help      :  ? or help\r\n\r\ndwm> "
+    " Compiled  :  Mar 27 2019 03:35:59\r\n\r\n Help      :  ? or help\r\n\r\n"
 )
 _TLV_ERROR = b"\x40\x01\x01"
 """Answer of the binary interface to an unknown request."""
@@ -39,13 +39,16 @@ class PansShell:
 
     The shell echoes what it receives. `lec` and `les` turn their output on and off; an empty line repeats nothing.
 
+    Args:
+        banner: what the shell prints when it opens, before its prompt.
+
     Attributes:
         is_open: whether the shell is open.
         output: the command whose output is on; empty: none.
     """
 
-    def __init__(self) -> None:
-        self.is_open, self.output = False, ""
+    def __init__(self, banner: str = _BANNER) -> None:
+        self.is_open, self.output, self._banner = False, "", banner
         self._line, self._entered_s = "", -math.inf
 
     def receive(self, data: bytes, now_s: float) -> bytes:
@@ -60,7 +63,7 @@ class PansShell:
             return _TLV_ERROR
         is_second, self._entered_s = now_s - self._entered_s < _ENTER_TIMEOUT_S, now_s
         self.is_open, self._line = is_second, ""
-        return _BANNER.encode() if is_second else b""
+        return f"{self._banner}dwm> ".encode() if is_second else b""
 
     def _shell(self, key: str) -> bytes:
         if key != "\r":

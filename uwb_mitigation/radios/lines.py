@@ -32,6 +32,9 @@ REOPEN_NS = 70 * 10**9
 FIRST_PAUSE_NS, MAX_PAUSE_NS = 10**9, 30 * 10**9
 """Time without a range before the output is started, and longest time until the next try, which doubles."""
 
+MAX_WAKES = 7
+"""Number of tries without a range, after more than a minute, after which the board is treated as after its connection."""
+
 MAX_STAMP_OFFSET_S = 1.0
 """A larger difference between the stamps of a board and the clock of this computer is a warning."""
 
@@ -207,7 +210,7 @@ class LineSession:
         self._is_partial = not self._has_datagrams
         self._outgoing, self._answer = b"", b""
         self._is_waking = self._was_started = self._was_reset = False
-        self._pause_ns, self._due_ns = FIRST_PAUSE_NS, now_ns + FIRST_PAUSE_NS
+        self._pause_ns, self._due_ns, self._wakes = FIRST_PAUSE_NS, now_ns + FIRST_PAUSE_NS, 0
 
     @property
     def unused(self) -> Counter[str]:
@@ -259,24 +262,28 @@ class LineSession:
         start = self._start
         assert start is not None
         if has_ranges:
-            self._is_waking, self._pause_ns = False, FIRST_PAUSE_NS
+            self._is_waking, self._pause_ns, self._wakes = False, FIRST_PAUSE_NS, 0
             self._due_ns = now_ns + 3 * FIRST_PAUSE_NS
             return
         if self._is_waking:
             self._answer = (self._answer + data)[-_MAX_ANSWER:]
             answer = self._answer.decode("ascii", "replace")
-            if re.search(start.ready, answer):
+            is_ready = bool(re.search(start.ready, answer))
+            if not is_ready and start.unknown and not self._was_started and re.search(start.unknown, answer):
+                # Before the reset, `command` might turn the output off.
+                is_ready = self._was_reset
+                if not is_ready:
+                    self._outgoing += start.reset.encode()
+                    self._is_waking, self._was_reset = False, True
+            if is_ready:
                 self._outgoing += start.command.encode()
                 self._is_waking, self._was_started = False, True
                 self.counts[_STARTS] += 1
-            elif (
-                start.unknown
-                and not (self._was_started or self._was_reset)
-                and re.search(start.unknown, answer)
-            ):
-                self._outgoing += start.reset.encode()
-                self._is_waking, self._was_reset = False, True
         if now_ns >= self._due_ns:
+            self._wakes += 1
+            if self._wakes == MAX_WAKES:
+                self._was_started = self._was_reset = False
+                self._pause_ns = FIRST_PAUSE_NS
             self._outgoing += start.wake.encode()
             self._is_waking, self._answer = True, b""
             self._due_ns = now_ns + self._pause_ns

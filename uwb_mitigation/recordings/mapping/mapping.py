@@ -384,8 +384,8 @@ class StartDialogue(_Strict):
         wake: opens the board's command line.
         ready: regular expression of the answer after which `command` is sent; empty: at once.
         command: starts the output of ranges.
-        unknown: regular expression of the answer of a board whose output may be on or off, because it is on since an
-            earlier session. `reset` is then sent, once after each opening of the port.
+        unknown: regular expression of another answer, of a board whose output may be on or off since an earlier session.
+            The first time, `reset` is sent, and the next time `command`.
         reset: stops the output, and closes the command line.
     """
 
