@@ -320,6 +320,7 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
         assert (len(message.cir.samples), message.header.stamp.sec >= int(began)) == (0, True)
         status = ros.diagnosis("driver", lambda status: status.message == "receiving")
         assert diagnostic_values(status)["radio 1: mapping"] == "DWM1001 PANS"
+        assert node.output.count("DWM1001 PANS at /") == 2
         assert node.signal(signal.SIGINT) == 0, node.output
     raw.clear()
     ros.start("driver", "source:=pans", f"path:={tmp_path}/c.txt", "rate:=20.0")

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import socket
 import time
@@ -16,7 +17,14 @@ from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
 from uwb_mitigation.radios.capture import Capture, CaptureWriter
-from uwb_mitigation.radios.port import ExchangeMonitor, OnEvent, PortAddress, PortReport, StreamPort
+from uwb_mitigation.radios.port import (
+    ExchangeMonitor,
+    OnEvent,
+    PortAddress,
+    PortMessage,
+    PortReport,
+    StreamPort,
+)
 from uwb_mitigation.radios.settings import ValueReader, read_baud, read_ports
 from uwb_mitigation.recordings.mapping.live import LiveConverter
 from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
@@ -322,7 +330,7 @@ class LinePort(StreamPort):
             capture=capture,
             number=settings.number,
         )
-        self._received_ns = 0
+        self._received_ns, self._has_ranges = 0, False
         self._empty_read_is_loss = not self._is_udp
 
     def apply(self, settings: LineSettings) -> None:
@@ -362,7 +370,7 @@ class LinePort(StreamPort):
             mapping = self._settings.mapping.model_dump(mode="json", exclude_unset=True)
             settings = {"number": self._number, "datagrams": self._is_udp, "mapping": mapping}
             self._capture.add_board(self._number, settings)
-        self._received_ns = now_ns
+        self._received_ns, self._has_ranges = now_ns, False
         self.session.opened(now_ns)
         self.monitor.reset()
         return []
@@ -372,7 +380,12 @@ class LinePort(StreamPort):
             self._received_ns, self._was_connected = now_ns, True
         elif not self._is_udp and now_ns - self._received_ns > REOPEN_NS:
             raise LinkError("sends no data", where=str(self._address))
-        return list(self.session.receive(data, now_ns, stamp_ns))
+        measurements: list[Any] = [*self.session.receive(data, now_ns, stamp_ns)]
+        if measurements and not self._has_ranges:
+            self._has_ranges = True
+            text = f"{self.session.mapping.name} at {self.device}: ranges of tag {measurements[0].tag_id}"
+            return [PortMessage(logging.INFO, text), *measurements]
+        return measurements
 
     def _outgoing(self) -> bytes:
         data = self.session.outgoing()
