@@ -120,6 +120,15 @@ def test_hostile_bytes_are_counted_and_the_next_line_is_read():
     assert len(session._rest) <= lines.MAX_LINE
 
 
+@pytest.mark.parametrize("name", MAPPINGS.values())
+@pytest.mark.parametrize("text", ["a", "0", "a:", "a: (", "{", " ", "AN0,", "0.00,", "mac_address=0x1,", "022E["])
+def test_a_long_line_takes_no_more_steps_than_its_length(name: str, text: str):
+    # A search that is quadratic would take minutes.
+    session = session_of(name)
+    assert read(session, text * (60_000 // len(text)) + "\n" + LEC[:5] + "\n") == []
+    assert session.counts["lines"] == 1 + bool(text.strip())
+
+
 def test_the_stamp_is_that_of_the_first_byte_unless_the_mapping_gives_a_time():
     session = session_of("string_json")
     good = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}'
