@@ -121,7 +121,9 @@ def test_hostile_bytes_are_counted_and_the_next_line_is_read():
 
 
 @pytest.mark.parametrize("name", MAPPINGS.values())
-@pytest.mark.parametrize("text", ["a", "0", "a:", "a: (", "{", " ", "AN0,", "0.00,", "mac_address=0x1,", "022E["])
+@pytest.mark.parametrize(
+    "text", ["a", "0", "a:", "a: (", "{", " ", "AN0,", "0.00,", "mac_address=0x1,", "022E["]
+)
 def test_a_long_line_takes_no_more_steps_than_its_length(name: str, text: str):
     # A search that is quadratic would take minutes.
     session = session_of(name)
