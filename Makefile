@@ -16,7 +16,7 @@ setup-training:  ## the same, with torch and the test tools
 	@$(SETUP) develop
 
 demo: setup  ## replay RECORDING=path (default: simulated) through driver and mitigator, live
-	@$(IN_ROS) $(VENV)/bin/python -m uwb_mitigation.commands.entry demo $(if $(RECORDING),--recording '$(RECORDING)') $(if $(RATE),--rate $(RATE))
+	@$(IN_ROS) $(VENV)/bin/python -m benchmarks demo $(if $(RECORDING),--recording '$(RECORDING)') $(if $(RATE),--rate $(RATE))
 
 firmware-demo: setup  ## the firmware in an emulated Cortex-M4 as the driver's board (RECORDING=path), compared with the host
 	@$(IN_ROS) $(VENV)/bin/python -m benchmarks firmware-demo $(if $(RECORDING),--recording '$(RECORDING)')

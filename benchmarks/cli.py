@@ -1,7 +1,7 @@
 """Measure nodes, positions, radios, firmware and links: `python -m benchmarks NAME [--json FILE]`, in a checkout.
 
-More commands: emulated boards (`emulate-board`, `emulate-evb1000`, `emulate-uci`), two demonstrations (`radio-demo`,
-`firmware-demo`), and the experiment of the paper (`paper`).
+More commands: emulated boards (`emulate-board`, `emulate-evb1000`, `emulate-lines`, `emulate-uci`), three demonstrations (`demo`,
+`radio-demo`, `firmware-demo`), and the experiment of the paper (`paper`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import typer
 
 from benchmarks.equipment.emulate_board import emulate_board
 from benchmarks.equipment.emulate_evb1000 import emulate_evb1000
+from benchmarks.equipment.emulate_lines import emulate_lines
 from benchmarks.equipment.emulate_uci import emulate_uci
 from benchmarks.paper import cli as paper
 from uwb_mitigation.commands import cli
@@ -35,6 +36,7 @@ app = typer.Typer(
 )
 app.command("emulate-board")(emulate_board)
 app.command("emulate-evb1000")(emulate_evb1000)
+app.command("emulate-lines")(emulate_lines)
 app.command("emulate-uci")(emulate_uci)
 app.add_typer(paper.app, name="paper")
 
@@ -293,6 +295,23 @@ def firmware(
                 rows.append(bench.measure(network, kernels=Kernels.PORTABLE, inputs=min(inputs, 100)))
             advance()
     _report({"rows": [asdict(row) for row in rows]}, json)
+
+
+@app.command()
+def demo(
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
+    ] = None,
+    rate: Annotated[
+        float,
+        typer.Option(min=0.0, max=10_000.0, help="Speed of the replay; 0: total duration of about 15 s."),
+    ] = 0.0,
+) -> None:
+    """Replay a recording through driver and mitigator, show it live, and print a summary."""
+    from benchmarks import demo as shown
+
+    raise typer.Exit(shown.main(recording, rate))
 
 
 @app.command("radio-demo")

@@ -20,11 +20,12 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 
 from benchmarks.equipment.emulated_firmware import EmulatedFirmware
 from benchmarks.equipment.probe import Probe
+from benchmarks.equipment.processes import NodeProcesses, run_demo
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
+from uwb_mitigation.nodes.support.spinning import spinning_node
 from uwb_mitigation.radios.wire import messages as wire
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource

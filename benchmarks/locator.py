@@ -14,9 +14,10 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from uwb_mitigation_msgs.msg import RangeCorrected
 
+from benchmarks.equipment import processes
 from benchmarks.equipment.probe import Probe
-from uwb_mitigation.nodes.support import processes
-from uwb_mitigation.nodes.support.processes import spinning_node, wait
+from benchmarks.equipment.processes import wait
+from uwb_mitigation.nodes.support.spinning import spinning_node
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors

@@ -25,12 +25,13 @@ import numpy as np
 import psutil
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
+from benchmarks.equipment import processes
 from benchmarks.equipment.probe import Probe
+from benchmarks.equipment.processes import wait
 from benchmarks.equipment.relay import RELAYED
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.nodes.support import processes
-from uwb_mitigation.nodes.support.processes import spinning_node, wait
+from uwb_mitigation.nodes.support.spinning import spinning_node
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record

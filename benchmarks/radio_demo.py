@@ -22,8 +22,9 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 
 from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.equipment.probe import Probe
+from benchmarks.equipment.processes import NodeProcesses, run_demo
 from uwb_mitigation.nodes.monitor import REFRESH_HZ
-from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
+from uwb_mitigation.nodes.support.spinning import spinning_node
 from uwb_mitigation.simulation.scene import ANCHORS
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.ros import topics

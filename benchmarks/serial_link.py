@@ -17,12 +17,13 @@ from pathlib import Path
 
 from uwb_mitigation_msgs.msg import RangeCir
 
+from benchmarks.equipment import processes
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.probe import Probe
+from benchmarks.equipment.processes import wait
 from benchmarks.nodes import process_usage
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.nodes.support import processes
-from uwb_mitigation.nodes.support.processes import spinning_node, wait
+from uwb_mitigation.nodes.support.spinning import spinning_node
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.ros import topics

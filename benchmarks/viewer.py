@@ -11,6 +11,7 @@ from statistics import median
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from benchmarks.equipment.page_clients import PageClients
+from benchmarks.equipment.processes import wait
 from benchmarks.nodes import (
     Bench,
     ProgressCallback,
@@ -22,7 +23,6 @@ from benchmarks.nodes import (
     run_steps,
     searches,
 )
-from uwb_mitigation.nodes.support.processes import wait
 from uwb_mitigation.types.ros import topics
 
 RATE_HZ = 100.0

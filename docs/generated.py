@@ -23,7 +23,7 @@ from typer.cli import get_docs_for_click
 
 import uwb_mitigation
 from uwb_mitigation.commands import cli
-from uwb_mitigation.nodes.support.parameter_tables import TABLES
+from uwb_mitigation.nodes.support.parameter_tables import ALL_TABLES, TABLES
 from uwb_mitigation.radios.settings import MAX_ANCHORS, RadioState, Role
 from uwb_mitigation.radios.wire import layout
 from uwb_mitigation.radios.wire.layout import Layout, MessageType
@@ -96,7 +96,7 @@ def parameter_file(node: str) -> str:
 def parameters() -> str:
     """Return a section with a table of parameters for each node."""
     lines: list[str] = []
-    for node, table in TABLES.items():
+    for node, table in ALL_TABLES.items():
         lines += [
             f"## Parameters of `{node}`",
             "",

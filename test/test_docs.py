@@ -26,7 +26,7 @@ from test_launch import launch
 
 from benchmarks import cli as benchmarks
 from uwb_mitigation.commands import cli
-from uwb_mitigation.nodes.support.parameter_tables import TABLES
+from uwb_mitigation.nodes.support.parameter_tables import ALL_TABLES, TABLES
 from uwb_mitigation.recordings.formats import open_recording
 
 PAGES = sorted(
@@ -80,7 +80,7 @@ NODES = {
     "locator": ("locator",),
     "pipeline": ("driver", "mitigator", "locator"),
     "monitor": (),
-    "px4": (),
+    "px4": ("px4",),
     "viewer": ("viewer",),
 }
 BLOCK = re.compile(r"^(?:```(?:console|sh|bash)?\n(.*?)^```|((?:    .*\n|\n)+))", re.MULTILINE | re.DOTALL)
@@ -161,7 +161,7 @@ def test_scripts_that_import_benchmarks_are_called_with_a_python_path():
 
 
 def check_parameters(node: str, values: dict[str, object]) -> None:
-    rows = {row.name: row for name in NODES[node] for row in TABLES[name]}
+    rows = {row.name: row for name in NODES[node] for row in ALL_TABLES[name]}
     for name, value in values.items():
         if name not in ("use_sim_time", "qos_overrides"):
             rows[name].check(value)

@@ -18,12 +18,10 @@ LOADING = "import time\nprint('loading', flush=True)\nwhile True:\n    time.slee
 
 
 def run(executable: str, *words: str, path: Path | None = None) -> subprocess.Popen[str]:
-    """Start an executable or a demo; modules in `path` replace installed ones."""
+    """Start an executable or a benchmark; modules in `path` replace installed ones."""
     start = ["-c", f"from uwb_mitigation.commands.entry import {executable}; {executable}()"]
     if executable == "benchmarks":
         start = ["-m", "benchmarks", "radio-demo"]
-    elif "demo" in executable:
-        start = ["-m", "uwb_mitigation.commands.entry", executable]
     modules = os.pathsep.join(str(entry) for entry in (path, REPOSITORY) if entry is not None)
     return subprocess.Popen(
         [sys.executable, *start, *words],
@@ -53,7 +51,6 @@ def test_module_without_a_node_names_the_nodes_in_one_line():
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     assert "driver, mitigator, locator" in line
-    assert "demo" in line
 
 
 @pytest.mark.parametrize(
@@ -63,7 +60,6 @@ def test_module_without_a_node_names_the_nodes_in_one_line():
         ("driver", signal.SIGTERM),
         ("monitor", signal.SIGINT),
         ("command_line", signal.SIGINT),
-        ("demo", signal.SIGINT),
         ("benchmarks", signal.SIGINT),
     ],
 )

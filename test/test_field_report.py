@@ -26,7 +26,7 @@ from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
 from uwb_mitigation.commands import cli, field_report
 from uwb_mitigation.commands.field.checks import Observation, Verdict, run_checks
-from uwb_mitigation.radios.fira.capture import UciCapture
+from uwb_mitigation.radios import uci
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement
 
@@ -91,7 +91,7 @@ def test_good_uci_boards_pass_and_the_file_names_nobody(
             assert secret not in text
         if not name.endswith(".mcap"):  # compressed bytes may contain a short name by chance
             assert not re.search(rf"\b({socket.gethostname()}|{getpass.getuser()})\b", text)
-    assert len(list(UciCapture(tmp_path / "out" / "capture.txt"))) > 20
+    assert len(list(uci.open_capture(tmp_path / "out" / "capture.txt"))) > 20
     records = list(McapRecording(tmp_path / "out" / "ranges.mcap"))
     assert len(records) > 20
     assert records[0].truth.range_m == 3.0

@@ -247,7 +247,7 @@ def test_deepuwb_is_corrected_live_and_offline_without_an_option(
 
 @pytest.mark.ros
 def test_demo_corrects_deepuwb(deepuwb: Path):
-    command = [sys.executable, "-m", "uwb_mitigation.commands.entry", "demo", "--recording", str(deepuwb)]
+    command = [sys.executable, "-m", "benchmarks", "demo", "--recording", str(deepuwb)]
     environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
     run = subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
     assert run.returncode == 0, run.stdout + run.stderr

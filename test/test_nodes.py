@@ -210,7 +210,7 @@ def test_duplicate_node_names_are_reported_except_for_a_killed_node(
 
 
 def run_demo(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "uwb_mitigation.commands.entry", "demo", *arguments]
+    command = [sys.executable, "-m", "benchmarks", "demo", *arguments]
     environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
     return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
 

@@ -19,7 +19,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 TIMEOUT_S = 240.0
 RUNS = {
     "bench": ["-m", "benchmarks", "nodes"],
-    "demo": ["-m", "uwb_mitigation.commands.entry", "demo"],
+    "demo": ["-m", "benchmarks", "demo"],
     "radio demo": ["-m", "benchmarks", "radio-demo", "--seconds", "600"],
 }
 

@@ -8,7 +8,9 @@ import math
 import signal
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
@@ -18,6 +20,11 @@ from geometry_msgs.msg import Point, Pose, PoseWithCovariance, PoseWithCovarianc
 from message_package import build
 from ros_harness import Ros
 from std_msgs.msg import Header
+from uwb_mitigation_msgs.msg import RangeCorrected
+
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.geodetic import parse_origin, to_geodetic
+from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 
 pytestmark = pytest.mark.ros
 
@@ -42,24 +49,72 @@ int8 quality
 """
 """Fields of VehicleOdometry in px4_msgs, release/1.15."""
 
+BEACON = """
+uint64 timestamp
+uint64 timestamp_sample
+uint8 beacon_id
+float32 range
+float64 lat
+float64 lon
+float32 alt
+uint8 alt_type
+uint8 ALT_TYPE_WGS84 = 0
+uint8 ALT_TYPE_MSL = 1
+float32 hacc
+float32 vacc
+uint8 sequence_nr
+uint8 status
+uint16 carrier_freq
+float32 range_accuracy
+"""
+"""Fields of RangingBeacon in px4_msgs, main."""
+
+LOCAL_POSITION = """
+uint32 MESSAGE_VERSION = 1
+bool xy_global
+bool z_global
+float64 ref_lat
+float64 ref_lon
+float32 ref_alt
+"""
+"""The used fields of VehicleLocalPosition in px4_msgs, main."""
+
 RECEIVER = """
 import json, rclpy
-from px4_msgs.msg import VehicleOdometry
+from px4_msgs.msg import VehicleOdometry, RangingBeacon
 rclpy.init()
 node = rclpy.create_node("receiver")
 def show(message):
     names = message.get_fields_and_field_types()
     values = {name: getattr(message, name) for name in names}
-    print(json.dumps({name: v if isinstance(v, int) else [float(x) for x in v] for name, v in values.items()}))
+    print(json.dumps({name: v if isinstance(v, (int, float)) else [float(x) for x in v] for name, v in values.items()}))
+node.create_subscription(RangingBeacon, "/fmu/in/ranging_beacon", show, 10)
 node.create_subscription(VehicleOdometry, "/fmu/in/vehicle_visual_odometry", show, 10)
 rclpy.spin(node)
+"""
+
+
+LOCAL_PUBLISHER = """
+import time, rclpy
+from px4_msgs.msg import VehicleLocalPosition
+from rclpy.qos import qos_profile_sensor_data
+rclpy.init()
+node = rclpy.create_node("fmu")
+publisher = node.create_publisher(VehicleLocalPosition, "/fmu/out/vehicle_local_position_v1", qos_profile_sensor_data)
+while True:
+    publisher.publish(VehicleLocalPosition(xy_global=True, z_global=True, ref_lat=47.397742, ref_lon=8.545594, ref_alt=488.0))
+    time.sleep(0.1)
 """
 
 
 @pytest.fixture(scope="module")
 def px4_msgs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Return the environment with a message package that has the name and the fields of px4_msgs."""
-    return build("px4_msgs", {"VehicleOdometry": MESSAGE}, tmp_path_factory.mktemp("px4"))
+    return build(
+        "px4_msgs",
+        {"VehicleOdometry": MESSAGE, "RangingBeacon": BEACON, "VehicleLocalPosition": LOCAL_POSITION},
+        tmp_path_factory.mktemp("px4"),
+    )
 
 
 def pose(seconds: float, x: float, variance: float = 0.04) -> PoseWithCovarianceStamped:
@@ -131,3 +186,117 @@ def test_missing_px4_msgs_is_a_one_line_error(ros: Ros):
     node = ros.start("px4")
     assert node.wait() == 1
     assert node.output.startswith("error: px4_msgs is not installed (build the branch of")
+
+
+# Ranges ----------------------------------------------------------------------------------------------------------
+
+ZURICH = (47.397742, 8.545594, 488.0)
+ANCHORS = {0x022E: (0.0, 0.0, 2.0), 0x9280: (8.0, 0.0, 2.0), 0xDCAE: (8.0, 6.0, 2.0), 0x5431: (0.0, 6.0, 2.0)}
+MIN_INTERVAL_US = 10_600
+"""EKF2's smallest interval between stamps: EKF2_DELAY_MAX of 200 ms in 19 intervals (setRangingBeaconData)."""
+
+
+def ecef(latitude: float, longitude: float, height: float) -> np.ndarray:
+    """Return a position as EKF2 computes it from latitude, longitude and altitude (LatLonAlt::toEcef)."""
+    phi, la = math.radians(latitude), math.radians(longitude)
+    normal = 6378137.0 / math.sqrt(1 - 6.69437999014e-3 * math.sin(phi) ** 2)
+    across = (normal + height) * math.cos(phi)
+    z = (normal * (1 - 6.69437999014e-3) + height) * math.sin(phi)
+    return np.array([across * math.cos(la), across * math.sin(la), z])
+
+
+@pytest.mark.parametrize(
+    "origin", [ZURICH, (-33.9, 151.2, -20.0), (0.0, -179.9999, 0.0), (78.2, 15.6, 8000.0)]
+)
+def test_positions_of_anchors_keep_their_distances_on_the_ellipsoid(origin: tuple[float, float, float]):
+    local = np.random.default_rng(1).uniform(-1000, 1000, (50, 3))
+    placed = np.array([ecef(*row) for row in to_geodetic(local, origin)])
+    assert np.linalg.norm(placed - ecef(*origin), axis=1) == pytest.approx(
+        np.linalg.norm(local, axis=1), abs=1e-5
+    )
+    assert np.linalg.norm(placed - placed[0], axis=1) == pytest.approx(
+        np.linalg.norm(local - local[0], axis=1), abs=1e-5
+    )
+    (north, east, up) = to_geodetic([[0, 10, 0], [10, 0, 0], [0, 0, 10]], origin) - np.array(origin)
+    assert north[0] > 8e-5
+    assert abs(north[1]) < 1e-9
+    assert (east[1] % 360) > 8e-5
+    assert up[2] == pytest.approx(10)
+
+
+@pytest.mark.parametrize("text", ["", "1,2", "91,0,0", "nan,0,0", "1,2,x", "1,2,3,4"])
+def test_invalid_origins_are_refused(text: str):
+    with pytest.raises(ParameterError, match="LATITUDE,LONGITUDE,ALTITUDE"):
+        parse_origin(text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("has_origin", [True, False])
+def test_ranges_are_sent_as_ekf2_accepts_them(
+    ros: Ros, px4_msgs: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, has_origin: bool
+):
+    for name, value in px4_msgs.items():
+        monkeypatch.setenv(name, value)
+    path = tmp_path / "anchors.yaml"
+    path.write_text(dump_anchors(AnchorMap([Anchor(key, place, 0.03) for key, place in ANCHORS.items()])))
+    options = ["mode:=ranges", f"anchors:={path}"]
+    options += [f"origin:={','.join(map(str, ZURICH))}"] if has_origin else []
+    node, receiver = ros.start("px4", *options), ros.run([sys.executable, "-c", RECEIVER])
+    publisher = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 100)
+    ros.wait_for_subscribers("/uwb/range_corrected", 1)
+    ros.wait_for_subscribers("/fmu/in/ranging_beacon", 1)
+    if not has_origin:
+        ros.diagnosis("px4", lambda status: "the origin of PX4 is unknown" in status.message)
+        ros.run([sys.executable, "-c", LOCAL_PUBLISHER])
+    tag, rounds = (3.0, 2.0, 0.4), itertools.count(100)
+
+    def send_round() -> None:
+        """Publish ranges of four anchors with the same stamp, as a DWM1001 with PANS, and invalid ones."""
+        number = next(rounds)
+        for anchor, place in [*ANCHORS.items(), (7, (0, 0, 0))]:
+            for range_m, variance in [
+                (math.nan, 0.01),
+                (-1.0, 0.01),
+                (1.0, math.inf),
+                (math.dist(tag, place), 0.01),
+            ]:
+                stamp = Time(sec=number // 10, nanosec=number % 10 * 10**8)
+                header = Header(frame_id="uwb", stamp=stamp)
+                fields = {
+                    "tag_id": 1,
+                    "anchor_id": anchor,
+                    "sequence": number,
+                    "range": range_m,
+                    "variance": variance,
+                }
+                publisher.publish(RangeCorrected(header=header, **fields))
+        ros.spin_for(0.1)
+
+    def received() -> list[dict[str, float]]:
+        lines = [line for line in receiver.output.splitlines() if line.startswith("{")]
+        return [message for message in map(json.loads, lines) if "beacon_id" in message]
+
+    ros.spin_until(lambda: send_round() or len(received()) > 40, 60.0)
+    messages = received()
+    vehicle = ecef(*to_geodetic([tag], ZURICH)[0])
+    stamps = [message["timestamp_sample"] for message in messages]
+    assert min(np.diff(stamps)) >= MIN_INTERVAL_US
+    assert max(stamp % 100_000 for stamp in stamps) <= 60_000
+    assert {message["beacon_id"] for message in messages} == {1, 2, 3, 4}, "ids above 255 are numbered"
+    for message in messages:
+        assert message["alt_type"] == 1
+        beacon = ecef(message["lat"], message["lon"], message["alt"])
+        assert math.dist(beacon, vehicle) == pytest.approx(message["range"], abs=1e-3)
+    # Ten correlated ranges a second from each anchor: each has ten times the variance.
+    assert {round(message["range_accuracy"] ** 2, 4) for message in messages[8:]} <= {0.1, 0.05}
+    ros.diagnosis("px4", lambda status: "anchors that are not in the file: 7" in status.message)
+    assert node.signal(signal.SIGINT) == 0, node.output
+
+
+def test_invalid_settings_of_ranges_are_named(
+    ros: Ros, px4_msgs: dict[str, str], monkeypatch: pytest.MonkeyPatch
+):
+    for name, value in px4_msgs.items():
+        monkeypatch.setenv(name, value)
+    ros.start("px4", "mode:=ranges").wait_for_output("parameter anchors is empty")
+    ros.start("px4", "mode:=range").wait_for_output("mode = 'range'")

@@ -77,7 +77,7 @@ def printed(name: str, folder: Path, request: pytest.FixtureRequest) -> str:
         return output_of(folder, f"data info {logs}" if name == "info" else f"offset {logs} --truth --common")
     if name == "demo":
         pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
-        words = [sys.executable, "-m", "uwb_mitigation.commands.entry", "demo", "--rate", "2"]
+        words = [sys.executable, "-m", "benchmarks", "demo", "--rate", "2"]
         environment = os.environ | {"COLUMNS": "80"}
         return subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout
     outputs: dict[str, str] = request.getfixturevalue("outputs")

@@ -6,6 +6,7 @@ import contextlib
 import os
 import struct
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,9 @@ from benchmarks import uci
 from benchmarks.equipment.uci_board import FIRST_PATH, TAPS, UciBoardModel, UciFaults, _Session, taps_of
 from uwb_mitigation.errors import DamagedRecordingError, LinkError, RecordingError
 from uwb_mitigation.mitigation.model.choice import CirKind
+from uwb_mitigation.radios.capture import CaptureWriter, first_line
 from uwb_mitigation.radios.fira import codes, messages
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
-from uwb_mitigation.radios.fira.capture import FIRST_LINE, CaptureWriter, UciCapture
 from uwb_mitigation.radios.fira.cir import PositionUnit, read_cir
 from uwb_mitigation.radios.fira.codes import PacketType
 from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher
@@ -28,9 +29,10 @@ from uwb_mitigation.radios.fira.packets import MAX_GAP_NS, PacketDecoder, encode
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import Role
-from uwb_mitigation.radios.uci import UciPort, UciPortSettings
+from uwb_mitigation.radios.uci import UciPort, UciPortSettings, open_capture
 from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment
 
+FIRST_LINE = first_line("UCI")
 MS = 10**6
 RANGE = bytes.fromhex(
     # seq 7, handle 1, rfu, 200 ms, two-way, rfu, short, primary session, rfu, 1 record
@@ -550,7 +552,7 @@ def test_a_long_command_is_sent_in_fragments():
 def test_a_capture_replays_the_same_measurements(tmp_path):
     run = Bench()
     writer = CaptureWriter(tmp_path / "session.txt")
-    writer.add_board(0, run.session.settings)
+    writer.add_board(0, asdict(run.session.settings) | {"role": "TAG"})
     receive = run.session.receive
 
     def recorded(data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
@@ -562,7 +564,7 @@ def test_a_capture_replays_the_same_measurements(tmp_path):
     for sequence in range(1, 30):
         run.exchange(sequence)
     writer.close()
-    capture = UciCapture(tmp_path / "session.txt")
+    capture = open_capture(tmp_path / "session.txt")
     for _ in range(2):
         replayed = [record.measurement for record in capture]
         assert [m.sequence for m in replayed] == [m.sequence for m in run.measured_ranges]
@@ -577,19 +579,19 @@ def test_a_capture_replays_the_same_measurements(tmp_path):
     [
         ("", RecordingError),
         ("0.1 0 < 00", RecordingError),
-        (f"{FIRST_LINE}\n0.1 0 < 00", DamagedRecordingError),
-        (f"{FIRST_LINE}\nboard 0 {{", DamagedRecordingError),
+        (f"{first_line('UCI')}\n0.1 0 < 00", DamagedRecordingError),
+        (f"{first_line('UCI')}\nboard 0 {{", DamagedRecordingError),
         (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [1]}}', DamagedRecordingError),
         (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [2]}}\ninf 0 < 00', DamagedRecordingError),
         (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [2]}}\n1 0 < 0g', DamagedRecordingError),
-        (f"{FIRST_LINE}\n" + "9" * 400_000, DamagedRecordingError),
+        (f"{first_line('UCI')}\n" + "9" * 400_000, DamagedRecordingError),
     ],
 )
 def test_a_capture_that_is_damaged_is_refused(tmp_path, text: str, error: type):
     path = tmp_path / "session.txt"
     path.write_text(text)
     with pytest.raises(error):
-        list(UciCapture(path))
+        list(open_capture(path))
 
 
 def test_responses_have_no_effect_before_their_command():

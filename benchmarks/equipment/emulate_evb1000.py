@@ -19,6 +19,7 @@ from uwb_mitigation.errors import ParameterError
 
 if TYPE_CHECKING:
     from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
+    from benchmarks.equipment.text_board import TextBoards
     from benchmarks.equipment.uci_board import EmulatedUciBoards
 
 _UNPLUG_DURATION_S = 0.5
@@ -123,7 +124,7 @@ def _signals() -> Iterator[list[int]]:
 
 
 def keep_running(
-    emulated: EmulatedEvb1000s | EmulatedUciBoards,
+    emulated: EmulatedEvb1000s | EmulatedUciBoards | TextBoards,
     received_signals: list[int],
     duration: float | None,
     unplug_every: float | None,

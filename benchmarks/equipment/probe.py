@@ -14,8 +14,8 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from benchmarks.equipment.processes import _DEPTH, wait
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.nodes.support.processes import _DEPTH, wait
 
 
 class Probe(Node):

@@ -1,6 +1,6 @@
 """Entry points, with signal handling during imports. Standard library only: other imports take a second.
 
-python -m uwb_mitigation.commands.entry NODE --ros-args ..., or demo ...
+python -m uwb_mitigation.commands.entry NODE --ros-args ...
 """
 
 from __future__ import annotations
@@ -105,9 +105,5 @@ def _end(number: int, frame: Any) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) < 2:
-        sys.exit(f"error: no node is named (one of {', '.join(_NODES)}, or demo)")
-    name = sys.argv.pop(1)
-    if name == "demo":
-        run_program("uwb_mitigation.commands.demo", "run_demo_command")
-    else:
-        _node(name)
+        sys.exit(f"error: no node is named (one of {', '.join(_NODES)})")
+    _node(sys.argv.pop(1))

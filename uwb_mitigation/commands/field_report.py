@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 
 def field_report(
-    source: Annotated[Literal["uci", "evb1000", "spi", "serial"], typer.Option(help="Kind of radio.")],
+    source: Annotated[
+        Literal["uci", "evb1000", "spi", "serial", "lines", "pans"], typer.Option(help="Kind of radio.")
+    ],
     port: Annotated[
         str,
         typer.Option(
@@ -40,6 +42,9 @@ def field_report(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE.zip", help="File to attach to an issue.")
     ] = Path("field_report.zip"),
+    mapping: Annotated[
+        str, typer.Option("--map", metavar="MAPPING", help="Mapping for the source lines, as for the driver.")
+    ] = "",
     seconds: Annotated[float, typer.Option(min=2.0, max=3600.0, help="Duration of the measurement.")] = 300.0,
     unplug: Annotated[
         bool, typer.Option("--unplug/--no-unplug", help="Test unplugging and reconnecting the first port.")
@@ -50,8 +55,8 @@ def field_report(
     """Test a pair of radios at a known distance and write a report.
 
     Place both radios in line of sight, 2 m to 10 m apart, and stop all drivers. The zip file contains the page
-    report.html, the ranges with their CIRs, the release of the kernel and, for UCI boards, the raw bytes and the device
-    information of the board. It contains no host name, user name or path. Attach it to an issue of type "Field report".
+    report.html, the ranges with their CIRs, the release of the kernel and, for uci, lines and pans, the raw bytes and the
+    device information of the board. It contains no host name, user name or path. Attach it to an issue of type "Field report".
     The exit code is 1 if a check fails.
 
         uwb-mitigation field-report --source uci --port /dev/ttyACM0 --distance 3
@@ -75,7 +80,16 @@ def field_report(
         folder = Path(name)
         with console.share_bar("ranging") as advance:
             unplug_request = _ask if unplug else None
-            observe(source, ports, observation, folder / "capture.txt", unplug_request, advance, console.warn)
+            observe(
+                source,
+                ports,
+                mapping,
+                observation,
+                folder / "capture.txt",
+                unplug_request,
+                advance,
+                console.warn,
+            )
         _correct(observation)
         observation.problem = anonymise(observation.problem, ports)
         observation.warnings = [anonymise(text, ports) for text in observation.warnings]
@@ -115,7 +129,7 @@ def _correct(observation: Observation) -> None:
     mitigation = Mitigation(load_model())
     choices = {mitigation.choose(CirKind.of(measured.cir)) for measured in observation.ranges}
     observation.model = "; ".join(sorted(map(str, choices)))
-    if all(choice.is_trained for choice in choices):
+    if observation.has_cirs and all(choice.is_trained for choice in choices):
         observation.corrected = mitigation.correct(observation.ranges)
 
 

@@ -11,9 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.nodes.feeds.publishing import RangePublisher
-from uwb_mitigation.nodes.feeds.radios import RADIO_SOURCES, RadioFeed, SourceHandle, radio_source
+from uwb_mitigation.nodes.feeds.radios import (
+    CAPTURED_SOURCES,
+    RADIO_SOURCES,
+    RadioFeed,
+    SourceHandle,
+    radio_source,
+)
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed, open_source
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
@@ -79,10 +85,8 @@ class Driver(ManagedNode):
 
     @property
     def _has_radios(self) -> bool:
-        # The source uci with a path is a capture.
-        return self.value("source") in RADIO_SOURCES and not (
-            self.value("source") == "uci" and self.value("path")
-        )
+        is_capture = self.value("source") in CAPTURED_SOURCES and self.value("path")
+        return self.value("source") in RADIO_SOURCES and not is_capture
 
     def _prepare_radios(self) -> Callable[[], SourceHandle]:
         source = radio_source(self.value("source"))
@@ -96,11 +100,7 @@ class Driver(ManagedNode):
         from uwb_mitigation.nodes.feeds.topic import TopicFeed
         from uwb_mitigation.recordings.mapping.mapping import load_mapping
 
-        if not (name := self.value("map")):
-            raise ParameterError(
-                "parameter map is empty", valid="map:=FILE, or the name of a shipped mapping"
-            )
-        mapping = load_mapping(name)
+        mapping = load_mapping(self.value("map"))
         self._output = RangePublisher(self, self._consumer, corrections=False, recording=False)
         feed = TopicFeed(self, mapping, self.value("topic"), self._publish_topic_range, self.now_ns)
         return lambda: feed

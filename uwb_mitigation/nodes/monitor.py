@@ -19,8 +19,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import RecordingError, UwbMitigationError, format_id
 from uwb_mitigation.nodes.support import endpoints
-from uwb_mitigation.nodes.support.processes import spinning_node
-from uwb_mitigation.nodes.support.spinning import stop_event
+from uwb_mitigation.nodes.support.spinning import spinning_node, stop_event
 from uwb_mitigation.types.measurement import CorrectedRange, Status, Truth
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, decode_truth

@@ -1,55 +1,205 @@
-"""The node `px4`: sends the positions of `/uwb/pose` to a PX4 autopilot, through the uXRCE-DDS agent.
+"""The node `px4`: sends positions or ranges to a PX4 autopilot, through the uXRCE-DDS agent.
 
-It sends positions only. Orientation and velocity are NaN, so that EKF2 takes the heading from the compass.
+Mode positions: `/uwb/pose` as external vision. Orientation and velocity are NaN, so that EKF2 takes the heading from the
+compass. Mode ranges: `/uwb/range_corrected` with the positions of the anchors, which EKF2 fuses itself (PX4 1.18).
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.node import Node
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.errors import MissingDependencyError
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, format_id
+from uwb_mitigation.nodes.support import diagnostics, endpoints
+from uwb_mitigation.nodes.support.diagnostics import Description
+from uwb_mitigation.nodes.support.lifecycle import ManagedNode
+from uwb_mitigation.nodes.support.parameter_tables import PX4
+from uwb_mitigation.positioning.geodetic import parse_origin, to_geodetic
+from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 
 CORRELATION_S = 1.0
-"""Errors of positions within this time are correlated. EKF2 takes them as independent, so their variance is increased."""
+"""Errors within this time are correlated. EKF2 takes them as independent, so their variance is increased."""
 
 MAX_VALUE = 1e6
 """Positions (m) and variances (m^2) beyond this, NaN, and stamps before 1970 are not sent."""
 
+RANGE_PERIOD_NS = 15_000_000
+"""Interval between ranges: EKF2 drops ranges whose stamps are less than about 11 ms apart, and PX4 queues only one."""
+
+MAX_SHIFT_NS = 60_000_000
+"""A range whose stamp would have to be later by more than this is not sent: at 1 m/s, it is 0.06 m."""
+
 _NAN3 = (math.nan,) * 3
+_QOS = QoSProfile(depth=10)
 
 
-class Px4(Node):
-    """Subscribes to `PoseWithCovarianceStamped` in ENU axes and publishes `px4_msgs/VehicleOdometry` in NED axes.
+class Px4(ManagedNode):
+    """Lifecycle: configure subscribes, activate sends.
 
-    The message type is loaded at run time, because it must be that of the firmware's release.
+    The message types are loaded at run time, because they must be those of the firmware's release.
 
     Raises:
         MissingDependencyError: px4_msgs is not installed.
     """
 
     def __init__(self) -> None:
-        super().__init__("px4")
+        super().__init__("px4", PX4)
         try:
-            from px4_msgs.msg import VehicleOdometry
+            import px4_msgs.msg as messages
         except ImportError as error:
             self.destroy_node()
             raise MissingDependencyError(
                 "px4_msgs is not installed",
                 valid="build the branch of https://github.com/PX4/px4_msgs for your firmware, and source its workspace",
             ) from error
-        self._type = VehicleOdometry
+        self._messages: Any = messages
+        self._sent = 0
         self._latest_ns: int | None = None
         self._resets = 0
-        self._publisher = self.create_publisher(VehicleOdometry, topics.relative(topics.PX4_ODOMETRY), 10)
-        poses = self.create_subscription(
-            PoseWithCovarianceStamped, topics.relative(topics.POSE), self._on_pose, 10
+        self._publisher: Publisher
+        self._tag = 0
+        self._anchors: AnchorMap
+        self._positions: NDArray[np.float64] | None = None
+        self._waiting: dict[int, tuple[int, RangeCorrected]] = {}
+        self._last_ns: dict[int, int] = {}
+        self._unknown: set[int] = set()
+        self.autostart()
+
+    def open(self) -> None:
+        self._latest_ns = None
+        if self.value("mode") == "ranges":
+            self._open_ranges()
+        else:
+            self._publisher = self.publisher(self._messages.VehicleOdometry, topics.PX4_ODOMETRY, _QOS)
+            poses = self.create_subscription(
+                PoseWithCovarianceStamped, topics.relative(topics.POSE), self._on_pose, 10
+            )
+            self.destroy_at_close(poses, self.destroy_subscription)
+            self.get_logger().info(f"sends {poses.topic_name} to {self._publisher.topic_name}")
+
+    def begin(self) -> None:
+        """Nothing: the lifecycle publisher sends while the node is active."""
+
+    def end(self) -> None:
+        """Nothing."""
+
+    def describe(self) -> Description:
+        values: dict[str, object] = {"sent": self._sent, "mode": self.value("mode")}
+        level, text = diagnostics.OK, "sending" if self._sent else "no positions or ranges yet"
+        if self.value("mode") == "ranges" and self._positions is None:
+            level, text = (
+                diagnostics.WARN,
+                "the origin of PX4 is unknown: set parameter origin, or wait for GNSS",
+            )
+        elif self._unknown:
+            level, text = (
+                diagnostics.WARN,
+                f"ranges of anchors that are not in the file: {', '.join(map(format_id, sorted(self._unknown)))}",
+            )
+        return "PX4", level, text, values
+
+    def _open_ranges(self) -> None:
+        beacon = getattr(self._messages, "RangingBeacon", None)
+        if beacon is None or not hasattr(beacon, "alt_type"):
+            raise MissingDependencyError(
+                "this px4_msgs has no message RangingBeacon with alt_type",
+                valid="px4_msgs of PX4 1.18 or newer; mode:=positions for others",
+            )
+        if not self.value("anchors"):
+            raise ParameterError("parameter anchors is empty", valid="anchors:=FILE for mode:=ranges")
+        self._anchors = load_anchors(Path(self.value("anchors")).expanduser())
+        self._tag, self._positions = self.value("tag"), None
+        self._waiting, self._last_ns, self._unknown = {}, {}, set()
+        if self.value("origin"):
+            self._place_anchors(parse_origin(self.value("origin")))
+        else:
+            kind = self._messages.VehicleLocalPosition
+            version = getattr(kind, "MESSAGE_VERSION", 0)
+            name = topics.relative(topics.PX4_LOCAL_POSITION) + (f"_v{version}" if version else "")
+            local = self.create_subscription(kind, name, self._on_local_position, qos_profile_sensor_data)
+            self.destroy_at_close(local, self.destroy_subscription)
+        self._publisher = self.publisher(beacon, topics.PX4_BEACON, _QOS)
+        name = topics.relative(topics.RANGE_CORRECTED)
+        ranges = endpoints.create_subscription(
+            self, RangeCorrected, name, self._on_range, ReliabilityPolicy.BEST_EFFORT
         )
-        self.get_logger().info(f"sends {poses.topic_name} to {self._publisher.topic_name}")
+        self.destroy_at_close(ranges, self.destroy_subscription)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        timer = self.create_timer(RANGE_PERIOD_NS / NS_PER_S, self._send_range, clock=steady)
+        self.destroy_at_close(timer, self.destroy_timer)
+        self.get_logger().info(f"sends {ranges.topic_name} to {self._publisher.topic_name}")
+
+    def _place_anchors(self, origin: tuple[float, float, float]) -> None:
+        self._positions = to_geodetic(self._anchors.position, origin)
+
+    def _on_local_position(self, message: Any) -> None:
+        """Place the anchors in the local frame of PX4, whose origin changes if PX4 sets another one."""
+        if message.xy_global and message.z_global:
+            self._place_anchors((message.ref_lat, message.ref_lon, message.ref_alt))
+
+    def _on_range(self, message: RangeCorrected) -> None:
+        """Keep the latest range of each anchor until it is sent."""
+        stamp_ns = to_ns(message.header.stamp)
+        self._tag = self._tag or message.tag_id
+        if message.tag_id != self._tag:
+            return
+        if message.anchor_id not in self._anchors.index:
+            if len(self._unknown) < 10:
+                self._unknown.add(message.anchor_id)
+            return
+        is_valid = stamp_ns >= 0 and 0.0 < message.range < MAX_VALUE and 0.0 < message.variance < MAX_VALUE
+        if is_valid:
+            self._waiting[message.anchor_id] = stamp_ns, message
+
+    def _send_range(self) -> None:
+        """Send the range that has waited longest."""
+        if not self._waiting or self._positions is None or not self.is_active:
+            return
+        # The oldest one; of those with the same stamp, that of the anchor whose range was sent least recently.
+        anchor = min(
+            self._waiting, key=lambda key: (self._waiting[key][0], self._last_ns.get(key, -NS_PER_S))
+        )
+        stamp_ns, message = self._waiting.pop(anchor)
+        sent_ns = stamp_ns
+        if self._latest_ns is not None and abs(stamp_ns - self._latest_ns) < CORRELATION_S * NS_PER_S:
+            sent_ns = max(stamp_ns, self._latest_ns + RANGE_PERIOD_NS)
+            if sent_ns - stamp_ns > MAX_SHIFT_NS:
+                return
+        since_ns = max(abs(stamp_ns - self._last_ns.get(anchor, -NS_PER_S)), RANGE_PERIOD_NS)
+        increase = max(1.0, CORRELATION_S * NS_PER_S / since_ns)
+        self._latest_ns, self._last_ns[anchor] = sent_ns, stamp_ns
+        row = self._anchors.index[anchor]
+        latitude, longitude, altitude = self._positions[row].tolist()
+        kind = self._messages.RangingBeacon
+        self._sent += 1
+        self._publisher.publish(
+            kind(
+                timestamp=self.get_clock().now().nanoseconds // 1000,
+                timestamp_sample=sent_ns // 1000,
+                # The field has 8 bits: larger ids are numbered in the order of the file.
+                beacon_id=anchor if max(self._anchors.index) < 256 else row + 1,
+                range=message.range,
+                lat=latitude,
+                lon=longitude,
+                alt=altitude,
+                alt_type=kind.ALT_TYPE_MSL,
+                hacc=float(self._anchors.sd[row]),
+                vacc=float(self._anchors.sd[row]),
+                sequence_nr=message.sequence % 256,
+                range_accuracy=math.sqrt(message.variance * increase),
+            )
+        )
 
     def _on_pose(self, pose: PoseWithCovarianceStamped) -> None:
         stamp_ns = to_ns(pose.header.stamp)
@@ -70,14 +220,16 @@ class Px4(Node):
         # After a gap, or if a replay starts again, the position may be elsewhere: EKF2 must not reject it as an outlier.
         self._resets += is_reset
         self._latest_ns = stamp_ns
+        self._sent += 1
+        kind = self._messages.VehicleOdometry
         self._publisher.publish(
-            self._type(
+            kind(
                 timestamp=self.get_clock().now().nanoseconds // 1000,
                 timestamp_sample=stamp_ns // 1000,
-                pose_frame=self._type.POSE_FRAME_NED,
+                pose_frame=kind.POSE_FRAME_NED,
                 position=values,
                 q=(math.nan,) * 4,
-                velocity_frame=self._type.VELOCITY_FRAME_UNKNOWN,
+                velocity_frame=kind.VELOCITY_FRAME_UNKNOWN,
                 velocity=_NAN3,
                 angular_velocity=_NAN3,
                 position_variance=[variance * increase for variance in variances],

@@ -22,6 +22,7 @@ import serial
 from serial.tools import list_ports
 
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
+from uwb_mitigation.radios.capture import CaptureWriter
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 MIN_RETRY_S = 0.1
@@ -260,6 +261,7 @@ class StreamPort(RadioPort):
         name, on_event, monitor: see `RadioPort`.
         stamp_clock: the clock of the stamps, ns.
         baud, dtr: see `PortAddress.open`.
+        capture: stores the raw bytes, as those of board `number`; None = not stored.
         tick_s: maximum time between two calls of the session.
     """
 
@@ -272,12 +274,16 @@ class StreamPort(RadioPort):
         stamp_clock: Callable[[], int],
         baud: int,
         dtr: bool = True,
+        capture: CaptureWriter | None = None,
+        number: int = 0,
         tick_s: float = 0.05,
     ) -> None:
         super().__init__(str(address), on_event, monitor)
         self._address, self._baud, self._dtr = address, baud, dtr
         self._stamp_clock = stamp_clock
         self._tick_s = tick_s
+        self._capture, self._number = capture, number
+        self._empty_read_is_loss = True
 
     @abstractmethod
     def _opened(self, now_ns: int) -> list[Any]:
@@ -303,8 +309,16 @@ class StreamPort(RadioPort):
         """Return whether the port may be closed; called after `close`, until it returns true."""
         return True
 
-    def _on_sent(self, data: bytes) -> None:
-        """Handle bytes that were sent."""
+    def close(self) -> None:
+        """Stop the thread, and close the hardware and the capture; may be called twice."""
+        super().close()
+        capture, self._capture = self._capture, None
+        if capture is not None:
+            capture.close()
+
+    def _add_to_capture(self, data: bytes, *, sent: bool) -> None:
+        if self._capture is not None:
+            self._capture.add(self._number, data, sent=sent)
 
     def _connect(self) -> None:
         port = self._address.open(self._baud, self._dtr)
@@ -331,9 +345,10 @@ class StreamPort(RadioPort):
         while not (self.closed and self._is_stopped(time.monotonic_ns())):
             readable, _, _ = select.select([fd], [], [], self._tick_s)
             data = os.read(fd, _READ_BYTES) if readable else b""
-            if readable and not data:
+            if readable and not data and self._empty_read_is_loss:
                 raise LinkError("was unplugged", where=str(self._address))
             now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
+            self._add_to_capture(data, sent=False)
             with self._lock:
                 events = self._received(data, now_ns, stamp_ns)
                 # While the port accepts no bytes, requests wait in the bounded queue of the session.
@@ -342,7 +357,7 @@ class StreamPort(RadioPort):
             if outgoing:
                 with contextlib.suppress(BlockingIOError):
                     written = os.write(fd, outgoing)
-                    self._on_sent(bytes(outgoing[:written]))
+                    self._add_to_capture(bytes(outgoing[:written]), sent=True)
                     del outgoing[:written]
             self._emit(events)
             self._log_problem()

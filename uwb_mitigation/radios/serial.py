@@ -31,6 +31,7 @@ from uwb_mitigation.radios.settings import (
     ValueReader,
     count_failures,
     radio_values,
+    read_baud,
     read_radio,
     settings_text,
     status_warning,
@@ -42,6 +43,8 @@ from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Log, Ra
 from uwb_mitigation.radios.wire.session import BoardSession
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
+
+BAUD = 921_600
 
 REOPEN_TIMEOUT_NS = 10 * 10**9
 """Timeout after which the port is opened again. After a suspend, an open port may never receive data again."""
@@ -65,7 +68,7 @@ class SerialSettings:
     """
 
     address: PortAddress
-    baud: int = 921_600
+    baud: int = BAUD
     dtr: bool = True
     mode: Mode | None = None
     model_id: int | None = None
@@ -83,7 +86,7 @@ def read_settings(value: ValueReader) -> list[SerialSettings]:
     radio = read_radio(value)
     settings = SerialSettings(
         PortAddress.parse(value("port")),
-        value("baud"),
+        read_baud(value, BAUD),
         value("dtr"),
         Mode[value("mode").upper()],
         int(digits, 16) if digits else None,

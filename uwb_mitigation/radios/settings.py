@@ -177,6 +177,13 @@ def read_ports(value: ValueReader) -> list[str]:
     return ports
 
 
+def read_baud(value: ValueReader, default: int) -> int:
+    """Return the parameter `baud`, or a default for 0; raise ParameterError if it is too small."""
+    if 0 < (baud := int(value("baud"))) < 1200:
+        raise ParameterError(f"parameter baud = {baud}", valid="0, or 1200 to 12000000")
+    return baud or default
+
+
 def read_addresses(value: ValueReader, name: str, highest: int = 2**64 - 2) -> tuple[int, ...]:
     """Return the addresses of the parameter `radio.NAME`: a number, a text with commas, or an array.
 

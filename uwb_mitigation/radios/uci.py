@@ -7,13 +7,13 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
+from uwb_mitigation.radios.capture import Capture, CaptureWriter
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
-from uwb_mitigation.radios.fira.capture import CaptureWriter
 from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import (
@@ -103,11 +103,22 @@ def open(
         ParameterError: the file of the capture cannot be written.
     """
     path = settings[0].capture
-    capture = CaptureWriter(path, boards=len(settings)) if path is not None else None
+    capture = CaptureWriter(path, "UCI", len(settings)) if path is not None else None
     ports = [UciPort(board, number, capture, on_event, stamp_clock) for number, board in enumerate(settings)]
     for port in ports:
         port.start()
     return ports
+
+
+def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
+    """Open a capture as a recording; raise RecordingError if it cannot be read."""
+
+    def session(settings: dict[str, Any]) -> UciSession:
+        settings.pop("identify", None)  # of earlier versions
+        role, peers = Role[settings["role"]], tuple(map(int, settings["peers"]))
+        return UciSession(UciSettings(**settings | {"role": role, "peers": peers}))
+
+    return Capture(path, "UCI", session)
 
 
 class UciPort(StreamPort):
@@ -134,10 +145,18 @@ class UciPort(StreamPort):
         remedies = {cause.name: cause.remedy for cause in EXCHANGE_CAUSES.values()}
         unexpected = [cause.name for cause in EXCHANGE_CAUSES.values() if cause.unexpected]
         monitor = ExchangeMonitor(remedies, unexpected)
-        super().__init__(settings.address, on_event, monitor, stamp_clock=stamp_clock, baud=BAUD, tick_s=0.01)
+        super().__init__(
+            settings.address,
+            on_event,
+            monitor,
+            stamp_clock=stamp_clock,
+            baud=BAUD,
+            capture=capture,
+            number=number,
+            tick_s=0.01,
+        )
         self._originals = OriginalsFile(str(settings.address))
         self.session = UciSession(settings.board, self._originals)
-        self._number, self._capture = number, capture
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
 
@@ -153,13 +172,6 @@ class UciPort(StreamPort):
                 self.session.ranging.settings = settings.board
                 if self.device:
                     self._opened(time.monotonic_ns())
-
-    def close(self) -> None:
-        """End the sessions, restore the calibration, and close the port."""
-        super().close()
-        capture, self._capture = self._capture, None
-        if capture is not None:
-            capture.close()
 
     @property
     def problem(self) -> str:
@@ -221,15 +233,14 @@ class UciPort(StreamPort):
 
     def _opened(self, now_ns: int) -> list[Any]:
         if self._capture is not None:
-            self._capture.add_board(self._number, self.session.settings)
+            settings = self.session.settings
+            self._capture.add_board(self._number, asdict(settings) | {"role": settings.role.name})
         self._worked_ns = now_ns
         self.monitor.reset()
         self.session.opened(now_ns)
         return []
 
     def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
-        if self._capture is not None:
-            self._capture.add(self._number, data, sent=False)
         session = self.session
         measurements = session.receive(data, now_ns, stamp_ns)
         messages: list[Any] = []
@@ -258,10 +269,6 @@ class UciPort(StreamPort):
                 self._stop_ns = now_ns
                 self.session.stop(now_ns)
             return self.session.stopped or now_ns - self._stop_ns > SHUTDOWN_NS
-
-    def _on_sent(self, data: bytes) -> None:
-        if self._capture is not None:
-            self._capture.add(self._number, data, sent=True)
 
     def _started_text(self) -> str:
         s, window = self.session.settings, self.session.window

@@ -53,6 +53,7 @@ class Observation:
         written, read: settings or registers that were written, and read back, {name: value}.
         ranges: measurements at the distance.
         corrected: ranges corrected by the model; empty: the model was not trained for the radio.
+        has_cirs: whether the radio reports CIRs.
         model: name of the model, and what it was trained for.
         foreign: number of ranges with unexpected addresses.
         damaged: number of damaged packets.
@@ -75,6 +76,7 @@ class Observation:
     read: dict[str, object] = field(default_factory=dict)
     ranges: list[RangeMeasurement] = field(default_factory=list)
     corrected: Sequence[CorrectedRange] = ()
+    has_cirs: bool = True
     model: str = ""
     foreign: int = 0
     damaged: int = 0
@@ -105,7 +107,7 @@ def run_checks(o: Observation) -> list[Check]:
         *_failures(o),
     ]
     if o.ranges:
-        checks += [*_ranges(o), *_cirs(o), *_model(o)]
+        checks += [*_ranges(o), *(_cirs(o) if o.has_cirs else ()), *_model(o)]
     damage = o.damaged / max(len(o.ranges), 1)
     checks.append(_judge("damaged packets per range", damage, 0.01, 0.1, "", "use another cable or USB port"))
     if not math.isnan(o.temperature_c):

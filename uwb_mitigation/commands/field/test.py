@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 from uwb_mitigation.commands.field.checks import Observation
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
-from uwb_mitigation.radios import evb1000, serial, spi, uci
+from uwb_mitigation.radios import evb1000, lines, serial, spi, uci
 from uwb_mitigation.radios.dw1000.port import ChipPort
 from uwb_mitigation.radios.evb1000 import Evb1000Bus, Evb1000Settings
 from uwb_mitigation.radios.fira.session import UciSettings
+from uwb_mitigation.radios.lines import LinePort, LineSettings
 from uwb_mitigation.radios.port import OnEvent, PortAddress, PortMessage, RadioPort
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
 from uwb_mitigation.radios.settings import RadioSettings, Role
@@ -36,6 +37,8 @@ SOURCES = {
     "evb1000": "EVB1000",
     "spi": "DW1000 on SPI",
     "serial": "board with the firmware of uwb_mitigation",
+    "lines": "board that prints lines",
+    "pans": "DWM1001 with PANS",
 }
 """Names of the kinds of radios."""
 
@@ -58,6 +61,7 @@ _ANTENNA_DELAY = "antenna delay (15.65 ps)"
 def observe(
     source: str,
     ports: list[str],
+    mapping: str,
     observation: Observation,
     capture: Path,
     unplug: Callable[[str], None] | None,
@@ -70,26 +74,27 @@ def observe(
         source: one of `SOURCES`.
         ports: port of the tag, and of the anchor if it is at this computer.
         observation: has distance and duration.
-        capture: file for the raw bytes of UCI boards.
+        mapping: name or file, for lines; empty for pans: its own.
+        capture: file for the raw bytes, for uci, lines and pans.
         unplug: asks the user to unplug and reconnect the first port; None = skip this test.
         on_progress: called with the completed fraction.
         on_warning: called with each warning of the driver.
 
     Raises:
-        ParameterError: a port is invalid.
+        ParameterError: a port or mapping is invalid.
         LinkError: a port does not exist.
         MissingDependencyError: a library of the source is not installed.
     """
     if source not in SOURCES:
         raise ParameterError(f"source {source!r}", valid=", ".join(SOURCES))
-    if not 1 <= len(ports) <= (1 if source == "serial" else 2):
+    if not 1 <= len(ports) <= (1 if source in ("serial", "lines", "pans") else 2):
         raise ParameterError(f"{len(ports)} ports", valid="the tag's, or the tag's and the anchor's")
     for port in ports:
-        if source != "spi" and not PortAddress.parse(port).find():
+        if source != "spi" and not lines.parse_address(port).find():
             raise LinkError("is not there", where=port, valid="connect the board")
     events: SimpleQueue[object] = SimpleQueue()
     with ExitStack() as stack:
-        radios = _open(source, ports, capture, lambda event: events.put(event))
+        radios = _open(source, ports, mapping, capture, lambda event: events.put(event))
         for radio in radios:
             stack.enter_context(closing(radio))
         collector = _Collector(radios, events, observation, on_warning)
@@ -159,7 +164,12 @@ class _Collector:
             self._on_warning(text)
 
 
-def _open(source: str, ports: list[str], capture: Path, on_event: OnEvent) -> Sequence[RadioPort]:
+def _open(
+    source: str, ports: list[str], mapping: str, capture: Path, on_event: OnEvent
+) -> Sequence[RadioPort]:
+    if source in ("lines", "pans"):
+        used = lines.read_mapping({"map": mapping, "source": source}.__getitem__)
+        return lines.open([LineSettings(lines.parse_address(ports[0]), used, capture=capture)], on_event)
     if source == "serial":
         return serial.open([SerialSettings(PortAddress.parse(ports[0]), mode=Mode.HOST)], on_event)
     if source == "uci":
@@ -205,6 +215,10 @@ def _describe(radios: Sequence[RadioPort], o: Observation) -> None:
             o.read = dict(zip(o.written, session.window, strict=True))
         o.clock_offset_ppm = tag.clock_offset_ppm
         o.damaged, o.foreign = counts["damaged"], counts["unknown_session"]
+    elif isinstance(tag, LinePort):
+        # Such boards have no CIRs unless their mapping has them, and other lines are not damaged.
+        o.has_cirs = tag.session.mapping.cir is not None
+        o.identity = {"mapping": tag.session.mapping.name}
     elif isinstance(tag, BoardPort):
         if (hello := tag.session.hello) is not None:
             o.identity = {

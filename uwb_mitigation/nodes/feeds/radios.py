@@ -6,6 +6,7 @@ import importlib
 import logging
 import threading
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 from uwb_mitigation.nodes.feeds.publishing import RangePublisher
@@ -15,9 +16,13 @@ from uwb_mitigation.radios.port import OnEvent, PortMessage, RadioPort
 from uwb_mitigation.radios.settings import ValueReader
 from uwb_mitigation.radios.wire.messages import Correction
 from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.types.source import Source
 
-RADIO_SOURCES = ("serial", "evb1000", "spi", "uci")
-"""Sources that are modules of `radios`."""
+RADIO_SOURCES = ("serial", "evb1000", "spi", "uci", "lines", "pans")
+"""Sources that are modules of `radios`; pans is lines with the mapping of a board."""
+
+CAPTURED_SOURCES = ("uci", "lines", "pans")
+"""Sources that replay a capture, if there is a path."""
 
 
 class SourceHandle(Protocol):
@@ -44,10 +49,14 @@ class RadioSource(Protocol):
     ) -> Sequence[RadioPort]:
         """Open the radios."""
 
+    def open_capture(self, path: Path, value: ValueReader) -> Source:
+        """Open a capture; only for `CAPTURED_SOURCES`."""
+
 
 def radio_source(name: str) -> RadioSource:
     """Return the module of a source; it is imported here, because each needs other dependencies."""
-    source: RadioSource = importlib.import_module(f"uwb_mitigation.radios.{name}")
+    module = "lines" if name == "pans" else name
+    source: RadioSource = importlib.import_module(f"uwb_mitigation.radios.{module}")
     return source
 
 

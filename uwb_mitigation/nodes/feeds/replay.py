@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from rclpy.clock import Clock, ClockType
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.nodes.feeds.radios import CAPTURED_SOURCES, radio_source
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import clock_reader
@@ -53,10 +54,8 @@ def open_source(value: Callable[[str], Any]) -> Source:
     if not value("path"):
         raise ParameterError("parameter path is empty", valid="the recording to replay, as -p path:=FILE")
     path = Path(value("path")).expanduser()
-    if value("source") == "uci":
-        from uwb_mitigation.radios.fira.capture import UciCapture
-
-        return UciCapture(path)
+    if value("source") in CAPTURED_SOURCES:
+        return radio_source(value("source")).open_capture(path, value)
     if value("source") == "mcap":
         from uwb_mitigation.recordings.mcap import McapRecording
 

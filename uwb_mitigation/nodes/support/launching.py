@@ -185,10 +185,11 @@ def check_package(argument: str, package: str) -> None:
 def check_driver(values: Mapping[str, Any]) -> None:
     """Raise ParameterError if the source needs a port or a recording, and none is given, or the recording is missing."""
     serial = ("port", "/dev/ttyACM0")
+    captured = ("path" if values.get("path") else "port", "/dev/ttyACM0")
     needed = {
         "serial": serial,
         "evb1000": serial,
-        "uci": ("path" if values.get("path") else "port", "/dev/ttyACM0"),
+        **dict.fromkeys(("uci", "lines", "pans"), captured),
         "spi": ("port", "/dev/spidev0.0"),
         "mcap": ("path", "FILE"),
         "decaranging": ("path", "FILE"),

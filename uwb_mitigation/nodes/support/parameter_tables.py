@@ -132,14 +132,15 @@ RADIO = (
 
 DRIVER = (
     Parameter("source", "simulated", "Source of the measurements.",
-              choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi", "uci", "topic"), filed=False),
-    Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging), or a capture (uci)."),
+              choices=("mcap", "decaranging", "simulated", "serial", "evb1000", "spi", "uci", "lines", "pans", "topic"), filed=False),
+    Parameter("path", "", "Recording to replay: a bag (mcap), a log or a folder of logs (decaranging), or a capture (uci, lines, pans)."),
     Parameter("topic", "", "Topic of the ranges inside the bag, empty: /uwb/range_raw (mcap); or topics instead of those "
               "of the mapping, separated by commas (topic)."),
     Parameter("robot_topics", "/odom,/imu,/tf,/tf_static", "Topics of a robot that are replayed with the ranges of a bag, if "
               "it contains them, separated by commas: Odometry, Imu and TFMessage. Transforms from map are left out, because "
               "a locator publishes them. Empty: none (mcap)."),
-    Parameter("map", "", "Mapping file for messages of other software, or name of a shipped mapping (topic)."),
+    Parameter("map", "", "Mapping file for messages of other software or for lines of text, or name of a shipped mapping "
+              "(topic, lines). With pans, empty: dwm1001_pans."),
     Parameter("cir", "final", "Frame whose CIR belongs to a range (decaranging).",
               choices=("final", "poll")),
     Parameter("seed", 1, "Seed of the simulated measurements.", low=0, high=2**31 - 1),
@@ -165,13 +166,13 @@ DRIVER = (
               "otherwise 3 s.",
               low=-1.0, high=3600.0, unit="s"),
     Parameter("port", "", "Serial port of the board: a path such as /dev/ttyACM0, or "
-              "usb:VENDOR:PRODUCT[:SERIAL] with hexadecimal ids for any USB port (serial, evb1000, uci); or "
-              "/dev/spidev0.0 (spi). Several radios are separated by commas: the first has radio.role, the others "
-              "are anchors."),
-    Parameter("baud", 921_600, "Baud rate of a serial line; native USB ignores it (serial).",
-              low=1200, high=12_000_000, unit="bit/s"),
+              "usb:VENDOR:PRODUCT[:SERIAL] with hexadecimal ids for any USB port (serial, evb1000, uci, lines, pans); udp:PORT or "
+              "udp:ADDRESS:PORT to receive datagrams (lines); or /dev/spidev0.0 (spi). Several radios are separated by "
+              "commas: the first has radio.role, the others are anchors; with lines and pans, each is a tag."),
+    Parameter("baud", 0, "Baud rate of a serial line; native USB ignores it. 0: 921600 (serial), or that of the mapping (lines, "
+              "pans).", low=0, high=12_000_000, unit="bit/s"),
     Parameter("dtr", True, "Level of DTR: boards with native USB send only while it is set; through a bridge, "
-              "its change resets the board (serial)."),
+              "its change resets the board (serial, lines, pans)."),
     Parameter("mode", "host", "Where the model runs: on the host or on the device (serial).",
               choices=("host", "device"), live=True),
     Parameter("offsets", "", "Offsets for a board in mode device, as in the mitigator (serial).",
@@ -181,7 +182,7 @@ DRIVER = (
     *RADIO,
     Parameter("radio.tags", "", "Addresses of the tags of an anchor, separated by commas; empty: 1 (uci).",
               live=True, or_number=True, or_array=True),
-    Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced. Empty: none (uci)."),
+    Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced. Empty: none (uci, lines, pans)."),
     Parameter("record", "", "MCAP bag to which the raw ranges are written, completed when the node ends or is cleaned up; an "
               "existing file is refused. Empty: none."),
     Parameter("radio.reset", "", "Reset line of the chip, such as gpiochip0:25; empty: not connected (spi)."),
@@ -263,6 +264,16 @@ VIEWER = (
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
+PX4 = (
+    Parameter("mode", "positions", "What is sent: positions (uwb/pose, as external vision), or ranges (uwb/range_corrected, which "
+              "EKF2 of PX4 1.18 fuses itself).", choices=("positions", "ranges")),
+    Parameter("anchors", "", "YAML file with the positions of the anchors (ranges)."),
+    Parameter("origin", "", "Latitude, longitude (degrees) and altitude above mean sea level (m) of the origin of the anchors' frame, "
+              "whose x is true east and y true north. Empty: the origin of PX4's local frame (ranges)."),
+    Parameter("tag", 0, "Number of the tag on the vehicle; 0: the first received tag (ranges).", low=0, high=2**63 - 1),
+    Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
+)  # fmt: skip
+
 RESPAWN_FOLDER = "UWB_MITIGATION_RESPAWN_FOLDER"
 """Environment variable with a folder that exists while a launch file runs. A respawned node finds there the parameters
 that were set at run time, and the locator also its latest state."""
@@ -276,12 +287,15 @@ TABLES: dict[str, tuple[Parameter, ...]] = {
     "locator": LOCATOR,
     "viewer": VIEWER,
 }
+"""Tables of the nodes that launch files start."""
+
+ALL_TABLES = TABLES | {"px4": PX4}
 
 
 def help_text(name: str) -> str:
     """Return the text of `NODE --help`: usage and parameters of an executable."""
     nodes = ("driver", "mitigator", "locator") if name == "pipeline" else (name,)
-    rows = {row.name: row for node in nodes for row in TABLES.get(node, ())}
+    rows = {row.name: row for node in nodes for row in ALL_TABLES.get(node, ())}
     lines = [f"usage: {name} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]"]
     if rows:
         lines.append("parameters with their defaults (* = can be set while the node runs):")

@@ -7,8 +7,9 @@ import importlib
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import rclpy
 from rclpy.context import Context
@@ -20,6 +21,8 @@ from rclpy.utilities import remove_ros_args
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
+
+NodeT = TypeVar("NodeT", bound=Node)
 
 SPIN_S = 0.2
 
@@ -50,6 +53,24 @@ def spin(nodes: Node | Sequence[Node], stop: threading.Event) -> None:
     gc.freeze()
     while not stop.is_set():
         executor.spin_once(timeout_sec=SPIN_S)
+
+
+@contextmanager
+def spinning_node(make_node: Callable[[Context], NodeT]) -> Iterator[NodeT]:
+    """Yield a node in its own ROS context, spun by a thread until the block ends."""
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = make_node(context)
+    stop = threading.Event()
+    thread = threading.Thread(target=spin, args=(node, stop), name="probe", daemon=True)
+    thread.start()
+    try:
+        yield node
+    finally:
+        stop.set()
+        thread.join()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
 
 
 def make_executor(context: Context | None = None) -> Executor:

@@ -86,6 +86,11 @@ class UciSession:
         self._received_ns = self._started_ns = 0
 
     @property
+    def delivers(self) -> bool:
+        """Whether the ranges of this board are published."""
+        return self.settings.delivers
+
+    @property
     def settings(self) -> UciSettings:
         """What the board does; other settings of `ranging` take effect with `opened`."""
         return self.ranging.settings

@@ -1,6 +1,7 @@
 """Mapping files: where the values of ranges are in the files or messages of other software, and in which unit.
 
-A mapping is a YAML file. `data import --map` reads recordings with it, and the driver (`source:=topic`) live topics.
+A mapping is a YAML file. `data import --map` reads recordings with it, and the driver live topics (`source:=topic`) and
+lines of serial ports and UDP (`source:=lines`).
 The mappings in `recordings/mappings` are found by their names. docs/guides/recordings.md describes the format.
 """
 
@@ -376,17 +377,45 @@ class OdometryTable(TableFormat):
     yaw_rate: Number
 
 
+class StartDialogue(_Strict):
+    r"""What is sent to a board on a serial port that reports no ranges; `\\r` in double quotes is the Enter key.
+
+    Attributes:
+        wake: opens the board's command line.
+        ready: regular expression of the answer after which `command` is sent; empty: at once.
+        command: starts the output of ranges.
+        unknown: regular expression of another answer, of a board whose output may be on or off since an earlier session.
+            The first time, `reset` is sent, and the next time `command`.
+        reset: stops the output, and closes the command line.
+    """
+
+    wake: str = ""
+    ready: str = ""
+    command: str
+    unknown: str = ""
+    reset: str = ""
+
+    @model_validator(mode="after")
+    def _check(self) -> StartDialogue:
+        _compiled(self.ready)
+        _compiled(self.unknown)
+        return self
+
+
 class Mapping(TableFormat):
     """A mapping file.
 
     Attributes:
         name, source: name of the data set or radio, and where its format is described.
+        baud, start: baud rate of a serial port with lines, and how their output is started.
         moving: the tag moves during pauses, so they are kept.
         range_sd: standard deviation of a range, m (data sheet); 0: unknown.
     """
 
     name: str
     source: str = ""
+    baud: int = Field(default=115_200, ge=1200, le=12_000_000)
+    start: StartDialogue | None = None
     simulated: bool = False
     moving: bool = True
     range_sd: float = Field(default=0.0, ge=0.0)
@@ -442,6 +471,8 @@ def load_mapping(name: str) -> Mapping:
             `refused` contains the reason why this data set contains no ranges.
     """
     path, shipped = Path(name).expanduser(), shipped_mappings()
+    if not name:
+        raise ParameterError("parameter map is empty", valid="map:=FILE, or the name of a shipped mapping")
     if name in shipped:
         path = _FOLDER / f"{name}.yaml"
     elif not path.exists():

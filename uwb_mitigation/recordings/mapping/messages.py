@@ -17,7 +17,8 @@ MAX_ROWS = 4096
 MAX_TEXT = 1 << 20
 _Columns = dict[str, list[Any]]
 _COMMAND = re.compile(r"^\s*AT\+\w+[=:]")
-_PAIRS = re.compile(r"(\w+)\s*[:=]\s*(\([^()]*\)|\[[^\[\]]*\]|[^,\s()\[\]]+)")
+# The boundary keeps the search linear in a long word.
+_PAIRS = re.compile(r"\b(\w+)\s*[:=]\s*(\([^()]*\)|\[[^\[\]]*\]|[^,\s()\[\]]+)")
 
 
 class MessageRows:

@@ -26,6 +26,8 @@ MARKERS_TYPE = "visualization_msgs/msg/MarkerArray"
 TF, TF_STATIC = "/tf", "/tf_static"
 DIAGNOSTICS, CLOCK = "/diagnostics", "/clock"
 PX4_ODOMETRY = "/fmu/in/vehicle_visual_odometry"
+PX4_BEACON = "/fmu/in/ranging_beacon"
+PX4_LOCAL_POSITION = "/fmu/out/vehicle_local_position"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 

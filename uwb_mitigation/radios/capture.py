@@ -1,6 +1,6 @@
-"""Captures of the raw bytes of UCI boards: text files that a user can attach to an issue, and replay.
+"""Captures of the raw bytes of boards: text files that a user can attach to an issue, and replay.
 
-The first line is `# uwb_mitigation UCI capture 1`. Lines `board N {JSON settings}` precede the bytes of a board; lines
+The first line is `# uwb_mitigation KIND capture 1`. Lines `board N {JSON settings}` precede the bytes of a board; lines
 `SECONDS N < HEX` and `SECONDS N > HEX` contain received and sent bytes. A capture contains no host or user name.
 """
 
@@ -10,21 +10,22 @@ import json
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, Protocol
 
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
-from uwb_mitigation.radios.fira.session import UciSession, UciSettings
-from uwb_mitigation.radios.settings import Role
-from uwb_mitigation.types.measurement import Record
+from uwb_mitigation.types.measurement import RangeMeasurement, Record
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import NS_PER_S
 
-FIRST_LINE = "# uwb_mitigation UCI capture 1"
 MAX_LINE = 1 << 18
 _TAIL_NS = 2 * NS_PER_S
+
+
+def first_line(kind: str) -> str:
+    """Return the first line of a capture of a kind of boards, UCI or lines."""
+    return f"# uwb_mitigation {kind} capture 1"
 
 
 class CaptureWriter:
@@ -32,6 +33,7 @@ class CaptureWriter:
 
     Args:
         path: replaced if it exists.
+        kind: see `first_line`.
         boards: number of boards; the last of as many calls of `close` closes the file.
         limit_bytes: size after which nothing more is written.
 
@@ -39,7 +41,7 @@ class CaptureWriter:
         ParameterError: the file cannot be written.
     """
 
-    def __init__(self, path: Path, boards: int = 1, limit_bytes: int = 1 << 30) -> None:
+    def __init__(self, path: Path, kind: str = "UCI", boards: int = 1, limit_bytes: int = 1 << 30) -> None:
         try:
             self._file: IO[str] = path.open("w", encoding="ascii")
         except OSError as error:
@@ -49,12 +51,11 @@ class CaptureWriter:
         self._free_bytes, self._users = limit_bytes, boards
         self._lock = threading.Lock()
         self._began_ns = time.monotonic_ns()
-        self._write(FIRST_LINE)
+        self._write(first_line(kind))
 
-    def add_board(self, number: int, settings: UciSettings) -> None:
+    def add_board(self, number: int, settings: Mapping[str, Any]) -> None:
         """Write the settings of a board whose port was opened; the bytes after it begin with its start."""
-        values = asdict(settings) | {"role": settings.role.name}
-        self._write(f"board {number} {json.dumps(values)}")
+        self._write(f"board {number} {json.dumps(settings)}")
 
     def add(self, number: int, data: bytes, *, sent: bool) -> None:
         """Write bytes that were sent to a board or received from it."""
@@ -77,32 +78,48 @@ class CaptureWriter:
                 self._file.flush()
 
 
-class UciCapture(Source):
+class CapturedSession(Protocol):
+    """Decodes the bytes of a board."""
+
+    @property
+    def delivers(self) -> bool:
+        """Whether the ranges of the board belong to the recording."""
+
+    def opened(self, now_ns: int) -> None: ...
+
+    def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]: ...
+
+    def outgoing(self) -> bytes: ...
+
+
+class Capture(Source):
     """A capture as a recording; the sessions decode its bytes as they decode those of a board.
 
     Args:
         path: a file of `CaptureWriter`.
+        kind: see `first_line`.
+        open_session: returns the session of a board with these settings.
 
     Raises:
-        RecordingError: the file cannot be read, or is not a capture.
+        RecordingError: the file cannot be read, or is not a capture of this kind.
     """
 
     simulated = None
 
-    def __init__(self, path: Path) -> None:
-        self.name = f"UCI capture {path}"
+    def __init__(
+        self, path: Path, kind: str, open_session: Callable[[dict[str, Any]], CapturedSession]
+    ) -> None:
+        self.name = f"{kind} capture {path}"
         self.skipped: Counter[str] = Counter()
-        self._path = path
+        self._path, self._open_session = path, open_session
         with self._open() as file:
-            if file.readline(len(FIRST_LINE) + 2).rstrip("\r\n") != FIRST_LINE:
-                raise RecordingError(
-                    "not a UCI capture", where=str(path), valid="a file of parameter capture"
-                )
+            if file.readline(len(first_line(kind)) + 2).rstrip("\r\n") != first_line(kind):
+                valid = "a file of parameter capture"
+                raise RecordingError(f"not a capture of source {kind.lower()}", where=str(path), valid=valid)
 
     def __iter__(self) -> Iterator[Record]:
         self.skipped.clear()
-        boards: dict[int, UciSession] = {}
-        reported: set[int] = set()
+        boards: dict[int, CapturedSession] = {}
         now_ns = 0
         with self._open() as file:
             number = 0
@@ -113,34 +130,21 @@ class UciCapture(Source):
                     if not words or words[0].startswith("#"):
                         continue
                     if words[0] == "board":
-                        settings = _settings(line.split(maxsplit=2)[2])
-                        board, session = int(words[1]), UciSession(settings)
-                        boards[board] = session
+                        session = self._open_session(json.loads(line.split(maxsplit=2)[2]))
+                        boards[int(words[1])] = session
                         session.opened(now_ns)
-                        (reported.add if settings.delivers else reported.discard)(board)
                         continue
                     seconds, board_text, direction, digits = words
-                    now_ns, board, data = (
-                        round(float(seconds) * NS_PER_S),
-                        int(board_text),
-                        bytes.fromhex(digits),
-                    )
-                    session = boards[board]
+                    now_ns, data = round(float(seconds) * NS_PER_S), bytes.fromhex(digits)
+                    session = boards[int(board_text)]
                 except (ValueError, KeyError, IndexError, TypeError, OverflowError, ParameterError) as error:
                     raise DamagedRecordingError(
                         "the capture is damaged", where=f"{self._path}, line {number}"
                     ) from error
                 if direction == "<":
-                    yield from self._records(session, data, now_ns, board in reported)
-            for board, session in boards.items():
-                yield from self._records(session, b"", now_ns + _TAIL_NS, board in reported)
-
-    def _records(self, session: UciSession, data: bytes, now_ns: int, reported: bool) -> Iterator[Record]:
-        measurements = session.receive(data, now_ns, now_ns)
-        # The commands of the replayed session repeat the captured ones.
-        session.outgoing()
-        if reported:
-            yield from (Record(measurement) for measurement in measurements)
+                    yield from _records(session, data, now_ns)
+            for session in boards.values():
+                yield from _records(session, b"", now_ns + _TAIL_NS)
 
     def _open(self) -> IO[str]:
         try:
@@ -149,10 +153,9 @@ class UciCapture(Source):
             raise RecordingError(f"cannot be read: {error.strerror}", where=str(self._path)) from error
 
 
-def _settings(text: str) -> UciSettings:
-    values = json.loads(text)
-    values |= {"role": Role[values["role"]], "peers": tuple(map(int, values["peers"]))}
-    values.pop("identify", None)  # of earlier versions
-    settings = UciSettings(**values)
-    settings.check()
-    return settings
+def _records(session: CapturedSession, data: bytes, now_ns: int) -> Iterator[Record]:
+    measurements = session.receive(data, now_ns, now_ns)
+    # The commands of the replayed session repeat the captured ones.
+    session.outgoing()
+    if session.delivers:
+        yield from map(Record, measurements)

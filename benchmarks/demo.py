@@ -1,6 +1,6 @@
 """`make demo`: replay a recording through `driver` and `mitigator`, two processes over DDS, and show it live.
 
-python -m uwb_mitigation.commands.entry demo [--recording PATH] [--rate FACTOR]
+python -m benchmarks demo [--recording PATH] [--rate FACTOR]
 """
 
 from __future__ import annotations
@@ -9,19 +9,19 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rich.console import Console
 from rich.live import Live
 
+from benchmarks.equipment.processes import NodeProcesses, run_demo
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.nodes.monitor import REFRESH_HZ, Monitor, live_table, summary
 from uwb_mitigation.nodes.support import endpoints
-from uwb_mitigation.nodes.support.processes import NodeProcesses, run_demo, spinning_node
+from uwb_mitigation.nodes.support.spinning import spinning_node
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import AnchorMap, dump_anchors
@@ -178,28 +178,9 @@ def watch(plan: DemoPlan, console: Console) -> list[str]:
     return nodes.failures
 
 
-def demo(
-    recording: Annotated[
-        Path | None,
-        typer.Option(help="DecaRanging log, folder of logs, or MCAP bag. Default: a simulated recording."),
-    ] = None,
-    rate: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=10_000.0,
-            help="Speed of the replay relative to the recording; 0: total duration of about 15 s.",
-        ),
-    ] = 0.0,
-) -> None:
-    """Replay a recording through driver and mitigator, show it live, and print a summary."""
-    code = run_demo(
+def main(recording: Path | None, rate: float) -> int:
+    """Run the demo of a recording or of the simulator; return the exit code."""
+    return run_demo(
         "demo",
         lambda console: watch(simulated(rate) if recording is None else recorded(recording, rate), console),
     )
-    raise typer.Exit(code)
-
-
-def run_demo_command() -> None:
-    """Run the demo with the options of the command line."""
-    typer.run(demo)

@@ -12,21 +12,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import NoReturn, TypeVar
+from typing import NoReturn
 
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.nodes.support.spinning import spin
-
-NodeT = TypeVar("NodeT", bound=Node)
 
 TIMEOUT_S = 30.0
 ENTRY = "uwb_mitigation.commands.entry"
@@ -111,24 +103,6 @@ def wait(
         if time.monotonic() > deadline or any(process.poll() is not None for process in processes):
             raise UwbMitigationError(failure)
         time.sleep(0.001)
-
-
-@contextmanager
-def spinning_node(make_node: Callable[[Context], NodeT]) -> Iterator[NodeT]:
-    """Yield a node in its own ROS context, spun by a thread until the block ends."""
-    context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = make_node(context)
-    stop = threading.Event()
-    thread = threading.Thread(target=spin, args=(node, stop), name="probe", daemon=True)
-    thread.start()
-    try:
-        yield node
-    finally:
-        stop.set()
-        thread.join()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
 
 
 class NodeProcesses:

@@ -1,0 +1,362 @@
+"""Boards that print ranges as text: the source `lines`, and `pans` for a DWM1001 with its factory firmware."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import ros_harness
+from port_events import PortEvents, wait_until
+from ros_harness import diagnostic_values
+from typer.testing import CliRunner
+from uwb_mitigation_msgs.msg import RangeCir
+
+from benchmarks.equipment.emulated_board import PseudoTerminal
+from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
+from uwb_mitigation.commands import cli
+from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.radios import lines, uci
+from uwb_mitigation.radios.lines import LineSession, LineSettings, UdpAddress
+from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.recordings.mapping.mapped import MappedRecording
+from uwb_mitigation.recordings.mapping.mapping import FieldRule, Mapping, load_mapping
+from uwb_mitigation.types.measurement import RangeMeasurement
+
+MAPPINGS = {"pans": "dwm1001_pans", "at": "string_at", "json": "string_json", "cli": "dwm3001_cli"}
+LEC = "DIST,2,AN0,022E,7.94,8.03,0.00,3.44,AN1,9280,7.95,0.00,-1.20,15.68,POS,6.95,5.37,-1.97,52"
+LES = "022E[7.94,8.03,0.00]=3.44 9280[7.95,0.00,-1.20]=15.68 le_us=3082 est[6.97,5.17,-1.77,53]"
+DEFAULTS = {row.name: row.default for row in DRIVER}
+S = 10**9
+
+
+def value_of(**changes: object) -> Callable[[str], object]:
+    return (DEFAULTS | {"source": "lines"} | changes).__getitem__
+
+
+def read(session: LineSession, text: str | bytes, stamp_ns: int = 5) -> list[tuple[int, int, float]]:
+    data = text.encode() if isinstance(text, str) else text
+    return [(m.tag_id, m.anchor_id, round(m.range_m, 4)) for m in session.receive(data, 0, stamp_ns)]
+
+
+def session_of(name: str, number: int = 0) -> LineSession:
+    session = LineSession(load_mapping(name), number)
+    assert read(session, "the rest of a line\n") == []
+    assert session.counts["lines"] == 0
+    return session
+
+
+# Lines -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("line", [LEC, LES, f"dwm> {LES}", LEC.partition(",POS")[0]])
+def test_both_shell_commands_of_a_dwm1001_are_read(line: str):
+    assert read(session_of("dwm1001_pans"), line + "\r\n") == [(1, 0x022E, 3.44), (1, 0x9280, 15.68)]
+
+
+@pytest.mark.parametrize(
+    ("line", "ranges"),
+    [
+        (LEC.replace("15.68", "15.6"), [(1, 0x022E, 3.44)]),
+        (LEC.replace("3.44", "344"), [(1, 0x9280, 15.68)]),
+        (LEC[:70] + LEC, [(1, 0x022E, 3.44), (1, 0x022E, 3.44), (1, 0x9280, 15.68)]),
+        (LEC.replace("022E,", "022E"), [(1, 0x9280, 15.68)]),
+        ("POS,6.95,5.37,-1.97,52", []),
+    ],
+)
+def test_cut_and_mixed_lines_give_no_wrong_range(line: str, ranges: list[tuple[int, int, float]]):
+    assert read(session_of("dwm1001_pans"), line + "\n") == ranges
+
+
+def test_a_timeout_of_the_cli_image_is_counted_and_not_a_range():
+    session = session_of("dwm3001_cli")
+    text = ' [mac_address=0x0001, status="SUCCESS", distance[cm]=245, loc_az=1.5, RSSI[dBm]=-66.5];\r\n'
+    assert read(session, text + ' [mac_address=0x0002, status="RX_TIMEOUT"]}\r\n') == [(1, 1, 2.45)]
+    assert read(session, '{"Block":1, "results":[{"Addr":"0xdc4c","Status":"Ok","D_cm":42}]}\n') == [
+        (1, 0xDC4C, 0.42)
+    ]
+    assert session.counts["status differs ['SUCCESS', 'Ok']"] == 1
+    assert session.counts["lines that do not match"] == 0
+
+
+def test_boards_without_an_own_id_are_different_tags():
+    assert read(session_of("dwm1001_pans", 2), LEC + "\n")[0] == (3, 0x022E, 3.44)
+    assert read(session_of("string_json", 2), '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4}]}\n') == [
+        (7, 1, 4.0)
+    ]
+
+
+def test_hostile_bytes_are_counted_and_the_next_line_is_read():
+    session = session_of("string_json")
+    good = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}\n'
+    hostile = [
+        b"\xff\xfe\x00\x01",
+        b"[" * 60_000,
+        b"x" * 300_000,
+        good[:30].encode(),
+        b'"x"',
+        b"null",
+        b"9" * 5000,
+    ]
+    hostile += [
+        f'{{"tag": 1, "ranges": [{{"anchor": 1, "range_m": {value}}}]}}'.encode()
+        for value in ("[1]", '"a"', "{}")
+    ]
+    for data in hostile:
+        assert read(session, data) == []
+        assert read(session, b"\n" + good.encode()) == [(7, 1, 4.31)]
+    values = ("NaN", "1e400", "-Infinity", "1e30", "null")
+    ranges = ",".join(f'{{"anchor": {n}, "range_m": {value}}}' for n, value in enumerate(values))
+    assert read(session, f'{{"tag": 7, "ranges": [{ranges}]}}\n') == []
+    assert session.counts["range is not a number"] + session.counts["range is above 10000"] == len(values)
+    assert (session.counts["lines that do not match"], session.counts["lines that are too long"]) == (9, 1)
+    assert session.example.startswith('\'{"tag": 1, "ranges": [')
+    assert len(session._rest) <= lines.MAX_LINE
+
+
+@pytest.mark.parametrize("name", MAPPINGS.values())
+@pytest.mark.parametrize(
+    "text", ["a", "0", "a:", "a: (", "{", " ", "AN0,", "0.00,", "mac_address=0x1,", "022E["]
+)
+def test_a_long_line_takes_no_more_steps_than_its_length(name: str, text: str):
+    # A search that is quadratic would take minutes.
+    session = session_of(name)
+    assert read(session, text * (60_000 // len(text)) + "\n" + LEC[:5] + "\n") == []
+    assert session.counts["lines"] == 1 + bool(text.strip())
+
+
+def test_the_stamp_is_that_of_the_first_byte_unless_the_mapping_gives_a_time():
+    session = session_of("string_json")
+    good = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}'
+    assert read(session, good[:20], 100) == []
+    stamps = [m.stamp_ns for m in session.receive(f"{good[20:]}\n{good}\n{good}".encode(), 0, 200)]
+    stamps += [m.stamp_ns for m in session.receive(b"\n", 0, 300)]
+    assert stamps == [100, 200, 200]
+    document = {"name": "x", "pattern": r"(?P<t>\d+) (?P<a>\d+) (?P<r>[\d.]+)"}
+    fields = {"stamp": {"column": "t", "unit": "ms"}, "anchor": "a", "range": "r"}
+    timed = LineSession(Mapping.model_validate(document | {"fields": fields}), has_datagrams=True)
+    assert [m.stamp_ns for m in timed.receive(b"7000 2 1.5", 0, 100 * S)] == [7 * S]
+    assert timed.stamp_offset_s == -93.0
+
+
+def test_a_log_and_a_live_port_give_the_same_ranges(tmp_path: Path):
+    text = f"dwm> lec\n{LEC}\nnoise\n{LEC.replace('3.44', '3.45')}\n"
+    path = tmp_path / "lec.log"
+    path.write_text(text)
+    mapping = load_mapping("dwm1001_pans")
+    fields = mapping.fields.model_copy(update={"stamp": FieldRule(rate_hz=10)})
+    log = MappedRecording(timed := mapping.model_copy(update={"fields": fields}), path)
+    recorded = [(r.measurement.anchor_id, r.measurement.range_m) for r in log]
+    session = LineSession(timed, has_datagrams=True)
+    live = [(m.anchor_id, m.range_m) for m in session.receive(text.encode(), 0, 7 * S)]
+    assert (recorded, len(recorded)) == (live, 4)
+    assert session.stamp_offset_s == 0.0, "the number of the row is no time of a live line"
+    assert log.anchors.anchors[log.anchors.index[0x9280]].position == (7.95, 0.0, -1.2)
+
+
+# Settings --------------------------------------------------------------------------------------------------------
+
+
+def test_settings():
+    first, second = lines.read_settings(value_of(port="/dev/a,udp:10.0.0.1:8000", map="string_at"))
+    assert (first.address, first.number, first.baud) == (PortAddress("/dev/a"), 0, 115_200)
+    assert (str(second.address), second.number) == ("udp:10.0.0.1:8000", 1)
+    (board,) = lines.read_settings(value_of(source="pans", port="/dev/a"))
+    assert board.mapping.name == "DWM1001 PANS"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"port": "/dev/a"}, "parameter map is empty"),
+        ({"port": "", "map": "string_at"}, "parameter port is empty"),
+        ({"port": "udp:x", "map": "string_at"}, "udp:ADDRESS:PORT"),
+        ({"port": "udp:70000", "map": "string_at"}, "udp:ADDRESS:PORT"),
+        ({"port": "/dev/a", "map": "ewine"}, "is for recordings or topics"),
+        ({"port": "/dev/a", "map": "string_at", "baud": 3}, "parameter baud = 3"),
+        ({"port": "/dev/a", "map": "string_aT"}, "did you mean 'string_at'"),
+    ],
+)
+def test_invalid_settings_are_refused(changes: dict[str, object], message: str):
+    with pytest.raises(ParameterError, match=message):
+        lines.read_settings(value_of(**changes))
+
+
+# Ports -----------------------------------------------------------------------------------------------------------
+
+
+def open_board(path: Path, kind: str, **settings: object) -> PortEvents:
+    return PortEvents(lines, LineSettings(PortAddress(str(path)), load_mapping(MAPPINGS[kind]), **settings))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_board_vanishes_and_returns(tmp_path: Path, kind: str):
+    with (
+        TextBoards(kind, links=tmp_path / "b", rate_hz=50.0) as boards,
+        open_board(tmp_path / "b0", kind) as events,
+    ):
+        events.wait_for(lambda event: isinstance(event, RangeMeasurement) and event.range_m > 0, 8)
+        boards.inject(0, b"\xff\x00garbage\r\n" + b"A" * 100_000 + b"\n")
+        boards.unplug(0)
+        wait_until(lambda: "not there" in events.port.report().problem)
+        boards.plug(0)
+        wait_until(lambda: not events.port.problem)
+        measured = events.wait_for(RangeMeasurement, 8)
+        assert {round(m.range_m) for m in measured} <= {round(true) for true in boards.true_ranges_m}
+        assert events.port.report().warning == ""
+
+
+@pytest.mark.parametrize("state", ["generic", "shell", "lec", "les"])
+def test_the_output_of_a_dwm1001_is_on_in_whatever_state_it_was(tmp_path: Path, state: str):
+    with TextBoards(links=tmp_path / "b", rate_hz=50.0) as boards:
+        shell = boards.shells[0]
+        if state != "generic":
+            shell.receive(b"\r\r", 0.0)
+            shell.output = state if state != "shell" else ""
+        with open_board(tmp_path / "b0", "pans") as events:
+            events.wait_for(RangeMeasurement, 8)
+            # It stays on: a second `lec` would turn it off.
+            events.wait_for(RangeMeasurement, 100)
+            assert events.port.session.counts["starts of the output"] == (state in ("generic", "shell"))
+            boards.reset(0)
+            events.wait_for(RangeMeasurement, 400)
+            assert boards.shells[0].output == "lec"
+
+
+def test_the_start_of_the_output_needs_neither_a_banner_nor_a_known_state():
+    """In virtual time: a shell without banner whose output someone turns off, after more than a minute."""
+    session, shell, now_ns = LineSession(load_mapping("dwm1001_pans")), PansShell(banner=""), 0
+    shell.receive(b"\r\r", 0.0)
+    session.opened(0)
+
+    def run(seconds: float) -> list[RangeMeasurement]:
+        nonlocal now_ns
+        ranges: list[RangeMeasurement] = []
+        for _ in range(round(seconds * 10)):
+            now_ns += S // 10
+            answer = shell.receive(session.outgoing(), now_ns / S)
+            ranges += session.receive(
+                answer + (f"{LEC}\r\n".encode() if shell.output else b""), now_ns, now_ns
+            )
+        return ranges
+
+    assert len(run(10.0)) > 100
+    shell.output = ""
+    assert len(run(40.0)) == 0
+    assert len(run(40.0)) > 20
+
+
+def test_a_dwm1001_that_is_silent_for_a_while_is_not_turned_off(tmp_path: Path):
+    with (
+        TextBoards(links=tmp_path / "b", rate_hz=50.0) as boards,
+        open_board(tmp_path / "b0", "pans") as events,
+    ):
+        events.wait_for(RangeMeasurement, 8)
+        boards.silent = True
+        wait_until(lambda: events.port.session._pause_ns > 4 * lines.FIRST_PAUSE_NS)
+        assert boards.shells[0].output == "lec"
+        boards.silent = False
+        events.wait_for(RangeMeasurement, 300)
+
+
+def test_a_board_without_ranges_is_explained(tmp_path: Path):
+    terminal = PseudoTerminal(tmp_path / "b0")
+    terminal.plug()
+    with open_board(tmp_path / "b0", "at") as events:
+        wait_until(lambda: events.port.device)
+        assert "no range yet: nothing was received; is the baud rate 115200" in events.port.report().warning
+        terminal.write(bytearray(b"x\nrst:0x1 (POWERON_RESET)\n"))
+        wait_until(
+            lambda: "do not match the mapping AT+RANGE, such as 'rst:0x1" in events.port.report().warning
+        )
+        assert events.port.report().values["lines that do not match"] == 1
+    terminal.unplug()
+
+
+def test_datagrams_are_received(tmp_path: Path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        number = probe.getsockname()[1]
+    address = UdpAddress(host="127.0.0.1", number=number)
+    settings = LineSettings(address, load_mapping("string_json"))
+    with TextBoards("json", udp=("127.0.0.1", number), rate_hz=50.0), PortEvents(lines, settings) as events:
+        events.wait_for(RangeMeasurement, 8)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for data in (b"", b"\xff" * 60_000, b'{"tag": 9, "ranges": [{"anchor": 3, "range_m": 1.5}]}'):
+                sender.sendto(data, ("127.0.0.1", number))
+        (measured,) = events.wait_for(lambda event: getattr(event, "tag_id", 0) == 9)
+        assert (measured.range_m, events.port.openings) == (1.5, 1)
+        with PortEvents(lines, settings) as second:
+            wait_until(lambda: "Address already in use" in second.port.problem)
+
+
+def test_a_capture_replays_the_ranges_also_with_another_mapping(tmp_path: Path):
+    path = tmp_path / "capture.txt"
+    with (
+        TextBoards(links=tmp_path / "b", rate_hz=50.0),
+        open_board(tmp_path / "b0", "pans", capture=path) as events,
+    ):
+        measured = events.wait_for(RangeMeasurement, 40)
+    replayed = [r.measurement.range_m for r in lines.open_capture(path, value_of())]
+    assert replayed[:40] == [m.range_m for m in measured]
+    assert b"lec".hex() in path.read_text()
+    assert not list(lines.open_capture(path, value_of(map="string_at")))
+    with pytest.raises(RecordingError, match="not a capture of source uci"):
+        uci.open_capture(path)
+    path.write_text('# uwb_mitigation lines capture 1\nboard 0 {"mapping": 3}\n')
+    with pytest.raises(DamagedRecordingError):
+        list(lines.open_capture(path, value_of()))
+
+
+# The driver ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.ros
+def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_path: Path):
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    with TextBoards(boards=2, links=tmp_path / "b") as boards:
+        began = time.time()
+        node = ros.start(
+            "driver", "source:=pans", f"port:={tmp_path}/b0,{tmp_path}/b1", f"capture:={tmp_path}/c.txt"
+        )
+        ros.spin_until(lambda: {message.tag_id for message in raw} == {1, 2} and len(raw) > 40, 60.0)
+        message = next(message for message in raw if message.anchor_id == 0x9280)
+        assert message.range == pytest.approx(boards.true_ranges_m[1], abs=0.15)
+        assert (len(message.cir.samples), message.header.stamp.sec >= int(began)) == (0, True)
+        status = ros.diagnosis("driver", lambda status: status.message == "receiving")
+        assert diagnostic_values(status)["radio 1: mapping"] == "DWM1001 PANS"
+        assert node.output.count("DWM1001 PANS at /") == 2
+        assert node.signal(signal.SIGINT) == 0, node.output
+    raw.clear()
+    ros.start("driver", "source:=pans", f"path:={tmp_path}/c.txt", "rate:=20.0")
+    ros.spin_until(lambda: len(raw) > 40, 60.0)
+
+
+def test_field_report_of_a_board_without_cirs(tmp_path: Path):
+    command = [
+        "field-report",
+        "--source",
+        "pans",
+        "--port",
+        str(tmp_path / "b0"),
+        "--distance",
+        "3",
+        "--seconds",
+        "3",
+    ]
+    files = ["--no-unplug", "-o", str(tmp_path / "out.zip"), "--json", str(tmp_path / "out.json")]
+    with TextBoards(links=tmp_path / "b", distance_m=3.0):
+        result = CliRunner().invoke(cli.app, [*command, *files])
+    checks = {check["name"]: check for check in json.loads((tmp_path / "out.json").read_text())["checks"]}
+    assert [name for name, check in checks.items() if check["verdict"] == "fail"] == [], result.output
+    assert "share of ranges with CIR" not in checks
+    assert checks["ids"]["value"] == "tag 1, anchor 558"
+    with zipfile.ZipFile(tmp_path / "out.zip") as archive:
+        archive.extract("capture.txt", tmp_path)
+    assert len(list(lines.open_capture(tmp_path / "capture.txt", value_of()))) > 10

@@ -1,0 +1,181 @@
+"""Nodes as a robot uses them, over DDS, each with what must not happen.
+
+Other cases are tested elsewhere: all transitions of the driver, a paused clock, a model that is swapped while driving, and
+publishers with another QoS (`test_reliability`), two tags and a best-effort height (`test_locator`), Ctrl-C with a board in
+each of its states (`test_serial_driver`), during imports and at the start (`test_entry`), several pipelines (`test_pipeline`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import signal
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
+
+from builtin_interfaces.msg import Time
+from drives import HALL, drive
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.msg import Transition
+from ros_harness import Ros
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
+from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+
+from uwb_mitigation.types.anchors import dump_anchors
+
+pytestmark = pytest.mark.ros
+
+NS = 10**9
+UP = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+DOWN = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+STATES = {
+    "unconfigured": (),
+    "inactive": UP[:1],
+    "active": UP,
+    "finalized": (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,),
+}
+SIMULATED = ("source:=simulated", "simulated_rate:=100.0", "start_delay:=0.0")
+
+
+@pytest.fixture
+def anchors(tmp_path: Path) -> Path:
+    path = tmp_path / "anchors.yaml"
+    path.write_text(dump_anchors(HALL))
+    return path
+
+
+def stamp(time_ns: int) -> Time:
+    return Time(sec=time_ns // NS, nanosec=time_ns % NS)
+
+
+def raw_range(tag: int, sequence: int, range_m: float, time_ns: int = 0) -> RangeCir:
+    """Return a range without a CIR: the mitigator subtracts exactly the offset."""
+    message = RangeCir(header=Header(stamp=stamp(time_ns)), tag_id=tag, anchor_id=1, sequence=sequence)
+    message.range = range_m
+    return message
+
+
+def test_a_manager_takes_all_nodes_of_one_process_up_and_down_twice(ros: Ros, anchors: Path):
+    nodes = ("driver", "mitigator", "locator")
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    process = ros.start("pipeline", *SIMULATED, f"anchors:={anchors}", "autostart:=false")
+    for _ in range(2):
+        # The order of Nav2's manager: all are configured, then all are activated, and the reverse.
+        for transition, node in itertools.product(UP, nodes):
+            assert ros.change_state(node, transition), process.output
+        ros.spin_until(lambda: len(corrected) > 20)
+        assert ros.change_state("mitigator", DOWN[0])
+        ros.spin_for(0.5)
+        corrected.clear()
+        ros.spin_for(0.5)
+        assert corrected == [], "an inactive mitigator must not publish"
+        assert ros.state_of("driver") == "active", "the others must not follow"
+        assert ros.change_state("mitigator", UP[1])
+        ros.spin_until(lambda: len(corrected) > 20)
+        for transition, node in itertools.product(DOWN, reversed(nodes)):
+            assert ros.change_state(node, transition), process.output
+        ros.spin_for(0.5)
+        corrected.clear()
+        ros.spin_for(0.5)
+        assert corrected == [], "nodes that were taken down must not publish"
+    for node in nodes:
+        assert ros.change_state(node, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+    assert process.exit_code() is None, "a transition must not end the process"
+    assert process.signal(signal.SIGINT) == 0
+    assert "Traceback" not in process.output
+
+
+def test_a_simulated_clock_that_jumps_neither_stops_positions_nor_mixes_their_times(ros: Ros, anchors: Path):
+    poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
+    clock = ros.node.create_publisher(Clock, "/clock", 10)
+    publisher = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 1000)
+    node = ros.start("locator", f"anchors:={anchors}", "use_sim_time:=true", "rate:=0.0")
+    ros.wait_for_subscribers("/uwb/range_corrected", 1)
+    ranges, truth = drive(seconds=10)
+    for start_s in (1000, 5000, 200):  # one hour ahead, and back, as a bag that is played again
+        poses.clear()
+        rounds = itertools.count()
+
+        def played(start_s: int = start_s, rounds: itertools.count = rounds) -> bool:
+            """Publish a fifth of a second."""
+            begin = next(rounds) * 0.2
+            for row in np.flatnonzero(
+                (ranges.stamp_ns / NS % 10 >= begin) & (ranges.stamp_ns / NS % 10 < begin + 0.2)
+            ):
+                time_ns = start_s * NS + int(ranges.stamp_ns[row])
+                clock.publish(Clock(clock=stamp(time_ns)))
+                fields = {"tag_id": 7, "anchor_id": HALL.anchors[ranges.anchor[row]].id, "variance": 0.01}
+                range_m = float(ranges.range_m[row])
+                publisher.publish(
+                    RangeCorrected(header=Header(stamp=stamp(time_ns)), range=range_m, **fields)
+                )
+            ros.spin_for(0.05)
+            return begin > 9.0 and len(poses) > 50
+
+        ros.spin_until(played, 120.0)
+        times_ns = np.array([pose.header.stamp.sec * NS + pose.header.stamp.nanosec for pose in poses])
+        new = times_ns // NS - start_s
+        assert ((new >= 0) & (new <= 11)).sum() > 50
+        assert not ((new > 11) & (new < 3000)).any(), "no position of a time that was never played"
+        used = [pose for pose, second in zip(poses, new, strict=True) if 5 <= second < 10]
+        places = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in used])
+        stamps = np.array([pose.header.stamp.sec * NS + pose.header.stamp.nanosec for pose in used])
+        errors_m = np.hypot(*(places - truth.position_at(stamps - start_s * NS)[:, :2]).T)
+        assert np.nanmedian(errors_m) < 0.5, "the position before the jump must not hold the new one"
+    assert node.signal(signal.SIGINT) == 0, node.output
+
+
+def test_offsets_that_change_while_two_tags_drive_lose_and_mix_no_range(ros: Ros):
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    node = ros.start("mitigator", "offsets:=0.125")
+    publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 1000)
+    ros.find_each_other(publisher, raw_range(1, 0, 5.0), corrected)
+    sequence = itertools.count(1)
+    sent: dict[int, list[int]] = defaultdict(list)
+
+    def drive_on(count: int) -> None:
+        for _, tag in itertools.product(range(count), (1, 2)):
+            sent[tag].append(number := next(sequence))
+            publisher.publish(raw_range(tag, number, 5.0 + tag))
+        ros.spin_for(0.05)
+
+    for offset, is_valid in [
+        (0.25, True),
+        ("absent.yaml", False),
+        (0.5, True),
+        ("nan", False),
+        (0.125, True),
+    ]:
+        drive_on(50)
+        assert ros.set_parameter("mitigator", "offsets", offset).successful == is_valid
+    drive_on(50)
+    ros.spin_until(lambda: len(corrected) >= sum(map(len, sent.values())))
+    for tag, numbers in sent.items():
+        messages = [message for message in corrected if message.tag_id == tag]
+        assert [message.sequence for message in messages] == numbers, "no range must be lost or repeated"
+        assert {message.range_raw for message in messages} == {5.0 + tag}, "tags must not be mixed"
+        assert {message.correction for message in messages} == {0.125, 0.25, 0.5}, (
+            "only offsets that were set"
+        )
+    assert node.signal(signal.SIGINT) == 0, node.output
+
+
+@pytest.mark.parametrize("node", ["driver", "mitigator", "locator", "pipeline", "viewer"])
+def test_ctrl_c_ends_a_node_in_every_state_without_a_traceback(ros: Ros, anchors: Path, node: str):
+    options = {"driver": SIMULATED, "pipeline": (*SIMULATED, f"anchors:={anchors}"), "viewer": ("port:=0",)}
+    given = options.get(node, (f"anchors:={anchors}",) if node == "locator" else ())
+    names = ("driver", "mitigator", "locator") if node == "pipeline" else (node,)
+    for state, transitions in STATES.items():
+        process = ros.start(node, *given, "autostart:=false")
+        for name, transition in itertools.product(names, transitions):
+            assert ros.change_state(name, transition), process.output
+        assert {ros.state_of(name) for name in names} == {state}
+        assert process.signal(signal.SIGINT) == 0, (state, process.output)
+        assert "Traceback" not in process.output, state
+        # The graph forgets a node that has ended.
+        ros.spin_until(lambda: not set(names) & set(ros.node.get_node_names()))

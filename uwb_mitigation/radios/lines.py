@@ -1,0 +1,395 @@
+"""Sources `lines` and `pans`: boards that print their ranges as text, on serial ports or UDP, read with a mapping file.
+
+`pans` is a DWM1001 with its factory firmware, which the mapping `dwm1001_pans` describes.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
+from uwb_mitigation.radios.capture import Capture, CaptureWriter
+from uwb_mitigation.radios.port import (
+    ExchangeMonitor,
+    OnEvent,
+    PortAddress,
+    PortMessage,
+    PortReport,
+    StreamPort,
+)
+from uwb_mitigation.radios.settings import ValueReader, read_baud, read_ports
+from uwb_mitigation.recordings.mapping.live import LiveConverter
+from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
+from uwb_mitigation.recordings.mapping.tables import UNREADABLE
+from uwb_mitigation.types.measurement import RangeMeasurement
+
+MAX_LINE = 1 << 16
+"""Size after which a line is discarded."""
+
+REOPEN_NS = 70 * 10**9
+"""Time without data after which the port is opened again; some tags report once a minute while they do not move."""
+
+FIRST_PAUSE_NS, MAX_PAUSE_NS = 10**9, 30 * 10**9
+"""Time without a range before the output is started, and longest time until the next try, which doubles."""
+
+MAX_WAKES = 7
+"""Number of tries without a range, after more than a minute, after which the board is treated as after its connection."""
+
+MAX_STAMP_OFFSET_S = 1.0
+"""A larger difference between the stamps of a board and the clock of this computer is a warning."""
+
+_MAX_ANSWER = 1024
+_LINES, _NO_MATCH, _TOO_LONG = "lines", "lines that do not match", "lines that are too long"
+_STARTS = "starts of the output"
+_LINE_COUNTS = (_LINES, _NO_MATCH, _TOO_LONG, _STARTS)
+
+
+@dataclass(frozen=True)
+class UdpAddress(PortAddress):
+    """An address at which datagrams are received, instead of a serial port; each ends a line.
+
+    Attributes:
+        host: address of this computer; empty: all.
+        number: of the UDP port.
+    """
+
+    host: str = ""
+    number: int = 0
+
+    def __str__(self) -> str:
+        return f"udp:{self.host}:{self.number}" if self.host else f"udp:{self.number}"
+
+    def find(self) -> str | None:
+        return str(self)
+
+    def open(self, baud: int = 0, dtr: bool = True) -> Any:
+        receiver = _UdpSocket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        try:
+            receiver.bind((self.host, self.number))
+        except OSError as error:
+            receiver.close()
+            raise LinkError(f"cannot be opened: {error.strerror or error}", where=str(self)) from error
+        receiver.port = str(self)
+        return receiver
+
+
+class _UdpSocket(socket.socket):
+    port = ""
+
+    def set_low_latency_mode(self, _: bool) -> None:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, slots=True)
+class LineSettings:
+    """Settings of a board.
+
+    Attributes:
+        address: address of its port.
+        mapping: where the values are in its lines.
+        number: number of the board; it is added to a constant id of the tag.
+        baud: baud rate; 0 = that of the mapping.
+        dtr: the level of DTR.
+        capture: file for the raw bytes; None = none.
+    """
+
+    address: PortAddress
+    mapping: Mapping
+    number: int = 0
+    baud: int = 0
+    dtr: bool = True
+    capture: Path | None = None
+
+
+def read_settings(value: ValueReader) -> list[LineSettings]:
+    """Return the settings of the boards at `port`; raise ParameterError if a parameter is invalid."""
+    addresses, mapping = [parse_address(port) for port in read_ports(value)], read_mapping(value)
+    capture = Path(value("capture")).expanduser() if value("capture") else None
+    baud, dtr = read_baud(value, mapping.baud), value("dtr")
+    return [
+        LineSettings(address, mapping, number, baud, dtr, capture) for number, address in enumerate(addresses)
+    ]
+
+
+def read_mapping(value: ValueReader) -> Mapping:
+    """Return the mapping of the parameters.
+
+    Raises:
+        ParameterError: there is none, or it is not for lines.
+    """
+    mapping = load_mapping(value("map") or ("dwm1001_pans" if value("source") == "pans" else ""))
+    LineSession(mapping)
+    return mapping
+
+
+def parse_address(text: str) -> PortAddress:
+    """Read `udp:PORT` or `udp:ADDRESS:PORT`, or an address of `PortAddress`; raise ParameterError for other texts."""
+    if not text.startswith("udp:"):
+        return PortAddress.parse(text)
+    host, _, port = text.removeprefix("udp:").rpartition(":")
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ParameterError(f"the port {text!r:.60}", valid="udp:PORT or udp:ADDRESS:PORT, such as udp:8000")
+    return UdpAddress(host=host, number=int(port))
+
+
+def open(
+    settings: Sequence[LineSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
+) -> list[LinePort]:
+    """Open boards; `RadioPort.close` ends them. Events are measurements and `PortMessage`.
+
+    Raises:
+        ParameterError: the file of the capture cannot be written.
+    """
+    path = settings[0].capture
+    capture = CaptureWriter(path, "lines", len(settings)) if path is not None else None
+    ports = [LinePort(board, capture, on_event, stamp_clock) for board in settings]
+    for port in ports:
+        port.start()
+    return ports
+
+
+def open_capture(path: Path, value: ValueReader) -> Capture:
+    """Open a capture as a recording; a mapping of the parameters replaces the captured one.
+
+    Raises:
+        RecordingError: it cannot be read.
+        ParameterError: the mapping is invalid.
+    """
+    mapping = read_mapping(value) if value("map") else None
+
+    def session(settings: dict[str, Any]) -> LineSession:
+        used = mapping or Mapping.model_validate(settings["mapping"])
+        return LineSession(used, int(settings["number"]), has_datagrams=bool(settings["datagrams"]))
+
+    return Capture(path, "lines", session)
+
+
+class LineSession:
+    """The host's side of a board that prints lines. No I/O.
+
+    Call `receive` after each read, and at least every second; send `outgoing`. `now_ns` is monotonic, `stamp_ns` is the
+    clock of the stamps.
+
+    Args:
+        mapping: where the values are in a line, and how the output is started.
+        number: see `LineSettings`.
+        has_datagrams: whether a line ends with each piece of data.
+
+    Attributes:
+        counts: numbers of lines and problems, and of rows that were not used, by reason.
+        example: the last line that does not match the mapping, and why; empty: none.
+        received: number of bytes since the port was opened.
+        stamp_offset_s: last stamp minus time of reception.
+
+    Raises:
+        ParameterError: the mapping is not for lines.
+    """
+
+    delivers = True
+
+    def __init__(self, mapping: Mapping, number: int = 0, *, has_datagrams: bool = False) -> None:
+        if not (mapping.pattern or mapping.text):
+            valid = "for lines: a mapping with pattern or text"
+            raise ParameterError(f"the mapping {mapping.name} is for recordings or topics", valid=valid)
+        tag = mapping.fields.tag
+        if number and isinstance(tag.constant, int):
+            tag = tag.model_copy(update={"constant": tag.constant + number})
+            fields = mapping.fields.model_copy(update={"tag": tag})
+            mapping = mapping.model_copy(update={"fields": fields})
+        self.mapping, self._start, self._has_datagrams = mapping, mapping.start, has_datagrams
+        self._converter = LiveConverter(mapping, "lines")
+        self.counts = self._converter.counts
+        self.example, self.stamp_offset_s = "", 0.0
+        self.opened(0)
+
+    def opened(self, now_ns: int) -> None:
+        """Begin with a port that was opened."""
+        self.received = 0
+        self._rest, self._rest_stamp_ns = b"", 0
+        # The port may be opened in the middle of a line.
+        self._is_partial = not self._has_datagrams
+        self._outgoing, self._answer = b"", b""
+        self._is_waking = self._was_started = self._was_reset = False
+        self._pause_ns, self._due_ns, self._wakes = FIRST_PAUSE_NS, now_ns + FIRST_PAUSE_NS, 0
+
+    @property
+    def unused(self) -> Counter[str]:
+        """Numbers of rows that were not used, by reason."""
+        return Counter({reason: count for reason, count in self.counts.items() if reason not in _LINE_COUNTS})
+
+    def outgoing(self) -> bytes:
+        """Return the bytes to send."""
+        data, self._outgoing = self._outgoing, b""
+        return data
+
+    def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
+        """Return the ranges of the lines that are complete; the stamp of a line is that of its first byte."""
+        self.received += len(data)
+        *lines, rest = re.split(
+            rb"[\r\n]", self._rest + data + (b"\n" if data and self._has_datagrams else b"")
+        )
+        stamps_ns = [self._rest_stamp_ns or stamp_ns] + [stamp_ns] * len(lines)
+        self._rest, self._rest_stamp_ns = rest, stamps_ns[len(lines)] if rest else 0
+        measurements: list[RangeMeasurement] = []
+        for line, line_stamp_ns in zip(lines, stamps_ns, strict=False):
+            if not self._is_partial and line.strip():
+                measurements += self._read(line.decode("utf-8", "replace").strip(), line_stamp_ns)
+            self._is_partial = False
+        if len(rest) > MAX_LINE:
+            self.counts[_TOO_LONG] += not self._is_partial
+            self._rest, self._rest_stamp_ns, self._is_partial = b"", 0, True
+        if self._start is not None:
+            self._converse(data, now_ns, bool(measurements))
+        return measurements
+
+    def _read(self, line: str, stamp_ns: int) -> list[RangeMeasurement]:
+        self.counts[_LINES] += 1
+        before, reason, measurements = self.counts.total(), "", []
+        try:
+            measurements = self._converter.measurements(line, "lines", stamp_ns)
+        except (RecordingError, *UNREADABLE) as error:
+            reason = f" ({getattr(error, 'what', error)!s:.60})"
+        # A row that was not used has already been counted by its reason.
+        if not measurements and self.counts.total() == before:
+            self.counts[_NO_MATCH] += 1
+            self.example = f"{line!r:.60}{reason}"
+        for measured in measurements:
+            self.stamp_offset_s = (measured.stamp_ns - stamp_ns) / 1e9
+        return measurements
+
+    def _converse(self, data: bytes, now_ns: int, has_ranges: bool) -> None:
+        """Start the output of a board without ranges."""
+        start = self._start
+        assert start is not None
+        if has_ranges:
+            self._is_waking, self._pause_ns, self._wakes = False, FIRST_PAUSE_NS, 0
+            self._due_ns = now_ns + 3 * FIRST_PAUSE_NS
+            return
+        if self._is_waking:
+            self._answer = (self._answer + data)[-_MAX_ANSWER:]
+            answer = self._answer.decode("ascii", "replace")
+            is_ready = bool(re.search(start.ready, answer))
+            if not is_ready and start.unknown and not self._was_started and re.search(start.unknown, answer):
+                # Before the reset, `command` might turn the output off.
+                is_ready = self._was_reset
+                if not is_ready:
+                    self._outgoing += start.reset.encode()
+                    self._is_waking, self._was_reset = False, True
+            if is_ready:
+                self._outgoing += start.command.encode()
+                self._is_waking, self._was_started = False, True
+                self.counts[_STARTS] += 1
+        if now_ns >= self._due_ns:
+            self._wakes += 1
+            if self._wakes == MAX_WAKES:
+                self._was_started = self._was_reset = False
+                self._pause_ns = FIRST_PAUSE_NS
+            self._outgoing += start.wake.encode()
+            self._is_waking, self._answer = True, b""
+            self._due_ns = now_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, MAX_PAUSE_NS)
+
+
+class LinePort(StreamPort):
+    """Operates one board until `close`. See `open`.
+
+    Args:
+        settings, on_event, stamp_clock: see `open`.
+        capture: stores the raw bytes; None = not stored.
+
+    Attributes:
+        session: the state of the board.
+    """
+
+    def __init__(
+        self,
+        settings: LineSettings,
+        capture: CaptureWriter | None,
+        on_event: OnEvent,
+        stamp_clock: Callable[[], int],
+    ) -> None:
+        self._settings = settings
+        self._baud = settings.baud or settings.mapping.baud
+        self._is_udp = isinstance(settings.address, UdpAddress)
+        self.session = LineSession(settings.mapping, settings.number, has_datagrams=self._is_udp)
+        super().__init__(
+            settings.address,
+            on_event,
+            ExchangeMonitor({}),
+            stamp_clock=stamp_clock,
+            baud=self._baud,
+            dtr=settings.dtr,
+            capture=capture,
+            number=settings.number,
+        )
+        self._received_ns, self._has_ranges = 0, False
+        self._empty_read_is_loss = not self._is_udp
+
+    def apply(self, settings: LineSettings) -> None:
+        """Change nothing: no parameter of this source is live."""
+
+    def report(self) -> PortReport:
+        """Return the present state."""
+        with self._lock:
+            session = self.session
+            values: dict[str, object] = {"mapping": session.mapping.name} | dict(session.counts)
+            if session.example:
+                values["last line that does not match"] = session.example
+            values |= {"bytes": session.received, "openings": self.openings}
+            hardware = f"{session.mapping.name} at {self._address}"
+            return PortReport(self.device, hardware, self.problem, self._warning(), "receiving", values)
+
+    def _warning(self) -> str:
+        session, text = self.session, self.monitor.warning(time.monotonic())
+        if text and not session.received:
+            remedy = (
+                "is the sender's address right?" if self._is_udp else f"is the baud rate {self._baud} right?"
+            )
+            return f"{text}: nothing was received; {remedy}"
+        if text and session.example:
+            count = session.counts[_NO_MATCH]
+            return f"{text}: {count} lines do not match the mapping {session.mapping.name}, such as {session.example}"
+        if text and (reasons := session.unused):
+            reason, count = reasons.most_common(1)[0]
+            return f"{text}: {count} rows were not used: {reason}"
+        if not text and abs(session.stamp_offset_s) > MAX_STAMP_OFFSET_S:
+            remedy = "leave fields.stamp out to use the time of reception"
+            return f"the stamps of the board differ by {session.stamp_offset_s:.1f} s from this computer's clock; {remedy}"
+        return text
+
+    def _opened(self, now_ns: int) -> list[Any]:
+        if self._capture is not None:
+            mapping = self._settings.mapping.model_dump(mode="json", exclude_unset=True)
+            settings = {"number": self._number, "datagrams": self._is_udp, "mapping": mapping}
+            self._capture.add_board(self._number, settings)
+        self._received_ns, self._has_ranges = now_ns, False
+        self.session.opened(now_ns)
+        self.monitor.reset()
+        return []
+
+    def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
+        if data:
+            self._received_ns, self._was_connected = now_ns, True
+        elif not self._is_udp and now_ns - self._received_ns > REOPEN_NS:
+            raise LinkError("sends no data", where=str(self._address))
+        measurements: list[Any] = [*self.session.receive(data, now_ns, stamp_ns)]
+        if measurements and not self._has_ranges:
+            self._has_ranges = True
+            text = f"{self.session.mapping.name} at {self.device}: ranges of tag {measurements[0].tag_id}"
+            return [PortMessage(logging.INFO, text), *measurements]
+        return measurements
+
+    def _outgoing(self) -> bytes:
+        data = self.session.outgoing()
+        return b"" if self._is_udp else data
+
+    def _closed(self, now_ns: int) -> list[Any]:
+        return []
