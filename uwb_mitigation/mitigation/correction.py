@@ -26,6 +26,7 @@ from uwb_mitigation.types.measurement import (
     RangeMeasurement,
     Record,
     Status,
+    reason,
 )
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
 
@@ -42,7 +43,7 @@ BATCH = 256
 MAX_KINDS = 1000
 """Number of kinds of CIRs whose models are kept."""
 
-_COLUMNS = ("range_m", "correction_m", "variance_m2", "status", "model_id")
+_COLUMNS = ("range_m", "correction_m", "variance_m2", "status", "model_id", "fault")
 _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
 _INFINITE_VARIANCE = np.float32(np.inf)
@@ -169,17 +170,19 @@ class Corrector:
         for indices, ranges in RangeColumns.grouped(measurements):
             corrected = self.correct_columns(ranges)
             columns = [getattr(corrected, name).tolist() for name in _COLUMNS]
-            for index, range_m, correction_m, variance_m2, status, model_id in zip(
+            for index, range_m, correction_m, variance_m2, status, model_id, fault in zip(
                 indices, *columns, strict=True
             ):
+                range_raw_m = measurements[index].range_m
                 results[index] = CorrectedRange(
                     range_m,
-                    measurements[index].range_m,
+                    range_raw_m,
                     correction_m,
                     variance_m2,
                     _STATUSES[status],
                     corrected.origin,
                     model_id,
+                    reason(status, fault, range_raw_m) if status else "",
                 )
         return [result for result in results if result is not None]
 
@@ -208,7 +211,9 @@ class Corrector:
     def correct_arrays(
         self, range_m: Any, cir: Any, first_path_index: Any, **fields: Any
     ) -> CorrectedColumns:
-        """Return n corrected ranges as arrays: `range_m` and `variance_m2` in metres and m^2, `status` as numbers.
+        """Return n corrected ranges as arrays: `range_m` and `variance_m2` in metres and m^2, `status` as numbers, `reason`.
+
+        `BATCH` rows are converted at a time, which bounds the memory.
 
         Args:
             range_m: float (n,), measured ranges.
@@ -220,13 +225,19 @@ class Corrector:
                 For all CIRs: `radio` and `segment`.
 
         Raises:
-            ParameterError: the shapes are inconsistent, all magnitudes are negative or in dB, or a field is unknown.
+            ParameterError: the shapes are inconsistent, all magnitudes are negative, most are in dB, most ranges are longer
+                than a radio reaches, all first paths are outside of the CIRs, or a field is unknown.
         """
-        return self.correct_columns(RangeColumns.from_arrays(range_m, cir, first_path_index, **fields))
+        parts = RangeColumns.from_arrays(range_m, cir, first_path_index, rows=BATCH, **fields)
+        return CorrectedColumns.joined([self.correct_columns(part) for part in parts])
 
 
 def pass_through(
-    bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32], status: NDArray[np.uint8]
+    bundle: Bundle,
+    ranges: RangeColumns,
+    offset_m: NDArray[np.float32],
+    status: NDArray[np.uint8],
+    fault: NDArray[np.uint8] | None = None,
 ) -> CorrectedColumns:
     """Return the raw ranges minus the offsets of their radios, with the variance of uncorrected ranges.
 
@@ -238,9 +249,10 @@ def pass_through(
         ranges: n measured ranges.
         offset_m: offset of the radios of each range, m, float32 (n,).
         status: `Status` of each range, uint8 (n,).
+        fault: `CirFault` of each range, uint8 (n,), 0 = none; None: of none.
 
     Returns:
-        n ranges; `status` is not copied.
+        n ranges; `status` and `fault` are not copied.
     """
     card = bundle.card
     range_m = _subtract_offset(ranges.range_m, offset_m).copy()
@@ -250,7 +262,9 @@ def pass_through(
     if not ranges.samples.shape[1]:
         variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
     model_id = np.array([bundle.model_id] * len(ranges), np.uint32)
-    return CorrectedColumns(range_m, offset_m, variance, status, CorrectedBy.HOST, model_id)
+    if fault is None:
+        fault = np.zeros(len(ranges), np.uint8)
+    return CorrectedColumns(range_m, offset_m, variance, status, CorrectedBy.HOST, model_id, fault)
 
 
 class OnnxBackend:
@@ -306,11 +320,13 @@ class OnnxBackend:
         ]
         if accepted is _ALL_ROWS:
             model_id = np.array([self.bundle.model_id] * n, np.uint32)
-            return CorrectedColumns(corrected_m, correction, variance, status, CorrectedBy.HOST, model_id)
+            return CorrectedColumns(
+                corrected_m, correction, variance, status, CorrectedBy.HOST, model_id, faults
+            )
         rejected = status == _OK
         rejected[accepted] = False
         status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
-        corrected = pass_through(self.bundle, ranges, offset_m, status)
+        corrected = pass_through(self.bundle, ranges, offset_m, status, faults)
         corrected.range_m[accepted], corrected.correction_m[accepted], corrected.variance_m2[accepted] = (
             corrected_m,
             correction,

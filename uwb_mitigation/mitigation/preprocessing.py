@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.types.measurement import Encoding, RangeColumns, RangeMeasurement
+from uwb_mitigation.types.measurement import (
+    CirFault,
+    Encoding,
+    RangeColumns,
+    RangeMeasurement,
+    is_logarithmic,
+)
 
 WINDOW_LEAD = 5
 """Samples of the window before floor(first path): enough to include the noise before the path."""
@@ -40,40 +46,6 @@ class Scaling(str, enum.Enum):
 
     MAX = "max"
     PREAMBLE = "preamble"
-
-
-class CirFault(enum.IntEnum):
-    """Reason why a channel impulse response is unusable; the values of `uwb_status` in the firmware."""
-
-    EMPTY = 3
-    ODD_LENGTH = 4
-    BAD_SCALE = 5
-    NO_FIRST_PATH = 6
-    OUTSIDE = 7
-    ALL_ZERO = 8
-    NEGATIVE = 9
-    SATURATED = 10
-    NO_PREAMBLE_COUNT = 11
-    NO_POWER = 12
-
-    @property
-    def text(self) -> str:
-        """The reason as text."""
-        return _FAULT_TEXTS[self]
-
-
-_FAULT_TEXTS = {
-    CirFault.EMPTY: "the CIR has no samples",
-    CirFault.ODD_LENGTH: "a complex CIR has an odd number of values",
-    CirFault.BAD_SCALE: "the scale of the CIR is not a positive number within the range of float32",
-    CirFault.NO_FIRST_PATH: "the first-path index is not finite",
-    CirFault.OUTSIDE: "the window around the first path is partly outside the CIR",
-    CirFault.ALL_ZERO: "the window contains only zeros",
-    CirFault.NEGATIVE: "a magnitude is negative",
-    CirFault.SATURATED: "the window contains a saturated sample",
-    CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
-    CirFault.NO_POWER: "the receive or first-path power is unknown, and the linear bias model needs it",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +94,9 @@ class Preprocessing:
             else:
                 start = width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
                 window = samples[start : start + size] if start >= 0 else samples[:0]
-                fault = CirFault.OUTSIDE if len(window) < size else 0
+                if len(window) < size:
+                    is_inside = 0 <= first_path - start_index < total // width
+                    fault = CirFault.TOO_SHORT if is_inside else CirFault.OUTSIDE
             faults.append(fault)
             if not fault:
                 windows.append(window)
@@ -169,7 +143,8 @@ def _are_usable(windows: NDArray[np.int16], total: int, is_complex: bool) -> boo
     """Return whether no window has a `_content_fault`; checks all windows at once."""
     lowest, highest = int(np.minimum.reduce(windows, axis=None)), int(np.maximum.reduce(windows, axis=None))
     in_range = lowest > -SATURATED and highest < SATURATED and (total % 2 == 0 if is_complex else lowest >= 0)
-    return in_range and all(np.logical_or.reduce(windows, axis=1).tolist())
+    usable = in_range and all(np.logical_or.reduce(windows, axis=1).tolist())
+    return usable and (is_complex or not is_logarithmic(windows).any())
 
 
 def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:
@@ -184,4 +159,4 @@ def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> i
         return CirFault.ALL_ZERO
     if highest >= SATURATED or lowest <= -SATURATED:
         return CirFault.SATURATED
-    return 0
+    return CirFault.DECIBELS if not is_complex and is_logarithmic(window) else 0
