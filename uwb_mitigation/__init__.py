@@ -27,7 +27,16 @@ if TYPE_CHECKING:
     from uwb_mitigation.recordings.dataframe import to_dataframe
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
-    from uwb_mitigation.types.measurement import Cir, CorrectedRange, RangeMeasurement, Record, Status
+    from uwb_mitigation.types.measurement import (
+        Cir,
+        CorrectedRange,
+        Encoding,
+        RadioType,
+        RangeMeasurement,
+        Record,
+        Segment,
+        Status,
+    )
     from uwb_mitigation.types.offsets import Offsets
     from uwb_mitigation.types.tracks import Estimate
 
@@ -41,11 +50,14 @@ __all__ = [
     "AnchorMap",
     "Cir",
     "CorrectedRange",
+    "Encoding",
     "Estimate",
     "Mitigation",
     "Offsets",
+    "RadioType",
     "RangeMeasurement",
     "Record",
+    "Segment",
     "SiteCalibration",
     "Status",
     "TagLocator",
@@ -62,11 +74,14 @@ _MODULES = {
     "AnchorMap": "types.anchors",
     "Cir": "types.measurement",
     "CorrectedRange": "types.measurement",
+    "Encoding": "types.measurement",
     "Estimate": "types.tracks",
     "Mitigation": "mitigation.correction",
     "Offsets": "types.offsets",
+    "RadioType": "types.measurement",
     "RangeMeasurement": "types.measurement",
     "Record": "types.measurement",
+    "Segment": "types.measurement",
     "SiteCalibration": "calibration.site",
     "Status": "types.measurement",
     "TagLocator": "positioning.tag_locator",
@@ -89,4 +104,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return [*__all__, "__version__"]

@@ -6,13 +6,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import islice
-from pathlib import Path
 from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import ModelError, ParameterError, UwbMitigationError
 from uwb_mitigation.mitigation.at_rest import PairsAtRest
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
@@ -28,7 +27,7 @@ from uwb_mitigation.types.measurement import (
     Status,
     reason,
 )
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
+from uwb_mitigation.types.offsets import NO_OFFSETS, AnyOffsets, as_offsets
 
 MAX_RANGE_M = 1e6
 """Upper limit of valid ranges: the radio reaches a few hundred metres."""
@@ -116,16 +115,20 @@ class Corrector:
 
     _backend: Callable[[Bundle], Backend]
 
-    def __init__(
-        self, model: Bundle | Sequence[Bundle], offsets: Offsets | float | str | Path = NO_OFFSETS
-    ) -> None:
-        self.bundles = (model,) if isinstance(model, Bundle) else tuple(model)
-        self.offsets = offsets if isinstance(offsets, Offsets) else read_offsets(str(offsets))
+    def __init__(self, model: Bundle | Sequence[Bundle], offsets: AnyOffsets = NO_OFFSETS) -> None:
+        self.bundles = tuple(model) if isinstance(model, Sequence) else (model,)
+        if not self.bundles or not all(isinstance(bundle, Bundle) for bundle in self.bundles):
+            raise ModelError(f"model {model!r:.60}", valid="what load_model() returns")
+        self.offsets = as_offsets(offsets)
         self.bundle = self.bundles[0]
         self._backends = [self._backend(bundle) for bundle in self.bundles]
         self.used: Counter[Choice] = Counter()
         # Bounded, because a stream may contain CIRs of any length.
         self.choose = lru_cache(MAX_KINDS)(partial(choose_model, self.bundles))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Sessions cannot be pickled. They are made again, and `used` begins at 0.
+        return type(self), (self.bundles, self.offsets)
 
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """Return the corrected ranges; never raises because of the content of a measurement."""
@@ -163,11 +166,19 @@ class Corrector:
         """Return the corrected range of a measurement, or of each one; never raises because of their content.
 
         Measurements whose CIRs have the same encoding and length are corrected in one batch.
+
+        Raises:
+            ParameterError: other objects than measurements.
         """
         if isinstance(measurements, RangeMeasurement):
             return self.correct([measurements])[0]
-        results: list[CorrectedRange | None] = [None] * len(measurements)
-        for indices, ranges in RangeColumns.grouped(measurements):
+        try:
+            results: list[CorrectedRange | None] = [None] * len(measurements)
+            groups = list(RangeColumns.grouped(measurements))
+        except (AttributeError, TypeError) as error:
+            what = f"{measurements!r:.60} has other values than a RangeMeasurement"
+            raise ParameterError(what, valid="record.measurement, or a list of them") from error
+        for indices, ranges in groups:
             corrected = self.correct_columns(ranges)
             columns = [getattr(corrected, name).tolist() for name in _COLUMNS]
             for index, range_m, correction_m, variance_m2, status, model_id, fault in zip(
@@ -219,8 +230,8 @@ class Corrector:
             range_m: float (n,), measured ranges.
             cir: complex (n, m), accumulator samples; or real (n, m), their magnitudes. Integers of 16 bits remain unchanged;
                 other values are rounded to 1/30,000 of the largest sample of the range.
-            first_path_index: float (n,), index in `cir` of the first path, sub-sample; NaN = unknown.
-            **fields: numbers, or arrays (n,): `preamble_count`, accumulated symbols (0 = unknown); `rx_power_dbm` and
+            first_path_index: float (n,), index of the first path, sub-sample; NaN = unknown.
+            **fields: numbers, or arrays (n,): `start_index`, index of the first sample of `cir` (default: 0); `preamble_count`, accumulated symbols (0 = unknown); `rx_power_dbm` and
                 `first_path_power_dbm`, levels (NaN = unknown); `tag_id` and `anchor_id`, integers that select offsets.
                 For all CIRs: `radio` and `segment`.
 
@@ -389,8 +400,8 @@ class Mitigation(Corrector):
 
     Args:
         model: the model, or several, of which `choose_model` selects one for each range.
-        offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, or a
-            file written by `uwb-mitigation offset` or `calibrate`.
+        offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, a
+            file written by `uwb-mitigation offset` or `calibrate`, or a dictionary like it: `{"anchors": {1: 0.21}}`.
         median_at_rest: replace predicted errors by their median while a pair of radios is at rest (`PairsAtRest`). The result
             then depends on the ranges before, which must be in the order of time.
 
@@ -400,19 +411,24 @@ class Mitigation(Corrector):
         used: number of corrected ranges by choice of the model. choose: returns the `Choice` for a `CirKind`.
 
     Raises:
-        ModelError: the backend rejects a model.
+        ModelError: the backend rejects a model, or `model` is none.
         ParameterError: the offset is not finite, too large, or no such file exists.
+
+    It can be pickled, for process pools; the copy has not seen earlier ranges.
     """
 
     def __init__(
         self,
         model: Bundle | Sequence[Bundle],
-        offsets: Offsets | float | str | Path = NO_OFFSETS,
+        offsets: AnyOffsets = NO_OFFSETS,
         *,
         median_at_rest: bool = False,
     ) -> None:
         self._median_at_rest = median_at_rest
         super().__init__(model, offsets)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(Mitigation, median_at_rest=self._median_at_rest), (self.bundles, self.offsets)
 
     def _backend(self, bundle: Bundle) -> Backend:
         return OnnxBackend(bundle, PairsAtRest() if self._median_at_rest else None)

@@ -126,7 +126,8 @@ def reason(status: int, fault: int, range_m: float) -> str:
     """Return why a measured range was not corrected; empty: it was.
 
     Args:
-        status, fault: its `Status` and `CirFault` (0: none).
+        status: its `Status`.
+        fault: its `CirFault`; 0: none.
         range_m: the measured range.
     """
     if status in (Status.OK, Status.UNRELIABLE):
@@ -135,7 +136,7 @@ def reason(status: int, fault: int, range_m: float) -> str:
         return f"range of {range_m:,.2f} m, beyond {MAX_REACH_M:,.0f} m: divide millimetres by 1000"
     if not range_m >= 0.0:
         return f"range of {range_m:.2f} m; valid: 0 or more"
-    return _FAULT_TEXTS[CirFault(fault)] if fault else _STATUS_TEXTS[status]
+    return _FAULT_TEXTS[CirFault(fault)] if fault else _STATUS_TEXTS[Status(status)]
 
 
 _STATUS_TEXTS = {
@@ -319,6 +320,7 @@ class RangeColumns:
         first_path_index: Any,
         *,
         rows: int,
+        start_index: Any = 0,
         preamble_count: Any = 0,
         rx_power_dbm: Any = math.nan,
         first_path_power_dbm: Any = math.nan,
@@ -347,12 +349,14 @@ class RangeColumns:
         }
         columns |= {
             "range_m": column("range_m", range_m),
+            "start_index": column("start_index", start_index),
             "first_path_index": column("first_path_index", first_path_index),
             "preamble_count": column("preamble_count", preamble_count),
             "rx_power_dbm": column("rx_power_dbm", rx_power_dbm),
             "first_path_power_dbm": column("first_path_power_dbm", first_path_power_dbm),
         }
-        _check_units(columns["range_m"], columns["first_path_index"], samples.shape[1])
+        index = columns["first_path_index"] - columns["start_index"]
+        _check_units(columns["range_m"], index, samples.shape[1])
         encoding = Encoding.COMPLEX_INT16 if np.iscomplexobj(samples) else Encoding.MAGNITUDE
         for start in range(0, max(len(samples), 1), rows):
             part = slice(start, start + rows)
@@ -360,7 +364,6 @@ class RangeColumns:
             yield cls(
                 encoding=encoding,
                 samples=int16,
-                start_index=np.zeros(len(int16)),
                 scale=scale,
                 **{name: values[part] for name, values in columns.items()},
                 **constants,
@@ -425,7 +428,7 @@ class RangeColumns:
 
 
 _ARRAY_FIELDS = (
-    *("preamble_count", "rx_power_dbm", "first_path_power_dbm"),
+    *("start_index", "preamble_count", "rx_power_dbm", "first_path_power_dbm"),
     *("tag_id", "anchor_id", "radio", "segment"),
 )
 
@@ -479,7 +482,7 @@ def _check_units(range_m: NDArray[np.float64], index: NDArray[np.float64], sampl
             f"range_m: the median is {middle:,.2f} m", valid="metres: divide millimetres by 1000"
         )
     if samples and len(finite) and ((finite < 0) | (finite >= samples)).all():
-        what = f"first_path_index: {finite.min():g} to {finite.max():g} is outside of every row of the cir"
+        what = f"first_path_index - start_index: {finite.min():g} to {finite.max():g} is outside of every row of the cir"
         raise ParameterError(what, valid=f"an index into the row, 0 to {samples - 1}")
 
 
