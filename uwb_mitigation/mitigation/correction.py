@@ -224,7 +224,7 @@ class Corrector:
     ) -> CorrectedColumns:
         """Return n corrected ranges as arrays: `range_m` and `variance_m2` in metres and m^2, `status` as numbers, `reason`.
 
-        `BATCH` rows are converted at a time, which bounds the memory.
+        The rows are corrected in batches, which bounds the memory.
 
         Args:
             range_m: float (n,), measured ranges.
@@ -239,7 +239,7 @@ class Corrector:
             ParameterError: the shapes are inconsistent, all magnitudes are negative, most are in dB, most ranges are longer
                 than a radio reaches, all first paths are outside of the CIRs, or a field is unknown.
         """
-        parts = RangeColumns.from_arrays(range_m, cir, first_path_index, rows=BATCH, **fields)
+        parts = RangeColumns.from_arrays(range_m, cir, first_path_index, **fields)
         return CorrectedColumns.joined([self.correct_columns(part) for part in parts])
 
 

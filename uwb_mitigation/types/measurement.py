@@ -319,21 +319,20 @@ class RangeColumns:
         cir: Any,
         first_path_index: Any,
         *,
-        rows: int,
         start_index: Any = 0,
         preamble_count: Any = 0,
         rx_power_dbm: Any = math.nan,
         first_path_power_dbm: Any = math.nan,
         **constants: Any,
     ) -> Iterator[RangeColumns]:
-        """Yield the columns of n ranges from arrays, `rows` at a time, which bounds the memory; numbers are valid for all ranges.
+        """Yield the columns of n ranges from arrays, `_ROWS` at a time, which bounds the memory; numbers are valid for all ranges.
 
         The arguments are those of `Mitigation.correct_arrays`.
 
         Raises:
             ParameterError: see `Mitigation.correct_arrays`.
         """
-        samples = _checked_samples(cir, rows)
+        samples = _checked_samples(cir)
         for name in constants:
             check_name("field", name, _ARRAY_FIELDS)
 
@@ -358,8 +357,8 @@ class RangeColumns:
         index = columns["first_path_index"] - columns["start_index"]
         _check_units(columns["range_m"], index, samples.shape[1])
         encoding = Encoding.COMPLEX_INT16 if np.iscomplexobj(samples) else Encoding.MAGNITUDE
-        for start in range(0, max(len(samples), 1), rows):
-            part = slice(start, start + rows)
+        for start in range(0, max(len(samples), 1), _ROWS):
+            part = slice(start, start + _ROWS)
             int16, scale = _as_int16(samples[part])
             yield cls(
                 encoding=encoding,
@@ -427,6 +426,9 @@ class RangeColumns:
         return len(self.range_m)
 
 
+_ROWS = 128
+"""Number of rows of arrays that are converted at a time: more are hardly faster."""
+
 _ARRAY_FIELDS = (
     *("start_index", "preamble_count", "rx_power_dbm", "first_path_power_dbm"),
     *("tag_id", "anchor_id", "radio", "segment"),
@@ -453,8 +455,8 @@ def is_logarithmic(magnitudes: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(is_flat)
 
 
-def _checked_samples(cir: Any, rows: int) -> NDArray[Any]:
-    """Return the samples (n, m) of n CIRs from a caller, which are checked `rows` at a time; see `RangeColumns.from_arrays`."""
+def _checked_samples(cir: Any) -> NDArray[Any]:
+    """Return the samples (n, m) of n CIRs from a caller; raises ParameterError, see `RangeColumns.from_arrays`."""
     try:
         samples = np.asarray(cir)
     except ValueError as error:
@@ -465,7 +467,7 @@ def _checked_samples(cir: Any, rows: int) -> NDArray[Any]:
         valid = "(n, m) samples: `cir[None]` for one range, `i + 1j * q` for pairs"
         raise ParameterError(f"cir of shape {samples.shape}", valid=valid)
     if np.isrealobj(samples) and samples.size:
-        parts = [samples[start : start + rows] for start in range(0, len(samples), rows)]
+        parts = [samples[start : start + _ROWS] for start in range(0, len(samples), _ROWS)]
         if all((part < 0).any(axis=1).all() for part in parts):
             valid = "magnitudes, or complex samples: `i + 1j * q`"
             raise ParameterError("every row of the real cir has negative samples", valid=valid)
@@ -488,15 +490,17 @@ def _check_units(range_m: NDArray[np.float64], index: NDArray[np.float64], sampl
 
 def _as_int16(cir: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
     """Return samples for `Cir.samples`, int16 (n, m or 2 m), and scales (n,), NaN for rows that are not finite."""
-    is_complex = np.iscomplexobj(cir)
-    values = np.ascontiguousarray(cir, np.complex128 if is_complex else np.float64).view(np.float64)
-    largest = np.abs(values).max(axis=1, initial=0.0)
-    is_int16 = (largest <= np.iinfo(np.int16).max) & (values == np.rint(values)).all(axis=1)
-    scale = np.where(is_int16, 1.0, largest / 30_000.0)  # below the limit of saturated samples
+    kind = np.complex128 if np.iscomplexobj(cir) else np.float64
+    values = np.ascontiguousarray(cir, kind).view(np.float64)
+    largest = np.maximum(values.max(axis=1, initial=0.0), -values.min(axis=1, initial=0.0))
     is_finite = np.isfinite(largest)
-    scale[~is_finite] = np.nan
-    scaled = np.where(is_finite[:, None], values, 0.0) / np.where(is_finite, scale, 1.0)[:, None]
-    return np.rint(scaled).astype(np.int16), scale
+    rounded = np.rint(values)
+    is_int16 = (largest <= np.iinfo(np.int16).max) & (values == rounded).all(axis=1)
+    scale = np.where(is_int16, 1.0, largest / 30_000.0)  # below the limit of saturated samples
+    if not is_int16.all():
+        np.rint(np.divide(values, scale[:, None], out=rounded), out=rounded)
+    rounded[~is_finite], scale[~is_finite] = 0.0, np.nan
+    return rounded.astype(np.int16), scale
 
 
 # Not frozen, because this takes 1 % of the time of a correction.

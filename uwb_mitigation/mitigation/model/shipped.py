@@ -99,8 +99,8 @@ def shared_folders(name: str) -> list[Path]:
     """Return possible paths of the shared folder `name`: in a checkout, this installation and sourced workspaces."""
     package = Path(__file__).resolve().parents[2]
     folders = [package.parent / name]
-    # lib/python3.x/site-packages/uwb_mitigation, or Debian's local/lib/python3.x/dist-packages.
-    folders += [prefix / _SHARE / name for prefix in list(package.parents)[3:5]]
+    # `pip install --target`, lib/python3.x/site-packages, or Debian's local/lib/python3.x/dist-packages.
+    folders += [package.parents[up] / _SHARE / name for up in (0, 3, 4) if up < len(package.parents)]
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     folders += [Path(prefix) / _SHARE / name for prefix in prefixes if prefix]
     folders.append(Path(sys.prefix) / _SHARE / name)
