@@ -76,42 +76,40 @@ class Preprocessing:
         is_complex = ranges.encoding == Encoding.COMPLEX_INT16
         width = 2 if is_complex else 1
         size, total = width * self.samples, ranges.samples.shape[1]
-        faults, windows, scales, symbols = [], [], [], []
         numbers = (ranges.first_path_index, ranges.start_index, ranges.scale, ranges.preamble_count)
-        # A loop over Python numbers: for a live range, a batch of one, it is faster than operations on arrays.
-        for samples, first_path, start_index, scale, count in zip(
-            ranges.samples, *(column.tolist() for column in numbers), strict=True
-        ):
-            fault = 0
-            if total == 0:
-                fault = CirFault.EMPTY
-            elif not MIN_SCALE <= scale <= MAX_SCALE:
-                fault = CirFault.BAD_SCALE
-            elif not math.isfinite(first_path):
-                fault = CirFault.NO_FIRST_PATH
-            elif self.scaling is Scaling.PREAMBLE and count <= 0:
-                fault = CirFault.NO_PREAMBLE_COUNT
-            else:
-                start = width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
-                window = samples[start : start + size] if start >= 0 else samples[:0]
-                if len(window) < size:
-                    is_inside = 0 <= first_path - start_index < total // width
-                    fault = CirFault.TOO_SHORT if is_inside else CirFault.OUTSIDE
-            faults.append(fault)
-            if not fault:
-                windows.append(window)
-                scales.append(scale)
-                symbols.append(PREAMBLE_DIVISOR * count)
-        if not windows:
-            return np.array(faults, np.uint8), np.empty((0, self.samples), np.float32)
+        first_paths, start_indices, scales, counts = (column.tolist() for column in numbers)
+        least = 0.0 if self.scaling is Scaling.PREAMBLE else -math.inf
+        # Loops over Python numbers: for a live range, a batch of one, they are faster than operations on arrays.
+        starts = [
+            width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
+            if MIN_SCALE <= scale <= MAX_SCALE and count > least and -math.inf < first_path < math.inf
+            else -1
+            for first_path, start_index, scale, count in zip(
+                first_paths, start_indices, scales, counts, strict=True
+            )
+        ]
+        windows = [
+            samples[start : start + size]
+            for samples, start in zip(ranges.samples, starts, strict=True)
+            if 0 <= start <= total - size
+        ]
+        faults = np.zeros(len(starts), np.uint8)
+        usable = range(len(starts))
+        if len(windows) < len(starts):
+            faults[:] = [
+                0 if 0 <= start <= total - size else self._fault(total // width, *row)
+                for start, *row in zip(starts, first_paths, start_indices, scales, counts, strict=True)
+            ]
+            usable = np.flatnonzero(faults == 0).tolist()
+            if not windows:
+                return faults, np.empty((0, self.samples), np.float32)
         stacked = np.array(windows)
         if not _are_usable(stacked, total, is_complex):
-            usable = [row for row, fault in enumerate(faults) if not fault]
-            for row, window in zip(usable, windows, strict=True):
-                faults[row] = _content_fault(window, total, is_complex)
-            rows = [number for number, row in enumerate(usable) if not faults[row]]
-            stacked = stacked[rows]
-            scales, symbols = ([values[row] for row in rows] for values in (scales, symbols))
+            faults[usable] = [_content_fault(window, total, is_complex) for window in windows]
+            stacked = stacked[faults[usable] == 0]
+            usable = np.flatnonzero(faults == 0).tolist()
+        if len(usable) < len(starts):
+            scales, counts = ([values[row] for row in usable] for values in (scales, counts))
 
         if is_complex:
             power = np.multiply(stacked, stacked, dtype=np.int32)
@@ -124,9 +122,24 @@ class Preprocessing:
         if self.scaling is Scaling.MAX:
             np.divide(inputs, inputs.max(axis=1, keepdims=True), out=inputs)
         else:
+            symbols = [PREAMBLE_DIVISOR * count for count in counts]
             np.divide(inputs, np.array(symbols, np.float32)[:, None], out=inputs)
             np.sqrt(inputs, out=inputs)
-        return np.array(faults, np.uint8), inputs
+        return faults, inputs
+
+    def _fault(
+        self, samples: int, first_path: float, start_index: float, scale: float, count: float
+    ) -> CirFault:
+        """Return why a CIR with the number of `samples` in time has no window."""
+        if samples == 0:
+            return CirFault.EMPTY
+        if not MIN_SCALE <= scale <= MAX_SCALE:
+            return CirFault.BAD_SCALE
+        if not math.isfinite(first_path):
+            return CirFault.NO_FIRST_PATH
+        if self.scaling is Scaling.PREAMBLE and not count > 0:
+            return CirFault.NO_PREAMBLE_COUNT
+        return CirFault.TOO_SHORT if 0 <= first_path - start_index < samples else CirFault.OUTSIDE
 
     def windows_of(self, measurements: Sequence[RangeMeasurement]) -> tuple[list[int], NDArray[np.float32]]:
         """Return `CirFault` of each measurement (0 = usable), and the inputs, float32 (n, samples), zeros if unusable."""
@@ -143,7 +156,10 @@ def _are_usable(windows: NDArray[np.int16], total: int, is_complex: bool) -> boo
     """Return whether no window has a `_content_fault`; checks all windows at once."""
     lowest, highest = int(np.minimum.reduce(windows, axis=None)), int(np.maximum.reduce(windows, axis=None))
     in_range = lowest > -SATURATED and highest < SATURATED and (total % 2 == 0 if is_complex else lowest >= 0)
-    usable = in_range and all(np.logical_or.reduce(windows, axis=1).tolist())
+    if len(windows) == 1:
+        usable = in_range and highest - lowest > 0
+    else:
+        usable = in_range and all(np.logical_or.reduce(windows, axis=1).tolist())
     return usable and (is_complex or not is_logarithmic(windows).any())
 
 
