@@ -294,11 +294,12 @@ class OnnxBackend:
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         predicted = linear_bias.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
-        status, score = np.zeros(n, np.uint8), np.zeros(n, np.float32)
-        has_bias, valid = np.isfinite(predicted), _is_valid_range(range_m)
-        if np.count_nonzero(faults) == 0 and np.count_nonzero(has_bias & valid) == n:
+        status = np.zeros(n, np.uint8)
+        numbers = zip(faults.tolist(), predicted.tolist(), range_m.tolist(), strict=True)
+        if all(not fault and bias == bias and 0.0 <= value <= MAX_RANGE_M for fault, bias, value in numbers):
             predicted, score = self._predict(ranges, _ALL_ROWS, range_m, windows, predicted)
         else:
+            has_bias, valid, score = np.isfinite(predicted), _is_valid_range(range_m), np.zeros(n, np.float32)
             # CirFault.NO_POWER, which the preprocessing does not check
             status[~has_bias] = _BAD_CIR
             status[~valid] = _OUT_OF_DISTRIBUTION
