@@ -20,6 +20,7 @@ from uwb_mitigation.files import VERSION
 
 if TYPE_CHECKING:
     from uwb_mitigation.calibration.site import SiteCalibration, calibrate
+    from uwb_mitigation.commands.offline.tracks import Tracks, track
     from uwb_mitigation.errors import UwbMitigationError
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.mitigation.model.shipped import load_model
@@ -61,12 +62,14 @@ __all__ = [
     "SiteCalibration",
     "Status",
     "TagLocator",
+    "Tracks",
     "UwbMitigationError",
     "calibrate",
     "load_anchors",
     "load_model",
     "open_recording",
     "to_dataframe",
+    "track",
 ]
 
 _MODULES = {
@@ -85,12 +88,14 @@ _MODULES = {
     "SiteCalibration": "calibration.site",
     "Status": "types.measurement",
     "TagLocator": "positioning.tag_locator",
+    "Tracks": "commands.offline.tracks",
     "UwbMitigationError": "errors",
     "calibrate": "calibration.site",
     "load_anchors": "types.anchors",
     "load_model": "mitigation.model.shipped",
     "open_recording": "recordings.formats",
     "to_dataframe": "recordings.dataframe",
+    "track": "commands.offline.tracks",
 }
 """Modules of the lazy names."""
 
