@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         Record,
         Segment,
         Status,
+        Truth,
     )
     from uwb_mitigation.types.offsets import Offsets
     from uwb_mitigation.types.tracks import Estimate
@@ -63,6 +64,7 @@ __all__ = [
     "Status",
     "TagLocator",
     "Tracks",
+    "Truth",
     "UwbMitigationError",
     "calibrate",
     "load_anchors",
@@ -89,6 +91,7 @@ _MODULES = {
     "Status": "types.measurement",
     "TagLocator": "positioning.tag_locator",
     "Tracks": "commands.offline.tracks",
+    "Truth": "types.measurement",
     "UwbMitigationError": "errors",
     "calibrate": "calibration.site",
     "load_anchors": "types.anchors",

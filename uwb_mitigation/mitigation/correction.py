@@ -18,6 +18,7 @@ from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.choice import Choice, CirKind, choose_model, kinds_of
 from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
 from uwb_mitigation.types.measurement import (
+    CirFault,
     CorrectedBy,
     CorrectedColumns,
     CorrectedRange,
@@ -150,7 +151,11 @@ class Corrector:
         choice = self.choose(kind)
         self.used[choice] += len(ranges)
         if choice.is_trained:
-            return self._backends[choice.model].correct(ranges, offset_m)
+            corrected = self._backends[choice.model].correct(ranges, offset_m)
+            if not (choice.fits or kind.has_levels):
+                is_unlike = (corrected.status == _OUT_OF_DISTRIBUTION) & (corrected.fault == 0)
+                corrected.fault[is_unlike] = CirFault.NO_POWER
+            return corrected
         status = np.full(len(ranges), _OUT_OF_DISTRIBUTION if kind.samples else _NO_CIR, np.uint8)
         return pass_through(self.bundles[choice.model], ranges, offset_m, status)
 

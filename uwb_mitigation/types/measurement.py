@@ -113,7 +113,7 @@ _FAULT_TEXTS = {
     CirFault.NEGATIVE: "a magnitude is negative",
     CirFault.SATURATED: "the window contains a saturated sample",
     CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
-    CirFault.NO_POWER: "the receive or first-path power is unknown, and the linear bias model needs it",
+    CirFault.NO_POWER: "the receive or first-path power is unknown, and the model needs it",
     CirFault.TOO_SHORT: "the CIR is too short before or after the first path: the window around it is partly outside",
     CirFault.DECIBELS: f"the CIR is in dB; valid: {LINEAR_MAGNITUDES}",
 }
