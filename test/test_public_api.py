@@ -14,6 +14,7 @@ from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -26,10 +27,14 @@ from uwb_mitigation import (
     RangeMeasurement,
     Record,
     SiteCalibration,
+    Status,
     TagLocator,
     UwbMitigationError,
+    load_anchors,
     load_model,
+    open_recording,
     to_dataframe,
+    track,
 )
 from uwb_mitigation.errors import DamagedRecordingError, ModelError, ParameterError
 from uwb_mitigation.recordings.bag.writer import BagWriter
@@ -37,6 +42,7 @@ from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import save_anchors
 from uwb_mitigation.types.measurement import is_logarithmic
 
+matplotlib.use("agg")
 PAGE = REPOSITORY / "docs" / "guides" / "python.md"
 IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
@@ -219,6 +225,44 @@ def test_ranges_that_are_not_corrected_have_a_reason(records: list[Record], chan
     good, bad = mitigation.correct([measurement, changed])
     assert (good.reason, bad.status.is_corrected) == ("", False)
     assert text in bad.reason
+
+
+@pytest.mark.parametrize(
+    ("fields", "status"), [({}, Status.BAD_CIR), ({"preamble_count": 100}, Status.OUT_OF_DISTRIBUTION)]
+)
+def test_universal_without_count_or_levels_says_what_it_needs(
+    mitigation: Mitigation, records: list[Record], fields: dict, status: Status
+):
+    cir, index = samples(records[0].measurement)[None], records[0].measurement.cir.first_path_index
+    corrected = mitigation.correct_arrays(3.0, cir, index, **fields)
+    assert corrected.status.tolist() == [status]
+    assert "is unknown, and the model" in corrected.reason[0]
+
+
+def test_track_of_a_recording_has_errors_data_frame_file_and_plot(tmp_path: Path, folder: Path):
+    tracks = track(folder / "drive.mcap", folder / "anchors.yaml", offsets=0.22, height_m=0.4)
+    assert (len(tracks), tracks.warnings) == (1, [])
+    (tag,) = tracks
+    assert tag.errors["smoothed"].rmse < tag.errors["snapshot"].rmse
+    frame = tracks.to_dataframe()
+    assert np.array_equal(frame[["x", "y", "z"]], tag.smoothed.positions_xyz)
+    assert np.sqrt((frame["error_m"] ** 2).mean()) == pytest.approx(tag.errors["smoothed"].rmse)
+    (file,) = tracks.write_tum(tmp_path / "track.tum")
+    evo = pytest.importorskip("evo.tools.file_interface").read_tum_trajectory_file(file)
+    for name in ("timestamps", "positions_xyz", "orientations_quat_wxyz"):
+        assert getattr(evo, name) == pytest.approx(getattr(tag.smoothed, name), abs=1e-6)
+    labels = [text.get_text() for text in tracks.plot().get_legend().get_texts()]
+    assert f"smoothed (RMSE {tag.errors['smoothed'].rmse:.2f} m)" in labels
+
+
+def test_track_of_records_equals_that_of_their_bag(folder: Path):
+    records = list(open_recording(folder / "drive.mcap"))
+    anchors = {anchor.id: anchor.position for anchor in load_anchors(folder / "anchors.yaml").anchors}
+    (of_records,), (of_bag,) = (
+        track(recording, anchors, offsets=0.22, height_m=0.4)
+        for recording in (records, folder / "drive.mcap")
+    )
+    assert np.array_equal(of_records.smoothed.position, of_bag.smoothed.position)
 
 
 def test_streams_of_millimetres_have_a_reason_in_each_range(mitigation: Mitigation, records: list[Record]):
