@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from conftest import REPOSITORY
 
 NOTEBOOK = REPOSITORY / "docs" / "tutorials" / "own_ranges.ipynb"
@@ -22,6 +23,7 @@ def script(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_cells_run_and_the_correction_reduces_the_error(tmp_path: Path):
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = os.environ | {"MPLBACKEND": "agg", "PATH": path}
@@ -34,6 +36,7 @@ def test_cells_run_and_the_correction_reduces_the_error(tmp_path: Path):
     assert corrected < 0.5 * raw
 
 
+@pytest.mark.slow
 def test_cells_have_valid_types(tmp_path: Path):
     command = [sys.executable, "-m", "mypy", "--strict", "--config-file", str(REPOSITORY / "pyproject.toml")]
     done = subprocess.run(
