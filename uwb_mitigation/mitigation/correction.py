@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation.at_rest import PairsAtRest
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.choice import Choice, CirKind, choose_model, kinds_of
-from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
+from uwb_mitigation.mitigation.model.ood import OodDetector, approximate_features, ood_features
 from uwb_mitigation.types.measurement import (
     CirFault,
     CorrectedBy,
@@ -36,6 +36,9 @@ MAX_RANGE_M = 1e6
 UNRELIABLE_VARIANCE_M2 = 0.25
 """A corrected range with a larger variance is UNRELIABLE. At simulated sites these are 10 % of the ranges, and half of those
 with an error of more than 0.5 m."""
+
+CLEARLY_IN_DISTRIBUTION = -0.01
+"""OOD score below which rounding decides nothing: all scores below 0 have the same result."""
 
 BATCH = 256
 """Number of records that `Corrector.correct_records` reads ahead."""
@@ -80,10 +83,15 @@ class CorrectionRule:
         """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
         if self._ood_detector is None:
             return np.zeros(len(windows), np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):
-            features = ood_features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
-            score = self._ood_detector.score(features)
-        return score if isinstance(score, np.ndarray) else np.array([score], np.float32)
+        reported = range_m, rx_power_dbm, first_path_power_dbm
+        if len(windows) == 1:
+            numbers = (float(values[0]) for values in reported)
+            score = self._ood_detector.score(approximate_features(windows[0], self._scaling, *numbers))
+            if score < CLEARLY_IN_DISTRIBUTION:
+                return np.array([score], np.float32)
+        return np.asarray(
+            self._ood_detector.score(ood_features(windows, self._scaling, *reported)), np.float32
+        )
 
     def apply(
         self, predicted: NDArray[np.float32], score: NDArray[np.float32]
@@ -135,14 +143,16 @@ class Corrector:
         """Return the corrected ranges; never raises because of the content of a measurement."""
         offset_m = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
         kinds = kinds_of(ranges)
-        if len(kinds) == 1:
-            return self._correct_kind(next(iter(kinds)), ranges, offset_m)
-        # All rows are replaced.
-        result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
-        for kind, rows in kinds.items():
-            part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
-            for name in _COLUMNS:
-                getattr(result, name)[rows] = getattr(part, name)
+        # A range or an energy beyond float32 is out of distribution, as an infinite one is.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if len(kinds) == 1:
+                return self._correct_kind(next(iter(kinds)), ranges, offset_m)
+            # All rows are replaced.
+            result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
+            for kind, rows in kinds.items():
+                part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
+                for name in _COLUMNS:
+                    getattr(result, name)[rows] = getattr(part, name)
         return result
 
     def _correct_kind(
@@ -444,8 +454,7 @@ def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32
     """Return ranges minus offsets in float32, as on boards; without an offset the unchanged range."""
     if not np.count_nonzero(offset_m):
         return range_m
-    with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.
-        return np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
+    return np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
 
 
 def _is_valid_range(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:

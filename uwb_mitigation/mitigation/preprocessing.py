@@ -104,19 +104,20 @@ class Preprocessing:
             if not windows:
                 return faults, np.empty((0, self.samples), np.float32)
         stacked = np.array(windows)
-        if not _are_usable(stacked, total, is_complex):
+        # Squares of the components of complex samples, or magnitudes.
+        values = np.multiply(stacked, stacked, dtype=np.int32) if is_complex else stacked
+        if not _are_usable(values, total, is_complex):
             faults[usable] = [_content_fault(window, total, is_complex) for window in windows]
-            stacked = stacked[faults[usable] == 0]
+            values = values[faults[usable] == 0]
             usable = np.flatnonzero(faults == 0).tolist()
         if len(usable) < len(starts):
-            scales, counts = ([values[row] for row in usable] for values in (scales, counts))
+            scales, counts = ([column[row] for row in usable] for column in (scales, counts))
 
         if is_complex:
-            power = np.multiply(stacked, stacked, dtype=np.int32)
-            inputs = (power[:, 0::2] + power[:, 1::2]).astype(np.float32)
+            inputs = (values[:, 0::2] + values[:, 1::2]).astype(np.float32)
             np.sqrt(inputs, out=inputs)
         else:
-            inputs = stacked.astype(np.float32)
+            inputs = values.astype(np.float32)
         if scales.count(1.0) < len(scales):
             np.multiply(inputs, np.array(scales, np.float32)[:, None], out=inputs)
         if self.scaling is Scaling.MAX:
@@ -152,15 +153,14 @@ class Preprocessing:
         return faults.tolist(), inputs
 
 
-def _are_usable(windows: NDArray[np.int16], total: int, is_complex: bool) -> bool:
-    """Return whether no window has a `_content_fault`; checks all windows at once."""
-    lowest, highest = int(np.minimum.reduce(windows, axis=None)), int(np.maximum.reduce(windows, axis=None))
-    in_range = lowest > -SATURATED and highest < SATURATED and (total % 2 == 0 if is_complex else lowest >= 0)
-    if len(windows) == 1:
-        usable = in_range and highest - lowest > 0
-    else:
-        usable = in_range and all(np.logical_or.reduce(windows, axis=1).tolist())
-    return usable and (is_complex or not is_logarithmic(windows).any())
+def _are_usable(values: NDArray[np.int32 | np.int16], total: int, is_complex: bool) -> bool:
+    """Return whether no window has a `_content_fault`, from squares of complex components or magnitudes (n, k)."""
+    highest = np.maximum.reduce(values, axis=1).tolist()
+    if is_complex:
+        return total % 2 == 0 and min(highest) > 0 and max(highest) < SATURATED**2
+    lowest = int(np.minimum.reduce(values, axis=None))
+    in_range = lowest >= 0 and min(highest) > 0 and max(highest) < SATURATED
+    return in_range and not is_logarithmic(values).any()
 
 
 def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:
