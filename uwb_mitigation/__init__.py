@@ -75,30 +75,25 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Anchor": "types.anchors",
-    "AnchorMap": "types.anchors",
-    "Cir": "types.measurement",
-    "CorrectedRange": "types.measurement",
-    "Encoding": "types.measurement",
-    "Estimate": "types.tracks",
-    "Mitigation": "mitigation.correction",
-    "Offsets": "types.offsets",
-    "RadioType": "types.measurement",
-    "RangeMeasurement": "types.measurement",
-    "Record": "types.measurement",
-    "Segment": "types.measurement",
-    "SiteCalibration": "calibration.site",
-    "Status": "types.measurement",
-    "TagLocator": "positioning.tag_locator",
-    "Tracks": "commands.offline.tracks",
-    "Truth": "types.measurement",
-    "UwbMitigationError": "errors",
-    "calibrate": "calibration.site",
-    "load_anchors": "types.anchors",
-    "load_model": "mitigation.model.shipped",
-    "open_recording": "recordings.formats",
-    "to_dataframe": "recordings.dataframe",
-    "track": "commands.offline.tracks",
+    name: module
+    for module, names in {
+        "calibration.site": ("SiteCalibration", "calibrate"),
+        "commands.offline.tracks": ("Tracks", "track"),
+        "errors": ("UwbMitigationError",),
+        "mitigation.correction": ("Mitigation",),
+        "mitigation.model.shipped": ("load_model",),
+        "positioning.tag_locator": ("TagLocator",),
+        "recordings.dataframe": ("to_dataframe",),
+        "recordings.formats": ("open_recording",),
+        "types.anchors": ("Anchor", "AnchorMap", "load_anchors"),
+        "types.measurement": (
+            *("Cir", "CorrectedRange", "Encoding", "RadioType", "RangeMeasurement", "Record"),
+            *("Segment", "Status", "Truth"),
+        ),
+        "types.offsets": ("Offsets",),
+        "types.tracks": ("Estimate",),
+    }.items()
+    for name in names
 }
 """Modules of the lazy names."""
 
