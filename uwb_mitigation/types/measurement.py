@@ -469,7 +469,7 @@ def _checked_samples(cir: Any) -> NDArray[Any]:
     if np.isrealobj(samples) and samples.size:
         parts = [samples[start : start + _ROWS] for start in range(0, len(samples), _ROWS)]
         if all((part < 0).any(axis=1).all() for part in parts):
-            valid = "magnitudes, or complex samples: `i + 1j * q`"
+            valid = f"complex samples: `i + 1j * q`, or {LINEAR_MAGNITUDES}"
             raise ParameterError("every row of the real cir has negative samples", valid=valid)
         if 2 * sum(np.count_nonzero(is_logarithmic(part)) for part in parts) > len(samples):
             raise ParameterError("the cir is in dB", valid=LINEAR_MAGNITUDES)
@@ -496,7 +496,8 @@ def _as_int16(cir: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float64]
     is_finite = np.isfinite(largest)
     rounded = np.rint(values)
     is_int16 = (largest <= np.iinfo(np.int16).max) & (values == rounded).all(axis=1)
-    scale = np.where(is_int16, 1.0, largest / 30_000.0)  # below the limit of saturated samples
+    # Below the limit of saturated samples.
+    scale = np.where(is_int16 | ~is_finite, 1.0, largest / 30_000.0)
     if not is_int16.all():
         np.rint(np.divide(values, scale[:, None], out=rounded), out=rounded)
     rounded[~is_finite], scale[~is_finite] = 0.0, np.nan
