@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.mitigation.arrays import columns_of_arrays
 from uwb_mitigation.mitigation.at_rest import PairsAtRest
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
@@ -254,7 +255,7 @@ class Corrector:
             ParameterError: the shapes are inconsistent, all magnitudes are negative, most are in dB, most ranges are longer
                 than a radio reaches, all first paths are outside of the CIRs, or a field is unknown.
         """
-        parts = RangeColumns.from_arrays(range_m, cir, first_path_index, **fields)
+        parts = columns_of_arrays(range_m, cir, first_path_index, **fields)
         return CorrectedColumns.joined([self.correct_columns(part) for part in parts])
 
 
