@@ -184,7 +184,7 @@ def parse_offsets(text: str, where: str) -> Offsets:
 
 def _from_sections(document: Mapping[Any, Any], where: str) -> Offsets:
     for name in document:
-        check_name("key", name, _SECTIONS, where, SCHEMA)
+        check_name("key", name, _SECTIONS, where, f"the keys {', '.join(_SECTIONS)}: {SCHEMA}")
     pairs, sd_by_pair = _by_pair(document.get("pairs") or [], where)
     return Offsets(
         _number(document.get("default", 0.0), "default", where),
