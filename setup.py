@@ -67,6 +67,7 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
+            "models/*",
             "types/ros/interfaces/*.msg",
             "recordings/mappings/*.yaml",
             "calibration/templates/*.j2",

@@ -134,7 +134,7 @@ def test_batch_equals_single_messages_or_is_refused(
         name: np.array(data.draw(st.lists(float32, min_size=3, max_size=3)), np.float32) for name in fields
     }
     status = np.array([0, 3, 4], np.uint8)
-    corrected = CorrectedColumns(*columns.values(), status, CorrectedBy.DEVICE, 77)
+    corrected = CorrectedColumns(*columns.values(), status, CorrectedBy.DEVICE, 77, status)
     encoded = batch.encode_corrected(corrected)
     for row, message in enumerate(messages):
         decoded, ranges = codec.decode_range(message), batch.columns

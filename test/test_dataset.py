@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from model_material import record, window_of
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import build_dataset
-from uwb_mitigation.types.measurement import RadioType, Segment, Truth
+from uwb_mitigation.types.measurement import CirFault, RadioType, Segment, Truth
 
 
 def test_record_becomes_a_row():

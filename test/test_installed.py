@@ -198,8 +198,9 @@ print(uwb_mitigation.__file__, default_model_path(), firmware_folder(), sep="\\n
 
 
 @NEEDS_CC
-def test_firmware_backend_needs_no_checkout(tmp_path: Path):
-    packages = tmp_path / "lib" / "python3" / "site-packages"
+@pytest.mark.parametrize("layout", ["lib/python3/site-packages", "."], ids=["prefix", "pip --target"])
+def test_models_and_firmware_backend_need_no_checkout(tmp_path: Path, layout: str):
+    packages = tmp_path / layout
     steps = [
         *("build", "-b", tmp_path / "build"),
         *("build_py", "-d", packages),

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_material import cir, window_of
 
-from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing, Scaling
-from uwb_mitigation.types.measurement import Cir, Encoding
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.types.measurement import Cir, CirFault, Encoding
 
 
 def single(value: float) -> float:
@@ -73,11 +73,14 @@ def test_inputs_equal_the_specification_bit_by_bit(scaling, encoding, data):
         preamble_count=subject.preamble_count,
     )
     found, out = apply(subject, 8, scaling)
-    if found == CirFault.OUTSIDE:
+    if found == CirFault.TOO_SHORT:
         assert math.floor(first_path) - subject.start_index + 3 > len(subject)
     else:
         assert found == 0
         assert out.tolist() == reference(subject, 8, scaling)
+
+
+IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 
 
 @pytest.mark.parametrize(
@@ -92,8 +95,8 @@ def test_inputs_equal_the_specification_bit_by_bit(scaling, encoding, data):
         ({"scale": 1e38}, CirFault.BAD_SCALE),
         ({"first_path_index": math.nan}, CirFault.NO_FIRST_PATH),
         ({"first_path_index": -math.inf}, CirFault.NO_FIRST_PATH),
-        ({"first_path_index": 4.99}, CirFault.OUTSIDE),
-        ({"first_path_index": 865.0}, CirFault.OUTSIDE),
+        ({"first_path_index": 4.99}, CirFault.TOO_SHORT),
+        ({"first_path_index": 865.0}, CirFault.TOO_SHORT),
         ({"first_path_index": 1e300}, CirFault.OUTSIDE),
         ({"first_path_index": -1e300}, CirFault.OUTSIDE),
         ({"start_index": 2**31 - 1}, CirFault.OUTSIDE),
@@ -103,6 +106,7 @@ def test_inputs_equal_the_specification_bit_by_bit(scaling, encoding, data):
         ({"samples": np.full(1016, 32767, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.SATURATED),
         ({"samples": np.full(1016, -1, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.NEGATIVE),
         ({"samples": np.zeros(1016, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.ALL_ZERO),
+        ({"samples": IN_DB, "encoding": Encoding.MAGNITUDE}, CirFault.DECIBELS),
         ({"preamble_count": 0}, CirFault.NO_PREAMBLE_COUNT),
     ],
 )

@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
+import math
 import os
+import pickle
 import re
 import subprocess
 import sys
+import tracemalloc
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 from conftest import REPOSITORY
 
 import uwb_mitigation
 from uwb_mitigation import (
+    AnchorMap,
+    Encoding,
     Mitigation,
     RangeMeasurement,
     Record,
     SiteCalibration,
+    Status,
     TagLocator,
+    UwbMitigationError,
+    load_anchors,
     load_model,
+    open_recording,
     to_dataframe,
+    track,
 )
-from uwb_mitigation.errors import DamagedRecordingError, ParameterError
+from uwb_mitigation.errors import DamagedRecordingError, ModelError, ParameterError
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import save_anchors
 from uwb_mitigation.types.measurement import is_logarithmic
 
+matplotlib.use("agg")
 PAGE = REPOSITORY / "docs" / "guides" / "python.md"
+IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
 
 
@@ -64,7 +80,8 @@ def test_import_loads_no_other_package_and_all_names_exist():
         "assert set(uwb_mitigation.__all__) <= set(dir(uwb_mitigation)) & set(globals())\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
-    assert uwb_mitigation.__all__ == list(uwb_mitigation._MODULES)
+    assert {*uwb_mitigation.__all__} == {*uwb_mitigation._MODULES}
+    assert {*dir(uwb_mitigation)} == {*uwb_mitigation.__all__, "__version__"}
     with pytest.raises(AttributeError, match="no attribute 'Mitigator'"):
         uwb_mitigation.Mitigator  # noqa: B018
 
@@ -121,6 +138,7 @@ def test_cir_that_is_not_finite_is_not_used(mitigation: Mitigation, records: lis
     index = measurement.cir.first_path_index - measurement.cir.start_index
     result = mitigation.correct_arrays(measurement.range_m, cir, index, preamble_count=100)
     assert result.status.tolist()[0] == uwb_mitigation.Status.BAD_CIR
+    assert "NaN" in result.reason[0]
 
 
 @pytest.mark.parametrize(
@@ -133,6 +151,10 @@ def test_cir_that_is_not_finite_is_not_used(mitigation: Mitigation, records: lis
         ({"cir": np.linspace(40.0, 80.0, 400)[None]}, "10 ** (level / 20)"),
         ({"range_m": [1.0, 2.0, 3.0]}, "range_m"),
         ({"first_path_index": "x"}, "first_path_index"),
+        ({"first_path_index": 205.0}, "205 to 205 is outside of every row"),
+        ({"start_index": 100}, "-80 to -80 is outside of every row"),
+        ({"range_m": [5299.78, 870.0]}, "divide millimetres by 1000"),
+        ({"cir": 20 * np.log10(np.random.default_rng(1).rayleigh(9.0, (3, 200)) + 1)}, "10 ** (level / 20)"),
         ({"tag_id": -1}, "tag_id"),
         ({"preamble": 3}, "preamble_count"),
     ],
@@ -143,11 +165,129 @@ def test_wrong_arrays_are_refused_with_a_remedy(mitigation: Mitigation, changes:
         mitigation.correct_arrays(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("code", "kind", "excerpt"),
+    [
+        ("load_model(3)", ModelError, "universal"),
+        ("Mitigation('universal')", ModelError, "load_model()"),
+        ("Mitigation(load_model(), offsets={1: 0.1})", ParameterError, "anchors: {id: m}"),
+        ("Mitigation(load_model()).correct([5.0])", ParameterError, "record.measurement"),
+        ("AnchorMap({1: (0, 0)})", ParameterError, "(x, y, z)"),
+        ("AnchorMap([(0, 0, 0)])", ParameterError, "(x, y, z)"),
+        ("TagLocator(3)", ParameterError, "(x, y, z)"),
+        ("TagLocator({1: (0, 0, 0)}).add(measurement, 5.0)", ParameterError, "Mitigation.correct"),
+        ("TagLocator({1: (0, 0, 0)}).add(5.0)", ParameterError, "record.measurement"),
+    ],
+)
+def test_other_types_are_refused_with_the_valid_ones(
+    records: list[Record], code: str, kind: type[UwbMitigationError], excerpt: str
+):
+    names = {name: getattr(uwb_mitigation, name) for name in uwb_mitigation.__all__}
+    with pytest.raises(kind, match=re.escape(excerpt)):
+        eval(code, names | {"measurement": records[0].measurement})
+
+
+def test_dictionaries_are_anchors_and_offsets():
+    assert AnchorMap({1: (0, 0, 2), 0x1F: np.ones(3)}).position.tolist() == [[0, 0, 2], [1, 1, 1]]
+    assert Mitigation(load_model("universal"), {"anchors": {1: 0.5}}).offsets.lookup([7], [1]) == [0.5]
+
+
+def test_process_pools_correct_with_the_same_result(mitigation: Mitigation, records: list[Record]):
+    measurements = [record.measurement for record in records[:20]]
+    copy = pickle.loads(pickle.dumps(mitigation))
+    assert copy.correct(measurements) == mitigation.correct(measurements)
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        assert list(pool.map(mitigation.correct, measurements)) == mitigation.correct(measurements)
+
+
+def test_models_are_printed_in_one_line(mitigation: Mitigation):
+    assert re.fullmatch(r"Bundle\('universal', id [0-9a-f]{8}, '.*universal.onnx'\)", repr(mitigation.bundle))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"first_path_index": 1e4}, "the first-path index is outside the CIR"),
+        ({"first_path_index": 1010.0}, "too short"),
+        ({"first_path_index": math.nan}, "index is not finite"),
+        ({"samples": np.zeros(2032, np.int16)}, "only zeros"),
+        ({"samples": np.full(2032, 32767, np.int16)}, "saturated"),
+        ({"scale": math.nan}, "NaN"),
+        ({"samples": np.zeros(0, np.int16)}, "no samples"),
+        ({"samples": IN_DB, "encoding": Encoding.MAGNITUDE}, "in dB"),
+        ({"rx_power_dbm": 10.0}, "unlike the training data"),
+    ],
+)
+def test_ranges_that_are_not_corrected_have_a_reason(records: list[Record], changes: dict, text: str):
+    measurement = records[0].measurement
+    changed = replace(measurement, cir=replace(measurement.cir, **changes))
+    mitigation = Mitigation(load_model("universal"))
+    good, bad = mitigation.correct([measurement, changed])
+    assert (good.reason, bad.status.is_corrected) == ("", False)
+    assert text in bad.reason
+
+
+@pytest.mark.parametrize(
+    ("fields", "status"), [({}, Status.BAD_CIR), ({"preamble_count": 100}, Status.OUT_OF_DISTRIBUTION)]
+)
+def test_universal_without_count_or_levels_says_what_it_needs(
+    mitigation: Mitigation, records: list[Record], fields: dict, status: Status
+):
+    cir, index = samples(records[0].measurement)[None], records[0].measurement.cir.first_path_index
+    corrected = mitigation.correct_arrays(3.0, cir, index, **fields)
+    assert corrected.status.tolist() == [status]
+    assert "is unknown, and the model" in corrected.reason[0]
+
+
+def test_track_of_a_recording_has_errors_data_frame_file_and_plot(tmp_path: Path, folder: Path):
+    tracks = track(folder / "drive.mcap", folder / "anchors.yaml", offsets=0.22, height_m=0.4)
+    assert (len(tracks), tracks.warnings) == (1, [])
+    (tag,) = tracks
+    assert tag.errors["smoothed"].rmse < tag.errors["snapshot"].rmse
+    frame = tracks.to_dataframe()
+    assert np.array_equal(frame[["x", "y", "z"]], tag.smoothed.positions_xyz)
+    assert np.sqrt((frame["error_m"] ** 2).mean()) == pytest.approx(tag.errors["smoothed"].rmse)
+    (file,) = tracks.write_tum(tmp_path / "track.tum")
+    evo = pytest.importorskip("evo.tools.file_interface").read_tum_trajectory_file(file)
+    for name in ("timestamps", "positions_xyz", "orientations_quat_wxyz"):
+        assert getattr(evo, name) == pytest.approx(getattr(tag.smoothed, name), abs=1e-6)
+    labels = [text.get_text() for text in tracks.plot().get_legend().get_texts()]
+    assert f"smoothed (RMSE {tag.errors['smoothed'].rmse:.2f} m)" in labels
+
+
+def test_track_of_records_equals_that_of_their_bag(folder: Path):
+    records = list(open_recording(folder / "drive.mcap"))
+    anchors = {anchor.id: anchor.position for anchor in load_anchors(folder / "anchors.yaml").anchors}
+    (of_records,), (of_bag,) = (
+        track(recording, anchors, offsets=0.22, height_m=0.4)
+        for recording in (records, folder / "drive.mcap")
+    )
+    assert np.array_equal(of_records.smoothed.position, of_bag.smoothed.position)
+
+
+def test_streams_of_millimetres_have_a_reason_in_each_range(mitigation: Mitigation, records: list[Record]):
+    (corrected,) = mitigation.correct([replace(records[0].measurement, range_m=5299.78)])
+    assert (corrected.status.is_corrected, corrected.reason[:19]) == (False, "range of 5,299.78 m")
+
+
+def test_arrays_need_little_more_memory_than_the_input(mitigation: Mitigation, records: list[Record]):
+    cir = np.tile(samples(records[0].measurement), (1500, 1))
+    mitigation.correct_arrays([3.0], cir[:1], 700.0)
+    tracemalloc.start()
+    mitigation.correct_arrays(3.0, cir, 700.0, preamble_count=100)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.5 * cir.nbytes
+
+
 def test_magnitudes_in_db_are_detected_and_linear_ones_are_not(records: list[Record]):
     for record in records:
         magnitude = np.abs(samples(record.measurement))
         assert not is_logarithmic(magnitude)
         assert is_logarithmic(20.0 * np.log10(np.maximum(magnitude, 1.0)))
+        assert is_logarithmic(
+            20.0 * np.log10(magnitude[int(record.measurement.cir.first_path_index) - 5 :][:157] + 1.0)
+        )
     generator = np.random.default_rng(1)
     assert not any(is_logarithmic(generator.rayleigh(30.0, 157)) for _ in range(1000))
 

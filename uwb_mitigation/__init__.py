@@ -20,6 +20,7 @@ from uwb_mitigation.files import VERSION
 
 if TYPE_CHECKING:
     from uwb_mitigation.calibration.site import SiteCalibration, calibrate
+    from uwb_mitigation.commands.offline.tracks import Tracks, track
     from uwb_mitigation.errors import UwbMitigationError
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.mitigation.model.shipped import load_model
@@ -27,7 +28,17 @@ if TYPE_CHECKING:
     from uwb_mitigation.recordings.dataframe import to_dataframe
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.types.anchors import Anchor, AnchorMap, load_anchors
-    from uwb_mitigation.types.measurement import Cir, CorrectedRange, RangeMeasurement, Record, Status
+    from uwb_mitigation.types.measurement import (
+        Cir,
+        CorrectedRange,
+        Encoding,
+        RadioType,
+        RangeMeasurement,
+        Record,
+        Segment,
+        Status,
+        Truth,
+    )
     from uwb_mitigation.types.offsets import Offsets
     from uwb_mitigation.types.tracks import Estimate
 
@@ -41,41 +52,48 @@ __all__ = [
     "AnchorMap",
     "Cir",
     "CorrectedRange",
+    "Encoding",
     "Estimate",
     "Mitigation",
     "Offsets",
+    "RadioType",
     "RangeMeasurement",
     "Record",
+    "Segment",
     "SiteCalibration",
     "Status",
     "TagLocator",
+    "Tracks",
+    "Truth",
     "UwbMitigationError",
     "calibrate",
     "load_anchors",
     "load_model",
     "open_recording",
     "to_dataframe",
+    "track",
 ]
 
 _MODULES = {
-    "Anchor": "types.anchors",
-    "AnchorMap": "types.anchors",
-    "Cir": "types.measurement",
-    "CorrectedRange": "types.measurement",
-    "Estimate": "types.tracks",
-    "Mitigation": "mitigation.correction",
-    "Offsets": "types.offsets",
-    "RangeMeasurement": "types.measurement",
-    "Record": "types.measurement",
-    "SiteCalibration": "calibration.site",
-    "Status": "types.measurement",
-    "TagLocator": "positioning.tag_locator",
-    "UwbMitigationError": "errors",
-    "calibrate": "calibration.site",
-    "load_anchors": "types.anchors",
-    "load_model": "mitigation.model.shipped",
-    "open_recording": "recordings.formats",
-    "to_dataframe": "recordings.dataframe",
+    name: module
+    for module, names in {
+        "calibration.site": ("SiteCalibration", "calibrate"),
+        "commands.offline.tracks": ("Tracks", "track"),
+        "errors": ("UwbMitigationError",),
+        "mitigation.correction": ("Mitigation",),
+        "mitigation.model.shipped": ("load_model",),
+        "positioning.tag_locator": ("TagLocator",),
+        "recordings.dataframe": ("to_dataframe",),
+        "recordings.formats": ("open_recording",),
+        "types.anchors": ("Anchor", "AnchorMap", "load_anchors"),
+        "types.measurement": (
+            *("Cir", "CorrectedRange", "Encoding", "RadioType", "RangeMeasurement", "Record"),
+            *("Segment", "Status", "Truth"),
+        ),
+        "types.offsets": ("Offsets",),
+        "types.tracks": ("Estimate",),
+    }.items()
+    for name in names
 }
 """Modules of the lazy names."""
 
@@ -89,4 +107,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return [*__all__, "__version__"]

@@ -54,7 +54,7 @@ from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.anchors import AnyAnchors, as_anchors
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import Offsets, dump_offsets
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -282,7 +282,7 @@ def offsets_file(bundle: Path) -> Path:
 
 def calibrate(
     recordings: Iterable[Iterable[Record]],
-    anchors: AnchorMap,
+    anchors: AnyAnchors,
     model: Bundle,
     *,
     height_m: float | None = None,
@@ -294,7 +294,7 @@ def calibrate(
 
     Args:
         recordings: records of each drive, in the order of time.
-        anchors: surveyed positions of the anchors.
+        anchors: surveyed positions of the anchors: a map, {id: (x, y, z)} in m, or the path of a file.
         model: bundle to start from, such as `load_model("universal")`.
         height_m: constant height of the tags' antennas in the frame of the anchors; None: unknown.
         check: records of other drives, on which the calibration is only tested.
@@ -305,7 +305,7 @@ def calibrate(
     """
     if not isinstance(model, Bundle):
         raise ParameterError("several models", valid='one to start from, such as load_model("universal")')
-    height = None if height_m is None else Height(height_m)
+    height, anchors = None if height_m is None else Height(height_m), as_anchors(anchors)
     site = read_site(recordings, anchors, model)
     checks = [read_site([records], anchors, model) for records in check]
     return calibrate_site(site, model, solve_without_truth(site, height=height, area=None), check=checks)

@@ -6,19 +6,20 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import islice
-from pathlib import Path
 from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import ModelError, ParameterError, UwbMitigationError
+from uwb_mitigation.mitigation.arrays import columns_of_arrays
 from uwb_mitigation.mitigation.at_rest import PairsAtRest
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, find_early_paths
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.choice import Choice, CirKind, choose_model, kinds_of
-from uwb_mitigation.mitigation.model.ood import OodDetector, ood_features
+from uwb_mitigation.mitigation.model.ood import OodDetector, approximate_features, ood_features
 from uwb_mitigation.types.measurement import (
+    CirFault,
     CorrectedBy,
     CorrectedColumns,
     CorrectedRange,
@@ -26,8 +27,9 @@ from uwb_mitigation.types.measurement import (
     RangeMeasurement,
     Record,
     Status,
+    reason,
 )
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, read_offsets
+from uwb_mitigation.types.offsets import NO_OFFSETS, AnyOffsets, as_offsets
 
 MAX_RANGE_M = 1e6
 """Upper limit of valid ranges: the radio reaches a few hundred metres."""
@@ -36,13 +38,16 @@ UNRELIABLE_VARIANCE_M2 = 0.25
 """A corrected range with a larger variance is UNRELIABLE. At simulated sites these are 10 % of the ranges, and half of those
 with an error of more than 0.5 m."""
 
+CLEARLY_IN_DISTRIBUTION = -0.01
+"""OOD score below which rounding decides nothing: all scores below 0 have the same result."""
+
 BATCH = 256
 """Number of records that `Corrector.correct_records` reads ahead."""
 
 MAX_KINDS = 1000
 """Number of kinds of CIRs whose models are kept."""
 
-_COLUMNS = ("range_m", "correction_m", "variance_m2", "status", "model_id")
+_COLUMNS = ("range_m", "correction_m", "variance_m2", "status", "model_id", "fault")
 _STATUSES = {int(status): status for status in Status}
 # NumPy takes microseconds to convert a member of an enumeration.
 _INFINITE_VARIANCE = np.float32(np.inf)
@@ -79,10 +84,15 @@ class CorrectionRule:
         """Return the OOD score of n measurements, float32 (n,); 0 if the card has no bands."""
         if self._ood_detector is None:
             return np.zeros(len(windows), np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):
-            features = ood_features(windows, self._scaling, range_m, rx_power_dbm, first_path_power_dbm)
-            score = self._ood_detector.score(features)
-        return score if isinstance(score, np.ndarray) else np.array([score], np.float32)
+        reported = range_m, rx_power_dbm, first_path_power_dbm
+        if len(windows) == 1:
+            numbers = (float(values[0]) for values in reported)
+            score = self._ood_detector.score(approximate_features(windows[0], self._scaling, *numbers))
+            if score < CLEARLY_IN_DISTRIBUTION:
+                return np.array([score], np.float32)
+        return np.asarray(
+            self._ood_detector.score(ood_features(windows, self._scaling, *reported)), np.float32
+        )
 
     def apply(
         self, predicted: NDArray[np.float32], score: NDArray[np.float32]
@@ -115,29 +125,35 @@ class Corrector:
 
     _backend: Callable[[Bundle], Backend]
 
-    def __init__(
-        self, model: Bundle | Sequence[Bundle], offsets: Offsets | float | str | Path = NO_OFFSETS
-    ) -> None:
-        self.bundles = (model,) if isinstance(model, Bundle) else tuple(model)
-        self.offsets = offsets if isinstance(offsets, Offsets) else read_offsets(str(offsets))
+    def __init__(self, model: Bundle | Sequence[Bundle], offsets: AnyOffsets = NO_OFFSETS) -> None:
+        self.bundles = tuple(model) if isinstance(model, Sequence) else (model,)
+        if not self.bundles or not all(isinstance(bundle, Bundle) for bundle in self.bundles):
+            raise ModelError(f"model {model!r:.60}", valid="what load_model() returns")
+        self.offsets = as_offsets(offsets)
         self.bundle = self.bundles[0]
         self._backends = [self._backend(bundle) for bundle in self.bundles]
         self.used: Counter[Choice] = Counter()
         # Bounded, because a stream may contain CIRs of any length.
         self.choose = lru_cache(MAX_KINDS)(partial(choose_model, self.bundles))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Sessions cannot be pickled. They are made again, and `used` begins at 0.
+        return type(self), (self.bundles, self.offsets)
+
     def correct_columns(self, ranges: RangeColumns) -> CorrectedColumns:
         """Return the corrected ranges; never raises because of the content of a measurement."""
         offset_m = self.offsets.lookup(ranges.tag_id, ranges.anchor_id)
         kinds = kinds_of(ranges)
-        if len(kinds) == 1:
-            return self._correct_kind(next(iter(kinds)), ranges, offset_m)
-        # All rows are replaced.
-        result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
-        for kind, rows in kinds.items():
-            part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
-            for name in _COLUMNS:
-                getattr(result, name)[rows] = getattr(part, name)
+        # A range or an energy beyond float32 is out of distribution, as an infinite one is.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if len(kinds) == 1:
+                return self._correct_kind(next(iter(kinds)), ranges, offset_m)
+            # All rows are replaced.
+            result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
+            for kind, rows in kinds.items():
+                part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
+                for name in _COLUMNS:
+                    getattr(result, name)[rows] = getattr(part, name)
         return result
 
     def _correct_kind(
@@ -146,7 +162,11 @@ class Corrector:
         choice = self.choose(kind)
         self.used[choice] += len(ranges)
         if choice.is_trained:
-            return self._backends[choice.model].correct(ranges, offset_m)
+            corrected = self._backends[choice.model].correct(ranges, offset_m)
+            if not (choice.fits or kind.has_levels):
+                is_unlike = (corrected.status == _OUT_OF_DISTRIBUTION) & (corrected.fault == 0)
+                corrected.fault[is_unlike] = CirFault.NO_POWER
+            return corrected
         status = np.full(len(ranges), _OUT_OF_DISTRIBUTION if kind.samples else _NO_CIR, np.uint8)
         return pass_through(self.bundles[choice.model], ranges, offset_m, status)
 
@@ -162,24 +182,34 @@ class Corrector:
         """Return the corrected range of a measurement, or of each one; never raises because of their content.
 
         Measurements whose CIRs have the same encoding and length are corrected in one batch.
+
+        Raises:
+            ParameterError: other objects than measurements.
         """
         if isinstance(measurements, RangeMeasurement):
             return self.correct([measurements])[0]
-        results: list[CorrectedRange | None] = [None] * len(measurements)
-        for indices, ranges in RangeColumns.grouped(measurements):
+        try:
+            results: list[CorrectedRange | None] = [None] * len(measurements)
+            groups = list(RangeColumns.grouped(measurements))
+        except (AttributeError, TypeError) as error:
+            what = f"{measurements!r:.60} has other values than a RangeMeasurement"
+            raise ParameterError(what, valid="record.measurement, or a list of them") from error
+        for indices, ranges in groups:
             corrected = self.correct_columns(ranges)
             columns = [getattr(corrected, name).tolist() for name in _COLUMNS]
-            for index, range_m, correction_m, variance_m2, status, model_id in zip(
+            for index, range_m, correction_m, variance_m2, status, model_id, fault in zip(
                 indices, *columns, strict=True
             ):
+                range_raw_m = measurements[index].range_m
                 results[index] = CorrectedRange(
                     range_m,
-                    measurements[index].range_m,
+                    range_raw_m,
                     correction_m,
                     variance_m2,
                     _STATUSES[status],
                     corrected.origin,
                     model_id,
+                    reason(status, fault, range_raw_m) if status else "",
                 )
         return [result for result in results if result is not None]
 
@@ -208,25 +238,33 @@ class Corrector:
     def correct_arrays(
         self, range_m: Any, cir: Any, first_path_index: Any, **fields: Any
     ) -> CorrectedColumns:
-        """Return n corrected ranges as arrays: `range_m` and `variance_m2` in metres and m^2, `status` as numbers.
+        """Return n corrected ranges as arrays: `range_m` and `variance_m2` in metres and m^2, `status` as numbers, `reason`.
+
+        The rows are corrected in batches, which bounds the memory.
 
         Args:
             range_m: float (n,), measured ranges.
             cir: complex (n, m), accumulator samples; or real (n, m), their magnitudes. Integers of 16 bits remain unchanged;
                 other values are rounded to 1/30,000 of the largest sample of the range.
-            first_path_index: float (n,), index in `cir` of the first path, sub-sample; NaN = unknown.
-            **fields: numbers, or arrays (n,): `preamble_count`, accumulated symbols (0 = unknown); `rx_power_dbm` and
+            first_path_index: float (n,), index of the first path, sub-sample; NaN = unknown.
+            **fields: numbers, or arrays (n,): `start_index`, index of the first sample of `cir` (default: 0); `preamble_count`, accumulated symbols (0 = unknown); `rx_power_dbm` and
                 `first_path_power_dbm`, levels (NaN = unknown); `tag_id` and `anchor_id`, integers that select offsets.
                 For all CIRs: `radio` and `segment`.
 
         Raises:
-            ParameterError: the shapes are inconsistent, all magnitudes are negative or in dB, or a field is unknown.
+            ParameterError: the shapes are inconsistent, all magnitudes are negative, most are in dB, most ranges are longer
+                than a radio reaches, all first paths are outside of the CIRs, or a field is unknown.
         """
-        return self.correct_columns(RangeColumns.from_arrays(range_m, cir, first_path_index, **fields))
+        parts = columns_of_arrays(range_m, cir, first_path_index, **fields)
+        return CorrectedColumns.joined([self.correct_columns(part) for part in parts])
 
 
 def pass_through(
-    bundle: Bundle, ranges: RangeColumns, offset_m: NDArray[np.float32], status: NDArray[np.uint8]
+    bundle: Bundle,
+    ranges: RangeColumns,
+    offset_m: NDArray[np.float32],
+    status: NDArray[np.uint8],
+    fault: NDArray[np.uint8] | None = None,
 ) -> CorrectedColumns:
     """Return the raw ranges minus the offsets of their radios, with the variance of uncorrected ranges.
 
@@ -238,9 +276,10 @@ def pass_through(
         ranges: n measured ranges.
         offset_m: offset of the radios of each range, m, float32 (n,).
         status: `Status` of each range, uint8 (n,).
+        fault: `CirFault` of each range, uint8 (n,), 0 = none; None: of none.
 
     Returns:
-        n ranges; `status` is not copied.
+        n ranges; `status` and `fault` are not copied.
     """
     card = bundle.card
     range_m = _subtract_offset(ranges.range_m, offset_m).copy()
@@ -250,7 +289,9 @@ def pass_through(
     if not ranges.samples.shape[1]:
         variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
     model_id = np.array([bundle.model_id] * len(ranges), np.uint32)
-    return CorrectedColumns(range_m, offset_m, variance, status, CorrectedBy.HOST, model_id)
+    if fault is None:
+        fault = np.zeros(len(ranges), np.uint8)
+    return CorrectedColumns(range_m, offset_m, variance, status, CorrectedBy.HOST, model_id, fault)
 
 
 class OnnxBackend:
@@ -269,11 +310,12 @@ class OnnxBackend:
         powers = (ranges.rx_power_dbm, ranges.first_path_power_dbm)
         predicted = linear_bias.predict_m(*powers)
         faults, windows = self.bundle.preprocessing.apply(ranges)
-        status, score = np.zeros(n, np.uint8), np.zeros(n, np.float32)
-        has_bias, valid = np.isfinite(predicted), _is_valid_range(range_m)
-        if np.count_nonzero(faults) == 0 and np.count_nonzero(has_bias & valid) == n:
+        status = np.zeros(n, np.uint8)
+        numbers = zip(faults.tolist(), predicted.tolist(), range_m.tolist(), strict=True)
+        if all(not fault and bias == bias and 0.0 <= value <= MAX_RANGE_M for fault, bias, value in numbers):
             predicted, score = self._predict(ranges, _ALL_ROWS, range_m, windows, predicted)
         else:
+            has_bias, valid, score = np.isfinite(predicted), _is_valid_range(range_m), np.zeros(n, np.float32)
             # CirFault.NO_POWER, which the preprocessing does not check
             status[~has_bias] = _BAD_CIR
             status[~valid] = _OUT_OF_DISTRIBUTION
@@ -306,11 +348,13 @@ class OnnxBackend:
         ]
         if accepted is _ALL_ROWS:
             model_id = np.array([self.bundle.model_id] * n, np.uint32)
-            return CorrectedColumns(corrected_m, correction, variance, status, CorrectedBy.HOST, model_id)
+            return CorrectedColumns(
+                corrected_m, correction, variance, status, CorrectedBy.HOST, model_id, faults
+            )
         rejected = status == _OK
         rejected[accepted] = False
         status[rejected] = np.where(np.isfinite(predicted[rejected]), _OUT_OF_DISTRIBUTION, _MODEL_ERROR)
-        corrected = pass_through(self.bundle, ranges, offset_m, status)
+        corrected = pass_through(self.bundle, ranges, offset_m, status, faults)
         corrected.range_m[accepted], corrected.correction_m[accepted], corrected.variance_m2[accepted] = (
             corrected_m,
             correction,
@@ -373,8 +417,8 @@ class Mitigation(Corrector):
 
     Args:
         model: the model, or several, of which `choose_model` selects one for each range.
-        offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, or a
-            file written by `uwb-mitigation offset` or `calibrate`.
+        offsets: offsets of the radios, in addition to the prediction of the model: one offset in m for all, `Offsets`, a
+            file written by `uwb-mitigation offset` or `calibrate`, or a dictionary like it: `{"anchors": {1: 0.21}}`.
         median_at_rest: replace predicted errors by their median while a pair of radios is at rest (`PairsAtRest`). The result
             then depends on the ranges before, which must be in the order of time.
 
@@ -384,19 +428,24 @@ class Mitigation(Corrector):
         used: number of corrected ranges by choice of the model. choose: returns the `Choice` for a `CirKind`.
 
     Raises:
-        ModelError: the backend rejects a model.
+        ModelError: the backend rejects a model, or `model` is none.
         ParameterError: the offset is not finite, too large, or no such file exists.
+
+    It can be pickled, for process pools; the copy has not seen earlier ranges.
     """
 
     def __init__(
         self,
         model: Bundle | Sequence[Bundle],
-        offsets: Offsets | float | str | Path = NO_OFFSETS,
+        offsets: AnyOffsets = NO_OFFSETS,
         *,
         median_at_rest: bool = False,
     ) -> None:
         self._median_at_rest = median_at_rest
         super().__init__(model, offsets)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(Mitigation, median_at_rest=self._median_at_rest), (self.bundles, self.offsets)
 
     def _backend(self, bundle: Bundle) -> Backend:
         return OnnxBackend(bundle, PairsAtRest() if self._median_at_rest else None)
@@ -406,8 +455,7 @@ def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32
     """Return ranges minus offsets in float32, as on boards; without an offset the unchanged range."""
     if not np.count_nonzero(offset_m):
         return range_m
-    with np.errstate(over="ignore"):  # A range beyond float32 is invalid, as an infinite one is.
-        return np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
+    return np.where(offset_m == 0.0, range_m, range_m.astype(np.float32, copy=False) - offset_m)
 
 
 def _is_valid_range(range_m: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -45,32 +45,31 @@ def find_early_paths(
     lead = NOISE_TAPS + SEARCH_TAPS
     width = 2 if ranges.encoding == Encoding.COMPLEX_INT16 else 1
     size = width * (lead - EDGE_TAPS + 1)
-    columns = (
-        ranges.first_path_index[rows].tolist(),
-        ranges.start_index[rows].tolist(),
-        ranges.samples[rows],
-    )
-    places, blocks = [], []
-    # As in the preprocessing: for a batch of one, a loop is faster than operations on arrays.
-    for index, (first_path, start_index, cir) in enumerate(zip(*columns, strict=True)):
-        start = width * (int(math.floor(first_path) - start_index) - lead)
-        if start >= 0:
-            places.append((index, cir, start, first_path))
-            blocks.append(cir[start : start + size])
+    first_paths, cirs = ranges.first_path_index[rows].tolist(), ranges.samples[rows]
+    # As in the preprocessing: for a batch of one, loops are faster than operations on arrays.
+    starts = [
+        width * (int(math.floor(first_path) - start_index) - lead)
+        for first_path, start_index in zip(first_paths, ranges.start_index[rows].tolist(), strict=True)
+    ]
     errors: dict[int, np.float32] = {}
-    if not blocks:
+    indices = [index for index, start in enumerate(starts) if start >= 0]
+    if not indices:
         return errors
     # The magnitude of -32768 needs an unsigned integer.
-    components = np.abs(np.array(blocks)).view(np.uint16)
+    components = np.abs(np.array([cirs[i, starts[i] : starts[i] + size] for i in indices])).view(np.uint16)
     strongest = np.maximum.reduceat(components, (0, width * NOISE_TAPS), axis=1).tolist()
-    for (index, cir, start, first_path), (noise, search) in zip(places, strongest, strict=True):
-        # The power of a tap is at most `width` times the square of its larger component.
-        if width * search * search > MIN_NOISE_RATIO * noise * noise:
-            stop = start + width * (lead - WINDOW_LEAD + samples)
-            power = np.square(cir[start:stop], dtype=np.int64)
-            error_m = _error_m(power[0::2] + power[1::2] if width == 2 else power, first_path)
-            if error_m is not None:
-                errors[index] = error_m
+    # The power of a tap is at most `width` times the square of its larger component.
+    found = [
+        index
+        for index, (noise, search) in zip(indices, strongest, strict=True)
+        if width * search * search > MIN_NOISE_RATIO * noise * noise
+    ]
+    for index in found:
+        stop = starts[index] + width * (lead - WINDOW_LEAD + samples)
+        power = np.square(cirs[index, starts[index] : stop], dtype=np.int64)
+        error_m = _error_m(power[0::2] + power[1::2] if width == 2 else power, first_paths[index])
+        if error_m is not None:
+            errors[index] = error_m
     return errors
 
 

@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.types.measurement import Encoding, RangeColumns, RangeMeasurement
+from uwb_mitigation.types.measurement import (
+    CirFault,
+    Encoding,
+    RangeColumns,
+    RangeMeasurement,
+    is_logarithmic,
+)
 
 WINDOW_LEAD = 5
 """Samples of the window before floor(first path): enough to include the noise before the path."""
@@ -40,40 +46,6 @@ class Scaling(str, enum.Enum):
 
     MAX = "max"
     PREAMBLE = "preamble"
-
-
-class CirFault(enum.IntEnum):
-    """Reason why a channel impulse response is unusable; the values of `uwb_status` in the firmware."""
-
-    EMPTY = 3
-    ODD_LENGTH = 4
-    BAD_SCALE = 5
-    NO_FIRST_PATH = 6
-    OUTSIDE = 7
-    ALL_ZERO = 8
-    NEGATIVE = 9
-    SATURATED = 10
-    NO_PREAMBLE_COUNT = 11
-    NO_POWER = 12
-
-    @property
-    def text(self) -> str:
-        """The reason as text."""
-        return _FAULT_TEXTS[self]
-
-
-_FAULT_TEXTS = {
-    CirFault.EMPTY: "the CIR has no samples",
-    CirFault.ODD_LENGTH: "a complex CIR has an odd number of values",
-    CirFault.BAD_SCALE: "the scale of the CIR is not a positive number within the range of float32",
-    CirFault.NO_FIRST_PATH: "the first-path index is not finite",
-    CirFault.OUTSIDE: "the window around the first path is partly outside the CIR",
-    CirFault.ALL_ZERO: "the window contains only zeros",
-    CirFault.NEGATIVE: "a magnitude is negative",
-    CirFault.SATURATED: "the window contains a saturated sample",
-    CirFault.NO_PREAMBLE_COUNT: "the preamble count is unknown, and the model's scaling needs it",
-    CirFault.NO_POWER: "the receive or first-path power is unknown, and the linear bias model needs it",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,55 +76,71 @@ class Preprocessing:
         is_complex = ranges.encoding == Encoding.COMPLEX_INT16
         width = 2 if is_complex else 1
         size, total = width * self.samples, ranges.samples.shape[1]
-        faults, windows, scales, symbols = [], [], [], []
         numbers = (ranges.first_path_index, ranges.start_index, ranges.scale, ranges.preamble_count)
-        # A loop over Python numbers: for a live range, a batch of one, it is faster than operations on arrays.
-        for samples, first_path, start_index, scale, count in zip(
-            ranges.samples, *(column.tolist() for column in numbers), strict=True
-        ):
-            fault = 0
-            if total == 0:
-                fault = CirFault.EMPTY
-            elif not MIN_SCALE <= scale <= MAX_SCALE:
-                fault = CirFault.BAD_SCALE
-            elif not math.isfinite(first_path):
-                fault = CirFault.NO_FIRST_PATH
-            elif self.scaling is Scaling.PREAMBLE and count <= 0:
-                fault = CirFault.NO_PREAMBLE_COUNT
-            else:
-                start = width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
-                window = samples[start : start + size] if start >= 0 else samples[:0]
-                fault = CirFault.OUTSIDE if len(window) < size else 0
-            faults.append(fault)
-            if not fault:
-                windows.append(window)
-                scales.append(scale)
-                symbols.append(PREAMBLE_DIVISOR * count)
-        if not windows:
-            return np.array(faults, np.uint8), np.empty((0, self.samples), np.float32)
+        first_paths, start_indices, scales, counts = (column.tolist() for column in numbers)
+        least = 0.0 if self.scaling is Scaling.PREAMBLE else -math.inf
+        # Loops over Python numbers: for a live range, a batch of one, they are faster than operations on arrays.
+        starts = [
+            width * int(math.floor(first_path) - WINDOW_LEAD - start_index)
+            if MIN_SCALE <= scale <= MAX_SCALE and count > least and -math.inf < first_path < math.inf
+            else -1
+            for first_path, start_index, scale, count in zip(
+                first_paths, start_indices, scales, counts, strict=True
+            )
+        ]
+        windows = [
+            samples[start : start + size]
+            for samples, start in zip(ranges.samples, starts, strict=True)
+            if 0 <= start <= total - size
+        ]
+        faults = np.zeros(len(starts), np.uint8)
+        usable = range(len(starts))
+        if len(windows) < len(starts):
+            faults[:] = [
+                0 if 0 <= start <= total - size else self._fault(total // width, *row)
+                for start, *row in zip(starts, first_paths, start_indices, scales, counts, strict=True)
+            ]
+            usable = np.flatnonzero(faults == 0).tolist()
+            if not windows:
+                return faults, np.empty((0, self.samples), np.float32)
         stacked = np.array(windows)
-        if not _are_usable(stacked, total, is_complex):
-            usable = [row for row, fault in enumerate(faults) if not fault]
-            for row, window in zip(usable, windows, strict=True):
-                faults[row] = _content_fault(window, total, is_complex)
-            rows = [number for number, row in enumerate(usable) if not faults[row]]
-            stacked = stacked[rows]
-            scales, symbols = ([values[row] for row in rows] for values in (scales, symbols))
+        # Squares of the components of complex samples, or magnitudes.
+        values = np.multiply(stacked, stacked, dtype=np.int32) if is_complex else stacked
+        if not _are_usable(values, total, is_complex):
+            faults[usable] = [_content_fault(window, total, is_complex) for window in windows]
+            values = values[faults[usable] == 0]
+            usable = np.flatnonzero(faults == 0).tolist()
+        if len(usable) < len(starts):
+            scales, counts = ([column[row] for row in usable] for column in (scales, counts))
 
         if is_complex:
-            power = np.multiply(stacked, stacked, dtype=np.int32)
-            inputs = (power[:, 0::2] + power[:, 1::2]).astype(np.float32)
+            inputs = (values[:, 0::2] + values[:, 1::2]).astype(np.float32)
             np.sqrt(inputs, out=inputs)
         else:
-            inputs = stacked.astype(np.float32)
+            inputs = values.astype(np.float32)
         if scales.count(1.0) < len(scales):
             np.multiply(inputs, np.array(scales, np.float32)[:, None], out=inputs)
         if self.scaling is Scaling.MAX:
             np.divide(inputs, inputs.max(axis=1, keepdims=True), out=inputs)
         else:
+            symbols = [PREAMBLE_DIVISOR * count for count in counts]
             np.divide(inputs, np.array(symbols, np.float32)[:, None], out=inputs)
             np.sqrt(inputs, out=inputs)
-        return np.array(faults, np.uint8), inputs
+        return faults, inputs
+
+    def _fault(
+        self, samples: int, first_path: float, start_index: float, scale: float, count: float
+    ) -> CirFault:
+        """Return why a CIR with the number of `samples` in time has no window."""
+        if samples == 0:
+            return CirFault.EMPTY
+        if not MIN_SCALE <= scale <= MAX_SCALE:
+            return CirFault.BAD_SCALE
+        if not math.isfinite(first_path):
+            return CirFault.NO_FIRST_PATH
+        if self.scaling is Scaling.PREAMBLE and not count > 0:
+            return CirFault.NO_PREAMBLE_COUNT
+        return CirFault.TOO_SHORT if 0 <= first_path - start_index < samples else CirFault.OUTSIDE
 
     def windows_of(self, measurements: Sequence[RangeMeasurement]) -> tuple[list[int], NDArray[np.float32]]:
         """Return `CirFault` of each measurement (0 = usable), and the inputs, float32 (n, samples), zeros if unusable."""
@@ -165,11 +153,14 @@ class Preprocessing:
         return faults.tolist(), inputs
 
 
-def _are_usable(windows: NDArray[np.int16], total: int, is_complex: bool) -> bool:
-    """Return whether no window has a `_content_fault`; checks all windows at once."""
-    lowest, highest = int(np.minimum.reduce(windows, axis=None)), int(np.maximum.reduce(windows, axis=None))
-    in_range = lowest > -SATURATED and highest < SATURATED and (total % 2 == 0 if is_complex else lowest >= 0)
-    return in_range and all(np.logical_or.reduce(windows, axis=1).tolist())
+def _are_usable(values: NDArray[np.int32 | np.int16], total: int, is_complex: bool) -> bool:
+    """Return whether no window has a `_content_fault`, from squares of complex components or magnitudes (n, k)."""
+    highest = np.maximum.reduce(values, axis=1).tolist()
+    if is_complex:
+        return total % 2 == 0 and min(highest) > 0 and max(highest) < SATURATED**2
+    lowest = int(np.minimum.reduce(values, axis=None))
+    in_range = lowest >= 0 and min(highest) > 0 and max(highest) < SATURATED
+    return in_range and not is_logarithmic(values).any()
 
 
 def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> int:
@@ -184,4 +175,4 @@ def _content_fault(window: NDArray[np.int16], total: int, is_complex: bool) -> i
         return CirFault.ALL_ZERO
     if highest >= SATURATED or lowest <= -SATURATED:
         return CirFault.SATURATED
-    return 0
+    return CirFault.DECIBELS if not is_complex and is_logarithmic(window) else 0

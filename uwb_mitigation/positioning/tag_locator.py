@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.anchors import AnyAnchors, as_anchors
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement
 from uwb_mitigation.types.tracks import Estimate
 
@@ -16,7 +17,7 @@ class TagLocator:
     """Estimates position and velocity of each tag from its ranges, as the node `locator` does. Not thread-safe.
 
     Args:
-        anchors: positions of the anchors.
+        anchors: positions of the anchors: a map, {id: (x, y, z)} in m, or the path of a file.
         height_m: height of the tags' antennas in the anchors' frame, if it is constant; None: estimate it.
         height_sd_m: standard deviation of this height.
         area: (lower corner, upper corner) of the box that contains the tags, x, y, z in m; None: unknown.
@@ -27,7 +28,7 @@ class TagLocator:
 
     def __init__(
         self,
-        anchors: AnchorMap,
+        anchors: AnyAnchors,
         *,
         height_m: float | None = None,
         height_sd_m: float = 0.1,
@@ -35,7 +36,7 @@ class TagLocator:
     ) -> None:
         height = None if height_m is None else Height(height_m, height_sd_m)
         box = None if area is None else Area(*area)
-        self._estimator = MultiTagEstimator(EstimatorConfig(anchors, height=height, area=box))
+        self._estimator = MultiTagEstimator(EstimatorConfig(as_anchors(anchors), height=height, area=box))
 
     def add(self, measurement: RangeMeasurement, corrected: CorrectedRange | None = None) -> Estimate | None:
         """Update with a range, in the order of the stamps.
@@ -47,7 +48,18 @@ class TagLocator:
         Returns:
             The position of the tag at the stamp of the measurement, in m in the anchors' frame, with its covariance; None: it
             is still unknown or ambiguous, or the range was skipped (`warnings` gives the reason).
+
+        Raises:
+            ParameterError: `measurement` or `corrected` is of another type.
         """
+        if not isinstance(measurement, RangeMeasurement):
+            raise ParameterError(
+                f"measurement = {measurement!r:.60}", valid="a RangeMeasurement: record.measurement"
+            )
+        if not isinstance(corrected, CorrectedRange | None):
+            raise ParameterError(
+                f"corrected = {corrected!r:.60}", valid="what Mitigation.correct returns, or None"
+            )
         range_m, variance_m2 = (
             (measurement.range_m, math.nan)
             if corrected is None

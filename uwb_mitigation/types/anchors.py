@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import yaml
@@ -63,6 +63,10 @@ class Anchor:
 class AnchorMap:
     """The anchors of a site; immutable.
 
+    Args:
+        anchors: the anchors, or {id: (x, y, z)} in m.
+        where: name of the file or parameter in errors.
+
     Attributes:
         anchors: one or more, with different ids.
         position: float64 (m, 3), m.
@@ -70,10 +74,18 @@ class AnchorMap:
         index: {id: row}.
 
     Raises:
-        ParameterError: no anchor, too many, or an id twice.
+        ParameterError: no anchor, too many, an id twice, or a position that is not finite.
     """
 
-    def __init__(self, anchors: Sequence[Anchor], where: str = "anchors") -> None:
+    def __init__(
+        self, anchors: Sequence[Anchor] | Mapping[int, Sequence[float]], where: str = "anchors"
+    ) -> None:
+        if isinstance(anchors, Mapping):
+            anchors = [_anchor_at(identity, position, where) for identity, position in anchors.items()]
+        if not isinstance(anchors, Sequence) or not all(isinstance(anchor, Anchor) for anchor in anchors):
+            raise ParameterError(
+                f"{anchors!r:.60}", where=where, valid="Anchor objects, or {id: (x, y, z)} in m"
+            )
         if not 1 <= len(anchors) <= MAX_ANCHORS:
             raise ParameterError(f"{len(anchors)} anchors", where=where, valid=f"1 to {MAX_ANCHORS}")
         self.anchors = tuple(anchors)
@@ -83,9 +95,12 @@ class AnchorMap:
             raise ParameterError(
                 f"anchor {format_id(twice)} is there twice", where=where, valid="one entry for each"
             )
-        self.position: NDArray[np.float64] = np.array(
-            [anchor.position for anchor in self.anchors], np.float64
-        )
+        try:
+            self.position = np.array([anchor.position for anchor in self.anchors], np.float64).reshape(-1, 3)
+        except (TypeError, ValueError) as error:
+            raise ParameterError(f"a position: {error}", where=where, valid="(x, y, z) in m") from error
+        if not np.isfinite(self.position).all():
+            raise ParameterError("a position is not finite", where=where, valid="(x, y, z) in m")
         self.sd: NDArray[np.float64] = np.array([anchor.sd for anchor in self.anchors], np.float64)
         self.position.setflags(write=False)
         self.sd.setflags(write=False)
@@ -146,6 +161,15 @@ def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:
     return out.getvalue()
 
 
+def _anchor_at(identity: object, position: Any, where: str) -> Anchor:
+    try:
+        x, y, z = map(float, position)
+    except (TypeError, ValueError) as error:
+        what = f"anchor {identity!r:.60} at {position!r:.60}"
+        raise ParameterError(what, where=where, valid="{id: (x, y, z)} in m") from error
+    return _anchor({"id": identity, "x": x, "y": y, "z": z}, where)
+
+
 def _anchor(entry: Any, where: str) -> Anchor:
     if not isinstance(entry, dict):
         raise ParameterError(f"{entry!r:.60} is no anchor", where=where, valid=SCHEMA)
@@ -186,6 +210,21 @@ class HasAnchors(Protocol):
     """
 
     anchors: AnchorMap
+
+
+AnyAnchors: TypeAlias = AnchorMap | Mapping[int, Sequence[float]] | Sequence[Anchor] | str | Path
+"""What `as_anchors` accepts."""
+
+
+def as_anchors(value: AnyAnchors) -> AnchorMap:
+    """Return anchors, those of a file, or those of a dictionary {id: (x, y, z)} in m.
+
+    Raises:
+        ParameterError: it is something else, see `AnchorMap` and `load_anchors`.
+    """
+    if isinstance(value, AnchorMap):
+        return value
+    return load_anchors(value) if isinstance(value, str | Path) else AnchorMap(value)
 
 
 def anchors_path(bag: Path) -> Path:

@@ -15,9 +15,10 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import yaml
@@ -140,6 +141,25 @@ def read_offsets(value: str) -> Offsets:
     return Offsets(number)
 
 
+AnyOffsets: TypeAlias = "Offsets | float | str | Path | Mapping[str, Any]"
+"""What `as_offsets` accepts."""
+
+
+def as_offsets(value: AnyOffsets) -> Offsets:
+    """Return offsets, a number in m for all pairs, the content of a file, or a dictionary with the sections of a file.
+
+    Raises:
+        ParameterError: it is something else, see `parse_offsets`.
+    """
+    if isinstance(value, Offsets):
+        return value
+    if isinstance(value, Mapping):
+        return _from_sections(value, "offsets")
+    if isinstance(value, bool) or not isinstance(value, str | Path | Real):
+        raise ParameterError(f"offsets = {value!r:.60}", valid=f"{VALID}, or {SCHEMA}")
+    return read_offsets(str(value))
+
+
 def parse_offsets(text: str, where: str) -> Offsets:
     """Parse the text of an offsets file.
 
@@ -159,8 +179,12 @@ def parse_offsets(text: str, where: str) -> Offsets:
         return Offsets(document, where=where)
     if not isinstance(document, dict):
         raise ParameterError("not a file of offsets", where=where, valid=SCHEMA)
+    return _from_sections(document, where)
+
+
+def _from_sections(document: Mapping[Any, Any], where: str) -> Offsets:
     for name in document:
-        check_name("key", name, _SECTIONS, where)
+        check_name("key", name, _SECTIONS, where, f"the keys {', '.join(_SECTIONS)}: {SCHEMA}")
     pairs, sd_by_pair = _by_pair(document.get("pairs") or [], where)
     return Offsets(
         _number(document.get("default", 0.0), "default", where),

@@ -126,6 +126,22 @@ class Track(TimeSeries):
         if len(self.yaw) != len(self.stamp_ns):
             object.__setattr__(self, "yaw", np.full((len(self.stamp_ns), 5), np.nan))
 
+    @property
+    def timestamps(self) -> NDArray[np.float64]:
+        """Stamps in s, float64 (n,); this and the next two names are those of evo."""
+        return self.stamp_ns / NS_PER_S
+
+    @property
+    def positions_xyz(self) -> NDArray[np.float64]:
+        """Positions in m, float64 (n, 3)."""
+        return self.position
+
+    @property
+    def orientations_quat_wxyz(self) -> NDArray[np.float64]:
+        """Orientations of the robot, unit quaternions float64 (n, 4); the identity where the yaw is unknown."""
+        half, zero = np.nan_to_num(self.yaw[:, 0]) / 2.0, np.zeros(len(self))
+        return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
+
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Track:
         """Return estimates as a track."""

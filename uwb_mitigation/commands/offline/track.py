@@ -287,17 +287,11 @@ def _body_twist(estimate: Estimate) -> BodyTwist | None:
 
 def tum(track: Track) -> str:
     """Return a track in TUM's format: stamp in s, position, and orientation, which is the identity if it is unknown."""
-    lines = (
-        f"{stamp // NS_PER_S}.{stamp % NS_PER_S:09d} {x:.6f} {y:.6f} {z:.6f} {_quaternion_text(yaw)}\n"
-        for stamp, (x, y, z), yaw in zip(
-            track.stamp_ns.tolist(), track.position.tolist(), track.yaw[:, 0].tolist(), strict=True
-        )
+    columns = track.stamp_ns.tolist(), track.position.tolist(), track.orientations_quat_wxyz.tolist()
+    return "".join(
+        f"{stamp // NS_PER_S}.{stamp % NS_PER_S:09d} {x:.6f} {y:.6f} {z:.6f} {qx:g} {qy:g} {qz:.6f} {qw:.6f}\n"
+        for stamp, (x, y, z), (qw, qx, qy, qz) in zip(*columns, strict=True)
     )
-    return "".join(lines)
-
-
-def _quaternion_text(yaw: float) -> str:
-    return f"0 0 {np.sin(yaw / 2.0):.6f} {np.cos(yaw / 2.0):.6f}" if np.isfinite(yaw) else "0 0 0 1"
 
 
 def tum_file(path: Path, tag_id: int, several: bool) -> Path:

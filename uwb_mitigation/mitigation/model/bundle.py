@@ -13,6 +13,7 @@ import re
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,6 +160,12 @@ class Bundle:
     card: ModelCard
     session: onnxruntime.InferenceSession
 
+    def __repr__(self) -> str:
+        return f"Bundle({self.name!r}, id {self.model_id:08x}, {str(self.path)!r})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, (self.model, self.path)
+
     @property
     def name(self) -> str:
         """Name of the model."""
@@ -183,6 +190,12 @@ class Bundle:
     def quantised(self) -> bool:
         """Whether the network is int8."""
         return self.card.quantised
+
+
+@lru_cache(8)
+def _unpickled(model: bytes, path: Path) -> Bundle:
+    """Return a bundle with a new session; one for each process, because a process pool pickles it with every task."""
+    return parse_bundle(model, path)
 
 
 class Session:

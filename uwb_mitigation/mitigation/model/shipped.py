@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, overload
 
@@ -44,10 +45,12 @@ def load_model(named: str | Path | None = None) -> Bundle | tuple[Bundle, ...]:
     no live range waits for one (7 ms each) and a damaged file is reported at once.
 
     Raises:
-        ModelError: there is no such model or file, or it is damaged.
+        ModelError: there is no such model or file, it is damaged, or `named` is neither a name nor a path.
     """
     from uwb_mitigation.mitigation.model.bundle import load_bundle
 
+    if not isinstance(named, str | Path | None):
+        raise ModelError(f"model {named!r:.60}", valid=f"a path, {AUTO}, or one of {', '.join(SHIPPED)}")
     if not named or str(named) in (AUTO, "."):
         return tuple(load_bundle(shipped_model_path(name)) for name in AUTOMATIC)
     return load_bundle(model_path(named))
@@ -80,28 +83,24 @@ def model_path(named: str | Path | None) -> Path:
 
 
 def shipped_model_path(name: str) -> Path:
-    """Return the path of one of `SHIPPED` in a source checkout, this installation, or a sourced ROS workspace.
+    """Return the path of one of `SHIPPED`, which are data of the package.
 
     Raises:
-        ModelError: the model is in none of these folders; the message lists them.
+        ModelError: it is not installed.
     """
-    candidates = [folder / f"{name}.onnx" for folder in shared_folders("models")]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise ModelError(
-        f"the shipped model {name} is not installed",
-        where=", ".join(str(candidate.parent) for candidate in candidates),
-        valid="install the package again, or give the path of a model",
-    )
+    path = Path(str(files("uwb_mitigation"))) / "models" / f"{name}.onnx"
+    if not path.is_file():
+        valid = "install the package again, or give the path of a model"
+        raise ModelError(f"the shipped model {name} is not installed", where=str(path.parent), valid=valid)
+    return path
 
 
 def shared_folders(name: str) -> list[Path]:
     """Return possible paths of the shared folder `name`: in a checkout, this installation and sourced workspaces."""
     package = Path(__file__).resolve().parents[2]
     folders = [package.parent / name]
-    # lib/python3.x/site-packages/uwb_mitigation, or Debian's local/lib/python3.x/dist-packages.
-    folders += [prefix / _SHARE / name for prefix in list(package.parents)[3:5]]
+    # `pip install --target`, lib/python3.x/site-packages, or Debian's local/lib/python3.x/dist-packages.
+    folders += [package.parents[up] / _SHARE / name for up in (0, 3, 4) if up < len(package.parents)]
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     folders += [Path(prefix) / _SHARE / name for prefix in prefixes if prefix]
     folders.append(Path(sys.prefix) / _SHARE / name)

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.early_path import MIN_RANGE_M, early_path_error_m
-from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing
+from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.types.measurement import (
     Cir,
+    CirFault,
     RadioType,
     RangeColumns,
     RangeMeasurement,

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.mitigation.preprocessing import CirFault, Preprocessing, Scaling
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.recordings import formats
 from uwb_mitigation.recordings.truth_table import load_truth, with_truth
 from uwb_mitigation.training.data import dataset as datasets
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.types.measurement import Record, Truth
+from uwb_mitigation.types.measurement import CirFault, Record, Truth
 
 
 def load_dataset(

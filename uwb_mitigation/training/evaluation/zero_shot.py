@@ -49,14 +49,10 @@ class CardCorrections:
 def correct_with_card(dataset: Dataset, card: ModelCard, predicted_m: NDArray[np.float32]) -> CardCorrections:
     """Apply the limits, the OOD score and the variances of a card to predictions, shape (n,)."""
     rule = CorrectionRule(card)
-    score = rule.score(
-        dataset.inputs,
-        dataset.range_m.astype(np.float32),
-        dataset.rx_power_dbm,
-        dataset.first_path_power_dbm,
-    )
-    accepted = np.array(rule.accepts(predicted_m, score))
-    with np.errstate(invalid="ignore"):
+    levels = dataset.rx_power_dbm, dataset.first_path_power_dbm
+    with np.errstate(over="ignore", invalid="ignore"):
+        score = rule.score(dataset.inputs, dataset.range_m.astype(np.float32), *levels)
+        accepted = np.array(rule.accepts(predicted_m, score))
         correction, variance = rule.apply(predicted_m, score)
     uncorrected = np.float32(card.variance_uncorrected_m2)
     return CardCorrections(
