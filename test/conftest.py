@@ -19,7 +19,7 @@ import pytest
 from browser import Browser, chromium
 from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
-from real_logs import Reading, read_once
+from real_logs import Reading, import_once, read_once
 
 from benchmarks.equipment.dw1000_model.air import Air
 
@@ -88,6 +88,12 @@ def apartment() -> Path:
 def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
     """Return all exchanges of the real logs and their warnings."""
     return read_once(apartment, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def apartment_imported(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the real logs in `apartment.mcap`, which is read faster; see `import_once`."""
+    return import_once(apartment, tmp_path_factory)
 
 
 @pytest.fixture
