@@ -41,6 +41,13 @@ settings.load_profile("suite")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
+LONGEST = (
+    *("site_page", "self_calibration", "calibrate_command", "viewer_page", "tutorial", "tracking"),
+    *("firmware_emulator", "firmware_parity", "paper_experiment", "viewer_node", "viewer_recordings"),
+    *("robot_localization", "locator_odometry", "topic_source", "robot_estimator", "public_api"),
+)
+"""Files that start first, so that none of them runs alone at the end."""
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
@@ -55,6 +62,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    order = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
     if not config.getoption("--fast"):
         return
     slow = [
