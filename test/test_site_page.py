@@ -123,7 +123,7 @@ def terminals(tmp_path: Path, ros: Ros) -> Iterator[Terminals]:
         "ROS_DOMAIN_ID": str(ros.domain),
         "PYTHONUNBUFFERED": "1",
         "COLUMNS": "160",
-        "RECORDED_RANGES": "look 20 first 320 second 50 los 30",
+        "RECORDED_RANGES": "look 10 first 220 second 30 los 20",
     }
     opened = Terminals(folder, environment)
     yield opened
