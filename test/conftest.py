@@ -19,12 +19,14 @@ import pytest
 from browser import Browser, chromium
 from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
-from real_logs import Reading, import_once, read_once
+from real_logs import import_once, read_once
 
 from benchmarks.equipment.dw1000_model.air import Air
 
 if TYPE_CHECKING:
     from ros_harness import Ros
+
+    from uwb_mitigation.types.measurement import Record
 
 # If a script starts pytest in the background, SIGINT is ignored, also by the processes of the tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -94,8 +96,8 @@ def apartment() -> Path:
 
 
 @pytest.fixture(scope="session")
-def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
-    """Return all exchanges of the real logs and their warnings."""
+def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Record]:
+    """Return all exchanges of the real logs."""
     return read_once(apartment, tmp_path_factory)
 
 

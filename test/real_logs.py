@@ -5,23 +5,14 @@ from __future__ import annotations
 import fcntl
 import os
 import pickle
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from command_line import succeed
 
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.types.measurement import Record
-
-
-class Reading(NamedTuple):
-    """Records and warnings of a source."""
-
-    records: list[Record]
-    skipped: Counter[str]
 
 
 def make_once(name: str, tmp_path_factory: pytest.TempPathFactory, make: Callable[[Path], object]) -> Path:
@@ -39,12 +30,12 @@ def make_once(name: str, tmp_path_factory: pytest.TempPathFactory, make: Callabl
     return folder
 
 
-def read_once(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
-    """Return all records of a recording."""
+def read_once(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Record]:
+    """Return the records of a recording."""
 
     def read(folder: Path) -> None:
         with open_recording(recording) as source:
-            (folder / "records.pickle").write_bytes(pickle.dumps(Reading(list(source), source.skipped)))
+            (folder / "records.pickle").write_bytes(pickle.dumps(list(source)))
 
     kept = make_once(f"{recording.name}_read", tmp_path_factory, read)
     return pickle.loads((kept / "records.pickle").read_bytes())

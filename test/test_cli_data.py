@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from bag_material import chunk_offsets
 from command_line import run, start, succeed
-from real_logs import Reading
 
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
@@ -89,7 +88,7 @@ def test_invalid_input_prints_one_line_and_exits_1(
 
 
 def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
-    apartment_imported: Path, apartment_reading: Reading
+    apartment_imported: Path, apartment_reading: list[Record]
 ) -> None:
     from rosbags.rosbag2 import Reader
 
@@ -107,7 +106,7 @@ def test_all_apartment_logs_become_one_bag_that_rosbags_agrees_with(
         assert connections[RANGE_RAW].msgcount == result["ranges"]
         assert connections[RANGE_TRUTH].msgcount == result["with_truth"] == result["ranges"]
         messages = reader.messages([connections[RANGE_RAW]])
-        for item, (connection, stamp_ns, data) in zip(apartment_reading.records, messages, strict=True):
+        for item, (connection, stamp_ns, data) in zip(apartment_reading, messages, strict=True):
             message = store.deserialize_cdr(data, connection.msgtype)
             measurement = item.measurement
             assert (message.tag_id, message.anchor_id) == (measurement.tag_id, measurement.anchor_id)

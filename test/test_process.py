@@ -335,7 +335,7 @@ def test_dask_cluster_gives_the_same_result_and_continues_after_an_invalid_bag(t
     sources[1].write_bytes(b"nothing of the kind")
     jobs = [job(source, tmp_path / f"{source.stem}_out.mcap") for source in sources]
     with distributed.LocalCluster(
-        n_workers=2,
+        n_workers=1,
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,
