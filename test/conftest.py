@@ -44,9 +44,18 @@ settings.load_profile("suite")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 LONGEST = (
-    *("site_page", "self_calibration", "calibrate_command", "viewer_page", "tutorial", "tracking"),
-    *("firmware_emulator", "firmware_parity", "paper_experiment", "viewer_node", "viewer_recordings"),
-    *("robot_localization", "locator_odometry", "topic_source", "robot_estimator", "public_api"),
+    *(
+        "site_page",
+        "self_calibration",
+        "tracking",
+        "viewer_page",
+        "viewer_node",
+        "calibrate_command",
+        "tutorial",
+    ),
+    *("viewer_recordings", "robot_estimator", "firmware_emulator", "paper_experiment", "firmware_parity"),
+    *("firmware_arduino_build", "topic_source", "robot_localization", "positioning", "locator_odometry"),
+    *("viewer_playback", "serial_driver", "survey_anchors", "universal", "px4", "process"),
 )
 """Files that start first, so that none of them runs alone at the end."""
 
