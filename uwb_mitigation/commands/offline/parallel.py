@@ -126,14 +126,11 @@ def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     for job in unfinished:
         # A process that was stopped may have written its output already.
         again = replace(job, force=job.force or is_new[job])
+        reason = "the process crashed, perhaps because memory ran out"
+        crashed = Outcome(job, error=RecordingError(reason, where=str(job.source)))
         with _processes(1) as executor:
             for _, outcome in _run(executor, _in_worker, [again]):
-                yield replace(outcome, job=job) if outcome else Outcome(
-                    job,
-                    error=RecordingError(
-                        "the process crashed, perhaps because memory ran out", where=str(job.source)
-                    ),
-                )
+                yield replace(outcome or crashed, job=job)
         partial_file(job.output).unlink(missing_ok=True)
 
 
