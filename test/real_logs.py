@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import succeed
 
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.types.measurement import Record
@@ -43,6 +42,7 @@ def read_once(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> list
 
 def import_once(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with `apartment.mcap`, `import.json` and `printed.txt` of `data import`."""
+    from command_line import succeed  # Quick tests without commands load this module, too.
 
     def convert(folder: Path) -> None:
         options = "-o apartment.mcap --longest-pause inf --json import.json"
