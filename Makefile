@@ -27,9 +27,10 @@ radio-demo: setup  ## a tag and four anchors on modelled DW1000s, in the simulat
 test-fast: setup-training  ## the quick tests without ROS and torch: a minute on two cores
 	@$(VENV)/bin/python -m pytest -q -n auto --fast
 
-# More workers than processors: during most of a test, nodes wait for each other.
+# More workers than processors: during most of a test, nodes wait for each other. The tests of a file share its fixtures.
 test: setup-training  ## run all tests (COVERAGE=yes: with the coverage of the code)
-	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $$(($$(nproc) + 3)) --dist worksteal $(if $(COVERAGE),--cov --cov-report=term:skip-covered)
+	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $$(($$(nproc) + 3)) --dist loadfile --no-loadscope-reorder \
+	  $(if $(COVERAGE),--cov --cov-report=term:skip-covered)
 
 # The commands of a user with ROS 2; without ROS, .venv is used in place of /opt/ros/jazzy.
 COLCON = $(IN_ROS) PATH="$(CURDIR)/$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$${AMENT_PREFIX_PATH:-$(CURDIR)/$(VENV)}" \

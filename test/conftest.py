@@ -19,12 +19,14 @@ import pytest
 from browser import Browser, chromium
 from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
-from real_logs import Reading, read_once
+from real_logs import import_once, read_once
 
 from benchmarks.equipment.dw1000_model.air import Air
 
 if TYPE_CHECKING:
     from ros_harness import Ros
+
+    from uwb_mitigation.types.measurement import Record
 
 # If a script starts pytest in the background, SIGINT is ignored, also by the processes of the tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -41,6 +43,22 @@ settings.load_profile("suite")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
+LONGEST = (
+    *(
+        "site_page",
+        "self_calibration",
+        "tracking",
+        "viewer_page",
+        "viewer_node",
+        "calibrate_command",
+        "tutorial",
+    ),
+    *("viewer_recordings", "robot_estimator", "firmware_emulator", "paper_experiment", "firmware_parity"),
+    *("firmware_arduino_build", "topic_source", "robot_localization", "positioning", "locator_odometry"),
+    *("viewer_playback", "serial_driver", "survey_anchors", "universal", "px4", "process"),
+)
+"""Files that start first, so that none of them runs alone at the end."""
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
@@ -55,6 +73,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    order = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
     if not config.getoption("--fast"):
         return
     slow = [
@@ -85,9 +105,15 @@ def apartment() -> Path:
 
 
 @pytest.fixture(scope="session")
-def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Reading:
-    """Return all exchanges of the real logs and their warnings."""
+def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Record]:
+    """Return all exchanges of the real logs."""
     return read_once(apartment, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def apartment_imported(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the real logs in `apartment.mcap`, which is read faster; see `import_once`."""
+    return import_once(apartment, tmp_path_factory)
 
 
 @pytest.fixture

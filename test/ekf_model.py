@@ -59,9 +59,10 @@ class Ekf:
         if self.time_s is not None and time_s > self.time_s:
             self._predict(time_s - self.time_s)
         self.time_s = time_s if self.time_s is None else max(time_s, self.time_s)
-        z, R = np.array(list(values.values()))[columns], R[np.ix_(columns, columns)]
+        z, R = np.array(list(values.values()))[columns], R[columns][:, columns]
         # H selects rows of the state.
-        K = np.linalg.solve(self.P[np.ix_(rows, rows)] + R, self.P[rows]).T
+        covariance = self.P[rows]
+        K = np.linalg.solve(covariance[:, rows] + R, covariance).T
         self.x = self.x + K @ (z - self.x[rows])
         residual = np.eye(8)
         residual[:, rows] -= K

@@ -18,7 +18,7 @@ SLOW_MODULES = {
     # They simulate and solve many drives.
     *("uwb_mitigation.calibration.self_calibration", "uwb_mitigation.calibration.survey"),
 }
-SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading"}
+SLOW_FIXTURES = {"ros", "browser", "air", "apartment", "apartment_reading", "apartment_imported"}
 
 
 def is_fast(path: Path) -> bool:

@@ -13,14 +13,7 @@ import yaml
 from bag_material import corrected, record, same, write_corrected
 from mcap.reader import SeekingReader
 from mcap.writer import Writer as McapWriter
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 

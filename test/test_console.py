@@ -48,9 +48,7 @@ def test_dataclasses_arrays_and_unknown_values_become_json(tmp_path: Path):
     }
 
 
-def test_table_shows_the_rows_of_the_json_result_and_omits_optional_columns(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_table_shows_the_rows_of_the_json_result_and_omits_optional_columns(monkeypatch: pytest.MonkeyPatch):
     columns = {"anchor": "anchor_id:id", "mean absolute error, m": "errors.mae:.2f", "status": "status"}
     texts = {}
     for width in (80, 40):

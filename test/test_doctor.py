@@ -59,8 +59,7 @@ def test_arithmetic_that_differs_by_one_bit_is_broken(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("vendor", "allowed", "state"),
-    [(0x2341, True, "ok"), (0x2341, False, "broken"), (None, False, None)],
+    ("vendor", "allowed", "state"), [(0x2341, True, "ok"), (0x2341, False, "broken"), (None, False, None)]
 )
 def test_usb_port_without_permission_is_broken(monkeypatch, vendor, allowed, state):
     port = SimpleNamespace(device="/dev/ttyACM7", vid=vendor, description="Nano 33 BLE")

@@ -30,7 +30,7 @@ def mitigation() -> Mitigation:
 
 @pytest.fixture(scope="module")
 def records(apartment_reading) -> list[Record]:
-    return apartment_reading.records[::EVERY]
+    return apartment_reading[::EVERY]
 
 
 def noise(cir: Cir) -> Cir:
@@ -162,9 +162,7 @@ def test_universal_model_improves_unseen_sites(universal, calibrated):
 
 def test_universal_model_reaches_the_error_of_its_card_on_the_real_logs(apartment_reading):
     bundle = load_bundle(default_model_path())
-    found = zero_shot.evaluate_zero_shot(
-        build_dataset(apartment_reading.records, bundle.preprocessing), bundle
-    )
+    found = zero_shot.evaluate_zero_shot(build_dataset(apartment_reading, bundle.preprocessing), bundle)
     left = [np.abs(found.errors[f"universal{offset}"]).mean() for offset in ("_los_offset", "_offset")]
     assert left == pytest.approx([0.220, 0.209], abs=0.001)
 

@@ -98,12 +98,7 @@ def test_library_properties_follow_the_rules_of_the_library_manager():
     assert "depends" not in fields or fields["depends"]
 
 
-C_VARIANTS = [
-    SOFTFP,
-    ("-mfloat-abi=hard", FPU),
-    ("-mfloat-abi=soft",),
-    (*SOFTFP, "-DUWB_PORTABLE"),
-]
+C_VARIANTS = [SOFTFP, ("-mfloat-abi=hard", FPU), ("-mfloat-abi=soft",), (*SOFTFP, "-DUWB_PORTABLE")]
 ASSEMBLER_VARIANTS = [
     (FPU,),
     (),

@@ -59,7 +59,7 @@ def image(exported: Exported) -> toolchain.Image:
 
 def test_kernels_equal_onnx_runtime_within_the_budgets(exported: Exported, image: toolchain.Image):
     subject = exported.subject
-    windows = exported.windows(2000)
+    windows = exported.windows()
     result = emulator.run_windows(image, windows)
     assert not result.records["status"].any()
     assert np.array_equal(bits(result.records["output_m"]), bits(subject.expect(windows)))

@@ -24,11 +24,7 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from uwb_mitigation.recordings.bag.odometry import (
-    encode_imu_row,
-    encode_odometry_row,
-    encode_transform_row,
-)
+from uwb_mitigation.recordings.bag.odometry import encode_imu_row, encode_odometry_row, encode_transform_row
 from uwb_mitigation.simulation.odometry import RATE_HZ, simulate_motion
 from uwb_mitigation.types.anchors import dump_anchors
 from uwb_mitigation.types.ros.poses import yaw_of

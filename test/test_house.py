@@ -123,10 +123,7 @@ def run_without(package: str, *words: object) -> subprocess.CompletedProcess[str
 
 @pytest.mark.parametrize(
     ("package", "words"),
-    [
-        ("numpy", ("process", "in.mcap", "-o", "out.mcap")),
-        ("onnx", ("board", "export-c", "-o", "/nowhere")),
-    ],
+    [("numpy", ("process", "in.mcap", "-o", "out.mcap")), ("onnx", ("board", "export-c", "-o", "/nowhere"))],
 )
 def test_missing_package_is_reported_in_one_line(package: str, words: tuple[str, ...]):
     done = run_without(package, *words)

@@ -146,12 +146,7 @@ SETTINGS = RadioSettings(
     bias_correction=True,
 )
 SENT |= {
-    "set_offsets": (
-        SetOffsets(Offsets(0.125, {2: 0.25}, {2**63 + 1: -0.5}, {(7, 3): 10.0})),
-        0,
-        4,
-        0,
-    ),
+    "set_offsets": (SetOffsets(Offsets(0.125, {2: 0.25}, {2**63 + 1: -0.5}, {(7, 3): 10.0})), 0, 4, 0),
     "offsets": (OffsetsAnswer(4, 64, True), Flag.ANSWER, 13, 9_000_000),
     "get_radio": (messages.GetRadio(), 0, 2, 0),
     "set_radio": (messages.SetRadio(SETTINGS), 0, 3, 0),

@@ -528,12 +528,7 @@ def test_the_real_labyrinth_is_imported_with_its_odometry(tmp_path: Path):
         )
     # README of the data: 0.07 to 0.15 m too long by anchor, here over the whole run.
     assert all(0.07 < np.mean(each) < 0.16 for each in errors.values())
-    assert set(errors) == {
-        105,
-        107,
-        108,
-        109,
-    }
+    assert set(errors) == {105, 107, 108, 109}
     odometry = read_odometry(tmp_path / "out.mcap", "/odom")
     assert len(odometry) > 200
     assert np.abs(odometry.twist[:, 0]).max() < 1.0

@@ -148,10 +148,7 @@ def test_unit_of_one_anchor_is_found_and_can_be_set(unit: str, factor: float, tr
 
 @pytest.mark.parametrize(
     "pairs",
-    [
-        [(true, true + 154.0) for true in (1.5, 3, 5, 8)],
-        [(0.04, 1.6), (6.0, 6.1), (8.0, 8.1), (9.0, 9.1)],
-    ],
+    [[(true, true + 154.0) for true in (1.5, 3, 5, 8)], [(0.04, 1.6), (6.0, 6.1), (8.0, 8.1), (9.0, 9.1)]],
     ids=["a large offset of all anchors", "one anchor next to the tag with a large error"],
 )
 def test_large_errors_are_no_unit_of_one_anchor(pairs: list[tuple[float, float]], tmp_path: Path):

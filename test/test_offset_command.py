@@ -135,9 +135,9 @@ def test_single_distance_needs_a_single_pair(universal: Mitigation, direct: list
         estimate_offset(universal, two, anchor_id=9)
 
 
-def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment: Path, tmp_path: Path):
+def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment_imported: Path, tmp_path: Path):
     outcome = command_line.run(
-        "offset", apartment, "--truth", "--common", "-o", "o.yaml", "--json", "o.json",
+        "offset", apartment_imported / "apartment.mcap", "--truth", "--common", "-o", "o.yaml", "--json", "o.json",
         "--model", default_model_path(), folder=tmp_path,
     )  # fmt: skip
     assert outcome.returncode == 0, outcome.stderr

@@ -274,13 +274,7 @@ def test_command_writes_its_results(folder):
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("--windows", "a"),
-        ("--windows", "0"),
-        ("--networks", "cnn"),
-        ("--workers", 0),
-    ],
+    "words", [("--windows", "a"), ("--windows", "0"), ("--networks", "cnn"), ("--workers", 0)]
 )
 def test_invalid_options_are_rejected_with_one_line(folder, words):
     done = run("paper", "protocol", "--data", "rooms.mcap", "-o", "x", *words, folder=folder)

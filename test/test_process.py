@@ -295,16 +295,23 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
     jobs = [
         job(write_bag(tmp_path / f"in{n}.mcap", exchanges(9)), tmp_path / f"out{n}.mcap") for n in range(3)
     ]
-    # As the system does if memory runs out.
+    # The system kills a process if memory runs out, here after another one has written its output but not returned.
     (tmp_path / "sitecustomize.py").write_text(
-        "import os, signal\n"
+        "import os, pathlib, signal, time\n"
         "from uwb_mitigation.commands.offline import process as job\n"
-        "load = job.BagReader\n"
-        "def killed(path):\n"
-        "    if path.name == 'in1.mcap':\n"
+        f"written = pathlib.Path({str(tmp_path / 'written')!r})\n"
+        "process = job.process_bag\n"
+        "def killed(one, report):\n"
+        "    if one.source.name == 'in1.mcap':\n"
+        "        while not written.exists():\n"
+        "            time.sleep(0.01)\n"
         "        os.kill(os.getpid(), signal.SIGKILL)\n"
-        "    return load(path)\n"
-        "job.BagReader = killed\n"
+        "    outcome = process(one, report)\n"
+        "    if one.source.name == 'in0.mcap' and not written.exists():\n"
+        "        written.touch()\n"
+        "        time.sleep(600)\n"
+        "    return outcome\n"
+        "job.process_bag = killed\n"
     )
     code = (
         "import pickle, sys; from uwb_mitigation.commands.offline.parallel import run_locally\n"
@@ -328,7 +335,7 @@ def test_dask_cluster_gives_the_same_result_and_continues_after_an_invalid_bag(t
     sources[1].write_bytes(b"nothing of the kind")
     jobs = [job(source, tmp_path / f"{source.stem}_out.mcap") for source in sources]
     with distributed.LocalCluster(
-        n_workers=2,
+        n_workers=1,
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,

@@ -10,10 +10,7 @@ from compilers import NEEDS_CC
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-pytestmark = [
-    pytest.mark.ros,
-    NEEDS_CC,
-]
+pytestmark = [pytest.mark.ros, NEEDS_CC]
 
 
 def test_each_anchor_ranges_and_the_demo_succeeds():

@@ -31,10 +31,7 @@ from uwb_mitigation.radios.settings import (
 )
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
-pytestmark = [
-    pytest.mark.ros,
-    NEEDS_CC,
-]
+pytestmark = [pytest.mark.ros, NEEDS_CC]
 
 DEFAULTS = {row.name: row.default for row in DRIVER}
 

@@ -212,9 +212,7 @@ def test_step_of_the_wall_clock_does_not_affect_a_replay(monkeypatch: pytest.Mon
     assert [round((b - a) / 1e9) for a, b in pairwise(stamps)] == [0, -3600, 14_400]
 
 
-def test_interruption_between_two_clock_readings_is_no_clock_step(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_interruption_between_two_clock_readings_is_no_clock_step(monkeypatch: pytest.MonkeyPatch):
     steady_ns, interrupted_ns = [0], [0]
 
     def wall_ns() -> int:

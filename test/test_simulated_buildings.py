@@ -87,9 +87,7 @@ def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
 
 
 @pytest.mark.parametrize("distance_m", [(0.0, 3.0), (3.0, 8.0), (12.0, 50.0)])
-def test_nlos_delay_grows_with_the_distance(
-    distance_m: tuple[float, float],
-) -> None:
+def test_nlos_delay_grows_with_the_distance(distance_m: tuple[float, float]) -> None:
     blocks = [block_of(5, number)[0] for number in range(24)]
     distance = np.concatenate([block.pairs.distance_m for block in blocks])
     first = np.concatenate([block.pairs.fields[1].delay_ns[:, 0] for block in blocks])

@@ -19,7 +19,7 @@ LEVEL = Height(1.0)
 
 @pytest.fixture(scope="module")
 def minute():
-    return drive(seconds=60)[0]
+    return drive(seconds=60, rate_hz=20.0)[0]
 
 
 def test_anchors_are_estimated_from_guesses_with_errors_of_1_5_m(minute):
@@ -63,7 +63,7 @@ def test_mirror_image_of_a_square_is_not_a_swapped_pair():
     square = AnchorMap(
         [Anchor(i, (x, y, 2.0)) for i, (x, y) in enumerate([(2, 0), (10, 0), (10, 8), (2, 8)], 1)]
     )
-    ranges, _ = drive(square, seconds=40, seed=2)
+    ranges, _ = drive(square, seconds=40, rate_hz=20.0, seed=2)
     guesses = square.position + np.random.default_rng(3).normal(0, (0.4, 0.4, 0), (4, 3))
     found = survey_anchors(EstimatorConfig(square.moved(guesses, square.sd), height=LEVEL), ranges, off_m=0.4)
     assert found.explained

@@ -73,8 +73,10 @@ def calibrated(folder: Path, outputs: dict[str, str]) -> str:
 
 def printed(name: str, folder: Path, request: pytest.FixtureRequest) -> str:
     if name in ("info", "offset"):
-        logs = shlex.quote(str(request.getfixturevalue("apartment")))
-        return output_of(folder, f"data info {logs}" if name == "info" else f"offset {logs} --truth --common")
+        if name == "info":
+            return output_of(folder, f"data info {shlex.quote(str(request.getfixturevalue('apartment')))}")
+        bag = request.getfixturevalue("apartment_imported") / "apartment.mcap"
+        return output_of(folder, f"offset {shlex.quote(str(bag))} --truth --common")
     if name == "demo":
         pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
         words = [sys.executable, "-m", "benchmarks", "demo", "--rate", "2"]

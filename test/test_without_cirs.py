@@ -114,20 +114,8 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
     los = result["by_label"]["LOS"]
     assert los["corrected_mae"] < los["raw_mae"] + 0.03
 
-    succeed(
-        *(
-            "evaluate",
-            "--data",
-            "bare.mcap",
-            "--cross-validate",
-            "configuration",
-            "--seeds",
-            1,
-            "--json",
-            "c.json",
-        ),
-        folder=tmp_path,
-    )
+    words = "evaluate --data bare.mcap --cross-validate configuration --seeds 1 --json c.json"
+    succeed(words, folder=tmp_path)
     rows = {row["name"]: row["mae_mean"] for row in json.loads((tmp_path / "c.json").read_text())["rows"]}
     assert list(rows) == ["raw", "los_median", "overall_median", "l1_line", "shipped_float"]
     assert rows["l1_line"] < 0.7 * rows["raw"]

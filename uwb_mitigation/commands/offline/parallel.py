@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from uwb_mitigation.commands.offline.process import Job, Outcome, try_process
@@ -115,6 +115,7 @@ def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     If a process crashes, for example because memory runs out, the remaining bags are processed one at a time, so that
     only the bag that causes it fails.
     """
+    is_new = {job: not job.output.exists() for job in jobs}
     unfinished = []
     with _processes(min(workers, len(jobs))) as executor:
         for job, outcome in _run(executor, _in_worker, jobs):
@@ -123,14 +124,13 @@ def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
             else:
                 yield outcome
     for job in unfinished:
+        # A process that was stopped may have written its output already.
+        again = replace(job, force=job.force or is_new[job])
+        reason = "the process crashed, perhaps because memory ran out"
+        crashed = Outcome(job, error=RecordingError(reason, where=str(job.source)))
         with _processes(1) as executor:
-            for _, outcome in _run(executor, _in_worker, [job]):
-                yield outcome or Outcome(
-                    job,
-                    error=RecordingError(
-                        "the process crashed, perhaps because memory ran out", where=str(job.source)
-                    ),
-                )
+            for _, outcome in _run(executor, _in_worker, [again]):
+                yield replace(outcome or crashed, job=job)
         partial_file(job.output).unlink(missing_ok=True)
 
 
