@@ -326,6 +326,21 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     assert np.nanmedian(residuals[5:]) < 1.0, "also of the ranges that a seek reads"
 
 
+@pytest.mark.parametrize("count", [1, 40])
+def test_tag_without_a_position_does_not_stop_the_player(tmp_path: Path, count: int):
+    path = tmp_path / "one_anchor.mcap"
+    with BagWriter(path, {}) as out:
+        for number in range(0, 2 * count, 2):
+            write_corrected(out, record(number).measurement, corrected(number))
+    player, scene = open_bag(path)
+    player.index(HALL).join()
+    assert player.timeline is not None
+    player.play(True)
+    seek(player, player.seconds)
+    assert latest(scene) == {(1, 7): 4.25 + 2 * count - 2}
+    assert "1 anchors received, 3 or more needed" in player.timeline.notices[0]
+
+
 def test_next_bad_range_is_found_and_a_step_advances_by_one_range(tmp_path: Path):
     path = tmp_path / "bad.mcap"
     with BagWriter(path, {}) as out:

@@ -342,7 +342,8 @@ def _estimate_tracks(
                 corrected = _ranges(*selected, "corrected_m")
                 estimator = TagEstimator(config)
                 tracks[TrackKind.CORRECTED] = live = estimator.run(corrected)
-                timeline.estimates[name] = live
+                if len(live):
+                    timeline.estimates[name] = live
                 determination = drive_determination(estimator, corrected, live)
                 if not determination.is_unique:
                     timeline.notices.append(f"tag {format_id(int(tag_id))} determination: {determination}")
