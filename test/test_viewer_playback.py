@@ -27,6 +27,7 @@ from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import anchors_path, dump_anchors, load_anchors
@@ -292,7 +293,7 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     player, scene = open_bag(bag)
     anchors = load_anchors(anchors_path(bag))
     scene.set_anchors({anchor.id: AnchorPosition(*anchor.position) for anchor in anchors.anchors})
-    player.index(anchors).join()
+    player.index(EstimatorConfig(anchors)).join()
     timeline = player.timeline
     assert timeline is not None
     assert len(timeline.time_s) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
@@ -333,7 +334,7 @@ def test_tag_without_a_position_does_not_stop_the_player(tmp_path: Path, count: 
         for number in range(0, 2 * count, 2):
             write_corrected(out, record(number).measurement, corrected(number))
     player, scene = open_bag(path)
-    player.index(HALL).join()
+    player.index(EstimatorConfig(HALL)).join()
     assert player.timeline is not None
     player.play(True)
     seek(player, player.seconds)

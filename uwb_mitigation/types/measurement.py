@@ -76,6 +76,10 @@ class Status(enum.IntEnum):
         return self in (Status.OK, Status.UNRELIABLE)
 
 
+CORRECTED = tuple(status for status in Status if status.is_corrected)
+"""Statuses of ranges that a model corrected."""
+
+
 class CorrectedBy(enum.IntEnum):
     """Device that computed a correction; the values of the `source` field of `RangeCorrected.msg`."""
 

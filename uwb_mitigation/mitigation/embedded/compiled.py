@@ -26,7 +26,7 @@ from uwb_mitigation.mitigation.embedded.compiling import (
 )
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.types.measurement import Cir, CorrectedColumns, RangeColumns, Status
+from uwb_mitigation.types.measurement import CORRECTED, Cir, CorrectedColumns, RangeColumns
 
 _OPTIONS = ("-std=c99", "-O3", "-fPIC", *WARNINGS)
 
@@ -59,7 +59,6 @@ class _Corrected(ctypes.Structure):
     _fields_ = (
         ("range_m", c_float),
         ("correction_m", c_float),
-        ("variance_m2", c_float),
         ("status", c_int),
     )
 
@@ -162,7 +161,7 @@ class FirmwareBackend:
             strict=True,
         )
         corrected = pass_through(self.bundle, ranges, offset_m, np.array(status, np.uint8))
-        is_corrected = np.isin(corrected.status, (Status.OK, Status.UNRELIABLE))
+        is_corrected = np.isin(corrected.status, CORRECTED)
         for column, computed in zip(
             (corrected.range_m, corrected.correction_m, corrected.variance_m2), values, strict=True
         ):
