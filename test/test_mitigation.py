@@ -87,7 +87,7 @@ def test_correction_is_linear_bias_plus_network_in_float32(mitigation):
     assert result.model_id == mitigation.bundle.model_id
 
 
-@pytest.mark.parametrize("uncorrected_m2", [0.04, 0.5])
+@pytest.mark.parametrize("uncorrected_m2", [1 / 32, 0.5])
 def test_variance_of_a_range_without_cir_does_not_depend_on_the_offset(tmp_path, uncorrected_m2):
     saved = bundle(tmp_path, variance_uncorrected_m2=uncorrected_m2)
     without = replace(measurement(samples=np.zeros(0, np.int16)), tag_id=7, anchor_id=1)

@@ -33,7 +33,7 @@ from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.headline import live_cards
-from uwb_mitigation.viewer.page import Page, View
+from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
@@ -45,6 +45,7 @@ from uwb_mitigation.viewer.scene import (
     Trace,
 )
 from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.state import View
 
 HOSTILE = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>$$x$$"
 

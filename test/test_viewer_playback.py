@@ -43,12 +43,13 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_RAW,
 )
 from uwb_mitigation.types.tracks import Estimate
-from uwb_mitigation.viewer import page, playback
+from uwb_mitigation.viewer import page, playback, texts
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, current_card, interval_cards
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import AnchorPosition, Scene
+from uwb_mitigation.viewer.state import View
 
 COUNT = 400
 """Number of ranges in the bag, at intervals of 10 ms, from two anchors in turn."""
@@ -304,9 +305,9 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     assert cards["Position error, now"][0] != "-"
     assert sum(entry[1] for entry in timeline.heat.values()) == len(timeline.time_s)
     counted: list[str] = []
-    monkeypatch.setattr(page, "interval_cards", lambda *arguments: counted.append(arguments[3]) or [])
+    monkeypatch.setattr(texts, "interval_cards", lambda *arguments: counted.append(arguments[3]) or [])
     document = Document()
-    opened = page.Page(document, page.View(scene, threading.Lock(), player=player))
+    opened = page.Page(document, View(scene, threading.Lock(), player=player))
     for position_s in (5.0, 8.0):
         player.seek(position_s)
         opened._table_due_s = 0.0

@@ -25,11 +25,11 @@ from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Pose, Sample, Scene
 from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.state import View
 
 BAD = 700
 """Row of the range whose status is not OK and whose error is the largest."""

@@ -96,10 +96,10 @@ def view(
     from uwb_mitigation.types.offsets import NO_OFFSETS
     from uwb_mitigation.viewer.feed import SceneUpdater
     from uwb_mitigation.viewer.floor_plan import load_floor_plan
-    from uwb_mitigation.viewer.page import View
     from uwb_mitigation.viewer.playback import BagPlayer
     from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.server import ViewerServer
+    from uwb_mitigation.viewer.state import View
 
     motion = odometry, imu, parse_lever_arm(lever_arm), stamp_offset, acceleration
     settings = TrackSettings(

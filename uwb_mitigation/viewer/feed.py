@@ -144,7 +144,11 @@ class SceneUpdater:
         """Add a position that the viewer itself estimated."""
         x, y, z = estimate.position.tolist()
         with self.lock:
-            self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance)), received_s)
+            sd_m = float(np.sqrt(np.trace(estimate.covariance[:2, :2])))
+            pose = Pose(
+                x, y, z, *_bounds(estimate.covariance), stamp_s=estimate.stamp_ns / NS_PER_S, sd_m=sd_m
+            )
+            self.scene.add_pose(tag, pose, received_s)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position

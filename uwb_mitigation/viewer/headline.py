@@ -67,8 +67,9 @@ def interval_cards(
     errors_m = dict(zip(("raw", ""), timeline.range_errors(*interval), strict=True))
     if second is not None:
         errors_m[TrackKind.SECOND.value] = second.range_errors(*interval)[1]
-    bad = timeline.bad[slice(*np.searchsorted(timeline.log_s, interval, side="right"))]
-    return cards + _range_cards(errors_m, int(bad.sum()), len(bad), window)
+    rows = slice(*np.searchsorted(timeline.log_s, interval, side="right"))
+    corrected, bad = timeline.is_corrected[rows], timeline.bad[rows]
+    return cards + _range_cards(errors_m, int(corrected.sum()), int(bad.sum()), len(bad), window)
 
 
 def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
@@ -81,19 +82,22 @@ def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
     cards = positions.current_card(now_s)
     cards += positions.interval_cards((now_s - HISTORY_S, now_s), RECENT, "raw + locator")
     means_m = scene.error_sums_m[:, None] / (scene.errors or math.nan)
-    return cards + _range_cards({"raw": means_m[0], "": means_m[1]}, scene.not_ok, scene.ranges, LIVE)
+    return cards + _range_cards(
+        {"raw": means_m[0], "": means_m[1]}, scene.corrected, scene.faults, scene.ranges, LIVE
+    )
 
 
 def _range_cards(
-    errors_m: Mapping[str, NDArray[np.float64]], not_ok: int, count: int, window: str
+    errors_m: Mapping[str, NDArray[np.float64]], corrected: int, faults: int, count: int, window: str
 ) -> list[Card]:
     """Return the figures of ranges, from their errors {name: errors, or the mean absolute error}; "": the corrected ranges."""
     if not count:
         return []
+    reason = "" if corrected or faults else ": no CIRs"
     not_ok_card = [
-        f"Ranges not OK, {window}",
-        f"{100.0 * not_ok / count:.1f} %",
-        f"{not_ok} of {count} corrected ranges",
+        f"Ranges corrected, {window}",
+        f"{100.0 * corrected / count:.1f} %" if corrected else "none",
+        f"{corrected} of {count} ranges corrected{reason}" + (f"; {faults} need attention" if faults else ""),
     ]
     means_m = {name: _metres(np.abs(errors)) for name, errors in errors_m.items()}
     if (mean_m := means_m.pop("")) == "-":
@@ -191,7 +195,8 @@ class _Positions:
         if self.second is not None:
             errors[TrackKind.SECOND.value] = self.second.errors(TrackKind.CORRECTED, interval)
         own = self.errors(TrackKind.CORRECTED, interval)
-        return [
+        change = _change(own.rmse, errors[raw_name].rmse, raw_name) if raw_name in errors else None
+        cards = [
             [
                 f"{title}, {window}",
                 _metres(getattr(own, name)),
@@ -201,6 +206,16 @@ class _Positions:
             ]
             for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95"))
         ]
+        return cards if change is None else [*cards, [f"Correction, {window}", *change]]
+
+
+def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str] | None:
+    """Return what the correction changes, as texts; None: unknown."""
+    if not corrected_m + raw_m > 0.0:
+        return None
+    share = 100.0 * (corrected_m / raw_m - 1.0)
+    text = "no change" if abs(share) < 0.5 else f"position error {share:+.0f} %"
+    return text, f"RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
 
 
 def _metres(values_m: Any, statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:

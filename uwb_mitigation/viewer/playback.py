@@ -89,11 +89,17 @@ class BagPlayer:
         self._clock_s, self._posed_s = 0.0, -math.inf
         self._posed: dict[str, int] = {}
         feed.scene.clock = lambda: self._clock_s
+        feed.scene.stamp_clock = lambda: self._clock_s + recording.start_ns / NS_PER_S
         self._window_s = min(HISTORY_S, MAX_MESSAGES / max(recording.rate_hz, 1e-9))
         # Anchors are published once at the beginning.
         with contextlib.suppress(RecordingError, StopIteration):
             feed.add(ANCHORS, next(recording.events([ANCHORS])).message)
         self.seek(0.0)
+
+    @property
+    def shown_s(self) -> float:
+        """The position that the scene shows: while playing, that of the last message that was read."""
+        return min(self._clock_s, self.position_s) if self.playing and self.is_behind else self.position_s
 
     def index(self, config: EstimatorConfig | None, stamp_offset_s: float = 0.0) -> threading.Thread:
         """Index the recording in a thread, which is returned; for the arguments see `index_recording`."""

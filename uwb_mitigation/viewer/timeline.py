@@ -10,6 +10,7 @@ import contextlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks, track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
-from uwb_mitigation.types.measurement import RangeMeasurement, Status
+from uwb_mitigation.types.measurement import CORRECTED, FAULTS, RangeMeasurement
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.ros.topics import (
@@ -57,14 +58,15 @@ _KINDS = {ODOMETRY_TRUTH: TrackKind.TRUE, POSE_SMOOTHED: TrackKind.SMOOTHED}
 _TRUTH = np.dtype([*KEY, ("true_m", "f8")])
 
 
-@dataclass(slots=True)
+@dataclass
 class Timeline:
     """Everything about a recording that does not depend on the position of the player.
 
     Attributes:
         log_s: log time of each range from the beginning, float64 (n,), increasing.
         time_s: time of each range from the beginning, float64 (n,).
-        anchor, tag: ids of each range, uint64 (n,). bad: bool (n,), whether the status is not OK.
+        stamp_s: stamps, s, float64 (n,).
+        anchor, tag: ids of each range, uint64 (n,). status: uint8 (n,).
         raw_m, corrected_m, true_m: float64 (n,); NaN: unknown.
         losses: {pair: (missing sequence numbers, ranges)}.
         notices: messages for the page.
@@ -76,9 +78,10 @@ class Timeline:
 
     log_s: NDArray[np.float64]
     time_s: NDArray[np.float64]
+    stamp_s: NDArray[np.float64]
     anchor: NDArray[np.uint64]
     tag: NDArray[np.uint64]
-    bad: NDArray[np.bool_]
+    status: NDArray[np.uint8]
     raw_m: NDArray[np.float64]
     corrected_m: NDArray[np.float64]
     true_m: NDArray[np.float64]
@@ -89,7 +92,26 @@ class Timeline:
     heat: BoundedDict[tuple[int, int], list[float]] = field(default_factory=lambda: BoundedDict(MAX_CELLS))
     is_complete: bool = False
 
-    @property
+    @cached_property
+    def bad(self) -> NDArray[np.bool_]:
+        """Whether the status of each range needs attention."""
+        return np.isin(self.status, FAULTS)
+
+    @cached_property
+    def is_corrected(self) -> NDArray[np.bool_]:
+        """Whether a model corrected each range."""
+        return np.isin(self.status, CORRECTED)
+
+    @cached_property
+    def _rows_of_pairs(self) -> dict[Pair, NDArray[np.intp]]:
+        return dict(_rows_by_pair(self.anchor, self.tag))
+
+    def rows_of(self, pair: Pair, begin_s: float, end_s: float) -> NDArray[np.intp]:
+        """Return the rows of a pair in an interval of the log time."""
+        rows = self._rows_of_pairs.get(pair, np.zeros(0, np.intp))
+        return rows[slice(*np.searchsorted(self.log_s[rows], (begin_s, end_s + 1e-6), side="right"))]
+
+    @cached_property
     def deviation_m(self) -> NDArray[np.float64]:
         """Absolute error of each corrected range; without any truth, the absolute correction. NaN: unknown."""
         reference_m = self.true_m if np.isfinite(self.true_m).any() else self.raw_m
@@ -274,12 +296,14 @@ class _Reader:
         timeline = Timeline(
             log_s=log_s,
             time_s=np.where(is_late, log_s, stamp_s),
+            stamp_s=ranges["stamp_ns"] / NS_PER_S,
             true_m=np.append(truths["true_m"], np.nan)[match(ranges, truths)],
             losses={
-                pair: (_lost(ranges["sequence"][rows]), len(rows)) for pair, rows in _rows_by_pair(ranges)
+                pair: (_lost(ranges["sequence"][rows]), len(rows))
+                for pair, rows in _rows_by_pair(ranges["anchor"], ranges["tag"])
             },
             notices=[notice] if notice else [],
-            bad=ranges["status"] != Status.OK,
+            status=ranges["status"].copy(),
             corrected_m=ranges["range_m"].copy(),
             **{name: ranges[name].copy() for name in ("anchor", "tag", "raw_m")},
         )
@@ -289,12 +313,13 @@ class _Reader:
         return timeline
 
 
-def _rows_by_pair(ranges: NDArray[Any]) -> Iterator[tuple[Pair, NDArray[np.intp]]]:
-    order = np.lexsort((ranges["tag"], ranges["anchor"]))
-    anchor, tag = ranges["anchor"][order], ranges["tag"][order]
-    begins = np.flatnonzero((np.diff(anchor) != 0) | (np.diff(tag) != 0)) + 1
-    for rows in np.split(order, begins) if len(order) else ():
-        yield (int(ranges["anchor"][rows[0]]), int(ranges["tag"][rows[0]])), rows
+def _rows_by_pair(
+    anchor: NDArray[np.uint64], tag: NDArray[np.uint64]
+) -> Iterator[tuple[Pair, NDArray[np.intp]]]:
+    order = np.lexsort((tag, anchor))
+    is_new = (np.diff(anchor[order]) != 0) | (np.diff(tag[order]) != 0)
+    for rows in np.split(order, np.flatnonzero(is_new) + 1) if len(order) else ():
+        yield (int(anchor[rows[0]]), int(tag[rows[0]])), rows
 
 
 def _lost(sequence: NDArray[np.uint32]) -> int:

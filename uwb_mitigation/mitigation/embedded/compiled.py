@@ -59,6 +59,7 @@ class _Corrected(ctypes.Structure):
     _fields_ = (
         ("range_m", c_float),
         ("correction_m", c_float),
+        ("variance_m2", c_float),
         ("status", c_int),
     )
 
