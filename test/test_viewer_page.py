@@ -928,3 +928,17 @@ def test_ipv6_address_is_served(browser: Browser, view: View) -> None:
         fill_scene(view)
         open_page(browser, server)
         assert browser.column("pairs", "anchor") == ["1", "2"]
+
+
+def test_long_names_do_not_widen_the_page(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    name = "warehouse_door_north_" * 20
+    with view.lock:
+        view.scene.set_anchors({n: AnchorPosition(4.0 * n, 0, 2, name) for n in (1, 2)})
+        view.scene.set_node_status(name, NodeStatus(1, name, determinations=(f"{name}: {name}",)))
+        view.scene.add_pose(name, Pose(4.0, 3.0, 1.0, stamp_s=1000.0))
+        view.scene.report_event(name)
+    view.title = name
+    open_page(browser, server)
+    browser.wait("the names", lambda: name in browser.text())
+    browser.wait("everything within 1280 pixels", lambda: not browser.cut_off(1280))

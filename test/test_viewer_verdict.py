@@ -74,7 +74,7 @@ def test_anchor_that_reads_long_degrades_the_position_by_its_name():
     scene, _ = driven({2: 0.6})
     state, reason, action, _ = controls(scene).verdict
     assert (state, reason) == ("degraded", "Anchor door reads 0.60 m long")
-    assert action == "calibrate, or check its position."
+    assert action == "Calibrate, or check its position."
     document = shown(scene)
     anchors = next(
         r.data_source for r in document.get_model_by_name("map").renderers if "health" in r.data_source.data

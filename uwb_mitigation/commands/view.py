@@ -84,7 +84,7 @@ def view(
 
         uwb-mitigation data simulate --like drive -o flat.mcap
 
-        uwb-mitigation view flat.mcap --browser
+        uwb-mitigation view flat.mcap --height 0 --browser
     """
     from threading import Lock
 

@@ -76,7 +76,7 @@ class Figures:
         for identity, anchor in scene.anchors.items():
             state, residual_m = self._state.health.get(identity, (health.UNKNOWN, math.nan))
             name = anchor.name or format_id(identity)
-            label = name if state == health.UNKNOWN else f"{name[:MAX_LABEL]} {state[0]}"
+            label = name[:MAX_LABEL] + (f" {state[0]}" if state != health.UNKNOWN else "")
             if state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"

@@ -145,14 +145,14 @@ class Page:
         else:
             state.forget("scene")
         self._figures.draw(scene)
-        player, timeline = self._player, self._view.timeline
+        timeline = self._view.timeline
         state.set(
             available={
                 "largest": timeline is not None and timeline.largest_error() is not None,
                 **dict.fromkeys(
                     ("previous_bad", "next_bad"), timeline is not None and bool(timeline.bad.any())
                 ),
-                **dict.fromkeys(("step", "window"), player is not None and timeline is not None),
+                **dict.fromkeys(("step", "window"), timeline is not None and len(timeline.bad) > 1),
                 **dict.fromkeys(("circles", "heat"), bool(scene.anchors and scene.pairs)),
                 "accuracy": len(scene.anchors) > 1,
                 "follow": bool(scene.tags),

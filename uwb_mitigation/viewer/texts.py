@@ -136,7 +136,11 @@ class Texts:
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
             corrected, count = self._counts(scene)
-            texts.append(f"{100.0 * corrected / count:.0f} % of ranges corrected")
+            texts.append(
+                f"{100.0 * corrected / count:.0f} % of ranges corrected"
+                if corrected
+                else "no range corrected"
+            )
         if (
             change := next((card for card in self._interval_cards if card[0].startswith("Correction")), None)
         ) is not None:

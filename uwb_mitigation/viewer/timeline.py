@@ -133,9 +133,9 @@ class Timeline:
         return int(rows[-1]) if len(rows) else None
 
     def largest_error(self) -> int | None:
-        """Return the row of the range with the largest `deviation_m`."""
-        deviation = self.deviation_m
-        return int(np.nanargmax(deviation)) if np.isfinite(deviation).any() else None
+        """Return the row of the range with the largest `deviation_m`; None: nothing deviates."""
+        deviation = np.nan_to_num(self.deviation_m)
+        return int(deviation.argmax()) if deviation.any() else None
 
     def range_errors(self, begin_s: float, end_s: float) -> NDArray[np.float64]:
         """Return raw and corrected errors of the ranges with known truth in an interval, float64 (2, k)."""

@@ -63,8 +63,8 @@ def verdict(
     if tag_id is None:
         tag = next(iter(scene.tags.values()))
     if tag is None or tag.pose is None:
-        reason, _, action = remedy.partition(". Remedy: ")
-        return Verdict(UNDETERMINED, reason or f"no position of {name}", action or "See the notices below.")
+        reason, _, action = remedy.removeprefix("unknown: ").partition(". Remedy: ")
+        return _verdict(UNDETERMINED, reason or f"no position of {name}", action or "See the notices below.")
     if scene.age_s(tag) > NO_DATA_S:
         return Verdict(
             LOST,
@@ -90,7 +90,13 @@ def verdict(
         reason, action = f"{received} anchors received", "Drive closer to the anchors, or add some."
     elif sd_m > MAX_SD_M:
         reason, action = f"uncertain by {sd_m:.2f} m", "Add an anchor, or set height and area of the locator."
-    return Verdict(DEGRADED if reason else GOOD, reason, action, accuracy)
+    return _verdict(DEGRADED if reason else GOOD, reason, action, accuracy)
+
+
+def _verdict(state: str, reason: str, action: str, accuracy: str = "") -> Verdict:
+    """Return a verdict whose action is a sentence."""
+    sentence = action[:1].upper() + action[1:]
+    return Verdict(state, reason, sentence + "." * (bool(sentence) and sentence[-1] not in ".!"), accuracy)
 
 
 class HeldVerdict:
