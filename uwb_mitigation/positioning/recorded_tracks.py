@@ -34,6 +34,7 @@ than `MIN_COVERAGE`."""
 
 
 MAX_STAMP_OFFSET_S = 3600.0
+UNKNOWN_POSITION = "no position can be determined"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +141,7 @@ def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
     live = (robot or locator).run(ranges)
     if len(live) < 2:
         raise DatasetError(
-            f"tag {format_id(recording.tag_id)}: no position can be determined from {len(ranges)} ranges: "
-            f"{current_determination(locator)}"
+            f"tag {format_id(recording.tag_id)}: {UNKNOWN_POSITION} from {len(ranges)} ranges: {current_determination(locator)}"
         )
     tracks = {
         "snapshot": snapshot(anchors, recording.raw, config.height),

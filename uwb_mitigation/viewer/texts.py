@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning.recorded_tracks import UNKNOWN_POSITION
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.headline import RECENT, Card, current_card, interval_cards, live_cards
 from uwb_mitigation.viewer.scene import NO_DATA_S, Pair, Scene, plain_tag_id, tag_label, tag_name
 from uwb_mitigation.viewer.state import PageState, no_data, set_rows
-from uwb_mitigation.viewer.verdict import verdict
+from uwb_mitigation.viewer.verdict import UNDETERMINED, WAITING, Verdict, verdict
 
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
@@ -42,16 +43,18 @@ class Texts:
         self._state.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
-        lost = [
-            line for line in notices if " determination: " in line or "no position can be determined" in line
-        ]
-        remedy = next(
-            (line.partition("determination: ")[2] or line.rpartition("ranges: ")[2] for line in lost), ""
-        )
-        of_tag = {pair[0]: means for pair, means in pairs.items() if pair[1] == self._state.tag_id}
-        found = verdict(scene, self._state.tag_id, of_tag, {key: states[key] for key in of_tag}, remedy)
-        if self._player is not None and self._view.timeline is None:
-            found = found._replace(state="no data yet", reason="the recording is being read", action="")
+        tag_id, timeline = self._state.tag_id, self._view.timeline
+        own = f"tag {'' if tag_id is None else format_id(tag_id)}"
+        remedies = [line.partition(separator)[2] for separator in (f"{own} determination: ", f"{own}: {UNKNOWN_POSITION} ")
+                    for line in notices if separator in line]  # fmt: skip
+        of_tag = {pair[0]: means for pair, means in pairs.items() if pair[1] == tag_id}
+        found = verdict(scene, tag_id, of_tag, {key: states[key] for key in of_tag}, next(iter(remedies), ""))
+        if (
+            self._player is not None
+            and not (timeline and timeline.is_complete)
+            and found.state == UNDETERMINED
+        ):
+            found = Verdict(WAITING, "the recording is being read")
         shown = self._state.verdict.update(found, scene.clock())
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
         self._state.set(
@@ -111,22 +114,13 @@ class Texts:
             rates[label] = sum(
                 np.nan_to_num(means["rate"]) for (_, tag), means in pairs.items() if tag == tag_id
             )
-        views = {label: scene.tags[name] for name, label in names.items()}
-        rows = []
+        views, rows = {label: scene.tags[name] for name, label in names.items()}, []
         for label, rate_hz in rates.items():
-            view = views.get(label)
-            pose = None if view is None else view.pose
-            age_s = math.nan if view is None else scene.age_s(view)
-            place = "-" if pose is None else f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}"
-            sd_m = math.nan if pose is None else pose.sd_m
-            late = (
-                "no position"
-                if pose is None
-                else f"no data for {age_s:.0f} s"
-                if age_s > NO_DATA_S
-                else f"{age_s:.1f} s"
-            )
-            rows.append([label, place, _number(sd_m, 2), late, _number(rate_hz, 1)])
+            place, sd_m, age = "-", math.nan, "no position"
+            if (view := views.get(label)) is not None and (pose := view.pose) is not None:
+                place, sd_m, age_s = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, scene.age_s(view)
+                age = f"no data for {age_s:.0f} s" if age_s > NO_DATA_S else f"{age_s:.1f} s"
+            rows.append([label, place, _number(sd_m, 2), age, _number(rate_hz, 1)])
         return rows
 
     def _facts(self, scene: Scene, accuracy: str) -> str:
@@ -136,15 +130,11 @@ class Texts:
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
             corrected, count = self._counts(scene)
-            texts.append(
-                f"{100.0 * corrected / count:.0f} % of ranges corrected"
-                if corrected
-                else "no range corrected"
-            )
-        if (
-            change := next((card for card in self._interval_cards if card[0].startswith("Correction")), None)
-        ) is not None:
-            texts.append(f"correction: {change[1]}")
+            share = f"{100.0 * corrected / count:.0f} % of ranges" if corrected else "no range"
+            texts.append(f"{share} corrected")
+        texts += [
+            f"correction: {card[1]}" for card in self._interval_cards if card[0].startswith("Correction")
+        ]
         return " \u00b7 ".join(texts)
 
     def _counts(self, scene: Scene) -> tuple[int, int]:
@@ -158,9 +148,8 @@ class Texts:
         """Return the large figures."""
         state, player, timeline = self._state, self._player, self._view.timeline
         if player is None:
-            cards = live_cards(scene, state.tag_id)
-            self._interval_cards = cards
-            return cards
+            self._interval_cards = live_cards(scene, state.tag_id)
+            return self._interval_cards
         if timeline is None:
             return [["Reading the recording ...", "", ""]]
         second = None if player.companion is None else player.companion.timeline

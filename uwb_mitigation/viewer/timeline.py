@@ -205,7 +205,10 @@ def index_recording(
                     continue
                 tracks[TrackKind.RAW], tracks[TrackKind.CORRECTED] = estimated.raw_live, estimated.live
                 tracks[TrackKind.SMOOTHED] = estimated.smoothed
-                timeline.notices += [f"tag {format_id(tag.tag_id)}: {text}" for text in estimated.warnings]
+                label, state = f"tag {format_id(tag.tag_id)}", str(estimated.determination)
+                timeline.notices += [
+                    f"{label}{' determination' * (text == state)}: {text}" for text in estimated.warnings
+                ]
             rows = np.flatnonzero(ranges["tag"] == tag.tag_id)
             rows = rows[np.argsort(ranges["stamp_ns"][rows], kind="stable")]
             stamp_ns = ranges["stamp_ns"][rows] + round(stamp_offset_s * NS_PER_S)

@@ -16,8 +16,8 @@ MAX_SD_M = 0.5
 MIN_ANCHORS = 3
 HOLD_S = 2.0
 """Time for which a better verdict must hold before it is shown."""
-NORMAL95 = math.sqrt(5.991)
-"""Radius of 95 % of a circular normal distribution, in its standard deviations in each axis."""
+RADIUS95 = math.sqrt(5.991 / 2.0)
+"""Radius of 95 % of a circular normal distribution, relative to the root of the sum of its variances in x and y."""
 
 
 class Verdict(NamedTuple):
@@ -57,24 +57,18 @@ def verdict(
     if tag_id is None and not scene.tags:
         return Verdict(WAITING)
     if ages_s and min(ages_s) > NO_DATA_S:
-        return Verdict(
-            LOST, f"no ranges of {name} for {min(ages_s):.0f} s", "Check power of the tag, and the driver."
-        )
+        reason = f"no ranges of {name} for {min(ages_s):.0f} s"
+        return Verdict(LOST, reason, "Check power of the tag, and the driver.")
     if tag_id is None:
         tag = next(iter(scene.tags.values()))
     if tag is None or tag.pose is None:
         reason, _, action = remedy.removeprefix("unknown: ").partition(". Remedy: ")
         return _verdict(UNDETERMINED, reason or f"no position of {name}", action or "See the notices below.")
     if scene.age_s(tag) > NO_DATA_S:
-        return Verdict(
-            LOST,
-            f"no position of {name} for {scene.age_s(tag):.0f} s",
-            remedy or "Drive into the area of the anchors.",
-        )
+        reason = f"no position of {name} for {scene.age_s(tag):.0f} s"
+        return _verdict(LOST, reason, remedy or "Drive into the area of the anchors.")
     sd_m = tag.pose.sd_m
-    accuracy = (
-        "" if math.isnan(sd_m) else f"sd {sd_m:.2f} m, 95 % within {NORMAL95 / math.sqrt(2.0) * sd_m:.2f} m"
-    )
+    accuracy = "" if math.isnan(sd_m) else f"sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
     common, advice = health.advice(anchors, names)
     bad = [anchor_id for anchor_id, state in states.items() if state == health.BAD]
     received = sum(means["stopped"] == 0.0 for means in anchors.values())
@@ -82,9 +76,7 @@ def verdict(
     if remedy:
         reason, _, action = remedy.partition(". Remedy: ")
     elif bad:
-        worst = max(
-            bad, key=lambda anchor_id: (anchors[anchor_id]["stopped"], abs(anchors[anchor_id]["residual"]))
-        )
+        worst = max(bad, key=lambda key: (anchors[key]["stopped"], abs(anchors[key]["residual"])))
         reason, _, action = (common or advice[worst]).partition(": ")
     elif anchors and received < MIN_ANCHORS:
         reason, action = f"{received} anchors received", "Drive closer to the anchors, or add some."
