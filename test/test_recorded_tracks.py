@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 import os
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import run, succeed
+from drives import HALL, drive
 
 from benchmarks.position_data import real_runs
 from uwb_mitigation.commands.offline.track import mitigation, read_anchors, read_config
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+from uwb_mitigation.positioning.tag_locator import TagLocator
+from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.offsets import read_offsets
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, interval_cards
@@ -114,10 +118,30 @@ def test_variance_of_ranges_without_cir_is_that_of_real_errors(tmp_path: Path):
     if not (HANYANG.exists() and LABYRINTH.exists()):
         pytest.skip(f"no {DATA}")
     for run_source in real_runs(DATA)[0]:
-        drive = run_source.read()
-        variance_m2 = drive.corrected(offsets=read_offsets("0.1")).variance_m2
-        true = drive.truth.position_at(drive.ranges.stamp_ns)
-        error_m = drive.ranges.range_m - np.linalg.norm(
-            true - drive.anchors.position[drive.ranges.anchor], axis=1
+        recorded = run_source.read()
+        variance_m2 = recorded.corrected(offsets=read_offsets("0.1")).variance_m2
+        true = recorded.truth.position_at(recorded.ranges.stamp_ns)
+        error_m = recorded.ranges.range_m - np.linalg.norm(
+            true - recorded.anchors.position[recorded.ranges.anchor], axis=1
         )
-        assert 0.05 < np.nanmean(error_m**2 / variance_m2) < 4.0, drive.name
+        assert 0.05 < np.nanmean(error_m**2 / variance_m2) < 4.0, recorded.name
+
+
+def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
+    ranges, _ = drive(seconds=8)
+    raw, passed, mixed = (TagLocator(HALL, height_m=1.0) for _ in range(3))
+    for row in range(len(ranges)):
+        anchor, range_m = HALL.anchors[ranges.anchor[row]].id, float(ranges.range_m[row])
+        measurement = RangeMeasurement(
+            int(ranges.stamp_ns[row]), 7, anchor, row, 0, range_m, Cir(np.zeros(0, np.int16))
+        )
+        result = CorrectedRange(range_m, range_m, 0.0, 0.25, Status.NO_CIR, CorrectedBy.HOST, 1)
+        expected, found = raw.add(measurement), passed.add(measurement, result)
+        corrected = mixed.add(measurement, replace(result, status=Status.OK) if row < 5 else result)
+        if expected is not None:
+            assert found is not None
+            assert found.position.tolist() == expected.position.tolist()
+    assert corrected is not None
+    assert corrected.position.tolist() != expected.position.tolist(), (
+        "after a corrected range, its variance counts"
+    )

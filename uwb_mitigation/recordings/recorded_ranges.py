@@ -25,7 +25,7 @@ CHUNK = 50_000
 """Number of rows that are collected before they are stored compactly."""
 
 KEY = [("stamp_ns", "i8"), ("tag", "u8"), ("anchor", "u8"), ("sequence", "u4")]
-_RAW = np.dtype([*KEY, ("range_m", "f8"), ("power_dbm", "f8")])
+_RAW = np.dtype([*KEY, ("range_m", "f8")])
 _CORRECTED = np.dtype(
     [*KEY, ("log_ns", "i8"), ("status", "u1"), ("raw_m", "f8"), ("range_m", "f8"), ("variance_m2", "f8")]
 )
@@ -94,7 +94,7 @@ class RangeTable:
 
     def add_raw(self, measured: RangeMeasurement) -> None:
         """Append a measured range."""
-        self.raw.add(*measurement_key(measured), measured.range_m, measured.cir.rx_power_dbm)
+        self.raw.add(*measurement_key(measured), measured.range_m)
 
     def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange, log_ns: int = 0) -> None:
         """Append the corrected range of a measurement; `log_ns`: its time on the clock of the recorder."""
@@ -112,8 +112,6 @@ class RangeTable:
         for name, _ in KEY:
             raw[name][len(measured) :] = corrected[name][row_of_raw < 0]
         raw["range_m"][len(measured) :] = corrected["raw_m"][row_of_raw < 0]
-        raw["power_dbm"][len(measured) :] = np.nan
-        power_dbm = np.append(measured["power_dbm"], np.nan)[row_of_raw]
         unknown_m2 = np.full(len(raw), np.nan)
         raw_rows = _usable(raw, anchors, unknown_m2)
         corrected_rows = _usable(corrected, anchors, corrected["variance_m2"])
@@ -126,8 +124,8 @@ class RangeTable:
         for tag in np.unique(
             np.concatenate([raw["tag"][raw_rows >= 0], corrected["tag"][corrected_rows >= 0]])
         ):
-            one = _ranges(raw, raw_rows, unknown_m2, raw["power_dbm"], tag, offset_ns)
-            ranges = _ranges(corrected, corrected_rows, corrected["variance_m2"], power_dbm, tag, offset_ns)
+            one = _ranges(raw, raw_rows, unknown_m2, tag, offset_ns)
+            ranges = _ranges(corrected, corrected_rows, corrected["variance_m2"], tag, offset_ns)
             is_tag = (corrected["tag"] == tag) & (corrected_rows >= 0)
             if not np.isin(corrected["status"][is_tag], CORRECTED).any():
                 # As in `MultiTagEstimator`.
@@ -152,15 +150,14 @@ def _ranges(
     rows: NDArray[Any],
     anchor: NDArray[np.intp],
     variance_m2: NDArray[np.float64],
-    power_dbm: NDArray[np.float64],
     tag: np.uint64,
     offset_ns: int,
 ) -> Ranges:
-    """Return the usable ranges of a tag in the order of their stamps."""
+    """Return the usable ranges of a tag in the order of their stamps; their received powers are not read."""
     index = np.flatnonzero((rows["tag"] == tag) & (anchor >= 0))
     index = index[np.argsort(rows["stamp_ns"][index], kind="stable")]
     measured = rows[index]
-    columns = measured["range_m"], variance_m2[index], power_dbm[index]
+    columns = measured["range_m"], variance_m2[index], np.full(len(index), np.nan)
     return Ranges(measured["stamp_ns"] + offset_ns, anchor[index], *columns, int(tag))
 
 

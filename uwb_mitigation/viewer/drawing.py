@@ -93,20 +93,13 @@ class Figures:
             if (pose := tag.pose) is not None:
                 age_s, label = scene.age_s(tag), tag_label(name, plain_id)
                 major, minor, angle = map(drawable, pose.ellipse)
-                tags.append(
-                    {
-                        "x": pose.x,
-                        "y": pose.y,
-                        "name": f"{label}: no data for {age_s:.0f} s" if age_s > NO_DATA_S else label,
-                        "status": "no data" if age_s > NO_DATA_S else "OK",
-                        "width": 2 * major,
-                        "height": 2 * minor,
-                        "label_y": pose.y + finite_or_zero(_half_height(pose)),
-                        "angle": angle,
-                        "protection": drawable(pose.protection_m),
-                        "heading": pose.heading_rad,
-                    }
-                )
+                is_late = age_s > NO_DATA_S
+                tags.append({
+                    "x": pose.x, "y": pose.y, "label_y": pose.y + finite_or_zero(_half_height(pose)),
+                    "name": f"{label}: no data for {age_s:.0f} s" if is_late else label, "status": "no data" if is_late else "OK",
+                    "width": 2 * major, "height": 2 * minor, "angle": angle, "heading": pose.heading_rad,
+                    "protection": drawable(pose.protection_m),
+                })  # fmt: skip
         set_rows(models.tags, tags)
         set_rows(models.ellipses, [row for row in tags if row["width"] > 0.0 and row["height"] > 0.0])
         set_rows(models.protection, [row for row in tags if row["protection"] > 0.0])

@@ -88,20 +88,11 @@ class Texts:
                 means["lost"] = 100.0 * lost / max(lost + received, 1)
             compared = None if second is None or pair not in second.pairs else second.pairs[pair].latest
             pairs[pair] = means
-            rows.append(
-                means
-                | {
-                    "anchor": format_id(pair[0]),
-                    "tag": format_id(pair[1]),
-                    "state": self._health(pair, means),
-                    "raw": sample.raw_m,
-                    "corrected": sample.range_m,
-                    "second": compared.range_m if compared else math.nan,
-                    "sigma": sample.sigma_m,
-                    "status": missing or sample.status.name,
-                    "no_data": bool(missing),
-                }
-            )
+            rows.append(means | {
+                "anchor": format_id(pair[0]), "tag": format_id(pair[1]), "state": self._health(pair, means),
+                "status": missing or sample.status.name, "no_data": bool(missing), "raw": sample.raw_m,
+                "corrected": sample.range_m, "second": compared.range_m if compared else math.nan, "sigma": sample.sigma_m,
+            })  # fmt: skip
         return rows, pairs
 
     def _tags(self, scene: Scene, pairs: dict[Pair, health.Means]) -> list[list[str]]:
