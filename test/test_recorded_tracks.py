@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -145,3 +146,16 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
     assert corrected.position.tolist() != expected.position.tolist(), (
         "after a corrected range, its variance counts"
     )
+
+
+def test_report_is_one_file_with_the_figures_of_track(tmp_path: Path):
+    bag, page = tmp_path / "drive.mcap", tmp_path / "drive.html"
+    succeed("data simulate --like drive --ranges 300 -o", bag, folder=tmp_path)
+    options = ("--height", "0", "--json", "track.json", "--report", page)
+    succeed("track", bag, "-o", "track.mcap", *options, folder=tmp_path)
+    rmse_m = json.loads((tmp_path / "track.json").read_text())["live"]["horizontal_rmse_m"]
+    text = page.read_text()
+    assert f"<td>Position RMSE, whole recording</td><td>{rmse_m:.3f} m</td>" in text
+    assert "<strong>Position " in text
+    assert not re.search(r"<(script|link)[^>]+(src|href)=", text)
+    assert "exists already" in run("track", bag, "-o", "other.mcap", *options, folder=tmp_path).stderr

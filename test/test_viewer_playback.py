@@ -215,6 +215,9 @@ def test_long_read_continues_at_the_next_call(bag: Path, monkeypatch: pytest.Mon
     player, scene = open_bag(bag)
     player.seek(player.seconds)
     assert player.is_behind
+    player.playing = True
+    assert player.shown_s == scene.clock() < player.position_s, "the slider shows the time of the map"
+    player.playing = False
     while player.is_behind:
         player.advance()
     assert latest(scene)[2, 7] == 4.25 + COUNT - 1

@@ -84,6 +84,10 @@ def track(
     acceleration: AccelerationOption = 0.8,
     model: ModelOption = None,
     offsets: OffsetsOption = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write an HTML page: verdict, map, errors over time."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -119,7 +123,7 @@ def track(
     show_models(corrector.used)
     several = len(recorded.tags) > 1
     tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
-    for file in tum_files.values():
+    for file in (*tum_files.values(), *([report] if report else [])):
         if file.exists() and not force:
             raise ParameterError("exists already", where=str(file), valid="--force replaces it")
     tracks, failures = [], list[DatasetError]()
@@ -146,6 +150,11 @@ def track(
     print_line(f"Wrote {out.counts.total()} messages to {out.file}.")
     for tracked in tracks if tum is not None else []:
         write_atomically(tum_files[tracked.recording.tag_id], tum_text(tracked.smoothed))
+    if report is not None:
+        from uwb_mitigation.viewer.report import write_report
+
+        write_report(report, bag, config, lambda: mitigation(settings), stamp_offset)
+        print_line(f"Wrote {report}.")
     console.write_json(json, _result(tracks, recorded), {"held_out": residuals})
 
 

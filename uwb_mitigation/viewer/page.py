@@ -36,7 +36,7 @@ HEARTBEAT_S = 1.0
 TRAILS_S = (10.0, 60.0, math.inf)
 """Durations of the tracks that a page can show."""
 
-_TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
+TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
 
 
 class Page:
@@ -68,7 +68,7 @@ class Page:
             for name, (title, interval, description) in COLUMNS.items()
             if name != "second" or compares
         }
-        document.template = _TEMPLATES.get_template("page.html.j2")
+        document.template = TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
             page_title=view.title,
             recording=player is not None,

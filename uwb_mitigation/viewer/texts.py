@@ -35,6 +35,7 @@ class Texts:
 
     def draw(self, scene: Scene) -> None:
         """Write the texts of a scene."""
+        cards = self._cards(scene)
         rows, pairs = self._pairs(scene)
         self._state.has_data = any(not row["no_data"] for row in rows)
         set_rows(self._models.pairs, rows)
@@ -64,7 +65,7 @@ class Texts:
             incidents=[
                 f"{self._time(time_s)}: {text}" for time_s, text in list(scene.events)[-MAX_SHOWN_EVENTS:]
             ],
-            cards=self._cards(scene),
+            cards=cards,
             nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports],
             notice=notices,
             summary=self._summary(scene),
