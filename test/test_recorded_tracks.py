@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_material import record
 from command_line import run, succeed
 from drives import HALL, drive
 
@@ -18,9 +19,18 @@ from benchmarks.position_data import real_runs
 from uwb_mitigation.commands.offline.track import mitigation, read_anchors, read_config
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.geometry import Area
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.recorded_tracks import TrackSettings
 from uwb_mitigation.positioning.tag_locator import TagLocator
-from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.measurement import (
+    Cir,
+    CorrectedBy,
+    CorrectedRange,
+    RangeMeasurement,
+    Record,
+    Status,
+)
 from uwb_mitigation.types.offsets import read_offsets
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, interval_cards
@@ -159,3 +169,16 @@ def test_report_is_one_file_with_the_figures_of_track(tmp_path: Path):
     assert "<strong>Position " in text
     assert not re.search(r"<(script|link)[^>]+(src|href)=", text)
     assert "exists already" in run("track", bag, "-o", "other.mcap", *options, folder=tmp_path).stderr
+
+
+def test_odometry_of_one_robot_is_not_used_for_several_tags(tmp_path: Path):
+    bag = tmp_path / "two.mcap"
+    with BagWriter(bag, {}) as out:
+        for number in range(20):
+            out.write(Record(replace(record(number).measurement, tag_id=7 + number % 3)))
+    config = EstimatorConfig(HALL, robot=RobotData())
+    player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(TrackSettings()))
+    player.index(config).join()
+    assert player.timeline is not None
+    assert "--odometry with the tags 7, 8, 9" in player.timeline.notices[-1]
+    assert not player.timeline.estimates

@@ -219,7 +219,8 @@ def survey(
 def _read(
     bag: Path, anchors: Path | None, settings: TrackSettings, mitigation: Mitigation | None = None
 ) -> tuple[EstimatorConfig, RecordedRanges]:
-    from uwb_mitigation.commands.offline.track import check_one_tag, read_anchors, read_config
+    from uwb_mitigation.commands.offline.track import read_anchors, read_config
+    from uwb_mitigation.positioning.recorded_tracks import check_one_tag
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
 
@@ -232,7 +233,7 @@ def _read(
         warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():
         warn(f"left out: {count} x {why}")
-    check_one_tag(settings, [tag.tag_id for tag in recorded.tags])
+    check_one_tag(config, recorded.tags)
     return config, recorded
 
 

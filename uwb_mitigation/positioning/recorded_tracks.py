@@ -5,6 +5,7 @@ The same `TrackSettings` give the same tracks in every command, on the page of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
@@ -127,6 +128,14 @@ class TagTracks:
             "warnings": self.warnings,
             **(errors if self.errors["live"].epochs else {}),
         }
+
+
+def check_one_tag(config: EstimatorConfig, recordings: Sequence[TagRecording]) -> None:
+    """Raise a ParameterError if motion or heights of one tag are given for several."""
+    option = "--odometry" if config.robot else "--height-topic" if config.heights is not None else ""
+    if option and len(recordings) > 1:
+        tags = ", ".join(format_id(recording.tag_id) for recording in recordings)
+        raise ParameterError(f"{option} with the tags {tags}", valid="a bag with one tag")
 
 
 def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:

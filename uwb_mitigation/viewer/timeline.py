@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, RecordingError, format_id
+from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
-from uwb_mitigation.positioning.recorded_tracks import TagTracks, track_tag
+from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
 from uwb_mitigation.types.measurement import CORRECTED, FAULTS, RangeMeasurement
@@ -199,8 +199,9 @@ def index_recording(
                 tracks[TrackKind.RAW] = live_track(config, tag.raw)
             else:
                 try:
+                    check_one_tag(config, recorded.tags)
                     estimated = timeline.estimates[name] = track_tag(tag, config)
-                except DatasetError as error:
+                except (DatasetError, ParameterError) as error:
                     timeline.notices.append(str(error))
                     continue
                 tracks[TrackKind.RAW], tracks[TrackKind.CORRECTED] = estimated.raw_live, estimated.live

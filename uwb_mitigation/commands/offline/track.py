@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.hypotheses import LIMITS, AnchorHypotheses
-from uwb_mitigation.errors import ParameterError, RecordingError, format_id
+from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.positioning.batch.smoother import Smoother
@@ -75,14 +75,6 @@ def read_config(
     topic = settings.height_topic
     heights = None if topic is None else read_heights(bag, topic, settings.height_sd_m)
     return settings.config(anchors, heights, _read_robot(bag, settings, warn))
-
-
-def check_one_tag(settings: TrackSettings, tag_ids: Sequence[int]) -> None:
-    """Raise a ParameterError if options for one tag are given for several."""
-    option = "--odometry" if settings.odometry else "--height-topic" if settings.height_topic else ""
-    if option and len(tag_ids) > 1:
-        tags = ", ".join(map(format_id, tag_ids))
-        raise ParameterError(f"{option} with the tags {tags}", valid="a bag with one tag")
 
 
 def _read_robot(bag: Path, settings: TrackSettings, warn: Callable[[str], object]) -> RobotData | None:
