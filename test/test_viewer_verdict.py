@@ -156,7 +156,7 @@ def test_radio_without_cirs_is_a_normal_state(tmp_path: Path):
     assert {row[0] for row in page.health} == {health.GOOD}
     cards = {title: (value, text) for title, value, text in page.cards}
     assert cards["Ranges corrected, since the start"] == ("none", "0 of 120 ranges corrected: no CIRs")
-    assert "0 of 120 ranges corrected" in page.summary
+    assert "0 corrected ranges of 120" in page.summary
     bag = tmp_path / "radio.mcap"
     with BagWriter(bag, {}) as out:
         for number in range(60):

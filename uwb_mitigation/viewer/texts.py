@@ -155,7 +155,7 @@ class Texts:
         """Return time and counts."""
         count = sum(1 for _ in scene.latest())
         corrected, ranges = self._counts(scene)
-        texts = [f"{count} pair{'' if count == 1 else 's'}", f"{corrected} of {ranges} ranges corrected"]
+        texts = [f"{count} pair{'' if count == 1 else 's'}", f"{corrected} corrected ranges of {ranges}"]
         if scene.dropped:
             texts.append(f"{scene.dropped} dropped by the viewer")
         if math.isfinite(now_s := scene.now_s(self._state.tag_id)):
