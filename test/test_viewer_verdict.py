@@ -236,3 +236,13 @@ def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
         r.data_source for r in document.get_model_by_name("strip").renderers if "raw" in r.data_source.data
     )
     assert np.nanmin(strip.data["age"]) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
+
+
+def test_late_positions_give_no_residuals():
+    scene, clock = driven()
+    for step in range(20):
+        clock.now_s += 0.1
+        scene.add_pose("tag_7", Pose(4.0 + step / 10, 3.0, 0.0, stamp_s=clock.now_s + 897.0, sd_m=0.1))
+        scene.add_sample((1, 7), Sample(clock.now_s + 900.0, 9.0, 9.0, 0.1, Status.OK))
+    assert np.isnan([sample.residual_m for sample in list(scene.pairs[1, 7].samples)[-18:]]).all()
+    assert {row[0] for row in controls(scene).health} == {health.GOOD}

@@ -145,14 +145,12 @@ class Page:
         else:
             state.forget("scene")
         self._figures.draw(scene)
-        timeline = self._view.timeline
+        marks, timeline = self._models.controls.marks or {}, self._view.timeline
         state.set(
             available={
-                "largest": timeline is not None and timeline.largest_error() is not None,
-                **dict.fromkeys(
-                    ("previous_bad", "next_bad"), timeline is not None and bool(timeline.bad.any())
-                ),
-                **dict.fromkeys(("step", "window"), timeline is not None and len(timeline.bad) > 1),
+                "largest": marks.get("largest") is not None,
+                **dict.fromkeys(("previous_bad", "next_bad"), marks.get("count", 0) > 0),
+                **dict.fromkeys(("step", "window"), timeline is not None and len(timeline.status) > 1),
                 **dict.fromkeys(("circles", "heat"), bool(scene.anchors and scene.pairs)),
                 "accuracy": len(scene.anchors) > 1,
                 "follow": bool(scene.tags),

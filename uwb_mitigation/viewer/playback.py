@@ -82,6 +82,7 @@ class BagPlayer:
             "No anchor positions: set --anchors FILE.",
             "" if recording.contents & POSITIONS else no_positions,
         )
+        self._stamp_offset_s = 0.0
         self._backend = backend() if self.corrects else None
         self._uncorrected: list[tuple[float, RangeMeasurement]] = []
         self._next: Event | None = None
@@ -118,6 +119,7 @@ class BagPlayer:
                 self._feed.scene.is_indexed = True
                 self._feed.scene.revision += 1
 
+        self._stamp_offset_s = stamp_offset_s
         thread = threading.Thread(target=run, name="index", daemon=True)
         thread.start()
         return thread
@@ -245,7 +247,7 @@ class BagPlayer:
             if count and self._posed.get(tag) != count:
                 self._posed[tag] = count
                 estimate = next(iter(estimated.live.take(slice(count - 1, count))))
-                self._feed.estimate(tag, estimate, float(time_s[count - 1]))
+                self._feed.estimate(tag, estimate, float(time_s[count - 1]), self._stamp_offset_s)
 
     def _show_tracks(self, timeline: Timeline) -> None:
         """Show the tracks up to the current position."""

@@ -50,6 +50,8 @@ HISTORY_S = 60.0
 """Length of the strip chart of a pair."""
 NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
 """A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer."""
+MAX_MOVED_M = 0.2
+"""A range has no residual if the tag moves further between the range and its latest position."""
 CLOCK_JUMP_S = 10.0
 """A larger change of the difference between stamps and the clock is a jump of a clock."""
 STALE_S, STALE = 5.0, 3
@@ -265,10 +267,11 @@ class Pose:
 
 @dataclass(slots=True)
 class TagView:
-    """A tag's latest pose and its time of reception on the scene's clock."""
+    """A tag's latest pose, its time of reception on the scene's clock, and its speed, m/s."""
 
     pose: Pose | None = None
     received_s: float = math.nan
+    speed: float = 0.0
 
 
 TrackPoint = tuple[float, float, float, float, float]
@@ -457,6 +460,10 @@ class Scene:
         """Set the pose of a tag; `received_s` is on the scene's clock, None: now."""
         if _is_plausible(pose.x, pose.y, pose.z):
             entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or TagView())
+            if (before := entry.pose) is not None and pose.stamp_s > before.stamp_s:
+                entry.speed = math.dist((pose.x, pose.y), (before.x, before.y)) / (
+                    pose.stamp_s - before.stamp_s
+                )
             entry.pose, entry.received_s = pose, self.clock() if received_s is None else received_s
             point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
             self.add_position(tag, TrackKind.CORRECTED, point)
@@ -494,8 +501,10 @@ class Scene:
             add_heat(self.heat, pose.x, pose.y, correction_m)
         if anchor is None:
             return
-        height_m = finite_or_zero(pose.z - anchor.z)
-        sample.residual_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
+        # On a busy computer, positions arrive late.
+        if not abs(pose.stamp_s - sample.time_s) * tag.speed > MAX_MOVED_M:
+            height_m = finite_or_zero(pose.z - anchor.z)
+            sample.residual_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
         if not self.is_indexed:
             self._locate_raw(pair, pose, sample)
 

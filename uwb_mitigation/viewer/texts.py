@@ -134,7 +134,7 @@ class Texts:
         timeline = self._view.timeline
         if timeline is None:
             return scene.corrected, scene.ranges
-        return int(timeline.is_corrected.sum()), len(timeline.bad)
+        return int(np.count_nonzero(timeline.is_corrected)), len(timeline.status)
 
     def _cards(self, scene: Scene) -> list[Card]:
         """Return the large figures."""
