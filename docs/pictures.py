@@ -28,9 +28,9 @@ sys.path.insert(0, str(REPOSITORY / "test"))
 from browser import Browser, chromium  # noqa: E402
 
 from benchmarks.equipment import processes  # noqa: E402
-from uwb_mitigation.commands.offline.track import track_tag  # noqa: E402
 from uwb_mitigation.positioning.geometry import Height  # noqa: E402
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig  # noqa: E402
+from uwb_mitigation.positioning.recorded_tracks import track_tag  # noqa: E402
 from uwb_mitigation.recordings.recorded_ranges import read_ranges  # noqa: E402
 from uwb_mitigation.simulation.scene import FLAT  # noqa: E402
 from uwb_mitigation.simulation.simulated import SimulatedSource  # noqa: E402

@@ -15,6 +15,7 @@ from conftest import REPOSITORY
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros import schemas, topics
+from uwb_mitigation.types.ros.poses import tag_topic
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import palette
 
@@ -29,6 +30,8 @@ TYPES = {
     topics.ANCHORS: topics.MARKERS_TYPE,
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
+TAGS = [tag_topic(topics.POSE, number) for number in (1, 2, 3)]
+TYPES |= dict.fromkeys(TAGS, topics.POSE_TYPE)
 CIR_TYPE = "uwb_mitigation_msgs/msg/Cir"
 DISPLAYS = {
     "rviz_default_plugins/MarkerArray": topics.MARKERS_TYPE,
@@ -130,6 +133,12 @@ def test_foxglove_scripts_filter_64_bit_ids_and_compute_magnitudes(browser: Brow
     odometry = "{header: {frame_id: 'map'}, pose: {pose: {position: {x: 1}}, covariance: []}}"
     place = run("uwb-truth", "/uwb/odometry_truth", odometry)
     assert place == {"header": {"frame_id": "map"}, "pose": {"position": {"x": 1}}}
+
+
+@pytest.mark.parametrize("path", ["foxglove/uwb.json", "rviz/uwb.rviz", "plotjuggler/uwb.xml"])
+def test_layouts_show_several_tags(path: str):
+    text = (REPOSITORY / path).read_text()
+    assert all(topic in text for topic in TAGS)
 
 
 def test_layouts_use_the_colours_of_the_page():

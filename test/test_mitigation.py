@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from model_material import LINE, bundle, measurement, window_of
 
-from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.correction import UNRELIABLE_VARIANCE_M2, Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
@@ -87,15 +87,14 @@ def test_correction_is_linear_bias_plus_network_in_float32(mitigation):
     assert result.model_id == mitigation.bundle.model_id
 
 
-def test_range_without_a_cir_gets_the_variance_of_its_offset(tmp_path):
-    one = Mitigation(bundle(tmp_path), Offsets(pairs={(7, 1): 0.2}, pair_sd={(7, 1): 0.03}))
-    card = one.bundle.card
+@pytest.mark.parametrize("uncorrected_m2", [1 / 32, 0.5])
+def test_variance_of_a_range_without_cir_does_not_depend_on_the_offset(tmp_path, uncorrected_m2):
+    saved = bundle(tmp_path, variance_uncorrected_m2=uncorrected_m2)
     without = replace(measurement(samples=np.zeros(0, np.int16)), tag_id=7, anchor_id=1)
-    calibrated = one.correct([without])[0]
-    assert calibrated.status is Status.NO_CIR
-    assert calibrated.variance_m2 == card.variance_m2 < card.variance_uncorrected_m2
-    one.offsets = Offsets()
-    assert one.correct([without])[0].variance_m2 == card.variance_uncorrected_m2
+    for offsets in (Offsets(), Offsets(pairs={(7, 1): 0.2}, pair_sd={(7, 1): 0.03})):
+        result = Mitigation(saved, offsets).correct([without])[0]
+        assert result.status is Status.NO_CIR
+        assert result.variance_m2 == max(uncorrected_m2, UNRELIABLE_VARIANCE_M2)
 
 
 @pytest.mark.parametrize(("changes", "range_m", "status"), BAD)

@@ -19,17 +19,17 @@ from drives import HALL, NANOSECONDS, Robot, circuit, drive, wrapped
 from benchmarks.position_data import real_runs, simulated_runs
 from benchmarks.positions import evaluate
 from uwb_mitigation.commands import positioning
-from uwb_mitigation.commands.offline import track as tracking
-from uwb_mitigation.commands.offline.track import held_out, track_tag
+from uwb_mitigation.commands.offline.track import held_out
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
+from uwb_mitigation.positioning import recorded_tracks as tracking
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.recorded_tracks import track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
-from uwb_mitigation.recordings.recorded_ranges import TagRecording
 from uwb_mitigation.types.anchors import AnchorMap, anchors_path, dump_anchors, parse_anchors
 from uwb_mitigation.types.measurement import (
     Cir,
@@ -41,7 +41,7 @@ from uwb_mitigation.types.measurement import (
 )
 from uwb_mitigation.types.ros.poses import encode_pose
 from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, POSE_TYPE
-from uwb_mitigation.types.tracks import Estimate, Ranges, TruePath
+from uwb_mitigation.types.tracks import Estimate, Ranges, TagRecording, TruePath
 
 
 def write_drive(
@@ -224,9 +224,7 @@ def test_odometry_adds_the_heading_to_tracks(robot_bag: Path, tmp_path: Path):
 
 
 def test_unknown_lever_arm_is_reported(robot_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(
-        "uwb_mitigation.recordings.bag.pose_paths.read_range_frame", lambda bag: "uwb_antenna"
-    )
+    monkeypatch.setattr("uwb_mitigation.commands.offline.track.read_range_frame", lambda bag: "uwb_antenna")
     options = ("--height", "0", "--odometry", "/odom")
     ran = succeed("track", str(robot_bag), "-o", str(tmp_path / "x.mcap"), *options, folder=tmp_path)
     assert "no transform from base_link to uwb_antenna" in ran.stderr

@@ -33,7 +33,7 @@ from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.headline import live_cards
-from uwb_mitigation.viewer.page import Page, View
+from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.scene import (
     MAX_PAIRS,
@@ -45,6 +45,7 @@ from uwb_mitigation.viewer.scene import (
     Trace,
 )
 from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.state import View
 
 HOSTILE = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>$$x$$"
 
@@ -927,3 +928,17 @@ def test_ipv6_address_is_served(browser: Browser, view: View) -> None:
         fill_scene(view)
         open_page(browser, server)
         assert browser.column("pairs", "anchor") == ["1", "2"]
+
+
+def test_long_names_do_not_widen_the_page(browser: Browser, view: View, server: ViewerServer) -> None:
+    fill_scene(view)
+    name = "warehouse_door_north_" * 20
+    with view.lock:
+        view.scene.set_anchors({n: AnchorPosition(4.0 * n, 0, 2, name) for n in (1, 2)})
+        view.scene.set_node_status(name, NodeStatus(1, name, determinations=(f"{name}: {name}",)))
+        view.scene.add_pose(name, Pose(4.0, 3.0, 1.0, stamp_s=1000.0))
+        view.scene.report_event(name)
+    view.title = name
+    open_page(browser, server)
+    browser.wait("the names", lambda: name in browser.text())
+    browser.wait("everything within 1280 pixels", lambda: not browser.cut_off(1280))

@@ -27,6 +27,7 @@ from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import anchors_path, dump_anchors, load_anchors
@@ -42,12 +43,13 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_RAW,
 )
 from uwb_mitigation.types.tracks import Estimate
-from uwb_mitigation.viewer import page, playback
+from uwb_mitigation.viewer import page, playback, texts
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, current_card, interval_cards
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import AnchorPosition, Scene
+from uwb_mitigation.viewer.state import View
 
 COUNT = 400
 """Number of ranges in the bag, at intervals of 10 ms, from two anchors in turn."""
@@ -213,6 +215,9 @@ def test_long_read_continues_at_the_next_call(bag: Path, monkeypatch: pytest.Mon
     player, scene = open_bag(bag)
     player.seek(player.seconds)
     assert player.is_behind
+    player.playing = True
+    assert player.shown_s == scene.clock() < player.position_s, "the slider shows the time of the map"
+    player.playing = False
     while player.is_behind:
         player.advance()
     assert latest(scene)[2, 7] == 4.25 + COUNT - 1
@@ -292,7 +297,7 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     player, scene = open_bag(bag)
     anchors = load_anchors(anchors_path(bag))
     scene.set_anchors({anchor.id: AnchorPosition(*anchor.position) for anchor in anchors.anchors})
-    player.index(anchors).join()
+    player.index(EstimatorConfig(anchors)).join()
     timeline = player.timeline
     assert timeline is not None
     assert len(timeline.time_s) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
@@ -303,9 +308,9 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     assert cards["Position error, now"][0] != "-"
     assert sum(entry[1] for entry in timeline.heat.values()) == len(timeline.time_s)
     counted: list[str] = []
-    monkeypatch.setattr(page, "interval_cards", lambda *arguments: counted.append(arguments[3]) or [])
+    monkeypatch.setattr(texts, "interval_cards", lambda *arguments: counted.append(arguments[3]) or [])
     document = Document()
-    opened = page.Page(document, page.View(scene, threading.Lock(), player=player))
+    opened = page.Page(document, View(scene, threading.Lock(), player=player))
     for position_s in (5.0, 8.0):
         player.seek(position_s)
         opened._table_due_s = 0.0
@@ -324,6 +329,21 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     assert scene.tags["tag_101"].pose is not None
     residuals = [abs(sample.residual_m) for sample in scene.pairs[1, 101].samples]
     assert np.nanmedian(residuals[5:]) < 1.0, "also of the ranges that a seek reads"
+
+
+@pytest.mark.parametrize("count", [1, 40])
+def test_tag_without_a_position_does_not_stop_the_player(tmp_path: Path, count: int):
+    path = tmp_path / "one_anchor.mcap"
+    with BagWriter(path, {}) as out:
+        for number in range(0, 2 * count, 2):
+            write_corrected(out, record(number).measurement, corrected(number))
+    player, scene = open_bag(path)
+    player.index(EstimatorConfig(HALL)).join()
+    assert player.timeline is not None
+    player.play(True)
+    seek(player, player.seconds)
+    assert latest(scene) == {(1, 7): 4.25 + 2 * count - 2}
+    assert "1 anchors received, 3 or more needed" in player.timeline.notices[0]
 
 
 def test_next_bad_range_is_found_and_a_step_advances_by_one_range(tmp_path: Path):

@@ -17,18 +17,19 @@ from bag_material import START_NS, corrected, record
 from browser import Browser
 from drives import HALL, drive
 
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.recordings import recorded_ranges
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
-from uwb_mitigation.viewer import timeline as timeline_module
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Pose, Sample, Scene
 from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.state import View
 
 BAD = 700
 """Row of the range whose status is not OK and whose error is the largest."""
@@ -81,7 +82,7 @@ def serve(path: Path, origins: tuple[str, ...] = ()) -> Iterator[tuple[BagPlayer
     feed = SceneUpdater(Scene(), lock)
     player = BagPlayer(path, feed, lambda: pytest.fail("the bag contains corrected ranges"))
     feed.anchors(HALL)
-    player.index(HALL).join()
+    player.index(EstimatorConfig(HALL)).join()
     with ViewerServer(View(feed.scene, lock, player=player), port=0, origins=origins) as server:
         yield player, server
 
@@ -163,7 +164,7 @@ def test_gaps_are_shown_as_gaps(browser: Browser, tmp_path: Path):
 
 
 def test_index_reads_all_ranges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(timeline_module, "CHUNK", 100)
+    monkeypatch.setattr(recorded_ranges, "CHUNK", 100)
     with serve(write_drive(tmp_path / "drive.mcap", {7: 0.0})) as (player, _):
         timeline = player.timeline
         assert timeline is not None

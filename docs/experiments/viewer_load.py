@@ -29,9 +29,9 @@ from uwb_mitigation.types.measurement import (
 )
 from uwb_mitigation.types.ros.codec import MeasurementKey
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.scene import AnchorPosition, Pose, Scene
 from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.state import View
 
 ANCHORS, TAGS, RATE_HZ = 30, 5, 500
 MEASURED_S, PERIOD_S = 20.0, 0.1

@@ -212,12 +212,10 @@ uwb_status uwb_correct(const uwb_model *model, float range_m, float offset_m, co
         const int valid = model != NULL && in_limits(offset_range_m, 0.0f, MAX_RANGE_M);
         corrected->range_m = offset_range_m;
         corrected->correction_m = offset_m;
-        /* Without an offset the variance contains the offsets of the training boards. */
-        const int calibrated = status == UWB_EMPTY && offset_m != 0.0f;
-        if (!valid) {
-            corrected->variance_m2 = INFINITY;
-        } else {
-            corrected->variance_m2 = calibrated ? model->variance_m2 : model->variance_uncorrected_m2;
+        corrected->variance_m2 = valid ? model->variance_uncorrected_m2 : INFINITY;
+        /* Without a CIR, the direct path may be lost. */
+        if (status == UWB_EMPTY && corrected->variance_m2 < UNRELIABLE_VARIANCE_M2) {
+            corrected->variance_m2 = UNRELIABLE_VARIANCE_M2;
         }
     }
     return status;

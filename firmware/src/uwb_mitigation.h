@@ -132,7 +132,6 @@ typedef struct {
     float linear_bias_per_power_gap;
     float correction_low_m; /* with a predicted error outside, the input is out of distribution */
     float correction_high_m;
-    float variance_m2; /* of a range without CIR from which an offset was subtracted */
     float variance_uncorrected_m2;
     const uwb_scale_line *scale; /* ascending, the first one from 0 on */
     uint16_t scale_count;

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.calibration.site_data import SiteData
     from uwb_mitigation.calibration.solution import Localisation
     from uwb_mitigation.mitigation.model.bundle import Bundle
+    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
     from uwb_mitigation.types.anchors import AnchorMap
 
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
@@ -128,42 +129,38 @@ def calibrate(
     """
     from uwb_mitigation.calibration.site import calibrate_site
     from uwb_mitigation.calibration.solution import solve_with_truth, solve_without_truth
+    from uwb_mitigation.commands.offline.track import read_anchors
     from uwb_mitigation.commands.support.bundles import bundle_for
-    from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
-    from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
-    from uwb_mitigation.types.anchors import anchors_path, load_anchors
+    from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
+    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
 
     _check_files(output, report, force)
     pose_options = _PoseOptions(
         truth_topic, frames, time_offset, parse_lever_arm(lever_arm), estimate_lever_arm
     )
     pose_options.check()
-    if height is not None and height_topic is not None:
-        raise ParameterError("--height and --height-topic", valid="either of them")
-    if not abs(stamp_offset) <= MAX_STAMP_OFFSET_S:
-        raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
+    settings = TrackSettings(height, height_sd, height_topic, Area.parse(area), stamp_offset_s=stamp_offset)
     if check and truth_topic is not None:
         raise ParameterError("--check with --truth-topic", valid="either of them")
-    prior = None if height is None else Height(height, height_sd)
-    box = Area.parse(area)
-    anchor_map = (None if anchors else recorded_anchors(bags[0])) or load_anchors(
-        anchors or anchors_path(bags[0])
-    )
+    anchor_map = read_anchors(bags[0], anchors)
     # For CIRs of another radio, a line in the levels is compared with offsets only.
     source = bundle_for(None, bags[0], may_be_experimental=False)
     try:
-        gather = functools.partial(
-            _gather, anchors=anchor_map, source=source, stamp_offset=stamp_offset,
-            height_topic=height_topic, height_sd=height_sd,
-        )  # fmt: skip
+        gather = functools.partial(_gather, anchors=anchor_map, source=source, settings=settings)
         site, drives = gather(bags), [gather([bag]) for bag in check or []]
         with console.stage_bars() as on_progress:
             if pose_options.topic is not None:
                 localisation = _localisation(bags, site, pose_options.topic, pose_options)
-                solution = solve_with_truth(site, localisation, height=prior, on_progress=on_progress)
+                solution = solve_with_truth(
+                    site, localisation, height=settings.height, on_progress=on_progress
+                )
             else:
                 solution = solve_without_truth(
-                    site, height=prior, area=box, height_sd_m=height_sd, on_progress=on_progress
+                    site,
+                    height=settings.height,
+                    area=settings.area,
+                    height_sd_m=height_sd,
+                    on_progress=on_progress,
                 )
             calibration = calibrate_site(
                 site,
@@ -252,28 +249,22 @@ def _write(
     return {"model_id": bundle.model_id, "offsets_file": offsets_path}
 
 
-def _gather(
-    bags: list[Path],
-    anchors: AnchorMap,
-    source: Bundle,
-    stamp_offset: float,
-    height_topic: str | None,
-    height_sd: float,
-) -> SiteData:
+def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle, settings: TrackSettings) -> SiteData:
     from contextlib import ExitStack
 
     from uwb_mitigation.calibration.site_data import read_site
     from uwb_mitigation.recordings.bag.pose_paths import read_heights
     from uwb_mitigation.recordings.formats import open_recording
 
-    heights = None if height_topic is None else [read_heights(bag, height_topic, height_sd) for bag in bags]
+    topic, sd_m = settings.height_topic, settings.height_sd_m
+    heights = None if topic is None else [read_heights(bag, topic, sd_m) for bag in bags]
     with ExitStack() as stack, console.reading() as on_record:
         site = read_site(
             [stack.enter_context(open_recording(bag)) for bag in bags],
             anchors,
             source,
             on_record,
-            stamp_offset_s=stamp_offset,
+            stamp_offset_s=settings.stamp_offset_s,
             heights=heights,
         )
     if heights is not None and len(site.tags) > 1:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,20 +13,25 @@ from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 from uwb_mitigation.commands.support.checks import OffsetsOption
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.commands.support.position_options import (
+    AccelerationOption,
     AnchorsOption,
     AreaOption,
     HeightOption,
     HeightSdOption,
     HeightTopicOption,
+    ImuOption,
+    LeverArmOption,
+    OdometryOption,
     OffsetOption,
 )
-from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
+from uwb_mitigation.errors import DatasetError, ParameterError, check_name, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.calibration.survey import SurveyResult
-    from uwb_mitigation.commands.offline.track import HoldoutErrors, TagTracks
+    from uwb_mitigation.commands.offline.track import HoldoutErrors
     from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+    from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+    from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap
 
@@ -54,13 +58,6 @@ TRACK_COLUMNS = {
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="An MCAP bag with ranges, corrected or raw.")
 ]
-AccelerationOption = Annotated[
-    float,
-    typer.Option(
-        help="Agility of the tags: 0.8 for robots, people and drones, less for slow vehicles. Square root of the spectral "
-        "density of the acceleration, m/s^1.5."
-    ),
-]
 
 
 def track(
@@ -80,31 +77,17 @@ def track(
     height_sd: HeightSdOption = 0.1,
     height_topic: HeightTopicOption = None,
     area: AreaOption = None,
-    odometry: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC",
-            help="Odometry of the robot with the tag (nav_msgs/Odometry): also estimate its heading.",
-        ),
-    ] = None,
-    imu: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TOPIC",
-            help="With --odometry: IMU of the robot (sensor_msgs/Imu); its yaw rate replaces that of the odometry.",
-        ),
-    ] = None,
-    lever_arm: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="With --odometry: the antenna in the robot's frame, m. Default: from the transforms of the bag, otherwise 0.",
-        ),
-    ] = None,
+    odometry: OdometryOption = None,
+    imu: ImuOption = None,
+    lever_arm: LeverArmOption = None,
     stamp_offset: OffsetOption = 0.0,
     acceleration: AccelerationOption = 0.8,
     model: ModelOption = None,
     offsets: OffsetsOption = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write an HTML page: verdict, map, errors over time."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -120,25 +103,27 @@ def track(
 
         uwb-mitigation track drive.mcap -o track.mcap --odometry /odom --imu /imu
     """
-    from uwb_mitigation.commands.offline.track import held_out, track_tag, tum_file, write_tracks
+    from uwb_mitigation.commands.offline.track import held_out, mitigation, tum_file, write_tracks
     from uwb_mitigation.commands.offline.track import tum as tum_text
     from uwb_mitigation.files import write_atomically
-    from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.mitigation.model.shipped import load_model
+    from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
+    from uwb_mitigation.positioning.recorded_tracks import TrackSettings, track_tag
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
     from uwb_mitigation.types.offsets import NO_OFFSETS
 
-    mitigation = Mitigation(load_model(model), offsets or NO_OFFSETS, median_at_rest=True)
-    options = height, height_sd, height_topic, area, stamp_offset, acceleration
-    config, recorded = _read(bag, anchors, *options, mitigation)
-    if not mitigation.used and (model or offsets):
+    motion = odometry, imu, parse_lever_arm(lever_arm), stamp_offset, acceleration
+    settings = TrackSettings(
+        height, height_sd, height_topic, Area.parse(area), *motion, model, offsets or NO_OFFSETS
+    )
+    corrector = mitigation(settings)
+    config, recorded = _read(bag, anchors, settings, corrector)
+    if not corrector.used and (model or offsets):
         raise ParameterError("--model or --offsets", where=str(bag), valid="a bag without corrected ranges")
-    show_models(mitigation.used)
-    config = replace(config, robot=_robot_of(bag, odometry, imu, lever_arm, recorded))
+    show_models(corrector.used)
     several = len(recorded.tags) > 1
     tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
-    for file in tum_files.values():
+    for file in (*tum_files.values(), *([report] if report else [])):
         if file.exists() and not force:
             raise ParameterError("exists already", where=str(file), valid="--force replaces it")
     tracks, failures = [], list[DatasetError]()
@@ -165,6 +150,11 @@ def track(
     print_line(f"Wrote {out.counts.total()} messages to {out.file}.")
     for tracked in tracks if tum is not None else []:
         write_atomically(tum_files[tracked.recording.tag_id], tum_text(tracked.smoothed))
+    if report is not None:
+        from uwb_mitigation.viewer.report import write_report
+
+        write_report(report, bag, config, lambda: mitigation(settings), stamp_offset)
+        print_line(f"Wrote {report}.")
     console.write_json(json, _result(tracks, recorded), {"held_out": residuals})
 
 
@@ -197,13 +187,17 @@ def survey(
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
     from uwb_mitigation.calibration.survey import survey_anchors
+    from uwb_mitigation.positioning.geometry import Area
+    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
     from uwb_mitigation.types.anchors import save_anchors
 
     if not 0.0 < off <= 100.0:
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
     if output.exists() and not force:
         raise ParameterError("exists already", where=str(output), valid="--force replaces it")
-    config, recorded = _read(bag, anchors, height, height_sd, height_topic, area, stamp_offset, acceleration)
+    motion = None, None, None, stamp_offset, acceleration
+    settings = TrackSettings(height, height_sd, height_topic, Area.parse(area), *motion)
+    config, recorded = _read(bag, anchors, settings)
     index = config.anchors.index
     ids = {text: row for identity, row in index.items() for text in (str(identity), format_id(identity))}
     for text in fixed or []:
@@ -223,82 +217,24 @@ def survey(
 
 
 def _read(
-    bag: Path,
-    anchors: Path | None,
-    height: float | None,
-    height_sd: float,
-    height_topic: str | None,
-    area: str | None,
-    stamp_offset: float,
-    acceleration: float,
-    mitigation: Mitigation | None = None,
+    bag: Path, anchors: Path | None, settings: TrackSettings, mitigation: Mitigation | None = None
 ) -> tuple[EstimatorConfig, RecordedRanges]:
-    from uwb_mitigation.positioning.geometry import Area, Height
-    from uwb_mitigation.positioning.noise_model import NoiseModel
-    from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
-    from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
-    from uwb_mitigation.recordings.bag.pose_paths import read_heights
+    from uwb_mitigation.commands.offline.track import read_anchors, read_config
+    from uwb_mitigation.positioning.recorded_tracks import check_one_tag
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
-    from uwb_mitigation.types.anchors import anchors_path, load_anchors
 
-    if not abs(stamp_offset) <= 3600.0:
-        raise ParameterError(f"stamp offset {stamp_offset}", valid="-3600 to 3600 s")
-    if height is not None and height_topic is not None:
-        raise ParameterError("--height and --height-topic", valid="one of the two")
-    # This also checks the standard deviation of measured heights.
-    prior, box, model = Height(height or 0.0, height_sd), Area.parse(area), NoiseModel(acceleration)
-    if not bag.exists():
-        raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
-    anchor_map = (None if anchors else recorded_anchors(bag)) or load_anchors(anchors or anchors_path(bag))
+    config = read_config(bag, read_anchors(bag, anchors), settings, warn)
     with console.progress() as bar:
         bar.add_task("reading", total=None)
         corrected = () if mitigation is None else mitigation.correct_records(open_recording(bag))
-        recorded = read_ranges(bag, anchor_map, stamp_offset, corrected)
+        recorded = read_ranges(bag, config.anchors, settings.stamp_offset_s, corrected)
     for identity, count in recorded.unknown_anchors.items():
         warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
     for why, count in recorded.skipped.items():
         warn(f"left out: {count} x {why}")
-    heights = None
-    if height_topic is not None:
-        _check_one_tag("--height-topic", recorded)
-        heights = read_heights(bag, height_topic, height_sd)
-    return EstimatorConfig(anchor_map, model, None if height is None else prior, box, heights), recorded
-
-
-def _check_one_tag(option: str, recorded: RecordedRanges) -> None:
-    if len(recorded.tags) > 1:
-        tags = ", ".join(format_id(tag.tag_id) for tag in recorded.tags)
-        raise ParameterError(f"{option} with the tags {tags}", valid="a bag with one tag")
-
-
-def _robot_of(
-    bag: Path, odometry: str | None, imu: str | None, lever_arm: str | None, recorded: RecordedRanges
-) -> RobotData | None:
-    """Read the motion of --odometry and --imu, and the lever arm."""
-    from uwb_mitigation.positioning.geometry import parse_lever_arm
-
-    arm = parse_lever_arm(lever_arm)
-    if odometry is None:
-        if imu is not None or arm is not None:
-            raise ParameterError("--imu or --lever-arm without --odometry", valid="with --odometry TOPIC")
-        return None
-    _check_one_tag("--odometry", recorded)
-    from uwb_mitigation.positioning.online.tag_estimator import RobotData
-    from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odometry
-    from uwb_mitigation.recordings.bag.pose_paths import read_lever_arm, read_range_frame
-
-    if arm is None:
-        frame = read_range_frame(bag)
-        arm = read_lever_arm(bag, BASE_LINK, frame)
-        if arm is None and frame.lstrip("/") != BASE_LINK:
-            antenna = frame or "the antenna (ranges without frame_id)"
-            warn(
-                f"lever arm of the antenna unknown, 0,0,0 is used: no transform from {BASE_LINK} to {antenna} in the bag. Set "
-                "--lever-arm X,Y,Z"
-            )
-    motion = read_odometry(bag, odometry)
-    return RobotData(motion, None if imu is None else read_imu(bag, imu), arm or (0.0, 0.0, 0.0))
+    check_one_tag(config, recorded.tags)
+    return config, recorded
 
 
 def _show_tracks(tracks: list[TagTracks]) -> None:
@@ -396,7 +332,7 @@ def _show_survey(result: SurveyResult) -> None:
 
 
 def _result(tracks: list[TagTracks], recorded: RecordedRanges) -> dict[str, Any]:
-    from uwb_mitigation.commands.offline.track import KINDS, pooled
+    from uwb_mitigation.positioning.recorded_tracks import KINDS, pooled
 
     has_truth = any(tag.errors["live"].epochs for tag in tracks)
     hdops = [tag.hdop for tag in tracks if math.isfinite(tag.hdop)]

@@ -168,7 +168,10 @@ def _show(result: dict[str, Any]) -> None:
         max_rows=len(result["bags"]),
         optional=("warnings", "messages", "replaced") if result["failed"] else tuple(columns)[5:],
     )
-    console.print_line(f"{result['ranges']} ranges, {result['ranges_per_s']:.0f} ranges/s")
+    corrected = result["ranges"] - sum(row["passed_through"] for row in result["bags"])
+    console.print_line(
+        f"{corrected} of {result['ranges']} ranges corrected, {result['ranges_per_s']:.0f} ranges/s"
+    )
     for row in result["bags"]:
         for kind, count in row["skipped"].items():
             console.warn(f"{row['source']}: {count} x {kind}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 import webbrowser
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,19 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, show_models
+from uwb_mitigation.commands.support.checks import OffsetsOption
+from uwb_mitigation.commands.support.position_options import (
+    AccelerationOption,
+    AnchorsOption,
+    AreaOption,
+    HeightOption,
+    HeightSdOption,
+    HeightTopicOption,
+    ImuOption,
+    LeverArmOption,
+    OdometryOption,
+    OffsetOption,
+)
 
 
 def view(
@@ -28,20 +42,21 @@ def view(
             metavar="[SECOND]", help="A bag of the same drive with another correction, to compare."
         ),
     ] = None,
-    anchors: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Anchors file. Default: X.anchors.yaml next to BAG, else the markers in BAG."
-        ),
-    ] = None,
-    height: Annotated[
-        float | None,
-        typer.Option(help="Height of the tags, m, for tracks. Default: the true height, if BAG contains it."),
-    ] = None,
+    anchors: AnchorsOption = None,
+    height: HeightOption = None,
+    height_sd: HeightSdOption = 0.1,
+    height_topic: HeightTopicOption = None,
+    area: AreaOption = None,
+    odometry: OdometryOption = None,
+    imu: ImuOption = None,
+    lever_arm: LeverArmOption = None,
+    stamp_offset: OffsetOption = 0.0,
+    acceleration: AccelerationOption = 0.8,
     floor_plan: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Floor plan: the YAML file of a map of map_server.")
     ] = None,
     model: ModelOption = None,
+    offsets: OffsetsOption = None,
     namespace: Annotated[
         str | None,
         typer.Option(
@@ -69,22 +84,27 @@ def view(
 
         uwb-mitigation data simulate --like drive -o flat.mcap
 
-        uwb-mitigation view flat.mcap --browser
+        uwb-mitigation view flat.mcap --height 0 --browser
     """
     from threading import Lock
 
-    from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.mitigation.model.shipped import load_model
-    from uwb_mitigation.positioning.geometry import Height
+    from uwb_mitigation.commands.offline.track import mitigation, read_config
+    from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
+    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
+    from uwb_mitigation.types.offsets import NO_OFFSETS
     from uwb_mitigation.viewer.feed import SceneUpdater
     from uwb_mitigation.viewer.floor_plan import load_floor_plan
-    from uwb_mitigation.viewer.page import View
     from uwb_mitigation.viewer.playback import BagPlayer
     from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.server import ViewerServer
+    from uwb_mitigation.viewer.state import View
 
+    motion = odometry, imu, parse_lever_arm(lever_arm), stamp_offset, acceleration
+    settings = TrackSettings(
+        height, height_sd, height_topic, Area.parse(area), *motion, model, offsets or NO_OFFSETS
+    )
     lock = Lock()
     anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
     players, scenes, threads = [], [], []
@@ -92,14 +112,15 @@ def view(
         if path is None:
             continue
         feed = SceneUpdater(Scene(), lock)
-        player = BagPlayer(path, feed, lambda: Mitigation(load_model(model)), namespace)
+        player = BagPlayer(path, feed, partial(mitigation, settings), namespace)
         if anchor_map is not None:
             feed.anchors(anchor_map)
         if player.corrects:
             console.err.print(
                 f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
             )
-        threads.append(player.index(anchor_map, None if height is None else Height(height)))
+        config = None if anchor_map is None else read_config(path, anchor_map, settings, console.warn)
+        threads.append(player.index(config, stamp_offset))
         players.append(player)
         scenes.append(feed.scene)
     first = players[0]

@@ -268,8 +268,9 @@ def pass_through(
 ) -> CorrectedColumns:
     """Return the raw ranges minus the offsets of their radios, with the variance of uncorrected ranges.
 
-    The offset does not depend on the CIR. A range without a CIR from which an offset was subtracted gets the
-    variance of corrected ranges: that of uncorrected ranges contains the offsets of the training boards.
+    Without a CIR, nothing shows whether the direct path was lost: the standard deviation is at least half a metre, as of an
+    UNRELIABLE range, whether the offset is known or not. The root mean square error of such real ranges is 0.24 to 0.93 m
+    outdoors and 0.16 m in a labyrinth (`test_variance_of_ranges_without_cir_is_that_of_real_errors`).
 
     Args:
         bundle: the model.
@@ -287,7 +288,7 @@ def pass_through(
         _is_valid_range(range_m), np.float32(card.variance_uncorrected_m2), _INFINITE_VARIANCE
     )
     if not ranges.samples.shape[1]:
-        variance[_is_valid_range(range_m) & (status == _NO_CIR) & (offset_m != 0.0)] = card.variance_m2
+        variance[status == _NO_CIR] = np.maximum(variance[status == _NO_CIR], UNRELIABLE_VARIANCE_M2)
     model_id = np.array([bundle.model_id] * len(ranges), np.uint32)
     if fault is None:
         fault = np.zeros(len(ranges), np.uint8)

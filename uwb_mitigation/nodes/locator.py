@@ -220,7 +220,7 @@ class Locator(ManagedNode):
         def on_range(measurement: RangeMeasurement) -> None:
             if self._estimator is not None and self.is_active:
                 self._update_lever_arm(measurement.tag_id, lambda: measurement.frame_id)
-                self._add(self._estimator, *_uncorrected(measurement, variance_m2))
+                self._add(self._estimator, *_uncorrected(measurement, variance_m2), has_variance=True)
 
         feed = TopicFeed(self, mapping, "", on_range, self.now_ns)
         self.destroy_at_close(feed, TopicFeed.stop).start()
@@ -287,12 +287,15 @@ class Locator(ManagedNode):
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return
         self._update_lever_arm(key.tag_id, lambda: decode_frame_id(data))
-        self._add(estimator, key, corrected)
+        self._add(estimator, key, corrected, corrected.status.is_corrected)
 
-    def _add(self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange) -> None:
+    def _add(
+        self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange, has_variance: bool
+    ) -> None:
         began_ns = time.perf_counter_ns()
         stamp_ns = key.stamp_ns + self._offset_ns
-        result = estimator.add(key.tag_id, key.anchor_id, stamp_ns, corrected.range_m, corrected.variance_m2)
+        measured = corrected.range_m, corrected.variance_m2, has_variance
+        result = estimator.add(key.tag_id, key.anchor_id, stamp_ns, *measured)
         if result is None:
             if key.anchor_id in estimator.unknown_anchors and key.anchor_id not in self._unknown_anchors:
                 self._unknown_anchors.add(key.anchor_id)

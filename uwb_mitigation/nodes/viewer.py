@@ -33,9 +33,9 @@ from uwb_mitigation.types.ros.topics import relative
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.floor_plan import load_floor_plan
-from uwb_mitigation.viewer.page import View
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, MissingData, Scene
 from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.state import View
 
 # Best effort: a publisher must not wait for a display.
 _QOS = QoSProfile(
@@ -72,6 +72,7 @@ class Viewer(ManagedNode):
         self._feed = SceneUpdater(self._scene, self._lock)
         pace = ReplayClock(self.get_clock())
         self._scene.clock = lambda: pace.now_ns() / NS_PER_S
+        self._scene.stamp_clock = lambda: self.now_ns() / NS_PER_S
         self._view: View | None = None
         self.autostart()
 

@@ -132,6 +132,7 @@ class TagState:
         estimator: position from ranges only. robot: with odometry, if a robot carries this tag; it contains `estimator`.
         smoother: of this tag.
         latest_ns: stamp of its latest range.
+        is_corrected: whether a range of this tag was corrected.
     """
 
     tag_id: int
@@ -139,6 +140,7 @@ class TagState:
     smoother: FixedLagSmoother
     robot: RobotEstimator | None = None
     latest_ns: int = 0
+    is_corrected: bool = False
 
     @property
     def best(self) -> TagEstimator | RobotEstimator:
@@ -184,9 +186,18 @@ class MultiTagEstimator:
         self._config = config
 
     def add(
-        self, tag_id: int, anchor_id: int, stamp_ns: int, range_m: float, variance_m2: float
+        self,
+        tag_id: int,
+        anchor_id: int,
+        stamp_ns: int,
+        range_m: float,
+        variance_m2: float,
+        is_corrected: bool = True,
     ) -> tuple[TagState, Estimate | None] | None:
         """Update with a range.
+
+        Until a range of the tag was corrected (a radio without CIRs), its ranges are those of an uncorrected radio: the variance
+        is that of `NoiseModel`, whose robust weights and offset cover what a published variance adds.
 
         Returns:
             The tag and its estimate (None: unknown); None: the range was skipped.
@@ -197,12 +208,15 @@ class MultiTagEstimator:
                 self.unknown_anchors[anchor_id] += 1
             return None
         tag = self.tags.get(tag_id)
+        if not is_corrected and (tag is None or not tag.is_corrected) and variance_m2 < math.inf:
+            variance_m2 = math.nan
         measurement = TagRange(stamp_ns, row, range_m, variance_m2)
         if not measurement.is_valid or (tag is None and len(self.tags) >= MAX_TAGS):
             self.invalid += 1
             return None
         if tag is None:
             tag = self.tags[tag_id] = self._new_tag(tag_id)
+        tag.is_corrected |= is_corrected
         estimate = tag.best.add(measurement)
         tag.latest_ns = stamp_ns
         range_filter = tag.estimator.filter

@@ -60,14 +60,12 @@ class TagLocator:
             raise ParameterError(
                 f"corrected = {corrected!r:.60}", valid="what Mitigation.correct returns, or None"
             )
-        range_m, variance_m2 = (
-            (measurement.range_m, math.nan)
-            if corrected is None
-            else (corrected.range_m, corrected.variance_m2)
-        )
-        result = self._estimator.add(
-            measurement.tag_id, measurement.anchor_id, measurement.stamp_ns, range_m, variance_m2
-        )
+        key = measurement.tag_id, measurement.anchor_id, measurement.stamp_ns
+        if corrected is None:
+            result = self._estimator.add(*key, measurement.range_m, math.nan, False)
+        else:
+            is_corrected = corrected.status.is_corrected
+            result = self._estimator.add(*key, corrected.range_m, corrected.variance_m2, is_corrected)
         return None if result is None else result[1]
 
     def warnings(self) -> list[str]:

@@ -3,39 +3,65 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.measurement import CorrectedRange, Record
+from uwb_mitigation.types.measurement import CORRECTED, CorrectedRange, RangeMeasurement, Record
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, measurement_key
 from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_CORRECTED, RANGE_CORRECTED_TYPE, RANGE_RAW
-from uwb_mitigation.types.tracks import Ranges, TruePath
+from uwb_mitigation.types.tracks import Ranges, TagRecording, TruePath
+
+CHUNK = 50_000
+"""Number of rows that are collected before they are stored compactly."""
+
+KEY = [("stamp_ns", "i8"), ("tag", "u8"), ("anchor", "u8"), ("sequence", "u4")]
+_RAW = np.dtype([*KEY, ("range_m", "f8")])
+_CORRECTED = np.dtype(
+    [*KEY, ("log_ns", "i8"), ("status", "u1"), ("raw_m", "f8"), ("range_m", "f8"), ("variance_m2", "f8")]
+)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TagRecording:
-    """The ranges of one tag in a bag.
+class Table:
+    """Rows of a structured array that grows."""
 
-    Attributes:
-        raw: ranges as measured, with unknown variances.
-        ranges: corrected ranges with their variances, if there are any; otherwise the raw ranges.
-        corrected: whether `ranges` are corrected.
-        truth: true positions; empty: unknown.
-    """
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._dtype, self._rows = dtype, list[tuple[Any, ...]]()
+        self._chunks: list[NDArray[Any]] = []
 
-    tag_id: int
-    raw: Ranges
-    ranges: Ranges
-    corrected: bool
-    truth: TruePath
+    def add(self, *row: Any) -> None:
+        """Append a row."""
+        self._rows.append(row)
+        if len(self._rows) == CHUNK:
+            self._chunks.append(np.array(self._rows, self._dtype))
+            self._rows.clear()
+
+    def array(self) -> NDArray[Any]:
+        """Return all rows."""
+        return np.concatenate([*self._chunks, np.array(self._rows, self._dtype)])
+
+
+def match(rows: NDArray[Any], others: NDArray[Any]) -> NDArray[np.intp]:
+    """Return for each of n rows the index of the row of `others` with the same `KEY`, int (n,); -1: none."""
+    columns = [np.concatenate([rows[name], others[name]]) for name, _ in KEY]
+    order = np.lexsort(columns)
+    is_new = np.zeros(len(order), bool)
+    for column in columns:
+        is_new[1:] |= np.diff(column[order]) != 0
+    group = np.empty(len(order), np.intp)
+    group[order] = np.cumsum(is_new)
+    index = np.full(len(order), -1)
+    index[group[len(rows) :]] = np.arange(len(others))
+    return index[group[: len(rows)]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,8 +79,86 @@ class RecordedRanges:
     skipped: Counter[str]
 
 
-_Row = tuple[int, int, float, float, float]
-_DTYPE = np.dtype([("s", "i8"), ("a", "i8"), ("r", "f8"), ("v", "f8"), ("p", "f8")])
+@dataclass(slots=True)
+class RangeTable:
+    """Raw and corrected ranges of a recording.
+
+    Attributes:
+        raw, corrected: their rows; `log_ns` is on the clock of the caller.
+        skipped: number of messages that cannot be decoded, {reason: count}.
+    """
+
+    raw: Table = field(default_factory=lambda: Table(_RAW))
+    corrected: Table = field(default_factory=lambda: Table(_CORRECTED))
+    skipped: Counter[str] = field(default_factory=Counter)
+
+    def add_raw(self, measured: RangeMeasurement) -> None:
+        """Append a measured range."""
+        self.raw.add(*measurement_key(measured), measured.range_m)
+
+    def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange, log_ns: int = 0) -> None:
+        """Append the corrected range of a measurement; `log_ns`: its time on the clock of the recorder."""
+        columns = corrected.status, corrected.range_raw_m, corrected.range_m, corrected.variance_m2
+        self.corrected.add(*key, log_ns, *columns)
+
+    def by_tag(
+        self, anchors: AnchorMap, stamp_offset_s: float, truths: Mapping[int | None, TruePath]
+    ) -> RecordedRanges:
+        """Return the usable ranges of each tag; see `read_ranges`."""
+        measured, corrected = self.raw.array(), self.corrected.array()
+        row_of_raw = match(corrected, measured)
+        # A bag without raw ranges: corrected ranges contain the measured ones.
+        raw = np.concatenate([measured, np.zeros(int((row_of_raw < 0).sum()), _RAW)])
+        for name, _ in KEY:
+            raw[name][len(measured) :] = corrected[name][row_of_raw < 0]
+        raw["range_m"][len(measured) :] = corrected["raw_m"][row_of_raw < 0]
+        unknown_m2 = np.full(len(raw), np.nan)
+        raw_rows = _usable(raw, anchors, unknown_m2)
+        corrected_rows = _usable(corrected, anchors, corrected["variance_m2"])
+        counted, rows = (measured, raw_rows) if len(measured) else (corrected, corrected_rows)
+        rejected = counted["anchor"][rows[: len(counted)] < 0].tolist()
+        unknown = Counter(anchor for anchor in rejected if anchor not in anchors.index)
+        skipped = self.skipped + Counter({"invalid range": len(rejected) - unknown.total()})
+        offset_ns = round(stamp_offset_s * 1e9)
+        no_truth, tags = TruePath(np.zeros(0, np.int64), np.zeros((0, 3))), []
+        for tag in np.unique(
+            np.concatenate([raw["tag"][raw_rows >= 0], corrected["tag"][corrected_rows >= 0]])
+        ):
+            one = _ranges(raw, raw_rows, unknown_m2, tag, offset_ns)
+            ranges = _ranges(corrected, corrected_rows, corrected["variance_m2"], tag, offset_ns)
+            is_tag = (corrected["tag"] == tag) & (corrected_rows >= 0)
+            if not np.isin(corrected["status"][is_tag], CORRECTED).any():
+                # As in `MultiTagEstimator`.
+                ranges = replace(ranges, variance_m2=np.full(len(ranges), np.nan))
+            if not len(ranges) or np.array_equal(ranges.range_m, one.range_m):
+                ranges = one
+            tags.append(
+                TagRecording(int(tag), one, ranges, ranges is not one, truths.get(int(tag), no_truth))
+            )
+        return RecordedRanges(tags, unknown, skipped)
+
+
+def _usable(rows: NDArray[Any], anchors: AnchorMap, variance_m2: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the row of the anchor of each range, int (n,); -1: the range cannot be used."""
+    ids, inverse = np.unique(rows["anchor"], return_inverse=True)
+    anchor = np.array([anchors.index.get(int(one), -1) for one in ids], np.intp)[inverse]
+    usable = np.isfinite(rows["range_m"]) & (rows["range_m"] >= 0.0) & (variance_m2 != math.inf)
+    return np.where(usable, anchor, -1)
+
+
+def _ranges(
+    rows: NDArray[Any],
+    anchor: NDArray[np.intp],
+    variance_m2: NDArray[np.float64],
+    tag: np.uint64,
+    offset_ns: int,
+) -> Ranges:
+    """Return the usable ranges of a tag in the order of their stamps; their received powers are not read."""
+    index = np.flatnonzero((rows["tag"] == tag) & (anchor >= 0))
+    index = index[np.argsort(rows["stamp_ns"][index], kind="stable")]
+    measured = rows[index]
+    columns = measured["range_m"], variance_m2[index], np.full(len(index), np.nan)
+    return Ranges(measured["stamp_ns"] + offset_ns, anchor[index], *columns, int(tag))
 
 
 def read_ranges(
@@ -69,14 +173,13 @@ def read_ranges(
         path: the bag.
         anchors: the map; ranges of other anchors are skipped.
         stamp_offset_s: added to the stamps of the ranges (not of the truth): -0.2 if they are late by 0.2 s.
-        corrected: corrected ranges of a bag that contains none; of a tag whose ranges they do not change, the raw ranges
-            are used. Not read if the bag contains corrected ranges.
+        corrected: corrected ranges of a bag that contains none. Not read if the bag contains corrected ranges. Of a tag whose
+            ranges the correction does not change, the raw ranges are used.
 
     Raises:
         RecordingError: the bag cannot be read, or has no range of an anchor in the map.
     """
-    bag = BagReader(path)
-    table = _RangeTable(anchors, round(stamp_offset_s * 1e9))
+    bag, table = BagReader(path), RangeTable()
     checked = set[int]()
     for message in bag.messages((RANGE_RAW, RANGE_CORRECTED)):
         is_raw = message.channel.topic == RANGE_RAW
@@ -85,78 +188,22 @@ def read_ranges(
             checked.add(id(message.channel))
         try:
             if is_raw:
-                table.add_raw(message.data)
+                table.add_raw(decode_range(message.data))
             else:
                 table.add_corrected(*decode_corrected(message.data))
         except RecordingError as error:
             table.skipped[error.what] += 1
-    if not (has_corrected := RANGE_CORRECTED in bag.topics):
+    if RANGE_CORRECTED not in bag.topics:
         for record, result in corrected:
             table.add_corrected(measurement_key(record.measurement), result)
-    if not table.raw and not table.corrected:
+    recorded = table.by_tag(anchors, stamp_offset_s, read_truth(path))
+    if not recorded.tags:
         map_ids = ", ".join(map(str, sorted(anchors.index)))
-        recorded_ids = ", ".join(map(str, sorted(table.unknown_anchors))) or "none"
+        recorded_ids = ", ".join(map(str, sorted(recorded.unknown_anchors))) or "none"
         raise RecordingError(
             f"no range of the anchors {map_ids}",
             where=str(path),
             valid=f"the bag's ranges come from anchors: {recorded_ids}",
         )
-    truths = read_truth(path)
-    no_truth = TruePath(np.zeros(0, np.int64), np.zeros((0, 3)))
-    tags = []
-    for tag in sorted(table.raw.keys() | table.corrected.keys()):
-        raw = _columns(tag, table.raw.get(tag, []))
-        ranges = _columns(tag, table.corrected[tag]) if tag in table.corrected else raw
-        if not has_corrected and np.array_equal(ranges.range_m, raw.range_m):
-            ranges = raw
-        tags.append(TagRecording(tag, raw, ranges, ranges is not raw, truths.get(tag, no_truth)))
-    return RecordedRanges(tags, table.unknown_anchors, table.skipped + bag.warnings)
-
-
-class _RangeTable:
-    """Rows of the raw and corrected ranges of a bag, by tag."""
-
-    def __init__(self, anchors: AnchorMap, offset_ns: int) -> None:
-        self._anchors, self._offset_ns = anchors, offset_ns
-        self._powers: dict[MeasurementKey, float] = {}
-        self.raw = defaultdict[int, list[_Row]](list)
-        self.corrected = defaultdict[int, list[_Row]](list)
-        self.unknown_anchors, self.skipped = Counter[int](), Counter[str]()
-
-    def add_raw(self, data: bytes) -> None:
-        measured = decode_range(data)
-        key, power = measurement_key(measured), measured.cir.rx_power_dbm
-        self._powers[key] = power
-        if not self._add(self.raw, key, measured.range_m, math.nan, power):
-            self._count(key)
-
-    def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
-        power = self._powers.get(key, math.nan)
-        if key not in self._powers:
-            # A bag without raw ranges: corrected ranges contain the measured ones.
-            self._add(self.raw, key, corrected.range_raw_m, math.nan, math.nan)
-        is_valid = self._add(self.corrected, key, corrected.range_m, corrected.variance_m2, power)
-        # Otherwise, the raw range was counted.
-        if not is_valid and not self.raw:
-            self._count(key)
-
-    def _add(
-        self, rows: dict[int, list[_Row]], key: MeasurementKey, range_m: float, variance: float, power: float
-    ) -> bool:
-        anchor = self._anchors.index.get(key.anchor_id)
-        if anchor is None or not (math.isfinite(range_m) and range_m >= 0.0) or variance == math.inf:
-            return False
-        rows[key.tag_id].append((key.stamp_ns + self._offset_ns, anchor, range_m, variance, power))
-        return True
-
-    def _count(self, key: MeasurementKey) -> None:
-        if key.anchor_id in self._anchors.index:
-            self.skipped["invalid range"] += 1
-        else:
-            self.unknown_anchors[key.anchor_id] += 1
-
-
-def _columns(tag_id: int, rows: list[_Row]) -> Ranges:
-    columns = np.array(sorted(rows, key=lambda row: row[0]), _DTYPE)
-    stamp, anchor, range_m, variance, power = (columns[name].copy() for name in "sarvp")
-    return Ranges(stamp, anchor, range_m, variance, power, tag_id)
+    recorded.skipped.update(bag.warnings)
+    return recorded

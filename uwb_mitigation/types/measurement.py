@@ -73,6 +73,18 @@ class Status(enum.IntEnum):
         """Whether a model corrected the range."""
         return self in (Status.OK, Status.UNRELIABLE)
 
+    @property
+    def is_fault(self) -> bool:
+        """Whether the status needs attention; a radio without CIRs does not."""
+        return self not in (Status.OK, Status.NO_CIR)
+
+
+CORRECTED = tuple(status for status in Status if status.is_corrected)
+"""Statuses of ranges that a model corrected."""
+
+FAULTS = tuple(status for status in Status if status.is_fault)
+"""Statuses that need attention."""
+
 
 class CirFault(enum.IntEnum):
     """Reason why a channel impulse response is unusable; up to NO_POWER the values of `uwb_status` in the firmware.

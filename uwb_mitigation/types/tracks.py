@@ -197,6 +197,24 @@ class TruePath(TimeSeries):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TagRecording:
+    """The ranges of one tag in a recording.
+
+    Attributes:
+        raw: ranges as measured, with unknown variances.
+        ranges: corrected ranges with their variances, if there are any; otherwise the raw ranges.
+        corrected: whether `ranges` differ from the raw ranges.
+        truth: true positions; empty: unknown.
+    """
+
+    tag_id: int
+    raw: Ranges
+    ranges: Ranges
+    corrected: bool
+    truth: TruePath
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Heights(TimeSeries):
     """Measured heights of a tag in the anchors' frame.
 

@@ -140,11 +140,13 @@ class SceneUpdater:
         with self.lock:
             self.scene.add_pose(tag, pose)
 
-    def estimate(self, tag: str, estimate: Estimate, received_s: float) -> None:
-        """Add a position that the viewer itself estimated."""
+    def estimate(self, tag: str, estimate: Estimate, received_s: float, stamp_offset_s: float) -> None:
+        """Add a position that the viewer itself estimated from ranges to whose stamps an offset was added."""
         x, y, z = estimate.position.tolist()
+        stamp_s, sd_m = estimate.stamp_ns / NS_PER_S - stamp_offset_s, _horizontal_sd_m(estimate.covariance)
         with self.lock:
-            self.scene.add_pose(tag, Pose(x, y, z, *_bounds(estimate.covariance)), received_s)
+            pose = Pose(x, y, z, *_bounds(estimate.covariance), stamp_s=stamp_s, sd_m=sd_m)
+            self.scene.add_pose(tag, pose, received_s)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.positioning.recorded_tracks import TagTracks
+from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.types.tracks import TruePath
+from uwb_mitigation.types.tracks import Track, TruePath
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, HISTORY_S, Pair, Scene, tag_label, tag_name
 from uwb_mitigation.viewer.timeline import Timeline
@@ -21,35 +23,25 @@ NOW_S = 3.0
 WHOLE, RECENT, LIVE = "whole recording", f"last {HISTORY_S:.0f} s", "since the start"
 """Names of the intervals."""
 
+_ATTRIBUTES = {TrackKind.RAW: "raw_live", TrackKind.CORRECTED: "live", TrackKind.SMOOTHED: "smoothed"}
+"""Attributes of `TagTracks`."""
+
 Card = list[str]
 """Title, value and explanation of a figure."""
 
 
-def position_errors(
-    track: NDArray[np.float64], truth: NDArray[np.float64], begin_s: float, end_s: float
-) -> NDArray[np.float64]:
-    """Return the horizontal errors of the positions of an interval whose true position is known, float64 (k,), m.
-
-    Args:
-        track: time (s), x, y, ..., float64 (n, 3 or more), in the order of time.
-        truth: the same of the true positions.
-        begin_s: begin of the interval.
-        end_s: its end.
-    """
-    rows = track[slice(*np.searchsorted(track[:, 0], (begin_s, end_s), side="right"))]
-    # True positions are interpolated: use those around the interval, too.
-    truth = truth[slice(*np.searchsorted(truth[:, 0], (begin_s - NOW_S, end_s + NOW_S)))]
-    path = TruePath(np.rint(truth[:, 0] * NS_PER_S).astype(np.int64), truth[:, 1:3])
-    true = path.position_at(np.rint(rows[:, 0] * NS_PER_S).astype(np.int64))
-    errors_m = np.hypot(rows[:, 1] - true[:, 0], rows[:, 2] - true[:, 1])
-    return errors_m[np.isfinite(errors_m)]
+def _track(columns: NDArray[np.float64]) -> Track:
+    """Return time (s), x, y, z, ..., float64 (n, 4 or more), as a track without covariances."""
+    n = len(columns)
+    stamp_ns = np.rint(columns[:, 0] * NS_PER_S).astype(np.int64)
+    return Track(stamp_ns, columns[:, 1:4], np.zeros((n, 3)), np.full((n, 6, 6), np.nan))
 
 
 def current_card(timeline: Timeline, tag_id: int | None, position_s: float) -> list[Card]:
     """Return the figure of a recording at a position of the player; empty before its index is complete."""
     if not timeline.is_complete:
         return []
-    return _Positions(timeline.tracks, tag_id, timeline.losses).current_card(position_s)
+    return _Positions(timeline.tracks, tag_id, timeline.losses, timeline.estimates).current_card(position_s)
 
 
 def interval_cards(
@@ -68,15 +60,16 @@ def interval_cards(
     cards = []
     if timeline.is_complete:
         raw_name = "raw + same filter" if timeline.estimates else "raw + locator with default settings"
-        positions = _Positions(timeline.tracks, tag_id, timeline.losses)
+        positions = _Positions(timeline.tracks, tag_id, timeline.losses, timeline.estimates)
         if second is not None and second.is_complete:
-            positions.second = _Positions(second.tracks, tag_id, second.losses).track(TrackKind.CORRECTED)
+            positions.second = _Positions(second.tracks, tag_id, second.losses, second.estimates)
         cards = positions.interval_cards(interval, window, raw_name)
     errors_m = dict(zip(("raw", ""), timeline.range_errors(*interval), strict=True))
     if second is not None:
         errors_m[TrackKind.SECOND.value] = second.range_errors(*interval)[1]
-    bad = timeline.bad[slice(*np.searchsorted(timeline.log_s, interval, side="right"))]
-    return cards + _range_cards(errors_m, int(bad.sum()), len(bad), window)
+    rows = slice(*np.searchsorted(timeline.log_s, interval, side="right"))
+    corrected, bad = timeline.is_corrected[rows], timeline.bad[rows]
+    return cards + _range_cards(errors_m, int(corrected.sum()), int(bad.sum()), len(bad), window)
 
 
 def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
@@ -89,19 +82,22 @@ def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
     cards = positions.current_card(now_s)
     cards += positions.interval_cards((now_s - HISTORY_S, now_s), RECENT, "raw + locator")
     means_m = scene.error_sums_m[:, None] / (scene.errors or math.nan)
-    return cards + _range_cards({"raw": means_m[0], "": means_m[1]}, scene.not_ok, scene.ranges, LIVE)
+    return cards + _range_cards(
+        {"raw": means_m[0], "": means_m[1]}, scene.corrected, scene.faults, scene.ranges, LIVE
+    )
 
 
 def _range_cards(
-    errors_m: Mapping[str, NDArray[np.float64]], not_ok: int, count: int, window: str
+    errors_m: Mapping[str, NDArray[np.float64]], corrected: int, faults: int, count: int, window: str
 ) -> list[Card]:
     """Return the figures of ranges, from their errors {name: errors, or the mean absolute error}; "": the corrected ranges."""
     if not count:
         return []
+    reason = "" if corrected or faults else ": no CIRs"
     not_ok_card = [
-        f"Ranges not OK, {window}",
-        f"{100.0 * not_ok / count:.1f} %",
-        f"{not_ok} of {count} corrected ranges",
+        f"Ranges corrected, {window}",
+        f"{100.0 * corrected / count:.1f} %" if corrected else "none",
+        f"{corrected} of {count} ranges corrected{reason}" + (f"; {faults} need attention" if faults else ""),
     ]
     means_m = {name: _metres(np.abs(errors)) for name, errors in errors_m.items()}
     if (mean_m := means_m.pop("")) == "-":
@@ -117,11 +113,12 @@ class _Positions:
         tracks: {(name, kind): time (s), x, y, z and standard deviation (m), float64 (n, 5)}.
         tag_id: the tag; None: the first one.
         pairs: all pairs with ranges.
+        estimates: {name: tracks that the viewer itself has estimated}.
 
     Attributes:
         name: name of its positions; empty: it has none.
         label: name of the tag for the page.
-        second: its track in the second recording; None: none.
+        second: its positions in the second recording; None: none.
     """
 
     def __init__(
@@ -129,12 +126,14 @@ class _Positions:
         tracks: Mapping[tuple[str, TrackKind], NDArray[np.float64]],
         tag_id: int | None,
         pairs: Iterable[Pair],
+        estimates: Mapping[str, TagTracks] = {},
     ) -> None:
         self._tracks = tracks
         self._names = [name for name, kind in tracks if kind is TrackKind.CORRECTED]
         self.name = next(iter(self._names), "") if tag_id is None else tag_name(tag_id, self._names, pairs)
         self.label = tag_label(self.name or DEFAULT_TAG, tag_id)
-        self.second: NDArray[np.float64] | None = None
+        self.second: _Positions | None = None
+        self._estimated = estimates.get(self.name)
 
     def track(self, kind: TrackKind) -> NDArray[np.float64] | None:
         """Return the track of a kind; a true track has the frame of the tag as name, or any name if there is only one tag."""
@@ -144,9 +143,24 @@ class _Positions:
         is_single = len(true) == len(self._names) == 1
         return next(iter(true.values())) if is_single else true.get(self.label.replace(" ", "_"))
 
+    def errors(self, kind: TrackKind, interval: tuple[float, float], latest: bool = False) -> TrackErrors:
+        """Return the errors of a track in an interval, or of its latest position there."""
+        columns, true = self.track(kind), self.track(TrackKind.TRUE)
+        if columns is None or true is None:
+            return NO_ERRORS
+        begin, end = np.searchsorted(columns[:, 0], interval, side="right").tolist()
+        rows = slice(max(begin, end - 1) if latest else begin, end)
+        if self._estimated is not None and len(self._estimated.recording.truth):
+            # Exact stamps: the same figures as those of `track`.
+            return track_errors(
+                getattr(self._estimated, _ATTRIBUTES[kind]).take(rows), self._estimated.recording.truth
+            )
+        path = _track(true)
+        return track_errors(_track(columns[rows]), TruePath(path.stamp_ns, path.position * (1.0, 1.0, 0.0)))
+
     def current_card(self, position_s: float) -> list[Card]:
         """Return the figure of the latest position."""
-        track, truth = self.track(TrackKind.CORRECTED), self.track(TrackKind.TRUE)
+        track = self.track(TrackKind.CORRECTED)
         if track is None:
             return [["Position", "-", f"no positions of {self.label}"]] if self._names else []
         interval = position_s - NOW_S, position_s
@@ -154,9 +168,10 @@ class _Positions:
         place = f"{self.label}, horizontal"
         if not len(latest):
             place = f"no position of {self.label} in the last {NOW_S:.0f} s"
-        if truth is None:
+        if self.track(TrackKind.TRUE) is None:
             return [["Reported standard deviation, now", _metres(latest[-1:, 4]), place]]
-        return [["Position error, now", _metres(position_errors(track, truth, *interval)[-1:]), place]]
+        error_m = self.errors(TrackKind.CORRECTED, interval, latest=True).rmse
+        return [["Position error, now", _metres(error_m), place]]
 
     def interval_cards(self, interval: tuple[float, float], window: str, raw_name: str) -> list[Card]:
         """Return the figures of the positions in an interval.
@@ -166,43 +181,45 @@ class _Positions:
             window: its name.
             raw_name: name of the track of raw ranges.
         """
-        track, truth = self.track(TrackKind.CORRECTED), self.track(TrackKind.TRUE)
+        track = self.track(TrackKind.CORRECTED)
         if track is None:
             return []
-        if truth is None:
+        if self.track(TrackKind.TRUE) is None:
             sds_m = track[slice(*np.searchsorted(track[:, 0], interval, side="right")), 4]
             median_m = _metres(sds_m, np.median)
             return [[f"Reported standard deviation, {window}", median_m, "median; no true positions"]]
-        references = {
-            "": track,
-            raw_name: self.track(TrackKind.RAW),
-            TrackKind.SMOOTHED.value: self.track(TrackKind.SMOOTHED),
-            TrackKind.SECOND.value: self.second,
+        names = {TrackKind.RAW: raw_name, TrackKind.SMOOTHED: TrackKind.SMOOTHED.value}
+        errors = {
+            name: self.errors(kind, interval) for kind, name in names.items() if self.track(kind) is not None
         }
-        errors_m = {
-            name: position_errors(reference, truth, *interval)
-            for name, reference in references.items()
-            if reference is not None
-        }
-        return [
+        if self.second is not None:
+            errors[TrackKind.SECOND.value] = self.second.errors(TrackKind.CORRECTED, interval)
+        own = self.errors(TrackKind.CORRECTED, interval)
+        change = _change(own.rmse, errors[raw_name].rmse, raw_name) if raw_name in errors else None
+        cards = [
             [
                 f"{title}, {window}",
-                _metres(errors_m[""], statistic),
-                "; ".join(f"{name}: {_metres(errors_m[name], statistic)}" for name in errors_m if name),
+                _metres(getattr(own, name)),
+                "; ".join(
+                    f"{reference}: {_metres(getattr(error, name))}" for reference, error in errors.items()
+                ),
             ]
-            for title, statistic in (("Position RMSE", _rms), ("95 % of position errors below", _p95))
+            for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95"))
         ]
+        return cards if change is None else [*cards, [f"Correction, {window}", *change]]
 
 
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str] | None:
+    """Return what the correction changes, as texts; None: unknown."""
+    if not corrected_m + raw_m > 0.0:
+        return None
+    share = 100.0 * (corrected_m / raw_m - 1.0)
+    text = "no change" if abs(share) < 0.5 else f"position error {share:+.0f} %"
+    return text, f"RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
 
 
-def _p95(values: NDArray[np.float64]) -> float:
-    return float(np.percentile(values, 95))
-
-
-def _metres(values_m: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:
-    """Return a statistic of the finite values as text; "-" without any."""
-    finite = values_m[np.isfinite(values_m)]
+def _metres(values_m: Any, statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:
+    """Return a value, or a statistic of the finite values, as text; "-" without any."""
+    finite = np.atleast_1d(values_m)
+    finite = finite[np.isfinite(finite)]
     return f"{statistic(finite):.3f} m" if len(finite) else "-"

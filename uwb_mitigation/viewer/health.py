@@ -16,30 +16,41 @@ LONG_M, VERY_LONG_M = 0.15, 0.3
 """Mean residuals that need attention, and that spoil positions."""
 LOST, NLOS, NOT_OK = 20.0, 50.0, 20.0
 """Shares of ranges that need attention, %."""
-GOOD, CHECK, BAD = "\u25cf good", "\u25b2 check", "\u2716 bad"
+EVIDENCE = 10
+"""Number of ranges with a residual from which an anchor is good or bad."""
+RELEASE = 0.8
+"""A state ends below this share of the limit at which it begins (hysteresis)."""
+GOOD, CHECK, BAD, UNKNOWN = "\u2713 good", "! check", "\u2297 bad", "? unknown"
 STATES = (
-    f"{BAD}: no ranges, or a mean residual over {VERY_LONG_M:.2f} m. {CHECK}: a mean residual over {LONG_M:.2f} m, "
-    f"{LOST:.0f} % lost, {NOT_OK:.0f} % not OK, or {NLOS:.0f} % NLOS. The status of a pair shows only "
-    "whether the network could correct the range, not whether the range agrees with the position."
+    f"{BAD}: no ranges, or a mean residual over {VERY_LONG_M:.2f} m with line of sight. {CHECK}: a mean residual over {LONG_M:.2f} "
+    f"m, {LOST:.0f} % lost, {NOT_OK:.0f} % with a status that needs attention, or {NLOS:.0f} % NLOS. {UNKNOWN}: fewer than "
+    f"{EVIDENCE} ranges can be compared with the position. The status of a pair shows only whether the network could correct the range."
 )
 """Definition of the states, for the page."""
 CELLS = 40
 """Width and height of the map of the predicted accuracy, cells."""
-MAX_PREDICTED_M = 10.0
-"""Larger predicted standard deviations are not shown."""
+STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
+"""Upper limits of the colours of the map of the predicted accuracy; above the last one, it is not shown."""
 
 Means = Mapping[str, float]
 """Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
-the estimated position (m); `stopped`, age of the last range if it is not recent, else 0 (s). NaN: unknown."""
+the estimated position (m); `evidence`, number of residuals; `stopped`, age of the last range if it is not recent, else 0 (s). NaN: unknown."""
 
 
-def state(means: Means) -> str:
-    """Return the state of a pair or an anchor."""
-    residual_m = abs(means["residual"])
-    if means["stopped"] > 0.0 or residual_m > VERY_LONG_M:
+def state(means: Means, before: str = "") -> str:
+    """Return the state of a pair or an anchor; `before`: its state until now."""
+    residual_m = abs(means["residual"]) if means["evidence"] >= EVIDENCE else math.nan
+    bad_m, check_m = (
+        limit_m * (RELEASE if before in states else 1.0)
+        for limit_m, states in ((VERY_LONG_M, (BAD,)), (LONG_M, (BAD, CHECK)))
+    )
+    # Without line of sight, ranges may be long although anchor and offset are right.
+    if means["stopped"] > 0.0 or (residual_m > bad_m and not means["nlos"] > NLOS):
         return BAD
     is_suspicious = means["lost"] > LOST or means["not_ok"] > NOT_OK or means["nlos"] > NLOS
-    return CHECK if is_suspicious or residual_m > LONG_M else GOOD
+    if is_suspicious or residual_m > check_m:
+        return CHECK
+    return GOOD if means["rate"] > 0.0 and not math.isnan(residual_m) else UNKNOWN
 
 
 def anchor_means(pairs: Mapping[Pair, Means]) -> dict[int, Means]:
@@ -52,18 +63,25 @@ def anchor_means(pairs: Mapping[Pair, Means]) -> dict[int, Means]:
         values = {name: [row[name] for row in rows if not math.isnan(row[name])] for name in rows[0]}
         means = {name: sum(column) / len(column) if column else math.nan for name, column in values.items()}
         # An anchor has stopped if all of its pairs have.
-        result[anchor_id] = means | {"rate": sum(values["rate"]), "stopped": min(values["stopped"])}
+        totals = {
+            "rate": sum(values["rate"]),
+            "evidence": sum(values["evidence"]),
+            "stopped": min(values["stopped"]),
+        }
+        result[anchor_id] = means | totals
     return result
 
 
-def advice(anchors: Mapping[int, Means]) -> tuple[str, dict[int, str]]:
-    """Return a sentence on what all anchors have in common, and one for each anchor; empty: no advice.
+def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple[str, dict[int, str]]:
+    """Return a sentence on what all anchors have in common, and one for each anchor (by its name); empty: no advice.
 
     If all anchors are wrong in the same way, the cause is probably not in each of them.
     """
     common = _common_advice(list(anchors.values())) if len(anchors) > 1 else ""
     return common, {
-        anchor_id: "" if common else _anchor_advice(f"Anchor {format_id(anchor_id)}", means)
+        anchor_id: ""
+        if common
+        else _anchor_advice(f"Anchor {names.get(anchor_id) or format_id(anchor_id)}", means)
         for anchor_id, means in anchors.items()
     }
 
@@ -97,7 +115,9 @@ def _anchor_advice(name: str, means: Means) -> str:
     if means["lost"] > LOST:
         return f"{name} loses {means['lost']:.0f} % of its ranges: check distance and antenna."
     if means["not_ok"] > NOT_OK:
-        return f"{means['not_ok']:.0f} % of the ranges of {name.lower()} are not OK: see their status."
+        return (
+            f"{name} has {means['not_ok']:.0f} % of ranges with a status that needs attention: see the pairs."
+        )
     if means["nlos"] > NLOS:
         return f"{name} has no line of sight in {means['nlos']:.0f} % of the CIRs: move it if possible."
     return ""
@@ -128,5 +148,4 @@ def predicted_accuracy(
     determinant = normal[..., 0, 0] * normal[..., 1, 1] - normal[..., 0, 1] ** 2
     trace = normal[..., 0, 0] + normal[..., 1, 1]
     predicted_m = sd_m * np.sqrt(trace / np.where(determinant > 1e-6, determinant, np.nan))
-    predicted_m[predicted_m > MAX_PREDICTED_M] = np.nan
     return predicted_m.astype(np.float32), low, size

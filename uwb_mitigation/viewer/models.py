@@ -22,24 +22,26 @@ from bokeh.models import (
     LinearColorMapper,
     Range1d,
 )
+from bokeh.palettes import cividis
 from bokeh.plotting import figure
 from bokeh.transform import factor_mark
 
 from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.headline import WHOLE
-from uwb_mitigation.viewer.health import STATES
+from uwb_mitigation.viewer.health import BAD, CHECK, GOOD, STATES, STEPS_M, UNKNOWN
 from uwb_mitigation.viewer.palette import (
     BLUE,
     GREEN,
     GREY,
     NIGHT,
+    ORANGE,
     PAPER,
     STATUS_LOOKS,
     TRACK_COLOURS,
     VERMILLION,
     TrackKind,
 )
-from uwb_mitigation.viewer.scene import CELL_M, HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
+from uwb_mitigation.viewer.scene import CELL_M, ERROR_EDGES_M, HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180
 """Number of samples shown before and after the first path."""
@@ -91,8 +93,19 @@ _STROKES = {
 
 _LIVE = TrackKind.RAW, TrackKind.CORRECTED, TrackKind.SECOND
 
+HEALTH_LOOKS = {
+    GOOD: ("hex", GREEN),
+    CHECK: ("square_pin", ORANGE),
+    BAD: ("circle_x", VERMILLION),
+    UNKNOWN: ("hex_dot", PAPER),
+}
+"""Marker and colour of an anchor for each state; statuses of ranges have other markers."""
+
 FADING = (1.0, 0.5, 0.2)
 """Opacity of the newest, the middle and the oldest third of a track."""
+
+MAP_HEIGHT = 380
+"""So that the map is on the first screen, pixels."""
 
 HEADING_M = 1.0
 """Length of the line that shows the heading of a tag."""
@@ -104,9 +117,10 @@ class Controls(DataModel):  # type: ignore[misc]
     Attributes:
         command: set by the script: name, arguments, and a number that makes it unique.
         update: set by the server after each update: its number, how long the previous one took, and the age of the
-            latest range, s; the age is negative if there are no recent ranges.
+            latest range by its reception and by its stamp, s; the age is negative if there are no recent ranges.
         acknowledged: set by the script to the number of the last update that it has drawn.
-        summary, notice, nodes, health, cards, player, selected, marks: set by the server.
+        verdict, summary, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
+        available: set by the server: whether a control has an effect, {id: bool}.
         empty: set by the server: messages of figures without data, {name: message}.
     """
 
@@ -115,6 +129,10 @@ class Controls(DataModel):  # type: ignore[misc]
     acknowledged = AnyValue(default=0)
     health = AnyValue(default=[])
     cards = AnyValue(default=[])
+    verdict = AnyValue(default=[])
+    tag_rows = AnyValue(default=[])
+    incidents = AnyValue(default=[])
+    available = AnyValue(default={})
     empty = AnyValue(default={})
     summary = AnyValue(default="")
     notice = AnyValue(default=[])
@@ -147,7 +165,7 @@ class Models:
         self._symbols = {"marker": marker, "color": self._colour}
         self.controls = Controls(name="controls")
         self.pairs = _source("pairs", "anchor", "tag", "no_data", *COLUMNS)
-        self.anchors = _source("anchors", "x", "y", "name", "id")
+        self.anchors = _source("anchors", "x", "y", "name", "id", "health", "label")
         self.selected = _source("", "x", "y")
         self.tags = _source("tags", "x", "y", "name", "status", "label_y")
         # The script of the page fills it with the names that do not cover each other.
@@ -205,7 +223,7 @@ class Models:
                 item.visible = shown
 
     def _map(self, plan: MapImage | None) -> figure:
-        plot = _figure(540, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
+        plot = _figure(MAP_HEIGHT, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
@@ -214,22 +232,24 @@ class Models:
             plot.image_url(
                 url=[plan.url], x=plan.x, y=plan.y, w=plan.width, h=plan.height, angle=plan.yaw, anchor="bottom_left"
             )  # fmt: skip
-        self.heat_levels, self.accuracy_levels = (
-            LinearColorMapper(palette, low=0.0, high=1.0, nan_color="#00000000")
-            for palette in ("Viridis256", "Cividis256")
+        self.heat_levels = LinearColorMapper("Viridis256", low=0.0, high=1.0, nan_color="#00000000")
+        steps = range(len(STEPS_M))
+        accuracy = LinearColorMapper(
+            cividis(len(STEPS_M)), low=-0.5, high=len(STEPS_M) - 0.5, nan_color="#00000000"
         )
+        labels = {step: f"\u2264 {limit_m:g}" for step, limit_m in zip(steps, STEPS_M, strict=True)}
         bars = [
-            _colour_bar(mapper, title=title, visible=False)
-            for mapper, title in (
-                (self.heat_levels, "mean correction, m"),
-                (self.accuracy_levels, "predicted \u03c3, m"),
-            )
-        ]
+            _colour_bar(self.heat_levels, title="mean correction, m", visible=False),
+            _colour_bar(
+                accuracy, title="predicted \u03c3, m", visible=False, ticker=FixedTicker(ticks=list(steps)),
+                major_label_overrides=labels,
+            ),
+        ]  # fmt: skip
         for bar in bars:
             plot.add_layout(bar, "right")
         self.layers["accuracy"] = [
             plot.image(
-                "image", "x", "y", "dw", "dh", source=self.accuracy, color_mapper=self.accuracy_levels, alpha=0.6, visible=False
+                "image", "x", "y", "dw", "dh", source=self.accuracy, color_mapper=accuracy, alpha=0.6, visible=False
             ), bars[1],
         ]  # fmt: skip
         items = defaultdict[str, list[Any]](list)
@@ -238,14 +258,16 @@ class Models:
         del items[""]
         self.layers["circles"] = items["raw range"] + items["corrected range"]
         self.layers["heat"] = [*items["mean correction"], bars[0]]
-        labels: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
-        self._legend = Legend(items=[LegendItem(label=labels[name], renderers=items[name]) for name in items])
+        legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
+        self._legend = Legend(items=[LegendItem(label=legend[name], renderers=items[name]) for name in items])
         return _with_legend(plot, self._legend, "below")
 
     def _map_layers(self, has_plan: bool) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
         """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
         walls = ColumnDataSource({name: [math.nan] * has_plan for name in "xy"})
         tag = CategoricalColorMapper(factors=["OK"], palette=[BLUE], nan_color=GREY)
+        looks = HEALTH_LOOKS
+        anchor = CategoricalColorMapper(factors=list(looks), palette=[colour for _, colour in looks.values()])
         on_request: dict[str, Any] = {"fill_color": None, "visible": False}
         label = {
             "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
@@ -277,7 +299,10 @@ class Models:
             ("tag", "scatter", self.tags, {
                 "marker": "star", "size": 13, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
             }),
-            ("anchor", "scatter", self.anchors, {"marker": "triangle", "size": 14, "color": NIGHT}),
+            ("anchor", "scatter", self.anchors, {
+                "marker": factor_mark("health", [marker for marker, _ in HEALTH_LOOKS.values()], list(HEALTH_LOOKS)),
+                "size": 15, "line_color": NIGHT, "fill_color": {"field": "health", "transform": anchor},
+            }),
             ("selected anchor", "scatter", self.selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
             }),
@@ -331,6 +356,9 @@ class Models:
 
     def _errors(self) -> figure:
         plot = _figure(230, "measured - true, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
+        low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
+        plot.xaxis.ticker = FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
+        plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
         for kind, hatch in zip(self._kinds, ("/", None, "."), strict=False):
             colour = TRACK_COLOURS[kind]
             plot.quad(

@@ -47,7 +47,9 @@ _DISC = tuple(corner for n in range(1, 5) for corner in (_HEXAGON[0], _HEXAGON[n
 _RAW = ": only the offset is subtracted"
 STATUS_LOOKS = {
     Status.OK: StatusStyle(BLUE, "circle", "\u25cf", "corrected by the model", _DISC),
-    Status.NO_CIR: StatusStyle(GREY, "square", "\u25a0", "no channel impulse response (CIR)" + _RAW, _SQUARE),
+    Status.NO_CIR: StatusStyle(
+        GREY, "square", "\u25a0", "not corrected: no CIRs (channel impulse responses)" + _RAW, _SQUARE
+    ),
     Status.BAD_CIR: StatusStyle(PURPLE, "diamond", "\u25c6", "the CIR is invalid" + _RAW, _DIAMOND),
     Status.OUT_OF_DISTRIBUTION: StatusStyle(
         VERMILLION, "inverted_triangle", "\u25bc", "unlike the training data of the model" + _RAW, _TRIANGLE

@@ -19,8 +19,7 @@ import numpy as np
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.mitigation.model.choice import Choice
-from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
@@ -83,6 +82,7 @@ class BagPlayer:
             "No anchor positions: set --anchors FILE.",
             "" if recording.contents & POSITIONS else no_positions,
         )
+        self._stamp_offset_s = 0.0
         self._backend = backend() if self.corrects else None
         self._uncorrected: list[tuple[float, RangeMeasurement]] = []
         self._next: Event | None = None
@@ -90,14 +90,20 @@ class BagPlayer:
         self._clock_s, self._posed_s = 0.0, -math.inf
         self._posed: dict[str, int] = {}
         feed.scene.clock = lambda: self._clock_s
+        feed.scene.stamp_clock = lambda: self._clock_s + recording.start_ns / NS_PER_S
         self._window_s = min(HISTORY_S, MAX_MESSAGES / max(recording.rate_hz, 1e-9))
         # Anchors are published once at the beginning.
         with contextlib.suppress(RecordingError, StopIteration):
             feed.add(ANCHORS, next(recording.events([ANCHORS])).message)
         self.seek(0.0)
 
-    def index(self, anchors: AnchorMap | None, height: Height | None = None) -> threading.Thread:
-        """Index the recording in a thread, which is returned; `anchors` and `height` are used for tracks."""
+    @property
+    def shown_s(self) -> float:
+        """The position that the scene shows: while playing, that of the last message that was read."""
+        return min(self._clock_s, self.position_s) if self.playing and self.is_behind else self.position_s
+
+    def index(self, config: EstimatorConfig | None, stamp_offset_s: float = 0.0) -> threading.Thread:
+        """Index the recording in a thread, which is returned; for the arguments see `index_recording`."""
 
         def run() -> None:
             recording = Recording(self._recording.path, self._recording.prefix)
@@ -106,13 +112,14 @@ class BagPlayer:
             def publish(timeline: Timeline) -> None:
                 self.timeline = timeline
 
-            timeline = index_recording(recording, anchors, height, backend, publish)
+            timeline = index_recording(recording, config, backend, publish, stamp_offset_s)
             self.models = {} if backend is None else backend.used
             with self._feed.lock:
                 self._feed.scene.heat = timeline.heat
                 self._feed.scene.is_indexed = True
                 self._feed.scene.revision += 1
 
+        self._stamp_offset_s = stamp_offset_s
         thread = threading.Thread(target=run, name="index", daemon=True)
         thread.start()
         return thread
@@ -233,14 +240,14 @@ class BagPlayer:
         ):
             return
         self._posed_s = self._clock_s
-        for tag, estimates in timeline.estimates.items():
+        for tag, estimated in timeline.estimates.items():
             time_s = timeline.tracks[tag, TrackKind.CORRECTED][:, 0]
             count = int(np.searchsorted(time_s, self._clock_s, side="right"))
             # A tag without new ranges has no new position: its age increases.
             if count and self._posed.get(tag) != count:
                 self._posed[tag] = count
-                estimate = next(iter(estimates.take(slice(count - 1, count))))
-                self._feed.estimate(tag, estimate, float(time_s[count - 1]))
+                estimate = next(iter(estimated.live.take(slice(count - 1, count))))
+                self._feed.estimate(tag, estimate, float(time_s[count - 1]), self._stamp_offset_s)
 
     def _show_tracks(self, timeline: Timeline) -> None:
         """Show the tracks up to the current position."""

@@ -38,17 +38,22 @@ MAX_SAMPLES, MAX_TRACK = (
     3000,
 )  # points of a strip chart (100 ranges per second for a minute), of a track
 MAX_CELLS = 4000  # of the heat map
+MAX_EVENTS = 100
 WATERFALL = 50  # CIRs of each pair
 MAX_VALUES = 2 * 1016  # of a CIR: the DW1000's complete accumulator, real and imaginary
 MAX_TEXT = 400  # characters of a name or a message
 MAX_RANGE_M = 10_000.0  # a longer range is shown in the table only; a larger error is not counted
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
-MAX_MESSAGES = 20_000  # read at a seek; older ones are skipped
+MAX_MESSAGES = 3000  # read at a seek; older ones are skipped
 
 HISTORY_S = 60.0
 """Length of the strip chart of a pair."""
 NO_DATA_S, NO_DATA_INTERVALS = 3.0, 3.0
 """A pair or a tag has no data after this time, or after this number of its mean intervals if that is longer."""
+MAX_MOVED_M = 0.2
+"""A range has no residual if the tag moves further between the range and its latest position."""
+CLOCK_JUMP_S = 10.0
+"""A larger change of the difference between stamps and the clock is a jump of a clock."""
 STALE_S, STALE = 5.0, 3
 """A node has this diagnostic level if its last diagnostics are older, as in rqt_robot_monitor."""
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
@@ -200,13 +205,15 @@ class History:
         cirs = [trace.cir for trace in self.traces]
         gap_db = _plausible_values([cir.power_gap_db for cir in cirs])
         correction_m = _plausible_values([sample.raw_m - sample.range_m for sample in samples])
+        residual_m = _plausible_values([sample.residual_m for sample in samples])
         return {
             "lost": 100.0 * self.lost / max(self.lost + self.received, 1),
-            "not_ok": _mean(np.array([100.0 * (sample.status is not Status.OK) for sample in samples])),
+            "not_ok": _mean(np.array([100.0 * sample.status.is_fault for sample in samples])),
+            "evidence": float(len(residual_m)),
             "nlos": _mean(100.0 * (gap_db >= LINE_OF_SIGHT_DB)),
             "correction": _mean(correction_m),
             "spread": float(correction_m.std()) if len(correction_m) else math.nan,
-            "residual": _mean(_plausible_values([sample.residual_m for sample in samples])),
+            "residual": _mean(residual_m),
             "rx": _mean(_plausible_values([cir.rx_power_dbm for cir in cirs])),
             "fp": _mean(_plausible_values([cir.first_path_power_dbm for cir in cirs])),
         }
@@ -260,10 +267,11 @@ class Pose:
 
 @dataclass(slots=True)
 class TagView:
-    """A tag's latest pose and its time of reception on the scene's clock."""
+    """A tag's latest pose, its time of reception on the scene's clock, and its speed, m/s."""
 
     pose: Pose | None = None
     received_s: float = math.nan
+    speed: float = 0.0
 
 
 TrackPoint = tuple[float, float, float, float, float]
@@ -334,7 +342,9 @@ class Scene:
     Attributes:
         clock: returns the time for ages, s: a steady clock live, the recording's time in a replay. Stamps are not
             compared with it, because they may come from another computer.
-        ranges, not_ok: number of ranges, and of those whose status is not OK.
+        stamp_clock: returns the time on the clock of the stamps, s, if it is that of this computer.
+        ranges, corrected, faults: number of ranges, of those that were corrected, and of those with a status that needs attention.
+        events: (time on the clock of the scene, text) of the latest incidents, such as a clock that jumped.
         received_s: time of the last range on the scene's clock.
         dropped: number of ranges that the viewer could not read in time.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
@@ -346,10 +356,11 @@ class Scene:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.clock = clock
+        self.clock, self.stamp_clock = clock, time.time
+        self.events: deque[tuple[float, str]] = deque(maxlen=MAX_EVENTS)
         # {tag: (latest stamp, its time of reception)}: stamps of different tags may come from different clocks.
         self._latest: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
-        self.ranges = self.not_ok = self.dropped = 0
+        self.ranges = self.corrected = self.faults = self.dropped = 0
         self.received_s = math.nan
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
         self.tags: BoundedDict[str, TagView] = BoundedDict(MAX_TAGS)
@@ -370,6 +381,24 @@ class Scene:
         entry = next(reversed(self._latest.values()), None) if tag_id is None else self._latest.get(tag_id)
         latest_s, received_s = entry or (math.nan, math.nan)
         return latest_s + max(self.clock() - received_s, 0.0)
+
+    def latest_stamp_s(self, tag_id: int) -> float:
+        """Return the latest stamp of a tag; NaN: none."""
+        return self._latest.get(tag_id, (math.nan, math.nan))[0]
+
+    def _check_clock(self, history: History, sample: Sample, tag_id: int) -> None:
+        """Report a jump of the clock of a tag relative to the clock of the scene."""
+        if (latest := history.latest) is None:
+            return
+        jump_s = sample.time_s - latest.time_s - (self.clock() - history.received_s)
+        # A viewer that reads late receives the ranges of some seconds at once.
+        if abs(jump_s) > CLOCK_JUMP_S:
+            self.report_event(f"clock of tag {format_id(tag_id)}: jump by {jump_s:+.0f} s")
+
+    def report_event(self, text: str) -> None:
+        """Add an incident, unless the latest one is the same."""
+        if not self.events or self.events[-1][1] != text:
+            self.events.append((self.clock(), text[:MAX_TEXT]))
 
     def stamp_age_s(self, pair: Pair) -> float:
         """Return the time from the last range of a pair to that of its tag by their stamps: 0 without other ranges.
@@ -402,7 +431,9 @@ class Scene:
         if not sample.time_s < tag_latest_s:
             tag_latest_s = self._latest.add(tag_id, (sample.time_s, self.clock()))[0]
         self.ranges += 1
-        self.not_ok += sample.status is not Status.OK
+        self.corrected += sample.status.is_corrected
+        self.faults += sample.status.is_fault
+        self._check_clock(history, sample, tag_id)
         history.add(sample, tag_latest_s)
         history.received_s = self.received_s = self.clock()
         self._compare_with_position(pair, sample)
@@ -429,6 +460,10 @@ class Scene:
         """Set the pose of a tag; `received_s` is on the scene's clock, None: now."""
         if _is_plausible(pose.x, pose.y, pose.z):
             entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or TagView())
+            if (before := entry.pose) is not None and pose.stamp_s > before.stamp_s:
+                entry.speed = math.dist((pose.x, pose.y), (before.x, before.y)) / (
+                    pose.stamp_s - before.stamp_s
+                )
             entry.pose, entry.received_s = pose, self.clock() if received_s is None else received_s
             point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
             self.add_position(tag, TrackKind.CORRECTED, point)
@@ -466,8 +501,10 @@ class Scene:
             add_heat(self.heat, pose.x, pose.y, correction_m)
         if anchor is None:
             return
-        height_m = finite_or_zero(pose.z - anchor.z)
-        sample.residual_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
+        # On a busy computer, positions arrive late.
+        if not abs(pose.stamp_s - sample.time_s) * tag.speed > MAX_MOVED_M:
+            height_m = finite_or_zero(pose.z - anchor.z)
+            sample.residual_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
         if not self.is_indexed:
             self._locate_raw(pair, pose, sample)
 
@@ -526,7 +563,8 @@ class Scene:
         if not self.is_indexed:
             self.heat.clear()
         self.pairs.clear()
-        self.ranges = self.not_ok = self.dropped = 0
+        self.ranges = self.corrected = self.faults = self.dropped = 0
+        self.events.clear()
         self.node_statuses.clear()
         self.error_counts[:] = 0
         self.error_sums_m[:] = 0

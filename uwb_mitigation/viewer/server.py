@@ -24,7 +24,8 @@ from tornado.ioloop import IOLoop
 from tornado.web import GZipContentEncoding, OutputTransform, RequestHandler
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.viewer.page import Page, View
+from uwb_mitigation.viewer.page import Page
+from uwb_mitigation.viewer.state import View
 
 ALL_ADDRESSES = ("0.0.0.0", "::", "*")
 LOCAL_ADDRESSES = ("localhost", "127.0.0.1", "::1")

@@ -10,20 +10,21 @@ import contextlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, RecordingError, format_id
+from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 from uwb_mitigation.mitigation.correction import Corrector
-from uwb_mitigation.positioning.batch.smoother import smooth
-from uwb_mitigation.positioning.determination import drive_determination
-from uwb_mitigation.positioning.geometry import Height
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Status
-from uwb_mitigation.types.ros.codec import MeasurementKey, measurement_key
+from uwb_mitigation.positioning.online.robot_estimator import live_track
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
+from uwb_mitigation.recordings.bag.pose_paths import read_truth
+from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
+from uwb_mitigation.types.measurement import CORRECTED, FAULTS, RangeMeasurement
+from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.ros.topics import (
     ODOMETRY_TRUTH,
@@ -33,7 +34,7 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_TRUTH,
 )
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
-from uwb_mitigation.types.tracks import Ranges, Track
+from uwb_mitigation.types.tracks import Track, TruePath
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
 from uwb_mitigation.viewer.scene import (
@@ -53,49 +54,64 @@ BINS = 300
 """Maximum number of points of the error over time."""
 BATCH = 256
 """Number of raw ranges that are corrected in one call."""
-CHUNK = 50_000
-"""Number of rows that are collected before they are stored compactly."""
 _KINDS = {ODOMETRY_TRUTH: TrackKind.TRUE, POSE_SMOOTHED: TrackKind.SMOOTHED}
-_KEY = [("stamp_ns", "i8"), ("tag", "u8"), ("anchor", "u8"), ("sequence", "u4")]
-_TRUTH = np.dtype([*_KEY, ("true_m", "f8")])
-_RANGE = np.dtype(
-    [*_KEY, ("log_ns", "i8"), ("bad", "?"), ("raw_m", "f8"), ("corrected_m", "f8"), ("variance_m2", "f8")]
-)
+_TRUTH = np.dtype([*KEY, ("true_m", "f8")])
 
 
-@dataclass(slots=True)
+@dataclass
 class Timeline:
     """Everything about a recording that does not depend on the position of the player.
 
     Attributes:
         log_s: log time of each range from the beginning, float64 (n,), increasing.
         time_s: time of each range from the beginning, float64 (n,).
-        anchor, tag: ids of each range, uint64 (n,). bad: bool (n,), whether the status is not OK.
+        stamp_s: stamps, s, float64 (n,).
+        anchor, tag: ids of each range, uint64 (n,). status: uint8 (n,).
         raw_m, corrected_m, true_m: float64 (n,); NaN: unknown.
         losses: {pair: (missing sequence numbers, ranges)}.
         notices: messages for the page.
         tracks: {(tag, kind): float64 (k, 5), time (s), x, y, z and horizontal standard deviation (m)}.
-        estimates: {tag: track of the filter}, if the recording contains no positions.
+        estimates: {tag: its estimated tracks}, if the recording contains no positions.
         heat: see `Scene`.
         is_complete: whether tracks and heat map have been added.
     """
 
     log_s: NDArray[np.float64]
     time_s: NDArray[np.float64]
+    stamp_s: NDArray[np.float64]
     anchor: NDArray[np.uint64]
     tag: NDArray[np.uint64]
-    bad: NDArray[np.bool_]
+    status: NDArray[np.uint8]
     raw_m: NDArray[np.float64]
     corrected_m: NDArray[np.float64]
     true_m: NDArray[np.float64]
     losses: dict[Pair, tuple[int, int]] = field(default_factory=dict)
     notices: list[str] = field(default_factory=list)
     tracks: dict[tuple[str, TrackKind], NDArray[np.float64]] = field(default_factory=dict)
-    estimates: dict[str, Track] = field(default_factory=dict)
+    estimates: dict[str, TagTracks] = field(default_factory=dict)
     heat: BoundedDict[tuple[int, int], list[float]] = field(default_factory=lambda: BoundedDict(MAX_CELLS))
     is_complete: bool = False
 
-    @property
+    @cached_property
+    def bad(self) -> NDArray[np.bool_]:
+        """Whether the status of each range needs attention."""
+        return np.isin(self.status, FAULTS)
+
+    @cached_property
+    def is_corrected(self) -> NDArray[np.bool_]:
+        """Whether a model corrected each range."""
+        return np.isin(self.status, CORRECTED)
+
+    @cached_property
+    def _rows_of_pairs(self) -> dict[Pair, NDArray[np.intp]]:
+        return dict(_rows_by_pair(self.anchor, self.tag))
+
+    def rows_of(self, pair: Pair, begin_s: float, end_s: float) -> NDArray[np.intp]:
+        """Return the rows of a pair in an interval of the log time."""
+        rows = self._rows_of_pairs.get(pair, np.zeros(0, np.intp))
+        return rows[slice(*np.searchsorted(self.log_s[rows], (begin_s, end_s + 1e-6), side="right"))]
+
+    @cached_property
     def deviation_m(self) -> NDArray[np.float64]:
         """Absolute error of each corrected range; without any truth, the absolute correction. NaN: unknown."""
         reference_m = self.true_m if np.isfinite(self.true_m).any() else self.raw_m
@@ -117,9 +133,9 @@ class Timeline:
         return int(rows[-1]) if len(rows) else None
 
     def largest_error(self) -> int | None:
-        """Return the row of the range with the largest `deviation_m`."""
-        deviation = self.deviation_m
-        return int(np.nanargmax(deviation)) if np.isfinite(deviation).any() else None
+        """Return the row of the range with the largest `deviation_m`; None: nothing deviates."""
+        deviation = np.nan_to_num(self.deviation_m)
+        return int(deviation.argmax()) if deviation.any() else None
 
     def range_errors(self, begin_s: float, end_s: float) -> NDArray[np.float64]:
         """Return raw and corrected errors of the ranges with known truth in an interval, float64 (2, k)."""
@@ -148,51 +164,64 @@ class Timeline:
 
 def index_recording(
     recording: Recording,
-    anchors: AnchorMap | None,
-    height: Height | None,
+    config: EstimatorConfig | None,
     backend: Corrector | None,
     publish: Callable[[Timeline], None],
+    stamp_offset_s: float = 0.0,
 ) -> Timeline:
     """Read a recording.
 
     Args:
         recording: the bag.
-        anchors: for tracks; None: unknown.
-        height: of the tags; None: the median of the true heights, or unknown.
+        config: of the estimators of tracks; None: the anchors are unknown.
         backend: corrects raw ranges; None: the recording contains corrected ranges.
         publish: called with the timeline as soon as the ranges have been read; the estimation of tracks takes longer.
+        stamp_offset_s: added to the stamps of the ranges.
     """
     reader = _Reader(recording, backend)
     # The player reports the damage of a bag when it reaches it.
     with contextlib.suppress(RecordingError):
         reader.read()
-    ranges = reader.ranges.array()
+    ranges = reader.table.corrected.array()
     timeline = reader.timeline(ranges)
     publish(timeline)
-    if anchors is not None and len(ranges):
-        _estimate_tracks(
-            timeline, ranges, anchors, height, has_positions=bool(recording.contents & POSITIONS)
-        )
+    if config is not None and len(ranges):
+        truths: dict[int | None, TruePath] = {}
+        with contextlib.suppress(RecordingError):
+            truths = read_truth(recording.path, recording.prefix + ODOMETRY_TRUTH)
+        recorded = reader.table.by_tag(config.anchors, stamp_offset_s, truths)
+        has_positions = bool(recording.contents & POSITIONS)
+        names = {name for name, kind in timeline.tracks if kind is TrackKind.CORRECTED}
+        for tag in recorded.tags[:MAX_TAGS]:
+            name = tag_name(tag.tag_id, names, timeline.losses) or tag_frame(tag.tag_id)
+            tracks: dict[TrackKind, Track] = {}
+            if has_positions:
+                tracks[TrackKind.RAW] = live_track(config, tag.raw)
+            else:
+                try:
+                    check_one_tag(config, recorded.tags)
+                    estimated = timeline.estimates[name] = track_tag(tag, config)
+                except (DatasetError, ParameterError) as error:
+                    timeline.notices.append(str(error))
+                    continue
+                tracks[TrackKind.RAW], tracks[TrackKind.CORRECTED] = estimated.raw_live, estimated.live
+                tracks[TrackKind.SMOOTHED] = estimated.smoothed
+                label, state = f"tag {format_id(tag.tag_id)}", str(estimated.determination)
+                timeline.notices += [
+                    f"{label}{' determination' * (text == state)}: {text}" for text in estimated.warnings
+                ]
+            rows = np.flatnonzero(ranges["tag"] == tag.tag_id)
+            rows = rows[np.argsort(ranges["stamp_ns"][rows], kind="stable")]
+            stamp_ns = ranges["stamp_ns"][rows] + round(stamp_offset_s * NS_PER_S)
+            for kind, track in tracks.items():
+                # Relative stamps: a float64 resolves nanoseconds since 1970 only to a fraction of a microsecond.
+                since_ns = track.stamp_ns - stamp_ns[0]
+                track_s = np.interp(since_ns, stamp_ns - stamp_ns[0], timeline.time_s[rows])
+                sd_m = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
+                timeline.tracks[name, kind] = np.column_stack([track_s, track.position, sd_m])
         _add_heat(timeline)
     timeline.is_complete = True
     return timeline
-
-
-class _Table:
-    """Rows of a structured array that grows."""
-
-    def __init__(self, dtype: np.dtype[Any]) -> None:
-        self._dtype, self._rows = dtype, list[tuple[Any, ...]]()
-        self._chunks: list[NDArray[Any]] = []
-
-    def add(self, *row: Any) -> None:
-        self._rows.append(row)
-        if len(self._rows) == CHUNK:
-            self._chunks.append(np.array(self._rows, self._dtype))
-            self._rows.clear()
-
-    def array(self) -> NDArray[Any]:
-        return np.concatenate([*self._chunks, np.array(self._rows, self._dtype)])
 
 
 class _Reader:
@@ -201,24 +230,25 @@ class _Reader:
     def __init__(self, recording: Recording, backend: Corrector | None) -> None:
         self._recording, self._backend = recording, backend
         self._batch: list[tuple[int, RangeMeasurement]] = []
-        self._truths = _Table(_TRUTH)
+        self._truths = Table(_TRUTH)
         self._points = defaultdict[tuple[str, TrackKind], list[tuple[float, ...]]](list)
         self._late = Counter[str]()
         self._delays_s: dict[str, float] = {}
-        self.ranges = _Table(_RANGE)
+        self.table = RangeTable()
 
     def read(self) -> None:
-        range_topic = RANGE_CORRECTED if self._backend is None else RANGE_RAW
+        topics = {RANGE_RAW, RANGE_CORRECTED, RANGE_TRUTH, ODOMETRY_TRUTH, *POSITIONS}
         try:
-            for log_ns, topic, message, tag in self._recording.events(
-                {range_topic, RANGE_TRUTH, ODOMETRY_TRUTH, *POSITIONS}
-            ):
+            for log_ns, topic, message, tag in self._recording.events(topics):
                 if message is None:
                     continue
                 if topic == RANGE_CORRECTED:
-                    self._add_range(log_ns, *message)
+                    key, result = message
+                    self.table.add_corrected(key, result, log_ns)
                 elif topic == RANGE_RAW:
-                    self._batch.append((log_ns, message))
+                    self.table.add_raw(message)
+                    if self._backend is not None:
+                        self._batch.append((log_ns, message))
                     if len(self._batch) == BATCH:
                         self._correct()
                 elif topic == RANGE_TRUTH:
@@ -232,12 +262,8 @@ class _Reader:
         if self._backend is not None and self._batch:
             corrected = self._backend.correct([measurement for _, measurement in self._batch])
             for (log_ns, measurement), result in zip(self._batch, corrected, strict=True):
-                self._add_range(log_ns, measurement_key(measurement), result)
+                self.table.add_corrected(measurement_key(measurement), result, log_ns)
             self._batch.clear()
-
-    def _add_range(self, log_ns: int, key: MeasurementKey, corrected: CorrectedRange) -> None:
-        is_bad = corrected.status is not Status.OK
-        self.ranges.add(*key, log_ns, is_bad, corrected.range_raw_m, corrected.range_m, corrected.variance_m2)
 
     def _add_position(self, log_ns: int, topic: str, message: Any, tag: str) -> None:
         kind = _KINDS.get(topic, TrackKind.CORRECTED)
@@ -270,15 +296,20 @@ class _Reader:
             self._late[name], self._delays_s[name] = int(rows.sum()), float(np.median(delay_s[rows]))
         names = ", ".join(f"{name} by {self._delays_s[name]:+.1f} s" for name in self._late)
         notice = f"Stamps differ from the log time, and the log time is used: {names[:300]}." if names else ""
+        truths = self._truths.array()
         timeline = Timeline(
             log_s=log_s,
             time_s=np.where(is_late, log_s, stamp_s),
-            true_m=_join_truths(ranges, self._truths.array()),
+            stamp_s=ranges["stamp_ns"] / NS_PER_S,
+            true_m=np.append(truths["true_m"], np.nan)[match(ranges, truths)],
             losses={
-                pair: (_lost(ranges["sequence"][rows]), len(rows)) for pair, rows in _rows_by_pair(ranges)
+                pair: (_lost(ranges["sequence"][rows]), len(rows))
+                for pair, rows in _rows_by_pair(ranges["anchor"], ranges["tag"])
             },
             notices=[notice] if notice else [],
-            **{name: ranges[name].copy() for name in ("anchor", "tag", "bad", "raw_m", "corrected_m")},
+            status=ranges["status"].copy(),
+            corrected_m=ranges["range_m"].copy(),
+            **{name: ranges[name].copy() for name in ("anchor", "tag", "raw_m")},
         )
         for key, points in self._points.items():
             columns = np.array(points)
@@ -286,12 +317,13 @@ class _Reader:
         return timeline
 
 
-def _rows_by_pair(ranges: NDArray[Any]) -> Iterator[tuple[Pair, NDArray[np.intp]]]:
-    order = np.lexsort((ranges["tag"], ranges["anchor"]))
-    anchor, tag = ranges["anchor"][order], ranges["tag"][order]
-    begins = np.flatnonzero((np.diff(anchor) != 0) | (np.diff(tag) != 0)) + 1
-    for rows in np.split(order, begins) if len(order) else ():
-        yield (int(ranges["anchor"][rows[0]]), int(ranges["tag"][rows[0]])), rows
+def _rows_by_pair(
+    anchor: NDArray[np.uint64], tag: NDArray[np.uint64]
+) -> Iterator[tuple[Pair, NDArray[np.intp]]]:
+    order = np.lexsort((tag, anchor))
+    is_new = (np.diff(anchor[order]) != 0) | (np.diff(tag[order]) != 0)
+    for rows in np.split(order, np.flatnonzero(is_new) + 1) if len(order) else ():
+        yield (int(anchor[rows[0]]), int(tag[rows[0]])), rows
 
 
 def _lost(sequence: NDArray[np.uint32]) -> int:
@@ -299,69 +331,6 @@ def _lost(sequence: NDArray[np.uint32]) -> int:
     step = np.diff(sequence)
     step = step[(step > 0) & (step < 1000)]
     return int(np.maximum(np.rint(step / np.median(step)) - 1.0, 0.0).sum()) if len(step) else 0
-
-
-def _join_truths(ranges: NDArray[Any], truths: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the true range of each range, float64 (n,); NaN: unknown."""
-    columns = [np.concatenate([ranges[name], truths[name]]) for name, _ in _KEY]
-    order = np.lexsort(columns)
-    is_new = np.zeros(len(order), bool)
-    for column in columns:
-        is_new[1:] |= np.diff(column[order]) != 0
-    group = np.empty(len(order), np.intp)
-    group[order] = np.cumsum(is_new)
-    true_m = np.full(len(order), np.nan)
-    true_m[group[len(ranges) :]] = truths["true_m"]
-    return true_m[group[: len(ranges)]]
-
-
-def _estimate_tracks(
-    timeline: Timeline, ranges: NDArray[Any], anchors: AnchorMap, height: Height | None, has_positions: bool
-) -> None:
-    """Add the tracks of the filter on raw ranges, and if the recording has no positions, on corrected ranges."""
-    true_z = [
-        z for (_, kind), track in timeline.tracks.items() if kind is TrackKind.TRUE for z in track[:, 3]
-    ]
-    if height is None and np.isfinite(true_z).any():
-        height = Height(float(np.nanmedian(true_z)))
-    config = EstimatorConfig(anchors, height=height)
-    row_of_anchor = np.array([anchors.index.get(int(anchor), -1) for anchor in np.unique(ranges["anchor"])])
-    anchor_row = row_of_anchor[np.unique(ranges["anchor"], return_inverse=True)[1]]
-    names = {name for name, kind in timeline.tracks if kind is TrackKind.CORRECTED}
-    for tag_id in np.unique(ranges["tag"])[:MAX_TAGS]:
-        rows = np.flatnonzero((ranges["tag"] == tag_id) & (anchor_row >= 0))
-        rows = rows[np.argsort(ranges["stamp_ns"][rows], kind="stable")]
-        stamp_ns, time_s = ranges["stamp_ns"][rows], timeline.time_s[rows]
-        name = tag_name(int(tag_id), names, timeline.losses) or tag_frame(int(tag_id))
-        selected = ranges[rows], anchor_row[rows]
-        tracks: dict[TrackKind, Track] = {}
-        # There may be too few ranges for a track of this tag.
-        with contextlib.suppress(DatasetError, IndexError, ValueError):
-            tracks[TrackKind.RAW] = TagEstimator(config).run(_ranges(*selected, "raw_m"))
-            if not has_positions:
-                corrected = _ranges(*selected, "corrected_m")
-                estimator = TagEstimator(config)
-                tracks[TrackKind.CORRECTED] = live = estimator.run(corrected)
-                timeline.estimates[name] = live
-                determination = drive_determination(estimator, corrected, live)
-                if not determination.is_unique:
-                    timeline.notices.append(f"tag {format_id(int(tag_id))} determination: {determination}")
-                tracks[TrackKind.SMOOTHED] = smooth(config, corrected, live)
-        for kind, track in tracks.items():
-            if len(track):
-                # Relative stamps: a float64 resolves nanoseconds since 1970 only to a fraction of a microsecond.
-                track_s = np.interp(track.stamp_ns - stamp_ns[0], stamp_ns - stamp_ns[0], time_s)
-                sd_m = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
-                timeline.tracks[name, kind] = np.column_stack([track_s, track.position, sd_m])
-
-
-def _ranges(rows: NDArray[Any], anchor_row: NDArray[np.intp], column: str) -> Ranges:
-    """Return the usable raw or corrected ranges of one tag; the variances of raw ranges are unknown."""
-    unknown = np.full(len(rows), np.nan)
-    variance_m2 = unknown if column == "raw_m" else rows["variance_m2"]
-    usable = (rows[column] >= 0.0) & (rows[column] < MAX_RANGE_M) & (variance_m2 != np.inf)
-    columns = (rows["stamp_ns"], anchor_row, rows[column], variance_m2, unknown)
-    return Ranges(*(values[usable].copy() for values in columns))
 
 
 def _add_heat(timeline: Timeline) -> None:

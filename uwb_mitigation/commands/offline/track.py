@@ -1,25 +1,27 @@
-"""Live, smoothed and snapshot tracks of a recording, with their errors if the ground truth is known."""
+"""Input and output of the tracks of a recording: settings and ranges from bags, residuals of held-out anchors, files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.hypotheses import LIMITS, AnchorHypotheses
-from uwb_mitigation.errors import DatasetError, format_id
-from uwb_mitigation.positioning.batch.smoother import Smoother, smooth
-from uwb_mitigation.positioning.determination import Determination, current_determination, drive_determination
-from uwb_mitigation.positioning.geometry import dop
-from uwb_mitigation.positioning.online.initialization import snapshot
-from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator, live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
-from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
+from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.shipped import load_model
+from uwb_mitigation.positioning.batch.smoother import Smoother
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings
+from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
+from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odometry
+from uwb_mitigation.recordings.bag.pose_paths import read_heights, read_lever_arm, read_range_frame
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.recordings.recorded_ranges import TagRecording
+from uwb_mitigation.types.anchors import AnchorMap, anchors_path, load_anchors
 from uwb_mitigation.types.ros.poses import (
     BodyTwist,
     encode_odometry,
@@ -32,119 +34,64 @@ from uwb_mitigation.types.ros.topics import ODOMETRY, ODOMETRY_TRUTH, ODOMETRY_T
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Ranges, Track, TruePath
 
-KINDS = ("snapshot", "raw_live", "live", "smoothed")
-MAX_WITHOUT_POSITION = 0.1
 MIN_OTHERS = 3
 """Other anchors that a track without an anchor needs."""
 
-WORSE = 1.1
-MIN_COVERAGE = 0.85
-MIN_HEIGHT_RMSE_M = 0.1
-"""If the truth is known, a warning is given if the RMSE of the smoothed track, horizontal or of the height, exceeds `WORSE`
-times the live one (heights: and this minimum); another one if its 95 % ellipses contain a smaller share of the true positions
-than `MIN_COVERAGE`."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TagTracks:
-    """The tracks of one tag and their errors; `NO_ERRORS` if the truth is unknown.
-
-    Attributes:
-        recording: the input.
-        live: an estimate for each range, from this and earlier ranges. raw_live: the same filter on raw ranges.
-        smoothed: ten per second, from all ranges. snapshot: least squares on raw ranges.
-        errors: errors of each of the `KINDS`.
-        hdop: median horizontal dilution of precision along the track.
-        determination: how well the position is determined, most of the time.
-        warnings: reasons why the tracks may be unreliable; empty = none.
-    """
-
-    recording: TagRecording
-    live: Track
-    raw_live: Track
-    smoothed: Track
-    snapshot: Track
-    errors: dict[str, TrackErrors]
-    hdop: float
-    determination: Determination
-    warnings: list[str]
-
-    def as_json(self) -> dict[str, object]:
-        """Return the entry of a tag in `track --json`; it contains errors only if the truth is known."""
-        errors = {kind: self.errors[kind].as_json() for kind in KINDS}
-        return {
-            "tag_id": self.recording.tag_id,
-            "ranges": len(self.recording.ranges),
-            **errors["smoothed"],
-            "epochs": self.errors["smoothed"].epochs or len(self.smoothed),
-            "determination": asdict(self.determination),
-            "warnings": self.warnings,
-            **(errors if self.errors["live"].epochs else {}),
-        }
-
-
-def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:
-    """Return the tracks of one tag.
+def mitigation(settings: TrackSettings) -> Mitigation:
+    """Return what corrects the raw ranges of a recording.
 
     Raises:
-        DatasetError: no position of the tag can be determined; the message contains the reason, if the anchors show it.
+        ModelError: the model cannot be loaded.
     """
-    ranges, anchors = recording.ranges, config.anchors
-    robot = None if config.robot is None else RobotEstimator(config)
-    locator = TagEstimator(config) if robot is None else robot.tag
-    live = (robot or locator).run(ranges)
-    if len(live) < 2:
-        raise DatasetError(
-            f"tag {format_id(recording.tag_id)}: no position can be determined from {len(ranges)} ranges: "
-            f"{current_determination(locator)}"
-        )
-    tracks = {
-        "snapshot": snapshot(anchors, recording.raw, config.height),
-        "raw_live": live_track(config, recording.raw) if recording.corrected else live,
-        "live": live,
-        "smoothed": smooth(config, ranges, live),
-    }
-    errors = {kind: track_errors(track, recording.truth) for kind, track in tracks.items()}
-    sample = tracks["smoothed"].position[:: max(len(tracks["smoothed"]) // 200, 1)]
-    used = anchors.position[np.unique(ranges.anchor)]
-    level = config.height is not None or config.heights is not None
-    hdop = float(np.median([dop(used, position, level=level).hdop for position in sample]))
-    determined = drive_determination(locator, ranges, tracks["smoothed"])
-    warnings = [] if determined.is_unique else [str(determined)]
-    without_position = 1.0 - len(live) / len(ranges)
-    if without_position > MAX_WITHOUT_POSITION:
-        warnings.append(
-            f"no position for {without_position:.0%} of the ranges, because several positions explain them or too few anchors "
-            "were received"
-        )
-    if robot is not None and (times := robot.tag.counts["odometry wrong"]):
-        warnings.append(
-            f"odometry contradicted the ranges {times} times and was not used then: wheels that slip, a robot moved by hand, "
-            "wrong axes, scale or signs"
-        )
-    warnings += _smoothing_warnings(errors["live"], errors["smoothed"])
-    return TagTracks(
-        recording, **tracks, errors=errors, hdop=hdop, determination=determined, warnings=warnings
-    )
+    return Mitigation(load_model(settings.model), settings.offsets, median_at_rest=True)
 
 
-def _smoothing_warnings(live: TrackErrors, smoothed: TrackErrors) -> list[str]:
-    warnings = []
-    if smoothed.rmse > WORSE * live.rmse:
-        warnings.append(
-            f"smoothing increases the RMSE from {live.rmse:.3f} m to {smoothed.rmse:.3f} m. Use the live track"
-        )
-    if smoothed.height_rmse > WORSE * max(live.height_rmse, MIN_HEIGHT_RMSE_M):
-        warnings.append(
-            f"smoothing increases the RMSE of the height from {live.height_rmse:.3f} m to {smoothed.height_rmse:.3f} m. Use "
-            "the live track"
-        )
-    if smoothed.coverage95 < MIN_COVERAGE:
-        warnings.append(
-            f"the covariances of the smoothed track are too small: its 95 % ellipses contain {smoothed.coverage95:.0%} of the "
-            "true positions"
-        )
-    return warnings
+def read_anchors(bag: Path, file: Path | None = None) -> AnchorMap:
+    """Return the anchors of a file, else those of the bag.
+
+    Raises:
+        ParameterError: there are none.
+    """
+    return (None if file else recorded_anchors(bag)) or load_anchors(file or anchors_path(bag))
+
+
+def read_config(
+    bag: Path, anchors: AnchorMap, settings: TrackSettings, warn: Callable[[str], object] = warnings.warn
+) -> EstimatorConfig:
+    """Return the configuration of the estimators, with measured heights and the motion of the robot from the bag.
+
+    Args:
+        bag: the recording.
+        anchors: its anchors.
+        settings: the options.
+        warn: called with a warning if the lever arm is unknown.
+
+    Raises:
+        RecordingError: the bag cannot be read, or a topic is missing.
+    """
+    if not bag.exists():
+        raise RecordingError("no such bag", where=str(bag), valid="an MCAP bag")
+    topic = settings.height_topic
+    heights = None if topic is None else read_heights(bag, topic, settings.height_sd_m)
+    return settings.config(anchors, heights, _read_robot(bag, settings, warn))
+
+
+def _read_robot(bag: Path, settings: TrackSettings, warn: Callable[[str], object]) -> RobotData | None:
+    if settings.odometry is None:
+        return None
+    arm = settings.lever_arm_m
+    if arm is None:
+        frame = read_range_frame(bag)
+        arm = read_lever_arm(bag, BASE_LINK, frame)
+        if arm is None and frame.lstrip("/") != BASE_LINK:
+            antenna = frame or "the antenna (ranges without frame_id)"
+            warn(
+                f"lever arm of the antenna unknown, 0,0,0 is used: no transform from {BASE_LINK} to {antenna} in the bag. Set "
+                "--lever-arm X,Y,Z"
+            )
+    motion, imu = read_odometry(bag, settings.odometry), settings.imu
+    return RobotData(motion, None if imu is None else read_imu(bag, imu), arm or (0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,17 +178,6 @@ def _track_without(rows: list[int], initial: Track, ranges: Ranges, config: Esti
 
 def _median(residual: NDArray[np.float64]) -> float:
     return float(np.median(np.abs(residual))) if len(residual) else float("nan")
-
-
-def pooled(errors: list[TrackErrors]) -> TrackErrors:
-    """Return the errors of all tags, weighted by epochs; medians and percentiles are means."""
-    with_truth = [error for error in errors if error.epochs]
-    if not with_truth:
-        return NO_ERRORS
-    epochs, *columns = np.array([astuple(error) for error in with_truth]).T
-    columns[0] = columns[0] ** 2
-    rmse, *means = (float(epochs @ column / epochs.sum()) for column in columns)
-    return TrackErrors(int(epochs.sum()), float(np.sqrt(rmse)), *means)
 
 
 def write_tracks(bag: BagWriter, tracks: list[TagTracks]) -> None:

@@ -42,3 +42,31 @@ OffsetOption = Annotated[
         "--stamp-offset", help="Time to add to the stamps of the ranges, s; -0.2 if they are late by 0.2 s."
     ),
 ]
+OdometryOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC",
+        help="Odometry of the robot with the tag (nav_msgs/Odometry): also estimate its heading.",
+    ),
+]
+ImuOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC",
+        help="With --odometry: IMU of the robot (sensor_msgs/Imu); its yaw rate replaces that of the odometry.",
+    ),
+]
+LeverArmOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="With --odometry: the antenna in the robot's frame, m. Default: from the transforms of the bag, otherwise 0.",
+    ),
+]
+AccelerationOption = Annotated[
+    float,
+    typer.Option(
+        help="Agility of the tags: 0.8 for robots, people and drones, less for slow vehicles. Square root of the spectral "
+        "density of the acceleration, m/s^1.5."
+    ),
+]

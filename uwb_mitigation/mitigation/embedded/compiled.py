@@ -26,7 +26,7 @@ from uwb_mitigation.mitigation.embedded.compiling import (
 )
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.types.measurement import Cir, CirFault, CorrectedColumns, RangeColumns, Status
+from uwb_mitigation.types.measurement import CORRECTED, Cir, CirFault, CorrectedColumns, RangeColumns, Status
 
 _OPTIONS = ("-std=c99", "-O3", "-fPIC", *WARNINGS)
 
@@ -165,7 +165,7 @@ class FirmwareBackend:
         faults, _ = self.bundle.preprocessing.apply(ranges)
         statuses = np.where(faults == CirFault.DECIBELS, Status.BAD_CIR, status).astype(np.uint8)
         corrected = pass_through(self.bundle, ranges, offset_m, statuses, faults)
-        is_corrected = np.isin(corrected.status, (Status.OK, Status.UNRELIABLE))
+        is_corrected = np.isin(corrected.status, CORRECTED)
         for column, computed in zip(
             (corrected.range_m, corrected.correction_m, corrected.variance_m2), values, strict=True
         ):

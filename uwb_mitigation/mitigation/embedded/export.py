@@ -181,7 +181,6 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
         format_number(linear_bias.per_power_gap),
         format_number(low),
         format_number(high),
-        format_number(card.variance_m2),
         format_number(card.variance_uncorrected_m2),
         "uwb_model_scale",
         f"{len(card.scale)}u",

@@ -51,7 +51,7 @@ class ModelCard:
         preprocessing: preprocessing of the input; its window length is K of the architecture.
         linear_bias: linear model whose residuals the network predicts.
         quantised: True: int8; False: float32.
-        variance_m2: variance of a range without CIR from which an offset was subtracted, m^2.
+        variance_m2: variance of a range whose predicted error is 0, m^2.
         variance_uncorrected_m2: variance of a range that is passed through, m^2.
         correction_limits_m: predicted errors outside of these limits mean that the input is out of distribution.
         training: data, split, seed, recipe and metrics; human-readable, JSON values only.

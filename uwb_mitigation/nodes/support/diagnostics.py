@@ -14,7 +14,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Status
+from uwb_mitigation.types.measurement import CORRECTED, Cir, RangeMeasurement, Status
 from uwb_mitigation.types.stamps import NS_PER_S
 
 if TYPE_CHECKING:
@@ -220,7 +220,9 @@ class MitigatorHealth:
             OFFSET: abs(median_m) if self.excludes_offset and len(los_m) >= MIN_LOS else 0.0,
         }
         entries: dict[str, object] = {f"ranges {status.name}": self.statuses[status] for status in Status}
+        corrected = sum(self.statuses[status] for status in CORRECTED)
         entries |= {
+            "ranges corrected": f"{corrected} of {self.statuses.total()}",
             "out of distribution": f"{out_of_distribution:.3f}",
             "dropped by a queue": f"{self.dropped}" + ("" if self.loss_counter.complete else " or more"),
             "malformed": self.malformed,

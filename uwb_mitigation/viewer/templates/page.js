@@ -31,11 +31,11 @@ function start(doc) {
   // The next update comes after this one has been drawn: a slow page skips updates instead of showing old ones.
   let received = performance.now();
   const showAge = () => {
-    const player = controls.player, [, took, rangeAge] = controls.update ?? [0, 0, -1], age = (performance.now() - received) / 1000 + took;
+    const player = controls.player, [, took, rangeAge, stampAge] = controls.update ?? [0, 0, -1, null], age = (performance.now() - received) / 1000 + took;
     const late = player?.behind ? "Reading ..." : age > 2 && (player?.playing ?? true) ? `${age.toFixed(0)} s behind`
       : player?.playing && !position && rangeAge < 0 ? "NO RANGES" : "";
     $("age").className = late ? "late" : "";
-    setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s`));
+    setText($("age"), late || (!player?.playing ? "PAUSED" : position ? "PLAYING" : `LIVE ${(age + rangeAge).toFixed(1)} s${Math.abs(stampAge - rangeAge) > 1 ? `, stamps ${Math.abs(stampAge) < 1e5 ? (age + stampAge).toFixed(1) : "> 1e5"} s old` : ""}`));
   };
   on("update", () => {
     received = performance.now();
@@ -54,6 +54,19 @@ function start(doc) {
     const card = document.createElement("div");
     texts.forEach((text, i) => { card.append(document.createElement(["span", "strong", "span"][i])); card.children[i].textContent = text; });
     return card;
+  })));
+  on("verdict", () => {
+    const [state, reason, action, facts] = controls.verdict, box = $("verdict");
+    if (!state) return;
+    box.className = state;
+    [`Position ${state}${reason ? `: ${reason}` : ""}`, action, facts].forEach((text, i) => setText(box.children[i], text));
+  });
+  on("available", () => { for (const [id, is] of Object.entries(controls.available)) if ($(id)) $(id).disabled = !is; });
+  on("tag_rows", () => $("tags").replaceChildren(...tableRows(controls.tag_rows)));
+  on("incidents", () => $("events").replaceChildren(...controls.incidents.map((text) => {
+    const item = document.createElement("li");
+    item.textContent = text;
+    return item;
   })));
   on("health", () => $("health").replaceChildren(...tableRows(controls.health)));
   on("summary", () => setText($("summary"), controls.summary));
@@ -168,7 +181,7 @@ function start(doc) {
     tags.data.name.forEach((name, i) => place(tags.data.x[i], tags.data.label_y[i], name, -4));
     const isSelected = (i) => controls.selected && BigInt(controls.selected[0]) == anchors.data.id[i];
     const order = [...anchors.data.name.keys()].sort((a, b) => isSelected(b) - isSelected(a));
-    for (const i of order) place(anchors.data.x[i], anchors.data.y[i], anchors.data.name[i], -13);
+    for (const i of order) place(anchors.data.x[i], anchors.data.y[i], anchors.data.label[i], -13);
     if (JSON.stringify(shown) !== JSON.stringify(labels.data)) labels.setv({data: shown}, {sync: false});
   };
   tags.properties.data.change.connect(placeLabels);
@@ -262,8 +275,8 @@ function start(doc) {
       const {bad, count, largest, truth} = controls.marks;
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
-        + (largest == null ? "" : mark(largest, "currentColor", "\u25b2"));
-      $("marks-legend").textContent = `| ranges that are not OK: ${count || "none"}; \u25b2 largest ${truth ? "error" : "correction"}`;
+        + (largest == null ? "" : mark(largest, "currentColor", "max"));
+      $("marks-legend").textContent = `| ranges that need attention: ${count || "none"}` + (largest == null ? "" : `; max: largest ${truth ? "error" : "correction"}`);
     });
   }
   on("player", () => {

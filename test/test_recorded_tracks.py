@@ -1,0 +1,184 @@
+"""The same settings give the same figures in `track` and on the page of the viewer, on every data set of the tests."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_material import record
+from command_line import run, succeed
+from drives import HALL, drive
+
+from benchmarks.position_data import real_runs
+from uwb_mitigation.commands.offline.track import mitigation, read_anchors, read_config
+from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.geometry import Area
+from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+from uwb_mitigation.positioning.tag_locator import TagLocator
+from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.measurement import (
+    Cir,
+    CorrectedBy,
+    CorrectedRange,
+    RangeMeasurement,
+    Record,
+    Status,
+)
+from uwb_mitigation.types.offsets import read_offsets
+from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.headline import WHOLE, interval_cards
+from uwb_mitigation.viewer.playback import BagPlayer
+from uwb_mitigation.viewer.scene import Scene
+from uwb_mitigation.viewer.timeline import Timeline
+
+DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
+HANYANG, LABYRINTH = DATA / "hanyang_outdoor", DATA / "chemnitz_labyrinth"
+BOX = Area((-20.0, -60.0, -2.0), (80.0, 60.0, 4.0))
+
+
+def viewed(bag: Path, settings: TrackSettings) -> Timeline:
+    """Return what `view` estimates of a bag."""
+    player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(settings))
+    player.index(read_config(bag, read_anchors(bag), settings), settings.stamp_offset_s).join()
+    assert player.timeline is not None
+    return player.timeline
+
+
+def imported(source: Path, folder: Path) -> Path:
+    if not source.exists():
+        pytest.skip(f"no {source}")
+    name = ["--map", "labyrinth"] if source == LABYRINTH else []
+    succeed("data", "import", source, *name, "-o", "raw.mcap", folder=folder)
+    return folder / "raw.mcap"
+
+
+@pytest.mark.parametrize("processed", [False, True])
+@pytest.mark.parametrize(
+    ("source", "options", "settings"),
+    [
+        (HANYANG / "NLOS_A1", ["--stamp-offset=-0.2", "--height", "1", "--area=-20,-60,-2,80,60,4"],
+         TrackSettings(1.0, area=BOX, stamp_offset_s=-0.2)),
+        (LABYRINTH, ["--height", "0", "--odometry", "/odom"], TrackSettings(0.0, odometry="/odom")),
+        (None, ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
+         TrackSettings(0.0, odometry="/odom", imu="/imu")),
+    ],
+    ids=["hanyang", "labyrinth", "simulated"],
+)  # fmt: skip
+def test_track_and_view_give_the_same_figures(
+    tmp_path: Path, source: Path | None, options: list[str], settings: TrackSettings, processed: bool
+):
+    bag = tmp_path / "raw.mcap"
+    if source is None:
+        succeed("data simulate --like drive --ranges 500 -o", bag, folder=tmp_path)
+    else:
+        imported(source, tmp_path)
+    if processed:
+        bag = tmp_path / "processed.mcap"
+        succeed("process", tmp_path / "raw.mcap", "-o", bag, folder=tmp_path)
+    succeed("track", bag, "-o", "track.mcap", *options, "--json", "track.json", folder=tmp_path)
+    result = json.loads((tmp_path / "track.json").read_text())
+    timeline = viewed(bag, settings)
+    (tag,) = result["tags"]
+    cards = {
+        title: (value, text)
+        for title, value, text in interval_cards(timeline, None, tag["tag_id"], WHOLE, 0.0)
+    }
+    for title, key in (
+        ("Position RMSE, whole recording", "horizontal_rmse_m"),
+        ("95 % of position errors below, whole recording", "p95_m"),
+    ):
+        live, raw, smoothed = (f"{result[kind][key]:.3f} m" for kind in ("live", "raw_live", "smoothed"))
+        assert cards[title] == (live, f"raw + same filter: {raw}; smoothed: {smoothed}")
+        if source is not None:
+            assert live == raw, "nothing was corrected"
+    shown = [notice.split(": ", 1)[1] for notice in timeline.notices]
+    assert [text for text in shown if text in tag["warnings"]] == tag["warnings"]
+
+
+def test_placements_have_no_positions_in_track_and_view(tmp_path: Path):
+    bag = imported(DATA / "evk1000_apartment", tmp_path)
+    refused = run("track", bag, "-o", "track.mcap", folder=tmp_path).stderr
+    timeline = viewed(bag, TrackSettings())
+    assert timeline.notices
+    assert timeline.notices[0] in refused.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"height_m": 1.0, "height_topic": "/height"},
+        {"imu": "/imu"},
+        {"stamp_offset_s": 4000.0},
+        {"acceleration": -1.0},
+    ],
+)
+def test_contradictory_settings_are_refused(options: dict[str, object]):
+    with pytest.raises(ParameterError):
+        TrackSettings(**options)
+
+
+def test_variance_of_ranges_without_cir_is_that_of_real_errors(tmp_path: Path):
+    """The mean squared error of each real drive is at most four variances."""
+    if not (HANYANG.exists() and LABYRINTH.exists()):
+        pytest.skip(f"no {DATA}")
+    for run_source in real_runs(DATA)[0]:
+        recorded = run_source.read()
+        variance_m2 = recorded.corrected(offsets=read_offsets("0.1")).variance_m2
+        true = recorded.truth.position_at(recorded.ranges.stamp_ns)
+        error_m = recorded.ranges.range_m - np.linalg.norm(
+            true - recorded.anchors.position[recorded.ranges.anchor], axis=1
+        )
+        assert 0.05 < np.nanmean(error_m**2 / variance_m2) < 4.0, recorded.name
+
+
+def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
+    ranges, _ = drive(seconds=8)
+    raw, passed, mixed = (TagLocator(HALL, height_m=1.0) for _ in range(3))
+    for row in range(len(ranges)):
+        anchor, range_m = HALL.anchors[ranges.anchor[row]].id, float(ranges.range_m[row])
+        measurement = RangeMeasurement(
+            int(ranges.stamp_ns[row]), 7, anchor, row, 0, range_m, Cir(np.zeros(0, np.int16))
+        )
+        result = CorrectedRange(range_m, range_m, 0.0, 0.25, Status.NO_CIR, CorrectedBy.HOST, 1)
+        expected, found = raw.add(measurement), passed.add(measurement, result)
+        corrected = mixed.add(measurement, replace(result, status=Status.OK) if row < 5 else result)
+        if expected is not None:
+            assert found is not None
+            assert found.position.tolist() == expected.position.tolist()
+    assert corrected is not None
+    assert corrected.position.tolist() != expected.position.tolist(), (
+        "after a corrected range, its variance counts"
+    )
+
+
+def test_report_is_one_file_with_the_figures_of_track(tmp_path: Path):
+    bag, page = tmp_path / "drive.mcap", tmp_path / "drive.html"
+    succeed("data simulate --like drive --ranges 300 -o", bag, folder=tmp_path)
+    options = ("--height", "0", "--json", "track.json", "--report", page)
+    succeed("track", bag, "-o", "track.mcap", *options, folder=tmp_path)
+    rmse_m = json.loads((tmp_path / "track.json").read_text())["live"]["horizontal_rmse_m"]
+    text = page.read_text()
+    assert f"<td>Position RMSE, whole recording</td><td>{rmse_m:.3f} m</td>" in text
+    assert "<strong>Position " in text
+    assert not re.search(r"<(script|link)[^>]+(src|href)=", text)
+    assert "exists already" in run("track", bag, "-o", "other.mcap", *options, folder=tmp_path).stderr
+
+
+def test_odometry_of_one_robot_is_not_used_for_several_tags(tmp_path: Path):
+    bag = tmp_path / "two.mcap"
+    with BagWriter(bag, {}) as out:
+        for number in range(20):
+            out.write(Record(replace(record(number).measurement, tag_id=7 + number % 3)))
+    config = EstimatorConfig(HALL, robot=RobotData())
+    player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(TrackSettings()))
+    player.index(config).join()
+    assert player.timeline is not None
+    assert "--odometry with the tags 7, 8, 9" in player.timeline.notices[-1]
+    assert not player.timeline.estimates
