@@ -78,6 +78,14 @@ class RecordedRanges:
     unknown_anchors: Counter[int]
     skipped: Counter[str]
 
+    def check(self, anchors: AnchorMap, where: str = "") -> None:
+        """Raise RecordingError if no range is of an anchor in the map."""
+        if not self.tags:
+            map_ids = ", ".join(map(str, sorted(anchors.index)))
+            recorded_ids = ", ".join(map(str, sorted(self.unknown_anchors))) or "none"
+            valid = f"the ranges come from anchors: {recorded_ids}"
+            raise RecordingError(f"no range of the anchors {map_ids}", where=where, valid=valid)
+
 
 @dataclass(slots=True)
 class RangeTable:
@@ -197,13 +205,6 @@ def read_ranges(
         for record, result in corrected:
             table.add_corrected(measurement_key(record.measurement), result)
     recorded = table.by_tag(anchors, stamp_offset_s, read_truth(path))
-    if not recorded.tags:
-        map_ids = ", ".join(map(str, sorted(anchors.index)))
-        recorded_ids = ", ".join(map(str, sorted(recorded.unknown_anchors))) or "none"
-        raise RecordingError(
-            f"no range of the anchors {map_ids}",
-            where=str(path),
-            valid=f"the bag's ranges come from anchors: {recorded_ids}",
-        )
+    recorded.check(anchors, str(path))
     recorded.skipped.update(bag.warnings)
     return recorded

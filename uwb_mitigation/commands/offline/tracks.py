@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,25 +12,24 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from uwb_mitigation.commands.offline.track import TagTracks, track_tag, tum, tum_file
-from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, check_name, format_id
+from uwb_mitigation.commands.offline.track import read_config, tum, tum_file
+from uwb_mitigation.errors import DatasetError, ParameterError, check_name, format_id
 from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.shipped import load_model
-from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings, check_one_tag, track_tag
 from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
-from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odometry
-from uwb_mitigation.recordings.bag.pose_paths import read_lever_arm, read_range_frame
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mcap import McapRecording
-from uwb_mitigation.recordings.recorded_ranges import RecordedRanges, TagRecording, read_ranges
+from uwb_mitigation.recordings.recorded_ranges import RangeTable, RecordedRanges, read_ranges
 from uwb_mitigation.types.anchors import AnchorMap, AnyAnchors, anchors_path, as_anchors
 from uwb_mitigation.types.measurement import CorrectedRange, Record
 from uwb_mitigation.types.offsets import NO_OFFSETS, AnyOffsets
-from uwb_mitigation.types.tracks import Ranges, TruePath
+from uwb_mitigation.types.ros.codec import measurement_key
+from uwb_mitigation.types.tracks import TruePath
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -200,6 +199,10 @@ def track(
         ParameterError: a value is invalid, or the anchors are unknown.
         ModelError: the model cannot be used.
     """
+    box = None if area is None else Area(*area)
+    settings = TrackSettings(
+        height_m, height_sd_m, None, box, odometry, imu, lever_arm_m, stamp_offset_s, acceleration
+    )
     path, source, bag = None, recording, None
     if isinstance(recording, str | Path):
         path, source = Path(recording), open_recording(recording, mapping=mapping)
@@ -211,23 +214,16 @@ def track(
     pairs = Mitigation(model or load_model(), offsets, median_at_rest=True).correct_records(
         cast(Iterable[Record], source)
     )
-    robot = None
     if bag is not None:
         recorded = read_ranges(bag, anchor_map, stamp_offset_s, pairs)
+        config = read_config(bag, anchor_map, settings)
+    elif odometry is not None:
+        raise ParameterError("odometry without a bag", valid="the path of a bag with one tag")
     else:
-        recorded = _by_tag(pairs, anchor_map, round(stamp_offset_s * 1e9))
-    if odometry is not None:
-        if bag is None or len(recorded.tags) > 1:
-            raise ParameterError(
-                f"odometry with {len(recorded.tags)} tags", valid="the path of a bag with one tag"
-            )
-        arm = lever_arm_m or read_lever_arm(bag, BASE_LINK, read_range_frame(bag))
-        rotation = None if imu is None else read_imu(bag, imu)
-        robot = RobotData(read_odometry(bag, odometry), rotation, arm or (0.0, 0.0, 0.0))
-    elif imu is not None or lever_arm_m is not None:
-        raise ParameterError("imu or lever_arm_m without odometry", valid="odometry=TOPIC")
-    height, box = None if height_m is None else Height(height_m, height_sd_m), area and Area(*area)
-    config = EstimatorConfig(anchor_map, NoiseModel(acceleration), height, box, robot=robot)
+        recorded = _read_records(pairs, anchor_map, stamp_offset_s)
+        recorded.check(anchor_map)
+        config = settings.config(anchor_map)
+    check_one_tag(config, recorded.tags)
     tags, failures = [], list[DatasetError]()
     for recorded_tag in recorded.tags:
         with _collected(failures):
@@ -253,45 +249,20 @@ def _collected(failures: list[DatasetError]) -> Iterator[None]:
         failures.append(error)
 
 
-_NUMBERS = [(name, "f8") for name in ("raw", "range", "variance", "power", "yaw")]
-_ROW = np.dtype([("stamp", "i8"), ("anchor", "i8"), ("at", "f8", 3), *_NUMBERS])
-
-
-def _by_tag(
-    pairs: Iterable[tuple[Record, CorrectedRange]], anchors: AnchorMap, offset_ns: int
+def _read_records(
+    pairs: Iterable[tuple[Record, CorrectedRange]], anchors: AnchorMap, stamp_offset_s: float
 ) -> RecordedRanges:
     """Return the ranges of records that are not in a bag, see `read_ranges`."""
-    rows, unknown, skipped = defaultdict[int, list[Any]](list), Counter[int](), Counter[str]()
+    table, poses = RangeTable(), defaultdict[int | None, list[tuple[int, Any, float]]](list)
     for record, corrected in pairs:
         measured = record.measurement
-        anchor = anchors.index.get(measured.anchor_id)
-        if anchor is None:
-            unknown[measured.anchor_id] += 1
-        elif not (measured.range_m >= 0.0 and corrected.variance_m2 < math.inf):
-            skipped["invalid range"] += 1
-        else:
-            numbers = measured.range_m, corrected.range_m, corrected.variance_m2, measured.cir.rx_power_dbm
+        table.add_raw(measured)
+        table.add_corrected(measurement_key(measured), corrected)
+        if record.tag_position is not None:
             yaw = math.nan if record.tag_yaw is None else record.tag_yaw
-            at = record.tag_position or (math.nan,) * 3
-            rows[measured.tag_id].append((measured.stamp_ns, anchor, at, *numbers, yaw))
-    if not rows:
-        recorded_ids = ", ".join(map(format_id, sorted(unknown))) or "none"
-        valid = f"the ranges come from anchors: {recorded_ids}"
-        raise RecordingError(
-            f"no range of the anchors {', '.join(map(format_id, anchors.index))}", valid=valid
-        )
-    tags = []
-    for tag_id, of_tag in sorted(rows.items()):
-        table = np.array(of_tag, _ROW)
-        table = table[np.argsort(table["stamp"], kind="stable")]
-        stamp, anchor, power = (table[name].copy() for name in ("stamp", "anchor", "power"))
-        raw = Ranges(
-            stamp + offset_ns, anchor, table["raw"].copy(), np.full(len(table), np.nan), power, tag_id
-        )
-        is_corrected = not np.array_equal(table["raw"], table["range"])
-        values = table["range"].copy(), table["variance"].copy()
-        ranges = Ranges(stamp + offset_ns, anchor, *values, power, tag_id) if is_corrected else raw
-        known = np.isfinite(table["at"]).all(axis=1)
-        truth = TruePath(stamp[known], table["at"][known], table["yaw"][known])
-        tags.append(TagRecording(tag_id, raw, ranges, is_corrected, truth))
-    return RecordedRanges(tags, unknown, skipped)
+            poses[measured.tag_id].append((measured.stamp_ns, record.tag_position, yaw))
+    truths = {
+        tag: TruePath(*map(np.array, zip(*sorted(rows, key=lambda row: row[0]), strict=True)))
+        for tag, rows in poses.items()
+    }
+    return table.by_tag(anchors, stamp_offset_s, truths)
