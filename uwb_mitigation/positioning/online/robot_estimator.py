@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
+from uwb_mitigation.positioning.online.heading_test import HeadingTest
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
-from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
+from uwb_mitigation.positioning.online.odometry_filter import YAW, OdometryFilter
 from uwb_mitigation.positioning.online.tag_estimator import (
     EstimatorConfig,
     RobotData,
@@ -92,6 +93,8 @@ class RobotEstimator:
         self._begin: PathPoint | None = None
         self.rejects_odometry = False
         self._rejections, self._separation = 0.0, 0.0
+        self._test = HeadingTest(self._robot.lever_arm)
+        self._is_confirmed = False
         self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
 
     @property
@@ -103,13 +106,14 @@ class RobotEstimator:
     def lever_arm(self, lever_arm: tuple[float, float, float]) -> None:
         if lever_arm != self._robot.lever_arm:
             self._robot = replace(self._robot, lever_arm=lever_arm)
+            self._test = HeadingTest(lever_arm)
             self._reset_heading(None)
 
     @property
     def heading(self) -> str:
-        """The state of the heading as text: known, unknown, or the number of hypotheses."""
+        """The state of the heading as text: known, unconfirmed, unknown, or the number of hypotheses."""
         if self._heading_filter is not None:
-            return "known"
+            return "known" if self._is_confirmed else "unconfirmed"
         return f"{len(self._yaws)} hypotheses" if self._yaws else "unknown"
 
     def add(self, measurement: TagRange | TagHeight) -> Estimate | None:
@@ -150,6 +154,7 @@ class RobotEstimator:
     def restart(self, stamp_ns: int | None = None) -> None:
         """Reset position and heading, but not the statistics."""
         self.tag.restart(stamp_ns)
+        self._test = HeadingTest(self._robot.lever_arm)
         self._reset_heading(None)
 
     def _recorded_motion(self) -> list[tuple[int, Callable[..., None], Any]]:
@@ -180,15 +185,19 @@ class RobotEstimator:
         covariance[:2, 2] *= 1.0 - weight
         covariance[2, :2] = covariance[:2, 2]
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
-        covariance[3:5, 3:5] = estimate.covariance[3:5, 3:5]
         position = ranges_only.position - weight * delta * (1.0, 1.0, 0.0)
         velocity = np.append(estimate.velocity[:2], ranges_only.velocity[2])
         if self._area is not None:
             position = self._area.clip(position)
-        yaw_covariance = estimate.heading.covariance
+        yaw_covariance, yaw = estimate.heading.covariance, estimate.heading.yaw
+        yaw_covariance[YAW] = self._test.variance(yaw, float(yaw_covariance[YAW]), heading_filter.point)
+        self._is_confirmed = bool(yaw_covariance[YAW] < KNOWN_YAW_SD**2)
+        if not self._is_confirmed:
+            return Estimate(estimate.stamp_ns, position, ranges_only.velocity, covariance)
         yaw_covariance[:2] *= weight
         yaw_covariance[2] = 0.0
-        heading = Heading(estimate.heading.yaw, yaw_covariance)
+        covariance[3:5, 3:5] = estimate.covariance[3:5, 3:5]
+        heading = Heading(yaw, yaw_covariance)
         return Estimate(estimate.stamp_ns, position, velocity, covariance, heading)
 
     def _update_headings(self, measurement: TagRange) -> None:
@@ -212,7 +221,12 @@ class RobotEstimator:
                 hypothesis.filter.confine(self._area)
             hypothesis.loss += self._config.model.student_loss(z) + math.log(sd)
         self._prune()
-        if self._heading_filter is not None and tag.filter is not None:
+        if tag.filter is None:
+            self._test.forget_positions()
+            return
+        (x, y), (a, b) = tag.filter.x[:2].tolist(), tag.filter.P.diagonal()[:2].tolist()
+        self._test.add(time_s, complex(x, y), 0.5 * (a + b) * tag.filter.state.covariance_scale(), point)
+        if self._heading_filter is not None:
             self._update_separation(self._heading_filter, dt)
 
     def _update_separation(self, heading_filter: OdometryFilter, dt: float) -> None:
