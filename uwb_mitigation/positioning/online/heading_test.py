@@ -140,10 +140,11 @@ class HeadingTest:
         evidence = self._evidence.tolist()
         variance = max(variance, self._variance)
         for fault, one, implied in zip(_FAULTS, evidence, differences, strict=True):
-            if fault is _FAULTS[0] or one >= fault.excluded:
-                continue
-            if one < IDENTIFIED or fault is _WORLD_AXES:
-                return math.inf
+            if fault is not _FAULTS[0]:
+                if one >= fault.excluded:
+                    continue
+                if one < IDENTIFIED or fault is _WORLD_AXES:
+                    return math.inf
             largest = max(abs(implied), self._fastest * fault.delay_s)
             variance = max(variance, (largest / IMPLIED_SD) ** 2)
         if differences[0] ** 2 > CONTRADICTION**2 * (variance + self._variance + self._drift):
