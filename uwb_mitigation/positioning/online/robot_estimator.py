@@ -48,6 +48,9 @@ EQUAL_SEPARATION, REJECTED_SEPARATION = 2.0, 4.0
 """Mean squared separation, relative to the covariance, at which both solutions have equal weights, and from which the odometry is
 rejected. Two is its mean if the odometry had no errors, and the ranges-only solution those of its covariance."""
 
+CONSTANT_SHARE = 0.4
+"""Share of the covariance of ranges only that odometry does not reduce: errors of ranges that stay the same, or return with the place."""
+
 VERIFIED_SEPARATION = 1.0
 """After a rejection the odometry is reported as wrong until the separation is smaller."""
 
@@ -179,9 +182,10 @@ class RobotEstimator:
         assert self.tag.filter is not None
         covariance, mean = ranges_only.covariance, estimate.covariance[:2, :2]
         spread = np.multiply.outer(delta[:2], delta[:2])
-        covariance[:2, :2] = weight * (mean + self.tag.filter.unseen[:2, :2] + (1.0 - weight) * spread) + (
-            (1.0 - weight) * covariance[:2, :2]
-        )
+        mean += self.tag.filter.unseen[:2, :2]
+        of_mean = weight * (1.0 - CONSTANT_SHARE)
+        covariance[:2, :2] = of_mean * mean + (1.0 - of_mean) * covariance[:2, :2]
+        covariance[:2, :2] += weight * (1.0 - weight) * spread
         covariance[:2, 2] *= 1.0 - weight
         covariance[2, :2] = covariance[:2, 2]
         covariance[:3, 3:] = covariance[3:, :3] = 0.0

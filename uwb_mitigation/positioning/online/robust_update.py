@@ -197,3 +197,13 @@ class RobustUpdate:
         `consistency`. The power and the limits were chosen on simulated drives, the Hanyang runs and the labyrinth.
         """
         return min(max(SCALE * math.pow(self.consistency, POWER), MIN_SCALE), MAX_SCALE)
+
+    def restore_offset(self, covariance: NDArray[np.float64], scale: float) -> None:
+        """Add to a covariance (n, n) of the first motion states that was multiplied by `scale`.
+
+        Its part from the common offset is multiplied by `SCALE` at least: small persisting errors say nothing about the offset.
+        """
+        variance = self.P.item(self._offset, self._offset)
+        if scale < SCALE and variance > 0.0:
+            by_offset = self.P[: len(covariance), self._offset]
+            covariance += (SCALE - scale) / variance * np.multiply.outer(by_offset, by_offset)
