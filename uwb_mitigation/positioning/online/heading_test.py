@@ -48,7 +48,7 @@ MOST_OF_FIT = 2.0
 WINDOW_SD, WINDOW_M = 20.0, (6.0, 25.0)
 """Length of the path that is fitted: this many standard deviations of the positions, within limits in m."""
 
-STEP_M, EVERY_M, SHORTEST_M, FEWEST = 0.2, 1.5, 2.0, 8
+STEP_M, EVERY_M, SHORTEST_M, FEWEST = 0.2, 1.5, 3.0, 8
 """Distances between positions and between fits; shortest path and fewest positions that are fitted."""
 
 ERROR_M, UNSEEN_M = 0.12, 0.05
@@ -60,8 +60,12 @@ SCALE_LIMITS = 0.9, 1.1
 CONTRADICTION = 3.0
 """Difference of heading and fit in standard deviations from which the heading is not confirmed."""
 
-IMPLIED_SD = 1.5
-"""The headings of faults that are not excluded are within this many standard deviations."""
+MAX_FIT_SD = math.radians(8.0)
+"""A fit with a larger standard deviation confirms no heading."""
+
+IMPLIED, IMPLIED_SD = math.radians(22.5), 3.0
+"""The heading is not confirmed if a fault that is not excluded implies another one that differs by more; smaller differences are within
+this many standard deviations of the published one."""
 
 RATE_S = 0.5
 """Averaging time of yaw rates."""
@@ -72,23 +76,43 @@ class HeadingTest:
 
     Args:
         lever_arm: the antenna in the frame of the base, m; only x and y are used.
+        is_verified: all faults were excluded before.
+
+    Attributes:
+        contradicts: the latest heading contradicted the ranges, or the odometry has a fault.
     """
 
-    def __init__(self, lever_arm: tuple[float, float, float]) -> None:
+    def __init__(self, lever_arm: tuple[float, float, float], *, is_verified: bool = False) -> None:
         self._arm = complex(*lever_arm[:2])
-        self._evidence = np.zeros(len(_FAULTS))
-        self._rate = self._fastest = 0.0
+        self._evidence = np.array([0.0, *(is_verified * fault.excluded for fault in _FAULTS[1:])])
+        self._rate, self._fastest, self.contradicts = 0.0, 0.0, False
+        self._remaining, self._has_fault = list[tuple[_Fault, float]](), False
         # Time, distance driven, variance, drift and turn of the odometry, position, and position relative to the start of the path for each fault.
         self._samples: deque[tuple[complex, ...]] = deque(maxlen=400)
         self._last: PathPoint | None = None
         self._path = np.zeros(len(_FAULTS), complex)
-        self._turned: tuple[float, float] | None = None
+        self._turned = (0.0, 0.0)
         self._fitted_m, self._rotations, self._variance, self._drift = 0.0, list[float](), math.inf, 0.0
 
     def forget_positions(self) -> None:
         """Start again with other positions, but keep the evidence and the latest fit: faults of odometry stay."""
         self._samples.clear()
-        self._last = self._turned = None
+        self._last = None
+
+    def is_due(self, time_s: float, point: PathPoint) -> bool:
+        """Follow the odometry; return whether `add` needs a position, at times in ascending order."""
+        last = self._last
+        if last is not None and last.segment != point.segment:
+            # Both paths have no known relative rotation.
+            self.forget_positions()
+            self._rotations, last = [], None
+        begin_s, yaw = self._turned
+        if time_s - begin_s >= RATE_S or last is None:
+            self._turned = time_s, point.yaw
+            if last is not None:
+                self._rate = (point.yaw - yaw) / (time_s - begin_s)
+                self._fastest = max(self._fastest, abs(self._rate))
+        return last is None or point.distance_m - last.distance_m >= STEP_M
 
     def add(self, time_s: float, position: complex, variance: float, point: PathPoint) -> None:
         """Add a position from ranges only.
@@ -99,20 +123,10 @@ class HeadingTest:
             variance: mean of both axes, m^2.
             point: of the odometry at this time.
         """
-        if self._last is not None and self._last.segment != point.segment:
-            # Both paths have no known relative rotation.
-            self.forget_positions()
-            self._rotations = []
         last = self._last
-        if self._turned is None or last is None:
-            self._turned, self._fitted_m = (time_s, point.yaw), point.distance_m
-        elif time_s - self._turned[0] >= RATE_S:
-            begin_s, yaw = self._turned
-            self._rate = (point.yaw - yaw) / (time_s - begin_s)
-            self._fastest, self._turned = max(self._fastest, abs(self._rate)), (time_s, point.yaw)
-        if last is not None:
-            if point.distance_m - last.distance_m < STEP_M:
-                return
+        if last is None:
+            self._fitted_m = point.distance_m
+        else:
             step = complex(point.x - last.x, point.y - last.y)
             self._path = self._path + step * np.exp(0.5j * _GAINS * (point.yaw + last.yaw))
         self._last = point
@@ -131,25 +145,23 @@ class HeadingTest:
             variance: of it, if the odometry has no fault, rad^2.
             point: of the odometry at this time.
         """
+        self.contradicts = False
         if not self._rotations:
             return math.inf
-        differences = [
-            math.remainder(rotation + fault.sign * point.yaw + self._rate * fault.delay_s - yaw, math.tau)
-            for fault, rotation in zip(_FAULTS, self._rotations, strict=True)
-        ]
-        evidence = self._evidence.tolist()
-        variance = max(variance, self._variance)
-        for fault, one, implied in zip(_FAULTS, evidence, differences, strict=True):
-            if fault is not _FAULTS[0]:
-                if one >= fault.excluded:
-                    continue
-                if one < IDENTIFIED or fault is _WORLD_AXES:
-                    return math.inf
-            largest = max(abs(implied), self._fastest * fault.delay_s)
-            variance = max(variance, (largest / IMPLIED_SD) ** 2)
-        if differences[0] ** 2 > CONTRADICTION**2 * (variance + self._variance + self._drift):
+        difference = math.remainder(self._rotations[0] + point.yaw - yaw, math.tau)
+        limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
+        self.contradicts = self._has_fault or difference**2 > limit
+        if self.contradicts:
             return math.inf
-        return variance
+        largest = 0.0
+        for fault, rotation in self._remaining:
+            if fault is _WORLD_AXES:
+                return math.inf
+            implied = rotation + fault.sign * point.yaw + self._rate * fault.delay_s - yaw
+            largest = max(largest, abs(math.remainder(implied, math.tau)), self._fastest * fault.delay_s)
+        if largest > IMPLIED or self._variance > MAX_FIT_SD**2:
+            return math.inf
+        return max(variance, self._variance, difference**2, (largest / IMPLIED_SD) ** 2)
 
     def _fit(self) -> None:
         """Fit the latest path for each fault, and add the log likelihood ratios."""
@@ -184,6 +196,9 @@ class HeadingTest:
         self._evidence += np.clip(gain, -MOST_OF_FIT, MOST_OF_FIT)
         self._evidence = np.minimum(self._evidence, MOST_EVIDENCE)
         self._fitted_m, self._rotations = float(distance_m[-1]), np.angle(rotation).tolist()
+        faults = zip(_FAULTS, self._evidence.tolist(), self._rotations, strict=True)
+        self._remaining = [(fault, angle) for fault, one, angle in faults if one < fault.excluded][1:]
+        self._has_fault = float(self._evidence.min()) < IDENTIFIED
         # Errors of ranges persist: averaging does not reduce the variance of the rotation.
         self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * float(np.mean(np.abs(position) ** 2)))
         # The fit is that of the middle of the path.

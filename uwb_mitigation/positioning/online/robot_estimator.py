@@ -85,7 +85,6 @@ class RobotEstimator:
         tag: estimator of the position from ranges only. Its `counts` also have `heading found`, `odometry missing` and
             `odometry wrong`.
         odometry: add live messages to it in the order of time.
-        rejects_odometry: the odometry contradicted the ranges, and was not verified since.
     """
 
     def __init__(self, config: EstimatorConfig, odometry: DeadReckoning | None = None) -> None:
@@ -94,11 +93,16 @@ class RobotEstimator:
         self._heading_filter: OdometryFilter | None = None
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
-        self.rejects_odometry = False
+        self._is_rejected = False
         self._rejections, self._separation = 0.0, 0.0
-        self._test = HeadingTest(self._robot.lever_arm)
+        self._test = HeadingTest(self._robot.lever_arm, is_verified=self._robot.is_verified)
         self._is_confirmed = False
         self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
+
+    @property
+    def rejects_odometry(self) -> bool:
+        """Whether the odometry contradicted the ranges, and was not verified since."""
+        return self._is_rejected or self._test.contradicts
 
     @property
     def lever_arm(self) -> tuple[float, float, float]:
@@ -109,7 +113,7 @@ class RobotEstimator:
     def lever_arm(self, lever_arm: tuple[float, float, float]) -> None:
         if lever_arm != self._robot.lever_arm:
             self._robot = replace(self._robot, lever_arm=lever_arm)
-            self._test = HeadingTest(lever_arm)
+            self._test = HeadingTest(lever_arm, is_verified=self._robot.is_verified)
             self._reset_heading(None)
 
     @property
@@ -228,8 +232,9 @@ class RobotEstimator:
         if tag.filter is None:
             self._test.forget_positions()
             return
-        (x, y), (a, b) = tag.filter.x[:2].tolist(), tag.filter.P.diagonal()[:2].tolist()
-        self._test.add(time_s, complex(x, y), 0.5 * (a + b) * tag.filter.state.covariance_scale(), point)
+        if self._test.is_due(time_s, point):
+            (x, y), (a, b) = tag.filter.x[:2].tolist(), tag.filter.P.diagonal()[:2].tolist()
+            self._test.add(time_s, complex(x, y), 0.5 * (a + b) * tag.filter.state.covariance_scale(), point)
         if self._heading_filter is not None:
             self._update_separation(self._heading_filter, dt)
 
@@ -245,11 +250,11 @@ class RobotEstimator:
         # Large range errors move the ranges-only solution away from correct odometry, too.
         scale = max(filter_.state.covariance_scale(), 1.0)
         if self._separation < VERIFIED_SEPARATION * scale:
-            self.rejects_odometry = False
+            self._is_rejected = False
         if self._separation > REJECTED_SEPARATION * scale:
             self._reset_heading("odometry wrong")
             self._rejections += 1.0
-            self.rejects_odometry = True
+            self._is_rejected = True
 
     def _start_yaws(self, point: PathPoint) -> None:
         """Start filters at the position of the ranges-only filter when the robot drives."""

@@ -106,11 +106,13 @@ class RobotData:
     Attributes:
         odometry, imu: recorded; None: none, or live.
         lever_arm: the antenna in the frame of the base, m.
+        is_verified: the heading was confirmed before, so that the odometry has no fault.
     """
 
     odometry: Odometry | None = None
     imu: Imu | None = None
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    is_verified: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
