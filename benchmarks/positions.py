@@ -257,7 +257,9 @@ def _with_faults(
     """Return the RMSE with wrong odometry relative to ranges only, and how often headings are published and wrong.
 
     Args:
-        run: with odometry. tracks: of it, `truth`: true path.
+        run: with odometry.
+        tracks: of it.
+        truth: true path on which positions are evaluated.
         names: of faults; None: all.
     """
     assert run.robot is not None
