@@ -60,6 +60,9 @@ SCALE_LIMITS = 0.9, 1.1
 CONTRADICTION = 3.0
 """Difference of heading and fit in standard deviations from which the heading is not confirmed."""
 
+FIT_SD = 1.5
+"""The fit is within this many standard deviations of the published heading."""
+
 MAX_FIT_SD = math.radians(8.0)
 """A fit with a larger standard deviation confirms no heading."""
 
@@ -161,7 +164,7 @@ class HeadingTest:
             largest = max(largest, abs(math.remainder(implied, math.tau)), self._fastest * fault.delay_s)
         if largest > IMPLIED or self._variance > MAX_FIT_SD**2:
             return math.inf
-        return max(variance, self._variance, difference**2, (largest / IMPLIED_SD) ** 2)
+        return max(variance, self._variance, (difference / FIT_SD) ** 2, (largest / IMPLIED_SD) ** 2)
 
     def _fit(self) -> None:
         """Fit the latest path for each fault, and add the log likelihood ratios."""
@@ -201,5 +204,5 @@ class HeadingTest:
         self._has_fault = float(self._evidence.min()) < IDENTIFIED
         # Errors of ranges persist: averaging does not reduce the variance of the rotation.
         self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * float(np.mean(np.abs(position) ** 2)))
-        # The fit is that of the middle of the path.
-        self._drift = sum(float(drift[-1] - np.mean(drift[fitted])) ** 2 for drift in drifts)
+        # From the beginning of the fitted path until now.
+        self._drift = sum(float(drift[-1] - drift[fitted.start]) ** 2 for drift in drifts)

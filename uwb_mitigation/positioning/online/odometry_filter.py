@@ -148,8 +148,7 @@ class OdometryFilter:
         to_antenna = np.eye(4)
         to_antenna[:2, YAW] = -arm_y, arm_x
         # Only the position: the heading depends on the odometry more than on errors of ranges.
-        scale = self.state.covariance_scale()
-        to_antenna[:3] *= math.sqrt(scale)
+        to_antenna[:3] *= math.sqrt(self.state.covariance_scale())
         pose = to_antenna @ P[:4, :4] @ to_antenna.T
         yaw = math.remainder(float(x[YAW]), math.tau)
         vx, vy, yaw_rate = odometry.twist or (0.0, 0.0, 0.0)
@@ -159,7 +158,6 @@ class OdometryFilter:
         )
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = pose[:3, :3]
-        self.state.restore_offset(covariance[:3, :3], scale)
         speed_variance = odometry.twist_variance[0] + float(P[YAW, YAW]) * (vx * vx + vy * vy)
         covariance[[3, 4], [3, 4]] = speed_variance
         position = x[:3] + np.array([arm_x, arm_y, self._lever_arm[2]])

@@ -184,26 +184,26 @@ class RobotEstimator:
         # The height and its velocity are those of the ranges-only estimate. Both estimates are new: they can be changed in place.
         assert estimate.heading is not None
         assert self.tag.filter is not None
-        covariance, mean = ranges_only.covariance, estimate.covariance[:2, :2]
-        spread = np.multiply.outer(delta[:2], delta[:2])
-        mean += self.tag.filter.unseen[:2, :2]
+        covariance, plane = ranges_only.covariance, ranges_only.covariance[:2, :2]
+        delta[2] = 0.0
         of_mean = weight * (1.0 - CONSTANT_SHARE)
-        covariance[:2, :2] = of_mean * mean + (1.0 - of_mean) * covariance[:2, :2]
-        covariance[:2, :2] += weight * (1.0 - weight) * spread
+        plane *= 1.0 - of_mean
+        plane += of_mean * (estimate.covariance[:2, :2] + self.tag.filter.unseen[:2, :2])
+        plane += weight * (1.0 - weight) * np.multiply.outer(delta[:2], delta[:2])
         covariance[:2, 2] *= 1.0 - weight
         covariance[2, :2] = covariance[:2, 2]
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
-        position = ranges_only.position - weight * delta * (1.0, 1.0, 0.0)
-        velocity = np.append(estimate.velocity[:2], ranges_only.velocity[2])
+        position, velocity = ranges_only.position - weight * delta, estimate.velocity
+        velocity[2] = ranges_only.velocity[2]
         if self._area is not None:
             position = self._area.clip(position)
         yaw_covariance, yaw = estimate.heading.covariance, estimate.heading.yaw
-        yaw_covariance[YAW] = self._test.variance(yaw, float(yaw_covariance[YAW]), heading_filter.point)
-        self._is_confirmed = bool(yaw_covariance[YAW] < KNOWN_YAW_SD**2)
+        variance = self._test.variance(yaw, yaw_covariance.item(YAW), heading_filter.point)
+        self._is_confirmed = variance < KNOWN_YAW_SD**2
         if not self._is_confirmed:
             return Estimate(estimate.stamp_ns, position, ranges_only.velocity, covariance)
         yaw_covariance[:2] *= weight
-        yaw_covariance[2] = 0.0
+        yaw_covariance[2:] = 0.0, variance
         covariance[3:5, 3:5] = estimate.covariance[3:5, 3:5]
         heading = Heading(yaw, yaw_covariance)
         return Estimate(estimate.stamp_ns, position, velocity, covariance, heading)

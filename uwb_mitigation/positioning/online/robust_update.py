@@ -198,12 +198,11 @@ class RobustUpdate:
         """
         return min(max(SCALE * math.pow(self.consistency, POWER), MIN_SCALE), MAX_SCALE)
 
-    def restore_offset(self, covariance: NDArray[np.float64], scale: float) -> None:
-        """Add to a covariance (n, n) of the first motion states that was multiplied by `scale`.
+    def hidden_offset_covariance(self) -> NDArray[np.float64]:
+        """Return what a position's published covariance (3, 3) lacks of the common offset, m^2.
 
-        Its part from the common offset is multiplied by `SCALE` at least: small persisting errors say nothing about the offset.
+        Its part from the offset is multiplied by `SCALE` at least: small persisting errors say nothing about the offset.
         """
-        variance = self.P.item(self._offset, self._offset)
-        if scale < SCALE and variance > 0.0:
-            by_offset = self.P[: len(covariance), self._offset]
-            covariance += (SCALE - scale) / variance * np.multiply.outer(by_offset, by_offset)
+        variance, by_offset = self.P.item(self._offset, self._offset), self.P[:3, self._offset]
+        share = max(SCALE - self.covariance_scale(), 0.0) / max(variance, 1e-12)
+        return share * np.multiply.outer(by_offset, by_offset)

@@ -388,7 +388,7 @@ class TagEstimator:
         gain, redundancy = constant_error_gain(anchors, position, dims, self._model.offset_sd)
         variance = state.persisting_variance(redundancy)
         excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
-        filter_.unseen = excess * self.config.widens * gain
+        filter_.unseen = self.config.widens * (excess * gain + state.hidden_offset_covariance())
         sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
         self.error_sd_m = sd_m
         offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))
