@@ -40,6 +40,9 @@ WARM_UP_S = 5.0
 PUBLISHED_AFTER_S = 10.0
 """Positions are due from this time on."""
 
+HEADING_FAULTS = ("world axes", "sign of yaw rate", "late by 1 s")
+"""Faults of odometry that make headings wrong as long as they exist."""
+
 BASELINE_OFFSET_SD_M = 0.15
 BASELINES = ("raw_least_squares", "raw_ekf", "raw_ekf_offset")
 ROWS = (
@@ -123,8 +126,8 @@ def evaluate(source: RunSource, *, calibrate: bool = True, complete: bool = True
         result |= _ratio(tracks, truth)
         if "corrected_locator" in rows:
             result["corrected_to_raw"] = rows["corrected_locator"]["rmse_m"] / rows["raw_locator"]["rmse_m"]
-    if run.robot is not None and complete and "raw_locator" in rows:
-        result["odometry_faults"] = _fault_ratios(run, truth)
+    if run.robot is not None and "odometry_locator" in rows and (complete or run.height is not None):
+        result |= _with_faults(run, tracks, truth, HEADING_FAULTS if not complete else None)
     return result
 
 
@@ -248,17 +251,37 @@ def odometry_faults(odometry: Odometry) -> dict[str, Odometry]:
     }
 
 
-def _fault_ratios(run: Run, truth: TruePath) -> dict[str, float]:
-    """Return the RMSE with wrong odometry, relative to ranges only."""
+def _with_faults(
+    run: Run, tracks: dict[str, tuple[Track, float]], truth: TruePath, names: Sequence[str] | None
+) -> dict[str, Any]:
+    """Return the RMSE with wrong odometry relative to ranges only, and how often headings are published and wrong.
+
+    Args:
+        run: with odometry.
+        tracks: of it.
+        truth: true path on which positions are evaluated.
+        names: of faults; None: all.
+    """
     assert run.robot is not None
     assert run.robot.odometry is not None
-    ranges_only = scores(locate(run, run.ranges), truth)
-    ratios = {}
+    ranges_only, track = scores(tracks["raw_locator"][0], truth), tracks["odometry_locator"][0]
+    headings, ratios = {"correct": _heading_shares(track, run.truth)}, {}
     for fault, odometry in odometry_faults(run.robot.odometry).items():
-        faulty = scores(locate(run, run.ranges, replace(run.robot, odometry=odometry)), truth)
+        if names is not None and fault not in names:
+            continue
+        track = locate(run, run.ranges, replace(run.robot, odometry=odometry))
+        headings[fault] = _heading_shares(track, run.truth)
+        faulty = scores(track, truth)
         if ranges_only and faulty:
             ratios[fault] = faulty["rmse_m"] / ranges_only["rmse_m"]
-    return ratios
+    return {"odometry_faults": ratios, "headings": headings}
+
+
+def _heading_shares(track: Track, truth: TruePath) -> dict[str, float]:
+    """Return the share of estimates with a heading, and of these the share with an error above 3.29 standard deviations."""
+    wrong = track_errors(track, truth).heading_exceeded
+    published = float(np.isfinite(track.yaw[:, 0]).mean())
+    return {"published": published, "wrong": wrong if math.isfinite(wrong) else 0.0}
 
 
 def ambiguous_drives() -> list[dict[str, Any]]:
@@ -375,6 +398,10 @@ def _summary_of(sets: Sequence[dict[str, Any]]) -> dict[str, Any]:
     by_correction = values(lambda entry: entry["corrected_to_raw"])
     by_odometry = values(lambda entry: row(entry, "odometry_locator") / row(entry, "raw_locator"))
     faults = values(lambda entry: max(entry["odometry_faults"].values()))
+    published_headings = values(lambda entry: entry["headings"]["correct"]["published"])
+    wrong_headings = values(
+        lambda entry: max(entry["headings"][fault]["wrong"] for fault in ("correct", *HEADING_FAULTS))
+    )
     summary = {
         "runs": len(sets),
         "ratio_mean": float(np.mean(ratio)),
@@ -392,5 +419,8 @@ def _summary_of(sets: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "calibrated_to_raw_max": max(by_calibration),
         "odometry_to_raw_mean": float(np.mean(by_odometry)),
         "odometry_fault_ratio_max": max(faults),
+        "heading_published_mean": float(np.mean(published_headings)),
+        "heading_published_min": min(published_headings),
+        "heading_wrong_max": max(wrong_headings),
     }
     return {key: value if math.isfinite(value) else None for key, value in summary.items()}

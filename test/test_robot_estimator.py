@@ -13,7 +13,7 @@ from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, Robot, drive, wrapped
 
 from benchmarks.position_data import real_runs
-from benchmarks.positions import evaluate
+from benchmarks.positions import evaluate, odometry_faults
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
@@ -427,6 +427,14 @@ def test_wrong_odometry_is_not_worse_than_ranges_only(change):
     wrong = replace(robot.config, robot=_twisted(robot, lambda twist: twist * change))
     mixed = robot.errors(RobotEstimator(wrong).run(ranges), 5.0)[0]
     assert rms(mixed) <= 1.02 * rms(alone)
+
+
+@pytest.mark.parametrize("fault", ["world axes", "sign of yaw rate"])
+def test_wrong_headings_are_not_published(fault: str):
+    robot = Robot()
+    wrong = replace(robot.config, robot=RobotData(odometry_faults(robot.odometry)[fault]))
+    _, of_yaw, sd = robot.errors(RobotEstimator(wrong).run(robot.ranges()))
+    assert np.sum(np.abs(of_yaw) > 3.29 * sd) <= 0.01 * len(of_yaw)
 
 
 @pytest.mark.parametrize("is_white", [False, True])

@@ -137,9 +137,14 @@ class Locator(ManagedNode):
         self._lever_arm = parse_lever_arm(self.value("lever_arm")) or (0.0, 0.0, 0.0)
         robot = RobotData(lever_arm=self._lever_arm) if self.value("odometry") else None
         path_of_base, self._plain_tag = DeadReckoning(), self.value("tag")
-        self._make_estimator = lambda anchors: MultiTagEstimator(
-            EstimatorConfig(anchors, model, height, area, robot=robot), self._plain_tag, path_of_base
-        )
+
+        def make_estimator(anchors: AnchorMap) -> MultiTagEstimator:
+            is_verified = self._robot is not None and self._robot.state.map_to_odom is not None
+            known = robot and replace(robot, is_verified=is_verified)
+            config = EstimatorConfig(anchors, model, height, area, robot=known)
+            return MultiTagEstimator(config, self._plain_tag, path_of_base)
+
+        self._make_estimator = make_estimator
         self._period_ns = round(NS_PER_S / self.value("rate")) if self.value("rate") > 0 else 0
         self._offset_ns = round(self.value("stamp_offset") * NS_PER_S)
         self._map, self._plain_frame = self.value("map_frame"), self.value("tag_frame")

@@ -32,6 +32,7 @@ class TrackErrors:
         height_rmse: RMSE of z.
         heading_rmse_deg: RMSE of the yaw where it is known, degrees; NaN: never, or without a true yaw.
         heading_found_after_s: time from the first estimate to the first one with a yaw; NaN as above.
+        heading_exceeded: share of known headings with an error above 3.29 standard deviations; NaN as above.
         height_coverage95: share of true heights within 1.96 standard deviations; NaN without covariances.
         height_exceeded: share of epochs with an error in z above its protection level; NaN without covariances.
     """
@@ -46,6 +47,7 @@ class TrackErrors:
     height_rmse: float
     heading_rmse_deg: float = math.nan
     heading_found_after_s: float = math.nan
+    heading_exceeded: float = math.nan
     height_coverage95: float = math.nan
     height_exceeded: float = math.nan
 
@@ -81,7 +83,8 @@ def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErro
         return NO_ERRORS
     errors = errors_of(track.position[known], track.covariance[known], true[known])
     of_yaw = np.angle(np.exp(1j * (track.yaw[:, 0] - truth.yaw_at(track.stamp_ns + offset_ns))))
-    of_yaw = of_yaw[np.isfinite(of_yaw)]
+    is_known = np.isfinite(of_yaw)
+    of_yaw, yaw_sd = of_yaw[is_known], np.sqrt(track.yaw[is_known, 4])
     if not len(of_yaw):
         return errors
     first = int(np.isfinite(track.yaw[:, 0]).argmax())
@@ -89,6 +92,7 @@ def track_errors(track: Track, truth: TruePath, offset_ns: int = 0) -> TrackErro
         errors,
         heading_rmse_deg=math.degrees(np.sqrt(np.mean(of_yaw**2))),
         heading_found_after_s=float(track.stamp_ns[first] - track.stamp_ns[0]) / 1e9,
+        heading_exceeded=float((np.abs(of_yaw) > PROTECTION * yaw_sd).mean()),
     )
 
 

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
+from uwb_mitigation.positioning.online.heading_test import HeadingTest
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
-from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
+from uwb_mitigation.positioning.online.odometry_filter import YAW, OdometryFilter
 from uwb_mitigation.positioning.online.tag_estimator import (
     EstimatorConfig,
     RobotData,
@@ -46,6 +47,9 @@ SEPARATION_S = 2.0
 EQUAL_SEPARATION, REJECTED_SEPARATION = 2.0, 4.0
 """Mean squared separation, relative to the covariance, at which both solutions have equal weights, and from which the odometry is
 rejected. Two is its mean if the odometry had no errors, and the ranges-only solution those of its covariance."""
+
+CONSTANT_SHARE = 0.4
+"""Share of the covariance of ranges only that odometry does not reduce: errors of ranges that stay the same, or return with the place."""
 
 VERIFIED_SEPARATION = 1.0
 """After a rejection the odometry is reported as wrong until the separation is smaller."""
@@ -81,7 +85,6 @@ class RobotEstimator:
         tag: estimator of the position from ranges only. Its `counts` also have `heading found`, `odometry missing` and
             `odometry wrong`.
         odometry: add live messages to it in the order of time.
-        rejects_odometry: the odometry contradicted the ranges, and was not verified since.
     """
 
     def __init__(self, config: EstimatorConfig, odometry: DeadReckoning | None = None) -> None:
@@ -90,9 +93,16 @@ class RobotEstimator:
         self._heading_filter: OdometryFilter | None = None
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
-        self.rejects_odometry = False
+        self._is_rejected = False
         self._rejections, self._separation = 0.0, 0.0
+        self._test = HeadingTest(self._robot.lever_arm, is_verified=self._robot.is_verified)
+        self._is_confirmed = False
         self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
+
+    @property
+    def rejects_odometry(self) -> bool:
+        """Whether the odometry contradicted the ranges, and was not verified since."""
+        return self._is_rejected or self._test.contradicts
 
     @property
     def lever_arm(self) -> tuple[float, float, float]:
@@ -103,13 +113,14 @@ class RobotEstimator:
     def lever_arm(self, lever_arm: tuple[float, float, float]) -> None:
         if lever_arm != self._robot.lever_arm:
             self._robot = replace(self._robot, lever_arm=lever_arm)
+            self._test = HeadingTest(lever_arm, is_verified=self._robot.is_verified)
             self._reset_heading(None)
 
     @property
     def heading(self) -> str:
-        """The state of the heading as text: known, unknown, or the number of hypotheses."""
+        """The state of the heading as text: known, unconfirmed, unknown, or the number of hypotheses."""
         if self._heading_filter is not None:
-            return "known"
+            return "known" if self._is_confirmed else "unconfirmed"
         return f"{len(self._yaws)} hypotheses" if self._yaws else "unknown"
 
     def add(self, measurement: TagRange | TagHeight) -> Estimate | None:
@@ -150,6 +161,7 @@ class RobotEstimator:
     def restart(self, stamp_ns: int | None = None) -> None:
         """Reset position and heading, but not the statistics."""
         self.tag.restart(stamp_ns)
+        self._test = HeadingTest(self._robot.lever_arm)
         self._reset_heading(None)
 
     def _recorded_motion(self) -> list[tuple[int, Callable[..., None], Any]]:
@@ -172,23 +184,28 @@ class RobotEstimator:
         # The height and its velocity are those of the ranges-only estimate. Both estimates are new: they can be changed in place.
         assert estimate.heading is not None
         assert self.tag.filter is not None
-        covariance, mean = ranges_only.covariance, estimate.covariance[:2, :2]
-        spread = np.multiply.outer(delta[:2], delta[:2])
-        covariance[:2, :2] = weight * (mean + self.tag.filter.unseen[:2, :2] + (1.0 - weight) * spread) + (
-            (1.0 - weight) * covariance[:2, :2]
-        )
+        covariance, plane = ranges_only.covariance, ranges_only.covariance[:2, :2]
+        delta[2] = 0.0
+        of_mean = weight * (1.0 - CONSTANT_SHARE)
+        plane *= 1.0 - of_mean
+        plane += of_mean * (estimate.covariance[:2, :2] + self.tag.filter.unseen[:2, :2])
+        plane += weight * (1.0 - weight) * np.multiply.outer(delta[:2], delta[:2])
         covariance[:2, 2] *= 1.0 - weight
         covariance[2, :2] = covariance[:2, 2]
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
-        covariance[3:5, 3:5] = estimate.covariance[3:5, 3:5]
-        position = ranges_only.position - weight * delta * (1.0, 1.0, 0.0)
-        velocity = np.append(estimate.velocity[:2], ranges_only.velocity[2])
+        position, velocity = ranges_only.position - weight * delta, estimate.velocity
+        velocity[2] = ranges_only.velocity[2]
         if self._area is not None:
             position = self._area.clip(position)
-        yaw_covariance = estimate.heading.covariance
+        yaw_covariance, yaw = estimate.heading.covariance, estimate.heading.yaw
+        variance = self._test.variance(yaw, yaw_covariance.item(YAW), heading_filter.point)
+        self._is_confirmed = variance < KNOWN_YAW_SD**2
+        if not self._is_confirmed:
+            return Estimate(estimate.stamp_ns, position, ranges_only.velocity, covariance)
         yaw_covariance[:2] *= weight
-        yaw_covariance[2] = 0.0
-        heading = Heading(estimate.heading.yaw, yaw_covariance)
+        yaw_covariance[2:] = 0.0, variance
+        covariance[3:5, 3:5] = estimate.covariance[3:5, 3:5]
+        heading = Heading(yaw, yaw_covariance)
         return Estimate(estimate.stamp_ns, position, velocity, covariance, heading)
 
     def _update_headings(self, measurement: TagRange) -> None:
@@ -212,7 +229,13 @@ class RobotEstimator:
                 hypothesis.filter.confine(self._area)
             hypothesis.loss += self._config.model.student_loss(z) + math.log(sd)
         self._prune()
-        if self._heading_filter is not None and tag.filter is not None:
+        if tag.filter is None:
+            self._test.forget_positions()
+            return
+        if self._test.is_due(time_s, point):
+            (x, y), (a, b) = tag.filter.x[:2].tolist(), tag.filter.P.diagonal()[:2].tolist()
+            self._test.add(time_s, complex(x, y), 0.5 * (a + b) * tag.filter.state.covariance_scale(), point)
+        if self._heading_filter is not None:
             self._update_separation(self._heading_filter, dt)
 
     def _update_separation(self, heading_filter: OdometryFilter, dt: float) -> None:
@@ -227,11 +250,11 @@ class RobotEstimator:
         # Large range errors move the ranges-only solution away from correct odometry, too.
         scale = max(filter_.state.covariance_scale(), 1.0)
         if self._separation < VERIFIED_SEPARATION * scale:
-            self.rejects_odometry = False
+            self._is_rejected = False
         if self._separation > REJECTED_SEPARATION * scale:
             self._reset_heading("odometry wrong")
             self._rejections += 1.0
-            self.rejects_odometry = True
+            self._is_rejected = True
 
     def _start_yaws(self, point: PathPoint) -> None:
         """Start filters at the position of the ranges-only filter when the robot drives."""

@@ -197,3 +197,12 @@ class RobustUpdate:
         `consistency`. The power and the limits were chosen on simulated drives, the Hanyang runs and the labyrinth.
         """
         return min(max(SCALE * math.pow(self.consistency, POWER), MIN_SCALE), MAX_SCALE)
+
+    def hidden_offset_covariance(self) -> NDArray[np.float64]:
+        """Return what a position's published covariance (3, 3) lacks of the common offset, m^2.
+
+        Its part from the offset is multiplied by `SCALE` at least: small persisting errors say nothing about the offset.
+        """
+        variance, by_offset = self.P.item(self._offset, self._offset), self.P[:3, self._offset]
+        share = max(SCALE - self.covariance_scale(), 0.0) / max(variance, 1e-12)
+        return share * np.multiply.outer(by_offset, by_offset)

@@ -106,11 +106,13 @@ class RobotData:
     Attributes:
         odometry, imu: recorded; None: none, or live.
         lever_arm: the antenna in the frame of the base, m.
+        is_verified: the heading was confirmed before, so that the odometry has no fault.
     """
 
     odometry: Odometry | None = None
     imu: Imu | None = None
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    is_verified: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -386,7 +388,7 @@ class TagEstimator:
         gain, redundancy = constant_error_gain(anchors, position, dims, self._model.offset_sd)
         variance = state.persisting_variance(redundancy)
         excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
-        filter_.unseen = excess * self.config.widens * gain
+        filter_.unseen = self.config.widens * (excess * gain + state.hidden_offset_covariance())
         sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
         self.error_sd_m = sd_m
         offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))

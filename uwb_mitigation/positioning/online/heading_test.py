@@ -1,0 +1,208 @@
+"""Test of a robot's heading: does its odometry explain the displacements that the ranges alone show?
+
+Over the last metres, the path of the odometry is fitted to the positions from ranges only by a rotation, once as it is and once for each
+fault in `_FAULTS`. The log likelihood ratios of the fits, for errors of unknown variance, are summed (Wald, Sequential Analysis, 1947).
+Until a fault is excluded, the variance of the heading contains the heading that it implies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from uwb_mitigation.positioning.online.dead_reckoning import PathPoint
+
+
+class _Fault(NamedTuple):
+    """What may be wrong with odometry.
+
+    Attributes:
+        gain: true displacements are turned, relative to those of the odometry, by its yaw multiplied by this.
+        sign: of the yaw of the odometry in the true heading.
+        delay_s: of its stamps.
+        excluded: sum of log likelihood ratios from which the fault is excluded.
+    """
+
+    gain: float = 0.0
+    sign: float = 1.0
+    delay_s: float = 0.0
+    excluded: float = 4.0
+
+
+_WORLD_AXES = _Fault(gain=-1.0)
+_FAULTS = (_Fault(), _WORLD_AXES, _Fault(gain=-2.0, sign=-1.0), _Fault(delay_s=1.0, excluded=2.0))
+"""None; velocities in the axes of the world, whose relation to the heading is unknown; yaw rates with the wrong sign; late stamps."""
+
+_GAINS, _SIGNS = np.array([[fault.gain, fault.sign] for fault in _FAULTS]).T
+_MAX_DELAY_S = max(fault.delay_s for fault in _FAULTS)
+
+IDENTIFIED, MOST_EVIDENCE = -2.0, 15.0
+"""The odometry has a fault if the sum of its log likelihood ratios is smaller; upper limit of the sum."""
+
+MOST_OF_FIT = 2.0
+"""Limit of the contribution of one fit: errors of ranges persist."""
+
+WINDOW_SD, WINDOW_M = 20.0, (6.0, 25.0)
+"""Length of the path that is fitted: this many standard deviations of the positions, within limits in m."""
+
+STEP_M, EVERY_M, SHORTEST_M, FEWEST = 0.2, 1.5, 3.0, 8
+"""Distances between positions and between fits; shortest path and fewest positions that are fitted."""
+
+ERROR_M, UNSEEN_M = 0.12, 0.05
+"""Standard deviations of positions that are added to the residuals of fits: to compare them, and for the variance of the heading."""
+
+SCALE_LIMITS = 0.9, 1.1
+"""Of distances in the odometry."""
+
+CONTRADICTION = 3.0
+"""Difference of heading and fit in standard deviations from which the heading is not confirmed."""
+
+FIT_SD = 1.5
+"""The fit is within this many standard deviations of the published heading."""
+
+MAX_FIT_SD = math.radians(8.0)
+"""A fit with a larger standard deviation confirms no heading."""
+
+IMPLIED, IMPLIED_SD = math.radians(22.5), 3.0
+"""The heading is not confirmed if a fault that is not excluded implies another one that differs by more; smaller differences are within
+this many standard deviations of the published one."""
+
+RATE_S = 0.5
+"""Averaging time of yaw rates."""
+
+
+class HeadingTest:
+    """Compares the path of odometry with positions from ranges only.
+
+    Args:
+        lever_arm: the antenna in the frame of the base, m; only x and y are used.
+        is_verified: all faults were excluded before.
+
+    Attributes:
+        contradicts: the latest heading contradicted the ranges, or the odometry has a fault.
+    """
+
+    def __init__(self, lever_arm: tuple[float, float, float], *, is_verified: bool = False) -> None:
+        self._arm = complex(*lever_arm[:2])
+        self._evidence = np.array([0.0, *(is_verified * fault.excluded for fault in _FAULTS[1:])])
+        self._rate, self._fastest, self.contradicts = 0.0, 0.0, False
+        self._remaining, self._has_fault = list[tuple[_Fault, float]](), False
+        # Time, distance driven, variance, drift and turn of the odometry, position, and position relative to the start of the path for each fault.
+        self._samples: deque[tuple[complex, ...]] = deque(maxlen=400)
+        self._last: PathPoint | None = None
+        self._path = np.zeros(len(_FAULTS), complex)
+        self._turned = (0.0, 0.0)
+        self._fitted_m, self._rotations, self._variance, self._drift = 0.0, list[float](), math.inf, 0.0
+
+    def forget_positions(self) -> None:
+        """Start again with other positions, but keep the evidence and the latest fit: faults of odometry stay."""
+        self._samples.clear()
+        self._last = None
+
+    def is_due(self, time_s: float, point: PathPoint) -> bool:
+        """Follow the odometry; return whether `add` needs a position, at times in ascending order."""
+        last = self._last
+        if last is not None and last.segment != point.segment:
+            # Both paths have no known relative rotation.
+            self.forget_positions()
+            self._rotations, last = [], None
+        begin_s, yaw = self._turned
+        if time_s - begin_s >= RATE_S or last is None:
+            self._turned = time_s, point.yaw
+            if last is not None:
+                self._rate = (point.yaw - yaw) / (time_s - begin_s)
+                self._fastest = max(self._fastest, abs(self._rate))
+        return last is None or point.distance_m - last.distance_m >= STEP_M
+
+    def add(self, time_s: float, position: complex, variance: float, point: PathPoint) -> None:
+        """Add a position from ranges only.
+
+        Args:
+            time_s: not before the latest one.
+            position: x + iy of the antenna, m.
+            variance: mean of both axes, m^2.
+            point: of the odometry at this time.
+        """
+        last = self._last
+        if last is None:
+            self._fitted_m = point.distance_m
+        else:
+            step = complex(point.x - last.x, point.y - last.y)
+            self._path = self._path + step * np.exp(0.5j * _GAINS * (point.yaw + last.yaw))
+        self._last = point
+        antenna = self._path + self._arm * np.exp(1j * _SIGNS * point.yaw)
+        self._samples.append(
+            (time_s, point.distance_m, variance, point.drift, point.turn, position, *antenna.tolist())
+        )
+        if point.distance_m - self._fitted_m >= EVERY_M:
+            self._fit()
+
+    def variance(self, yaw: float, variance: float, point: PathPoint) -> float:
+        """Return the variance of a heading, rad^2, with all faults that are not excluded; inf: it is not confirmed.
+
+        Args:
+            yaw: heading of the base, rad, from odometry and ranges.
+            variance: of it, if the odometry has no fault, rad^2.
+            point: of the odometry at this time.
+        """
+        self.contradicts = False
+        if not self._rotations:
+            return math.inf
+        difference = math.remainder(self._rotations[0] + point.yaw - yaw, math.tau)
+        limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
+        self.contradicts = self._has_fault or difference**2 > limit
+        if self.contradicts:
+            return math.inf
+        largest = 0.0
+        for fault, rotation in self._remaining:
+            if fault is _WORLD_AXES:
+                return math.inf
+            implied = rotation + fault.sign * point.yaw + self._rate * fault.delay_s - yaw
+            largest = max(largest, abs(math.remainder(implied, math.tau)), self._fastest * fault.delay_s)
+        if largest > IMPLIED or self._variance > MAX_FIT_SD**2:
+            return math.inf
+        return max(variance, self._variance, (difference / FIT_SD) ** 2, (largest / IMPLIED_SD) ** 2)
+
+    def _fit(self) -> None:
+        """Fit the latest path for each fault, and add the log likelihood ratios."""
+        samples = np.array(self._samples)
+        time_s, distance_m, variance, *drifts = samples[:, :5].real.T
+        # Later positions have no partner on a path with late stamps.
+        end = int(np.searchsorted(time_s, time_s[-1] - _MAX_DELAY_S, side="right"))
+        if end < FEWEST:
+            return
+        length_m = WINDOW_SD * math.sqrt(float(np.mean(variance[:end])))
+        length_m = min(max(length_m, WINDOW_M[0]), WINDOW_M[1])
+        fitted = slice(int(np.searchsorted(distance_m, distance_m[end - 1] - length_m)), end)
+        if end - fitted.start < FEWEST or distance_m[end - 1] - distance_m[fitted.start] < SHORTEST_M:
+            return
+        position = samples[fitted, 5]
+        position = position - position.mean()
+        paths = np.array(
+            [
+                np.interp(time_s[fitted] + fault.delay_s, time_s, path)
+                for fault, path in zip(_FAULTS, samples[:, 6:].T, strict=True)
+            ]
+        )
+        paths -= paths.mean(axis=1, keepdims=True)
+        product = paths.conj() @ position
+        scale = np.abs(product) / np.maximum(np.sum(np.abs(paths) ** 2, axis=1), 1e-9)
+        rotation = product / np.maximum(np.abs(product), 1e-12)
+        fit = (np.clip(scale, *SCALE_LIMITS) * rotation)[:, None] * paths
+        square = np.mean(np.abs(position - fit) ** 2, axis=1)
+        # One independent position for each metre of the path.
+        driven_m = min(float(distance_m[-1]) - self._fitted_m, length_m)
+        gain = driven_m * np.log((square + ERROR_M**2) / (square[0] + ERROR_M**2))
+        self._evidence += np.clip(gain, -MOST_OF_FIT, MOST_OF_FIT)
+        self._evidence = np.minimum(self._evidence, MOST_EVIDENCE)
+        self._fitted_m, self._rotations = float(distance_m[-1]), np.angle(rotation).tolist()
+        faults = zip(_FAULTS, self._evidence.tolist(), self._rotations, strict=True)
+        self._remaining = [(fault, angle) for fault, one, angle in faults if one < fault.excluded][1:]
+        self._has_fault = float(self._evidence.min()) < IDENTIFIED
+        # Errors of ranges persist: averaging does not reduce the variance of the rotation.
+        self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * float(np.mean(np.abs(position) ** 2)))
+        # From the beginning of the fitted path until now.
+        self._drift = sum(float(drift[-1] - drift[fitted.start]) ** 2 for drift in drifts)
