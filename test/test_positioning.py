@@ -30,6 +30,7 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import candidate_positions
 from uwb_mitigation.positioning.online.measurements import TagRange
+from uwb_mitigation.positioning.online.robust_update import SCALE, RobustUpdate
 from uwb_mitigation.positioning.online.tag_estimator import (
     RANGE_TIMEOUT_S,
     Ambiguity,
@@ -515,3 +516,12 @@ def test_constant_errors_move_a_position_as_least_squares_with_an_offset_does():
     np.testing.assert_allclose(covariance[:2, :2], expected, rtol=0.01)
     assert not covariance[2].any()
     assert redundancy == pytest.approx(1 / 4, abs=0.01), "four ranges, three unknowns"
+
+
+def test_small_errors_do_not_reduce_the_variance_of_the_common_offset():
+    state = RobustUpdate(HALL, NoiseModel(), np.zeros(6))
+    state.P[:3, 6] = 0.01
+    state.consistency = 0.5
+    of_offset = 0.01**2 / state.P[6, 6]
+    published = state.covariance_scale() * of_offset + state.hidden_offset_covariance()
+    np.testing.assert_allclose(published, SCALE * of_offset)
