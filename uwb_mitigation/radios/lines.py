@@ -26,9 +26,9 @@ from uwb_mitigation.radios.port import (
     StreamPort,
 )
 from uwb_mitigation.radios.settings import ValueReader, read_baud, read_ports
+from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
 from uwb_mitigation.recordings.mapping.live import LiveConverter
 from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
-from uwb_mitigation.recordings.mapping.tables import UNREADABLE
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 MAX_LINE = 1 << 16

@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
-from uwb_mitigation.recordings.mapping.conversion import ColumnDict, read_csv
+from uwb_mitigation.recordings.mapping.conversion import ColumnDict
+from uwb_mitigation.recordings.mapping.csv_tables import read_csv
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import (
     DEVICE_TICK_HZ,

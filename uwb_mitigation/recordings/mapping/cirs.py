@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.recordings.mapping.chunks import UNREADABLE, Chunk
 from uwb_mitigation.recordings.mapping.conversion import ColumnDict, samples_of
 from uwb_mitigation.recordings.mapping.mapping import CirSource, Join, series
-from uwb_mitigation.recordings.mapping.tables import UNREADABLE, Chunk
 from uwb_mitigation.types.measurement import LINEAR_MAGNITUDES, Cir, Encoding, is_logarithmic
 
 MAX_DELAY_S = 1.0

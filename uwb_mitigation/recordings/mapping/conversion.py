@@ -6,25 +6,22 @@ import contextlib
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter, TableFormat
-from uwb_mitigation.recordings.mapping.tables import LOG_TIME, UNREADABLE, Chunk, TableFile
+from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, UNREADABLE, Chunk
+from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter
 from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
 from uwb_mitigation.types.stamps import NS_PER_S
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
 
-MAX_ROWS = 100_000
 UNKNOWN_ID = (1 << 64) - 1
 UNKNOWN_STAMP = np.iinfo(np.int64).min
 """Id and stamp of a row without one."""
@@ -406,32 +403,3 @@ def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDA
     if bad.any():
         dropped[reason] += int(np.count_nonzero(bad))
     return bad
-
-
-def read_csv(
-    path: Path, ids: Sequence[str], numbers: Mapping[str, tuple[float, float]], optional: Sequence[str] = ()
-) -> ColumnDict:
-    """Read a CSV file of at most `MAX_ROWS` rows; `.xz` is decompressed.
-
-    Args:
-        path: the file.
-        ids: columns with ids.
-        numbers: columns with numbers, and their limits.
-        optional: names of numbers or texts that may be missing.
-
-    Raises:
-        RecordingError: a column or a value is missing or invalid; `where` gives the row.
-    """
-    values = {name: FieldRule(column=name, optional=name in optional) for name in (*ids, *numbers, *optional)}
-    converter = Converter(values, ids=ids)
-    file = TableFile(TableFormat(format="csv"), path, converter.columns, ids)
-    chunks = list(islice(file.chunks(), 2))
-    if len(chunks) != 1 or not 0 < chunks[0].count <= MAX_ROWS:
-        raise RecordingError("no rows, or too many", where=str(path), valid=f"1 to {MAX_ROWS} rows")
-    columns = converter.convert(chunks[0])
-    for name, (low, high) in [*((name, (0, UNKNOWN_ID - 1)) for name in ids), *numbers.items()]:
-        bad = ~((columns[name] >= low) & (columns[name] <= high))
-        for row in np.flatnonzero(bad & ~(np.isnan(columns[name]) & (name in optional)))[:1].tolist():
-            what, where = f"{name} = {columns[name][row]}", chunks[0].where(row)
-            raise RecordingError(what, where=where, valid=f"{low:g} to {high:g}")
-    return columns

@@ -9,6 +9,7 @@ import numpy as np
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.recordings.mapping.checks import impossible_rows, unknown_rows
+from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
 from uwb_mitigation.recordings.mapping.conversion import (
     NO_CIR,
     Converter,
@@ -19,7 +20,6 @@ from uwb_mitigation.recordings.mapping.conversion import (
 )
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TOPIC, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows
-from uwb_mitigation.recordings.mapping.tables import LOG_TIME, Chunk
 from uwb_mitigation.types.measurement import (
     LINEAR_MAGNITUDES,
     Cir,

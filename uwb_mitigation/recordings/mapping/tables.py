@@ -8,16 +8,16 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import compress, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError, did_you_mean
 from uwb_mitigation.files import read_bounded
+from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
 from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
 from uwb_mitigation.recordings.mapping.text_files import CsvRows, OnWarning, Rows, TextBlocks
@@ -31,49 +31,11 @@ MAX_ARRAY_BYTES = 4 << 30
 MAX_DOCUMENT_ROWS, MAX_YAML_BYTES = 20_000_000, 1 << 20
 """Largest number of rows of a JSON or YAML document, and largest size of a YAML file."""
 
-LOG_TIME = "@stamp"
-"""Column with the time at which a message was recorded, ns."""
-
 _SUFFIXES = {
     ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".log": "lines", ".jsonl": "lines", ".json": "json", ".mat": "matlab",
     ".h5": "hdf5", ".hdf5": "hdf5", ".bag": "messages", ".db3": "messages", ".mcap": "messages", ".yaml": "yaml",
     ".yml": "yaml",
 }  # fmt: skip
-UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError)
-"""Errors of values that do not have the expected form."""
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Rows of one file.
-
-    Attributes:
-        columns: {name: array or list}.
-        count: number of rows.
-        path: the file, or the topic.
-        rows: int64 (count,), numbers of the rows in the file, from 0.
-        before: number of rows in the files before.
-    """
-
-    columns: Mapping[str, Any]
-    count: int
-    path: Path | str
-    rows: NDArray[np.int64]
-    before: int = 0
-
-    def where(self, row: int) -> str:
-        """Return the location of a row for errors."""
-        return f"{self.path}: row {self.rows[row] + 1}"
-
-    def take(self, mask: NDArray[np.bool_]) -> Chunk:
-        """Return the chosen rows."""
-        if mask.all():
-            return self
-        columns: dict[str, Any] = {
-            name: values[mask] if isinstance(values, np.ndarray) else list(compress(values, mask))
-            for name, values in self.columns.items()
-        }
-        return Chunk(columns, int(mask.sum()), self.path, self.rows[mask], self.before)
 
 
 def _kind_of(path: Path) -> str:
