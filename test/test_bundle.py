@@ -28,7 +28,7 @@ from uwb_mitigation.mitigation.model.bundle import (
 )
 from uwb_mitigation.mitigation.model.choice import CirKind, is_trained_for
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.model.shipped import default_model_path, shared_folders, shipped_model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.types.measurement import RadioType, Segment
 
@@ -214,11 +214,8 @@ def test_float_graph_computes_what_numpy_computes(tmp_path, samples):
     assert np.allclose(Session(model).predict_m(inputs), floating.predict_m(weights, inputs), atol=1e-5)
 
 
-def test_shipped_model_of_an_installation_is_found(tmp_path, monkeypatch):
-    folder = tmp_path / "share" / "uwb_mitigation" / "models"
-    folder.mkdir(parents=True)
-    (folder / "universal.onnx").touch()
+def test_shared_folder_of_an_installation_is_found(tmp_path, monkeypatch):
     module = tmp_path / "lib/python3.12/site-packages/uwb_mitigation/mitigation/model/shipped.py"
     monkeypatch.setattr("uwb_mitigation.mitigation.model.shipped.__file__", str(module))
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    assert default_model_path() == folder / "universal.onnx"
+    assert tmp_path / "share" / "uwb_mitigation" / "firmware" in shared_folders("firmware")

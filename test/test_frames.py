@@ -32,7 +32,7 @@ from uwb_mitigation.types.ros.poses import yaw_of
 pytestmark = pytest.mark.ros
 
 ROUTE = ((2.0, 2.0), (10.0, 2.0), (10.0, 7.0), (6.0, 5.0), (2.0, 7.0))
-HEIGHT_M, SECONDS = 1.0, 30.0
+HEIGHT_M, SECONDS = 1.0, 45.0
 
 
 class Buffer:
@@ -128,9 +128,10 @@ def test_no_lookup_fails_and_the_yaw_error_fits_its_variance(ros: Ros, tmp_path:
     known = [row for row, pose in enumerate(found) if pose is not None]
     assert buffer.parents == {"odom": "map", "base_link": "odom"}
     assert known, "no heading"
-    assert known[0] < 15 * RATE_HZ
+    # The first corner is at 16 s: on a straight drive, ranges do not exclude faults of odometry.
+    assert known[0] < 30 * RATE_HZ
     assert known == list(range(known[0], len(found))), "failed lookups"
-    rows = np.arange(round(20 * RATE_HZ), len(found))
+    rows = np.arange(round(32 * RATE_HZ), len(found))
     pose = np.array([found[row] for row in rows])
     assert np.sqrt(2 * np.mean((pose[:, :2] - motion.position[rows]) ** 2)) < 0.15
     yaw_error = np.angle(np.exp(1j * (pose[:, 2] - motion.yaw[rows])))

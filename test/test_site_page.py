@@ -27,7 +27,11 @@ from ros_harness import Ros
 from uwb_mitigation.recordings.recorded_ranges import read_ranges
 from uwb_mitigation.types.anchors import load_anchors
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, NEEDS_CC]
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.slow,
+    NEEDS_CC,
+]
 
 PAGE = REPOSITORY / "docs" / "tutorials" / "your_site.md"
 FENCED = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -119,7 +123,7 @@ def terminals(tmp_path: Path, ros: Ros) -> Iterator[Terminals]:
         "ROS_DOMAIN_ID": str(ros.domain),
         "PYTHONUNBUFFERED": "1",
         "COLUMNS": "160",
-        "RECORDED_RANGES": "look 10 first 220 second 30 los 20",
+        "RECORDED_RANGES": "look 20 first 320 second 50 los 30",
     }
     opened = Terminals(folder, environment)
     yield opened
