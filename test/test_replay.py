@@ -30,7 +30,8 @@ from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
-from uwb_mitigation.nodes.feeds.replay import ReplayClock, ReplayFeed
+from uwb_mitigation.nodes.feeds.replay import ReplayFeed
+from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.mcap import McapRecording

@@ -23,7 +23,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from visualization_msgs.msg import MarkerArray
 
 from uwb_mitigation.nodes import markers
-from uwb_mitigation.nodes.feeds.replay import ReplayClock
+from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import VIEWER

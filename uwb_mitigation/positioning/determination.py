@@ -28,6 +28,8 @@ POOR_DOP = 10.0
 _TAG_DISTANCE_M, _OFFSET_SD_M = 1.0, NoiseModel().offset_sd
 _ANCHOR_DISTANCES_M = (0.5, 1.0, 1.5, 2.0, 3.0, 5.0)
 
+UNKNOWN_POSITION = "no position can be determined"
+
 
 @dataclass(frozen=True, slots=True)
 class Determination:

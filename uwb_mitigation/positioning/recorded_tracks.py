@@ -13,7 +13,12 @@ import numpy as np
 
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
 from uwb_mitigation.positioning.batch.smoother import smooth
-from uwb_mitigation.positioning.determination import Determination, current_determination, drive_determination
+from uwb_mitigation.positioning.determination import (
+    UNKNOWN_POSITION,
+    Determination,
+    current_determination,
+    drive_determination,
+)
 from uwb_mitigation.positioning.geometry import Area, Height, dop
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.initialization import snapshot
@@ -35,7 +40,6 @@ than `MIN_COVERAGE`."""
 
 
 MAX_STAMP_OFFSET_S = 3600.0
-UNKNOWN_POSITION = "no position can be determined"
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Track, TruePath
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, HISTORY_S, Pair, Scene, tag_label, tag_name
-from uwb_mitigation.viewer.timeline import Timeline
+
+if TYPE_CHECKING:
+    # A live page reads no recordings.
+    from uwb_mitigation.positioning.recorded_tracks import TagTracks
+    from uwb_mitigation.viewer.timeline import Timeline
 
 NOW_S = 3.0
 """Maximum age of a current value."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.positioning.recorded_tracks import UNKNOWN_POSITION
+from uwb_mitigation.positioning.determination import UNKNOWN_POSITION
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.headline import RECENT, Card, current_card, interval_cards, live_cards
 from uwb_mitigation.viewer.scene import NO_DATA_S, Pair, Scene, plain_tag_id, tag_label, tag_name

@@ -11,13 +11,13 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.nodes.feeds.radios import CAPTURED_SOURCES, radio_source
+from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
-from uwb_mitigation.nodes.support.lifecycle import clock_reader
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.ros.topics import RANGE_RAW
 from uwb_mitigation.types.source import Source
@@ -28,9 +28,6 @@ TICK_S = 0.02
 
 LATE_NS, BATCH = 1_000_000, 16
 """A record that is later than this is published in a batch with the next ones, of at most BATCH records."""
-
-CLOCK_STEP_NS = 1_000_000
-"""If the node's clock shifts by more than this relative to the steady clock, it was set, and stamps follow it."""
 
 ANNOUNCEMENT_S = 3.0
 """The middleware repeats its announcements after this time, if the first ones were lost."""
@@ -63,46 +60,6 @@ def open_source(value: Callable[[str], Any]) -> Source:
     from uwb_mitigation.recordings.decaranging import CirFrame, open_decaranging
 
     return open_decaranging(path, cir=CirFrame(value("cir")))
-
-
-class ReplayClock:
-    """The clock that paces a replay, and its stamps on a node's clock.
-
-    This is simulated time if it is active, else a steady clock: setting the system clock does not affect the replay.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._stamp_now_ns = clock_reader(clock)
-        self._offset_ns: int | None = None
-
-    def now_ns(self) -> int:
-        """Return the time of the replay clock."""
-        return self._stamp_now_ns() if self._simulated else time.monotonic_ns()
-
-    def stamp_ns(self, replay_ns: int) -> int:
-        """Convert a time of the replay clock to the node's clock; intervals are the same on both."""
-        if self._simulated:
-            return replay_ns
-        offset_ns, uncertainty_ns = self._read_both()
-        while self._offset_ns is None and uncertainty_ns > CLOCK_STEP_NS:
-            offset_ns, uncertainty_ns = self._read_both()
-        if self._offset_ns is None or abs(offset_ns - self._offset_ns) > CLOCK_STEP_NS + uncertainty_ns:
-            self._offset_ns = offset_ns
-        return replay_ns + self._offset_ns
-
-    def _read_both(self) -> tuple[int, int]:
-        """Return the offset of the node's clock to the steady clock, and its uncertainty, ns.
-
-        The uncertainty distinguishes an interruption of the process between the two readings from a clock that was set.
-        """
-        before_ns = time.monotonic_ns()
-        offset_ns = self._stamp_now_ns() - before_ns
-        return offset_ns, time.monotonic_ns() - before_ns
-
-    @property
-    def _simulated(self) -> bool:
-        return self._clock.clock_type == ClockType.ROS_TIME and bool(self._clock.ros_time_is_active)
 
 
 class RobotMessage(NamedTuple):
