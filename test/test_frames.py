@@ -135,6 +135,6 @@ def test_no_lookup_fails_and_the_yaw_error_fits_its_variance(ros: Ros, tmp_path:
     pose = np.array([found[row] for row in rows])
     assert np.sqrt(2 * np.mean((pose[:, :2] - motion.position[rows]) ** 2)) < 0.15
     yaw_error = np.angle(np.exp(1j * (pose[:, 2] - motion.yaw[rows])))
-    variances = [one.pose.covariance[35] for one in poses[len(poses) // 2 :]]
+    variances = [one.pose.covariance[35] for one in poses[-len(poses) // 4 :]]
     assert max(variances) < math.radians(15.0) ** 2
     assert np.mean(yaw_error**2) < 2.0 * np.mean(variances)
