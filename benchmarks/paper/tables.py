@@ -273,7 +273,7 @@ def statements(trainings: ExperimentResults) -> dict[str, str]:
         float(np.mean([model.errors[form].all.mae for model in remnet])) for form in FORMS
     )
     baseline = float(np.mean([model.errors["float"].all.mae for model in mlp]))
-    short = [model.errors["int8"].all.mae for model in trainings.of("remnet", _SHORT)]
+    short = trainings.of("remnet", _SHORT)
 
     def change(value: float, reference: float | None, digits: int = 1) -> str:
         return f"{100 * (value / (reference or 1.0) - 1):+.{digits}f} %"
@@ -294,7 +294,11 @@ def statements(trainings: ExperimentResults) -> dict[str, str]:
         "int8_size": smaller("int8", "optimised"),
         "minutes": f"{remnet[0].seconds / 60:.1f} min of one CPU core; {len(remnet)} trained together, time divided by {len(remnet)}",
         "mlp_size": f"{mlp[0].bytes['int8'] / remnet[0].bytes['int8']:.1f} times",
-        **({"shorter": change(float(np.mean(short)), int8)} if short else {}),
+        **(
+            {"shorter": change(float(np.mean([model.errors["int8"].all.mae for model in short])), int8)}
+            if short
+            else {}
+        ),
         **(
             {"rate": f"{test.falls_from:.1g} to {test.falls_to:.1g}"}
             if (test := trainings.range_test)
