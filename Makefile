@@ -53,7 +53,7 @@ PAPER_QUICK = --windows 157,16 --seeds 1 --epochs 5 --trials 2
 PAPER = build/paper/$(if $(DATA),$(shell echo '$(DATA)' | tr '/ ' '__'),simulated)$(if $(QUICK),-quick)
 PAPER_DATA = $(or $(DATA),build/paper/deepuwb.mcap)
 
-paper: setup-training  ## the paper's experiment, the firmware's cost and their report: 50 minutes (QUICK=1: 5; DATA=deepuwb.pkl)
+paper: setup-training  ## the paper's experiment, the firmware's cost and their report: 50 minutes (QUICK=1: 4; DATA=deepuwb.pkl)
 	@test -z '$(DATA)' || test -e '$(DATA)' || { echo "DATA=$(DATA) does not exist" >&2; exit 1; }
 	@mkdir -p $(PAPER); test -e '$(PAPER_DATA)' || $(VENV)/bin/python -m benchmarks paper simulate -o $(PAPER_DATA)
 	@$(VENV)/bin/python -m benchmarks firmware $(if $(QUICK),--inputs 200 --no-portable) --json $(PAPER)/firmware.json

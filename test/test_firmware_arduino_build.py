@@ -94,6 +94,8 @@ def test_library_properties_follow_the_rules_of_the_library_manager():
     assert "arduino" not in (fields["author"] + fields["maintainer"]).lower()
     assert not fields["paragraph"].startswith(fields["sentence"])
     assert all((SOURCES / header).is_file() for header in fields["includes"].split(","))
+    licences = [folder / "LICENSE" for folder in (firmware_folder(), firmware_folder().parent)]
+    assert licences[0].read_bytes() == licences[1].read_bytes()
     # The sketches include only headers of the library, of the core and of the exported model.
     assert "depends" not in fields or fields["depends"]
 

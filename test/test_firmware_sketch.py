@@ -187,11 +187,15 @@ def test_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_mode
         export_bundle(load_bundle(default_model_path()), tmp_path)
     files = (str(STUB / "radio_main.cpp"), *library_objects(), *model_objects(), "-lm", "-lpthread")
     program = compile_sketch("UwbRanger", tmp_path, "gnu++17", *files)
-    command = [program, f"{tmp_path}/session", host, "0.2", "0.3", "0.5"]
+    command = [program, f"{tmp_path}/session", host, "0.2", "10.2", "10.5"]
     done = subprocess.run(command, capture_output=True, timeout=240, check=False)
 
     assert done.returncode == 0
     sessions = [received_messages(path.read_bytes()) for path in sorted(tmp_path.glob("session*"))]
+    assert len(sessions) == (2 if host == "closed" else 1)
+    status = of_type(BoardStatus, sessions[-1])[-1]
+    assert status.measurements > 300, "it ranges on while the host does not read"
+    assert (status.measurements_lost > 0) is (host != "reads")
     hello = sessions[0][0]
     assert isinstance(hello, Hello)
     assert (hello.window == 157) is with_model

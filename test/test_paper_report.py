@@ -101,6 +101,7 @@ TRIALS = [
         ("random", 3, 0.09, False),
         ("random", 4, 0.095, False),
         ("grid", 2, 0.08, True),
+        ("grid", 2, 0.08, True),
     )
 ]
 
@@ -204,6 +205,7 @@ def test_every_part_of_the_paper_is_on_the_page(full):
     # Raw errors, and the change by REMNet, next to the paper's.
     assert "0.1242, 0.1642 0.2000, 0.1000" in text
     assert "-68.8 %" in text
+    assert "1.0 times" in text
     assert "0.0001 to 0.001: the loss falls" in text
 
 
@@ -231,6 +233,7 @@ def test_search_shows_the_front_and_the_choice_of_the_paper_by_operations(full):
     (table,) = (table for table in full.tables if table.id == "search")
     rows = [(row[0].text, row[1].value, row[-1].value) for row in table.rows]
     assert rows == [("grid, front", 2, 0.08), ("paper's choice", 3, 0.09)]
+    assert table.note.startswith("3 networks")
 
 
 def test_published_numbers_are_in_their_own_columns(full):

@@ -87,7 +87,8 @@ static inline size_t read_host(uint8_t *bytes, size_t limit) {
  * Serial.availableForWrite() is always 0 in this core, and Serial.write() waits without limit for a host that has the
  * port open and does not read: the watchdog would fire. send_nb() accepts a packet if the previous one was read, and
  * returns at once in any case. After a packet that was not read, the next calls do not wait until the host reads again.
- * When the host closes the port the core discards the packet in transfer: the frame starts again. */
+ * When the host closes the port the core discards the packet in transfer: the frame starts again. Nothing shows that the
+ * host has closed and opened it between two calls: then it gets the rest of a frame, which its decoder rejects. */
 static inline void send_to_host(uwb_queue *queue, uint32_t limit_us) {
     static bool host_reads;
     if (!host_connected()) {

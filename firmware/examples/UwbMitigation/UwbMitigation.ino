@@ -1,7 +1,8 @@
-/* Arduino Nano 33 BLE Sense between an EVB1000 and the host: corrects ranges, or passes them on.
+/* Arduino Nano 33 BLE Sense between a radio and the host: corrects ranges, or passes them on.
  *
  * Serial (USB)  the host, wire protocol of docs/reference/protocol.md
- * Pin RX        the EVB1000, 921600 baud: frames RANGE_CIR of the same protocol (docs/guides/boards.md)
+ * Pin RX        a radio with your own firmware, 921600 baud: frames RANGE_CIR of the same protocol (docs/guides/boards.md).
+ *               No factory firmware sends them, that of an EVB1000 neither.
  *
  * Green LED: the host has the port open. Orange LED: blinks with the measurements. A correction takes a few
  * milliseconds; meanwhile DMA and an interrupt receive. uwb_model.h is the shipped model; another one:
