@@ -23,7 +23,7 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(REPOSITORY / "test"))
+sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "test")]
 
 from browser import Browser, chromium  # noqa: E402
 
