@@ -16,6 +16,7 @@ from pathlib import Path
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
@@ -28,6 +29,13 @@ from rclpy.qos import QoSProfile
 from uwb_mitigation_msgs.msg import RangeCir
 
 TIMEOUT_S, RESPONSE_TIMEOUT_S = 240.0, 20.0
+STATE_AFTER = {
+    Transition.TRANSITION_CONFIGURE: "inactive",
+    Transition.TRANSITION_ACTIVATE: "active",
+    Transition.TRANSITION_DEACTIVATE: "inactive",
+    Transition.TRANSITION_CLEANUP: "unconfigured",
+    Transition.TRANSITION_UNCONFIGURED_SHUTDOWN: "finalized",
+}
 
 PAUSED = ("paused:=true", "start_delay:=0.0", "longest_wait:=3600.0")
 """Parameters of a driver that waits for a subscriber and for `Ros.play`."""
@@ -164,8 +172,8 @@ class Ros:
 
         def is_answered() -> bool:
             nonlocal sent
-            # The middleware drops a response while it does not know the client yet; transitions cannot be repeated.
-            if kind is not ChangeState and time.monotonic() > sent + RESPONSE_TIMEOUT_S:
+            # The middleware drops a response while it does not know the client yet.
+            if time.monotonic() > sent + RESPONSE_TIMEOUT_S:
                 futures.append(client.call_async(request))
                 sent = time.monotonic()
             return any(future.done() for future in futures)
@@ -178,9 +186,23 @@ class Ros:
         return self.call(GetState, f"/{node}/get_state", GetState.Request()).current_state.label
 
     def change_state(self, node: str, transition: int) -> bool:
+        """Send a transition once; if its response is dropped (see `call`), the state of the node shows its success."""
         request = ChangeState.Request()
         request.transition.id = transition
-        return self.call(ChangeState, f"/{node}/change_state", request).success
+        client = self.node.create_client(ChangeState, f"/{node}/change_state")
+        self.spin_until(client.service_is_ready)
+        future, checked = client.call_async(request), time.monotonic()
+
+        def is_answered() -> bool:
+            nonlocal checked
+            if not future.done() and time.monotonic() > checked + RESPONSE_TIMEOUT_S:
+                checked = time.monotonic()
+                return self.state_of(node) == STATE_AFTER[transition]
+            return future.done()
+
+        self.spin_until(is_answered)
+        self.node.destroy_client(client)
+        return future.result().success if future.done() else True
 
     def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
         """Set a parameter by its service."""
