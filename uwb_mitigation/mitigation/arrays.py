@@ -71,13 +71,13 @@ def columns_of_arrays(
     _check_units(columns["range_m"], index, samples.shape[1])
     encoding = Encoding.COMPLEX_INT16 if np.iscomplexobj(samples) else Encoding.MAGNITUDE
     for start in range(0, max(len(samples), 1), _ROWS):
-        part = slice(start, start + _ROWS)
-        int16, scale = _as_int16(samples[part])
+        rows = slice(start, start + _ROWS)
+        int16, scale = _as_int16(samples[rows])
         yield RangeColumns(
             encoding=encoding,
             samples=int16,
             scale=scale,
-            **{name: values[part] for name, values in columns.items()},
+            **{name: values[rows] for name, values in columns.items()},
             **constants,
         )
 

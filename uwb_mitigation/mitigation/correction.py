@@ -151,9 +151,9 @@ class Corrector:
             # All rows are replaced.
             result = pass_through(self.bundle, ranges, offset_m.copy(), np.zeros(len(ranges), np.uint8))
             for kind, rows in kinds.items():
-                part = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
+                of_kind = self._correct_kind(kind, ranges.take(rows), offset_m[rows])
                 for name in _COLUMNS:
-                    getattr(result, name)[rows] = getattr(part, name)
+                    getattr(result, name)[rows] = getattr(of_kind, name)
         return result
 
     def _correct_kind(

@@ -59,12 +59,12 @@ def find_early_paths(
     components = np.abs(np.array([cirs[i, starts[i] : starts[i] + size] for i in indices])).view(np.uint16)
     strongest = np.maximum.reduceat(components, (0, width * NOISE_TAPS), axis=1).tolist()
     # The power of a tap is at most `width` times the square of its larger component.
-    found = [
+    candidates = [
         index
         for index, (noise, search) in zip(indices, strongest, strict=True)
         if width * search * search > MIN_NOISE_RATIO * noise * noise
     ]
-    for index in found:
+    for index in candidates:
         stop = starts[index] + width * (lead - WINDOW_LEAD + samples)
         power = np.square(cirs[index, starts[index] : stop], dtype=np.int64)
         error_m = _error_m(power[0::2] + power[1::2] if width == 2 else power, first_paths[index])
@@ -76,8 +76,8 @@ def find_early_paths(
 def early_path_error_m(ranges: RangeColumns, rows: NDArray[np.intp], samples: int) -> NDArray[np.float32]:
     """Return the errors of `find_early_paths` as an array, m, float32 (len(rows),); NaN without an early path."""
     errors = np.full(len(rows), np.nan, np.float32)
-    found = find_early_paths(ranges, rows, samples)
-    errors[list(found)] = list(found.values())
+    early = find_early_paths(ranges, rows, samples)
+    errors[list(early)] = list(early.values())
     return errors
 
 

@@ -90,17 +90,17 @@ def determination(
         distance_m = float(np.linalg.norm(offset - np.outer(along, symmetry.axis), axis=1).max())
         state: Ambiguity = ambiguity if ambiguity is Ambiguity.ARC else Ambiguity.CIRCLE
         where = "a line" if dims == 3 else "a vertical line"
-        others = f"the positions on {'an arc' if state is Ambiguity.ARC else 'a circle'} around it"
+        positions = f"the positions on {'an arc' if state is Ambiguity.ARC else 'a circle'} around it"
         remedies = _circle_remedies(anchors, dims)
     else:
         distance_m = float(np.abs(along).max())
         is_level = ambiguity is Ambiguity.HEIGHT
         state = ambiguity if is_level else Ambiguity.MIRROR
         where = "a plane" if dims == 3 else "a line in plan"
-        others = "a height above and one below it" if is_level else "positions on both sides of it"
+        positions = "a height above and one below it" if is_level else "positions on both sides of it"
         assert position is not None
         remedies = _mirror_remedies(anchors, position, symmetry, dims, area, sd_m, is_level=is_level)
-    reason = f"the anchors are within {distance_m:.2f} m of {where}, so that {others} explain ranges with errors of {sd_m:.2f} m"
+    reason = f"the anchors are within {distance_m:.2f} m of {where}, so that {positions} explain ranges with errors of {sd_m:.2f} m"
     if area is not None:
         reason += "; the area does not exclude them"
     return Determination(state.value, reason, ", or ".join(remedies))
@@ -194,13 +194,13 @@ def _mirror_remedies(
 
 
 def _circle_remedies(anchors: NDArray[np.float64], dims: int) -> list[str]:
-    others = "two more anchors, not in one plane with these"
+    anchors_off_line = "two more anchors, not in one plane with these"
     if dims == 2:
         return ["two more anchors, not on one line in plan with these"]
     if Symmetry.of(anchors, 2, RANGE_ERROR_M).is_rotation:
         # With a height, the circle stays.
-        return [others]
-    return ["the height of the tag and an area on one side of the line", others]
+        return [anchors_off_line]
+    return ["the height of the tag and an area on one side of the line", anchors_off_line]
 
 
 def _is_unique(anchors: NDArray[np.float64], position: NDArray[np.float64], dims: int, sd_m: float) -> bool:
@@ -210,8 +210,8 @@ def _is_unique(anchors: NDArray[np.float64], position: NDArray[np.float64], dims
         return False
     along = float((position - symmetry.center) @ symmetry.axis)
     place = position + math.copysign(max(_TAG_DISTANCE_M - abs(along), 0.0), along) * symmetry.axis
-    found = separation(anchors, place, symmetry.images(place), sd_m, _OFFSET_SD_M, dims)
-    return bool(found[0] >= EXCLUDED_SD)
+    separations = separation(anchors, place, symmetry.images(place), sd_m, _OFFSET_SD_M, dims)
+    return bool(separations[0] >= EXCLUDED_SD)
 
 
 def _heights(mirror: Symmetry, anchors: NDArray[np.float64], area: Area | None) -> tuple[float, float]:

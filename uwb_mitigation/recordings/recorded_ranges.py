@@ -132,16 +132,18 @@ class RangeTable:
         for tag in np.unique(
             np.concatenate([raw["tag"][raw_rows >= 0], corrected["tag"][corrected_rows >= 0]])
         ):
-            one = _ranges(raw, raw_rows, unknown_m2, tag, offset_ns)
+            raw_ranges = _ranges(raw, raw_rows, unknown_m2, tag, offset_ns)
             ranges = _ranges(corrected, corrected_rows, corrected["variance_m2"], tag, offset_ns)
             is_tag = (corrected["tag"] == tag) & (corrected_rows >= 0)
             if not np.isin(corrected["status"][is_tag], CORRECTED).any():
                 # As in `MultiTagEstimator`.
                 ranges = replace(ranges, variance_m2=np.full(len(ranges), np.nan))
-            if not len(ranges) or np.array_equal(ranges.range_m, one.range_m):
-                ranges = one
+            if not len(ranges) or np.array_equal(ranges.range_m, raw_ranges.range_m):
+                ranges = raw_ranges
             tags.append(
-                TagRecording(int(tag), one, ranges, ranges is not one, truths.get(int(tag), no_truth))
+                TagRecording(
+                    int(tag), raw_ranges, ranges, ranges is not raw_ranges, truths.get(int(tag), no_truth)
+                )
             )
         return RecordedRanges(tags, unknown, skipped)
 

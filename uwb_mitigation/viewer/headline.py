@@ -216,8 +216,8 @@ def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str] 
     """Return what the correction changes, as texts; None: unknown."""
     if not corrected_m + raw_m > 0.0:
         return None
-    share = 100.0 * (corrected_m / raw_m - 1.0)
-    text = "no change" if abs(share) < 0.5 else f"position error {share:+.0f} %"
+    change_percent = 100.0 * (corrected_m / raw_m - 1.0)
+    text = "no change" if abs(change_percent) < 0.5 else f"position error {change_percent:+.0f} %"
     return text, f"RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
 
 

@@ -45,18 +45,20 @@ class Texts:
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
         tag_id, timeline = self._state.tag_id, self._view.timeline
-        own = f"tag {'' if tag_id is None else format_id(tag_id)}"
-        remedies = [line.partition(separator)[2] for separator in (f"{own} determination: ", f"{own}: {UNKNOWN_POSITION} ")
+        tag = f"tag {'' if tag_id is None else format_id(tag_id)}"
+        remedies = [line.partition(separator)[2] for separator in (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
                     for line in notices if separator in line]  # fmt: skip
         of_tag = {pair[0]: means for pair, means in pairs.items() if pair[1] == tag_id}
-        found = verdict(scene, tag_id, of_tag, {key: states[key] for key in of_tag}, next(iter(remedies), ""))
+        current = verdict(
+            scene, tag_id, of_tag, {key: states[key] for key in of_tag}, next(iter(remedies), "")
+        )
         if (
             self._player is not None
             and not (timeline and timeline.is_complete)
-            and found.state == UNDETERMINED
+            and current.state == UNDETERMINED
         ):
-            found = Verdict(WAITING, "the recording is being read")
-        shown = self._state.verdict.update(found, scene.clock())
+            current = Verdict(WAITING, "the recording is being read")
+        shown = self._state.verdict.update(current, scene.clock())
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
         self._state.set(
             verdict=[shown.state, shown.reason, shown.action, self._facts(scene, shown.accuracy)],
@@ -122,8 +124,8 @@ class Texts:
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
             corrected, count = self._counts(scene)
-            share = f"{100.0 * corrected / count:.0f} % of ranges" if corrected else "no range"
-            texts.append(f"{share} corrected")
+            corrected_text = f"{100.0 * corrected / count:.0f} % of ranges" if corrected else "no range"
+            texts.append(f"{corrected_text} corrected")
         texts += [
             f"correction: {card[1]}" for card in self._interval_cards if card[0].startswith("Correction")
         ]

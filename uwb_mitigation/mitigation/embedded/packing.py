@@ -207,15 +207,15 @@ def _channels(
     low, high = accumulator_range(weight, bias)
     constants = np.empty((3, len(bias)), np.int32)
     for channel, scale in enumerate(scales):
-        found = solve_requantisation(scale, int(low[channel]), int(high[channel]), int(bias[channel]))
-        if found is None:
+        constant = solve_requantisation(scale, int(low[channel]), int(high[channel]), int(bias[channel]))
+        if constant is None:
             raise ModelError(
                 f"channel {channel} has no exact integer requantisation (scale {scale!r}, "
                 f"accumulators {low[channel]} to {high[channel]})",
                 where=name,
                 valid=_REMEDY,
             )
-        constants[:, channel] = found.bias, found.multiplier, found.offset
+        constants[:, channel] = constant.bias, constant.multiplier, constant.offset
     return Channels(*constants)
 
 

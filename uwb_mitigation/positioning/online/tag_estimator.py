@@ -406,46 +406,46 @@ class TagEstimator:
             self._is_side_known = True
             return
         # The image, and the position half-way.
-        others = (symmetry.images(position) - position) * _HALF_WAY
-        places = position + others
+        images = (symmetry.images(position) - position) * _HALF_WAY
+        places = position + images
         separations = separation(anchors, position, places, sd_m, offset_sd_m, dims)
-        is_other = (separations < EXCLUDED_SD) & self._area_contains(places, covariance)
+        is_possible = (separations < EXCLUDED_SD) & self._area_contains(places, covariance)
         same_m = max(_SAME_M, EXCLUDED_SD * math.sqrt(max(covariance[0, 0], covariance[1, 1])))
-        if dims == 3 and abs(symmetry.axis[2]) > LEVEL and math.hypot(*others[0, :2]) < same_m:
-            self._is_side_known = not is_other[0]
-            others, weight = others[is_other], np.exp(-0.5 * separations[is_other] ** 2)
-            filter_.unseen += self.config.widens * (others.T @ others) / (len(others) + 1)
-            self._shift[:2] = (weight @ others)[:2] / (1.0 + weight.sum())
-            if len(others):
-                is_apart = is_other[0] and separations[0] < separations[1]
+        if dims == 3 and abs(symmetry.axis[2]) > LEVEL and math.hypot(*images[0, :2]) < same_m:
+            self._is_side_known = not is_possible[0]
+            images, weight = images[is_possible], np.exp(-0.5 * separations[is_possible] ** 2)
+            filter_.unseen += self.config.widens * (images.T @ images) / (len(images) + 1)
+            self._shift[:2] = (weight @ images)[:2] / (1.0 + weight.sum())
+            if len(images):
+                is_apart = is_possible[0] and separations[0] < separations[1]
                 self.ambiguity = Ambiguity.HEIGHT if is_apart else Ambiguity.WEAK
                 self._symmetry = symmetry
-        elif not is_other[0]:
+        elif not is_possible[0]:
             self._is_side_known = True
-        elif separations[0] < separations[1] and not self._knows_side(others[:1], covariance):
+        elif separations[0] < separations[1] and not self._knows_side(images[:1], covariance):
             # If the position half-way is better, all three are one solution with a large covariance.
             self.ambiguity, self._symmetry = Ambiguity.MIRROR, symmetry
 
     def _check_circle(self, filter_: RangeFilter, circle: Symmetry, covariance: NDArray[np.float64]) -> None:
         position = filter_.position
-        others = circle.images(position) - position
-        is_other = self._area_contains(position + others, np.eye(3) * (_SAME_M / EXCLUDED_SD) ** 2)
-        others = others[is_other]
-        if not len(others):
+        images = circle.images(position) - position
+        is_possible = self._area_contains(position + images, np.eye(3) * (_SAME_M / EXCLUDED_SD) ** 2)
+        images = images[is_possible]
+        if not len(images):
             self._is_side_known = True
-        elif not self._knows_side(others, covariance):
+        elif not self._knows_side(images, covariance):
             # From the position on, around the circle.
-            is_inside = np.append(True, is_other)
+            is_inside = np.append(True, is_possible)
             is_arc = np.count_nonzero(is_inside != np.roll(is_inside, 1)) == 2
-            spread = others.T @ others / (len(others) + 1)
+            spread = images.T @ images / (len(images) + 1)
             filter_.unseen += self.config.widens * spread
             is_short = np.trace(spread[:2, :2]) < _MAX_ARC_M**2
             self.ambiguity = Ambiguity.ARC if is_arc and is_short else Ambiguity.CIRCLE
 
-    def _knows_side(self, others: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
-        """Return whether the position was known before other ones at `others` (n, 3) relative to it appeared, and is far from them."""
-        squared = np.einsum("ni,ni->n", others, others)
-        variance = np.einsum("ni,ij,nj->n", others, covariance, others)
+    def _knows_side(self, images: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+        """Return whether the position was known before its `images` (n, 3) relative to it appeared, and is far from them."""
+        squared = np.einsum("ni,ni->n", images, images)
+        variance = np.einsum("ni,ij,nj->n", images, covariance, images)
         self._is_side_known &= bool((squared**2 > (2.0 * MIRROR_SD) ** 2 * variance).all())
         return self._is_side_known
 
@@ -579,8 +579,8 @@ class TagEstimator:
         self._hypotheses = plausible
         leader = plausible[0].filter
         self.undetermined = leader.horizontal_sd > _UNDETERMINED_M
-        others = [hypothesis.filter.position - leader.position for hypothesis in plausible[1:]]
-        if not self.undetermined and all(math.hypot(x, y) < _SAME_M for x, y, _ in others):
+        differences = [hypothesis.filter.position - leader.position for hypothesis in plausible[1:]]
+        if not self.undetermined and all(math.hypot(x, y) < _SAME_M for x, y, _ in differences):
             self._is_side_known = False
             self._check_ambiguity(leader)
             if not self.is_ambiguous:

@@ -76,8 +76,8 @@ class Ranging:
 
     def find(self, number: int) -> PeerSession | None:
         """Return the session with a handle, or with a number, which some boards put into notifications."""
-        found = [s for s in self.sessions if number in (s.handle, s.number)]
-        return min(found, key=lambda session: session.handle != number, default=None)
+        matching = [s for s in self.sessions if number in (s.handle, s.number)]
+        return min(matching, key=lambda session: session.handle != number, default=None)
 
     def follow(self, packet: Packet) -> None:
         """Note the state of a session in a notification."""
