@@ -102,6 +102,10 @@ def test_anchor_that_reads_long_degrades_the_position_by_its_name():
             lambda scene, clock: scene.add_pose("tag_7", Pose(4, 3, 0, sd_m=0.9)),
             ("degraded", "uncertain by 0.90 m"),
         ),
+        (
+            lambda scene, clock: scene.add_pose("tag_7", Pose(4, 3, 0)),
+            ("degraded", "its standard deviation is unknown"),
+        ),
     ],
 )
 def test_verdict_names_the_reason(change, expected: tuple[str, str]):

@@ -141,14 +141,14 @@ class TextBoards:
             self._terminals[number].unplug()
 
     def plug(self, number: int) -> None:
-        """Plug a board in; it starts anew."""
+        """Plug a board in; it starts again."""
         with self._lock:
             if self._udp is None and self._terminals[number].plug():
                 self._backlogs[number].clear()
                 self.reset(number)
 
     def reset(self, number: int) -> None:
-        """Let a board start anew while its port stays, as after a loss of its supply."""
+        """Let a board start again while its port stays, as after a loss of its supply."""
         with self._lock:
             self.shells[number] = PansShell()
 

@@ -80,6 +80,8 @@ def verdict(
         reason, _, action = (common or advice[worst]).partition(": ")
     elif anchors and received < MIN_ANCHORS:
         reason, action = f"{received} anchors received", "Drive closer to the anchors, or add some."
+    elif math.isnan(sd_m):
+        reason, action = "its standard deviation is unknown", "Publish poses with a covariance."
     elif sd_m > MAX_SD_M:
         reason, action = f"uncertain by {sd_m:.2f} m", "Add an anchor, or set height and area of the locator."
     return _verdict(DEGRADED if reason else GOOD, reason, action, accuracy)
