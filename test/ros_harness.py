@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
@@ -40,6 +41,11 @@ STATE_AFTER = {
 PAUSED = ("paused:=true", "start_delay:=0.0", "longest_wait:=3600.0")
 """Parameters of a driver that waits for a subscriber and for `Ros.play`."""
 
+EXPIRY = """<profiles xmlns="http://www.eprosima.com">
+<participant profile_name="fast_expiry" is_default_profile="true"><rtps><builtin><discovery_config>
+<leaseDuration><sec>{}</sec></leaseDuration><leaseAnnouncement><sec>0</sec><nanosec>500000000</nanosec></leaseAnnouncement>
+</discovery_config></builtin></rtps></participant></profiles>"""
+
 # For this process and its children; read when messages are imported and a context is created.
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_FIELDS": "1"}
 
@@ -47,6 +53,12 @@ os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_PYTHON_CHECK_F
 def diagnostic_values(status: DiagnosticStatus) -> dict[str, str]:
     """Return the values of a diagnostic status."""
     return {diagnostic_value.key: diagnostic_value.value for diagnostic_value in status.values}
+
+
+def set_expiry(monkeypatch: pytest.MonkeyPatch, folder: Path, seconds: int) -> None:
+    """Let nodes that are started later disappear for others so soon after they are killed, instead of after 20 s."""
+    (folder / "expiry.xml").write_text(EXPIRY.format(seconds))
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(folder / "expiry.xml"))
 
 
 class Process:

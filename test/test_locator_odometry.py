@@ -28,7 +28,7 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_harness import Ros, diagnostic_values
+from ros_harness import Ros, diagnostic_values, set_expiry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
@@ -49,6 +49,7 @@ UNKNOWN_YAW = math.pi**2 / 3.0
 """Variance of a uniform distribution over all yaws, rad^2."""
 
 LEVER = (0.3, 0.1, 0.2)
+RELIABLE = "qos_overrides.{}/odom.subscription.reliability:=reliable"
 CHUNK_S = 0.2
 
 
@@ -59,7 +60,8 @@ def stamp_ns(header: Header) -> int:
 class LiveRobot:
     """Publishes ranges and odometry of a robot in chunks, and waits until the locator has processed each.
 
-    The odometry is a chunk ahead, because messages of two topics arrive in any order.
+    The odometry is a chunk ahead, because messages of two topics arrive in any order, and the locator's subscription is
+    `RELIABLE`, because best-effort messages can be lost under load.
     """
 
     def __init__(
@@ -179,7 +181,14 @@ def anchors(tmp_path: Path) -> Path:
 def start(ros: Ros, anchors: Path, *parameters: str):
     height = f"height:={1.0 + LEVER[2]}"
     return ros.start(
-        "locator", f"anchors:={anchors}", "rate:=0.0", "level:=true", height, "odometry:=/odom", *parameters
+        "locator",
+        f"anchors:={anchors}",
+        "rate:=0.0",
+        "level:=true",
+        height,
+        "odometry:=/odom",
+        RELIABLE.format(""),
+        *parameters,
     )
 
 
@@ -283,6 +292,7 @@ def test_namespace_contains_the_topics_and_transforms_of_a_robot(ros: Ros, ancho
     )
     static.publish(TFMessage(transforms=[antenna]))
     parameters = (f"anchors:={anchors}", "level:=true", f"height:={1.0 + LEVER[2]}", "odometry:=odom")
+    parameters += (RELIABLE.format("/robot1"),)
     locator = ros.start(
         "locator", *parameters, "rate:=0.0", "publish_tf:=true", arguments=("-r", "__ns:=/robot1")
     )
@@ -353,6 +363,7 @@ def test_respawned_locator_continues_with_transform_and_heading(
     ros: Ros, anchors: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path))
+    set_expiry(monkeypatch, tmp_path, 5)
     parameters = ("lever_arm:=0.3,0.1,0.2", "publish_tf:=true", "use_sim_time:=true")
     locator = start(ros, anchors, *parameters)
     locator.wait_for_output("locating")
@@ -366,7 +377,7 @@ def test_respawned_locator_continues_with_transform_and_heading(
     saved = json.loads((tmp_path / "locator.state").read_text())
     assert (saved["format"], saved["state"]["tag"]) == (1, 7)
     # Messages may still be in transit when the state is written.
-    ros.spin_for(0.5)
+    ros.spin_until(lambda: ros.node.count_subscribers("/odom") == 0)
     latest = [message.transforms[0].transform for message in live.transforms[-20:]]
     live.transforms.clear()
     start(ros, anchors, *parameters)
@@ -377,6 +388,8 @@ def test_respawned_locator_continues_with_transform_and_heading(
     assert before in latest
     live.poses.clear()
     live.wait()
+    # Its answer shows that it also knows the publishers, which were announced before.
+    assert ros.state_of("locator") == "active"
     live.skip(18.6)
     live.send_odometry(18.4, 18.8)
     # Ranges are a topic of their own, and are also received before.

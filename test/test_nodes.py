@@ -21,7 +21,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
-from ros_harness import PAUSED, Process, Ros
+from ros_harness import PAUSED, Process, Ros, set_expiry
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -172,12 +172,6 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         assert math.isinf(answer.variance) == math.isnan(message.range)
 
 
-FAST_EXPIRY = """<profiles xmlns="http://www.eprosima.com">
-<participant profile_name="fast_expiry" is_default_profile="true"><rtps><builtin><discovery_config>
-<leaseDuration><sec>2</sec></leaseDuration><leaseAnnouncement><sec>0</sec><nanosec>500000000</nanosec></leaseAnnouncement>
-</discovery_config></builtin></rtps></participant></profiles>"""
-"""Settings of Fast DDS: a killed node disappears after 2 s instead of 20 s."""
-
 FAST_MITIGATOR = """
 from uwb_mitigation.nodes.support import lifecycle, spinning
 lifecycle.DUPLICATE_NAME_DELAY_S /= 5
@@ -188,8 +182,7 @@ spinning.run_node("mitigator")
 def test_duplicate_node_names_are_reported_except_for_a_killed_node(
     ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    (tmp_path / "expiry.xml").write_text(FAST_EXPIRY)
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(tmp_path / "expiry.xml"))
+    set_expiry(monkeypatch, tmp_path, 2)
 
     def start() -> Process:
         return ros.run([sys.executable, "-c", FAST_MITIGATOR])
