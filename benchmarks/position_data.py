@@ -333,21 +333,22 @@ def measured_heights(truth: TruePath, seed: int) -> Heights:
 def load_tutorial(set_name: str, name: str) -> Run:
     """Return the drive of the tutorial, whose radios have a documented offset."""
     source = SimulatedSource.with_anchors(4, seed=1, count=3000)
-    return replace(_simulated(set_name, name, source), offsets=Offsets(TUTORIAL_OFFSET_M))
+    return replace(simulated_run(set_name, name, source), offsets=Offsets(TUTORIAL_OFFSET_M))
 
 
 def load_flat(set_name: str, name: str, anchors: int, drive: int) -> Run:
     """Return a drive through the flat of the simulator."""
     source = SimulatedSource.with_anchors(anchors, seed=1 + drive, count=3000, rate_hz=40.0)
-    return _simulated(set_name, name, source)
+    return simulated_run(set_name, name, source)
 
 
 def load_site(set_name: str, name: str, seed: int, drive: int) -> Run:
     """Return a drive at a random site with 4 to 8 anchors, whose radios have offsets."""
-    return _simulated(set_name, name, Drive(seed, drive, 4 + seed % 5, 120.0))
+    return simulated_run(set_name, name, Drive(seed, drive, 4 + seed % 5, 120.0))
 
 
-def _simulated(set_name: str, name: str, source: SimulatedSource | Drive) -> Run:
+def simulated_run(set_name: str, name: str, source: SimulatedSource | Drive) -> Run:
+    """Return a simulated drive."""
     records, anchors = list(source), source.anchors
     stamps = np.array([record.measurement.stamp_ns for record in records], np.int64)
     rows = np.array([anchors.index[record.measurement.anchor_id] for record in records], np.intp)

@@ -17,7 +17,17 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
 from uwb_mitigation.simulation.odometry import SimulatedMotion
-from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point
+from uwb_mitigation.simulation.scene import (
+    ANCHORS,
+    BRICK,
+    CONCRETE,
+    FLAT,
+    MORE_ANCHORS,
+    PLASTERBOARD,
+    ROUTE,
+    Building,
+    Point,
+)
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import Record
@@ -43,6 +53,14 @@ UNSEEN = 7_000_000
 """Added to the seed of a building: the seeds of the universal model begin at 0 and at 1 000 003."""
 
 RATE_HZ = 40.0
+
+FLATS = {"open": replace(FLAT, walls=(), screens=())} | {
+    material.name: replace(
+        FLAT, walls=tuple(replace(wall, material=material, thickness_m=thickness_m) for wall in FLAT.walls)
+    )
+    for material, thickness_m in ((PLASTERBOARD, 0.025), (BRICK, 0.12), (CONCRETE, 0.20))
+}
+"""The flat of the simulator with inner walls of one material, and without walls and obstacles."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,16 +180,18 @@ class Drive:
     """A drive at a simulated site; a `Source` whose pairs have offsets.
 
     Args:
-        flat: use the flat of the simulator instead of a random building.
+        flat: the flat of the simulator, also with other walls, instead of a random building.
     """
 
     simulated = True
 
-    def __init__(self, seed: int, drive: int, anchors: int, seconds: float, flat: bool = False) -> None:
+    def __init__(
+        self, seed: int, drive: int, anchors: int, seconds: float, flat: Building | None = None
+    ) -> None:
         rng = np.random.default_rng(UNSEEN + seed)
         self.offset_m = 0.2 + rng.normal(0.0, 0.12, anchors)
-        if flat:
-            plan, places = FLAT, (ANCHORS + MORE_ANCHORS)[:anchors]
+        if flat is not None:
+            plan, places = flat, (ANCHORS + MORE_ANCHORS)[:anchors]
             route = ROUTE[drive * 5 :] + ROUTE[: drive * 5]
         else:
             site = draw_site(anchors, rng)

@@ -1,7 +1,7 @@
 """Make the pictures of the README and of the documentation. Both use simulated ranges.
 
-`raw_and_corrected.png` is a map of a simulated drive: positions by least squares on raw ranges, by the locator on raw
-ranges, and by the locator on corrected ranges. `viewer.png` and `viewer_narrow.png` are screenshots in Chromium.
+`raw_and_corrected.png` contains maps of two simulated drives with calibrated offsets: positions by least squares on raw ranges,
+by the locator on raw ranges, and by the locator on corrected ranges. `viewer.png` and `viewer_narrow.png` are screenshots in Chromium.
 
     python docs/pictures.py [map]
 """
@@ -9,7 +9,6 @@ ranges, and by the locator on corrected ranges. `viewer.png` and `viewer_narrow.
 from __future__ import annotations
 
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -28,13 +27,16 @@ sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "test")]
 from browser import Browser, chromium  # noqa: E402
 
 from benchmarks.equipment import processes  # noqa: E402
-from uwb_mitigation.positioning.geometry import Height  # noqa: E402
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig  # noqa: E402
-from uwb_mitigation.positioning.recorded_tracks import track_tag  # noqa: E402
-from uwb_mitigation.recordings.recorded_ranges import read_ranges  # noqa: E402
-from uwb_mitigation.simulation.scene import FLAT  # noqa: E402
+from benchmarks.position_data import simulated_run  # noqa: E402
+from benchmarks.positions import WARM_UP_S, locate  # noqa: E402
+from benchmarks.sites import FLATS, Drive  # noqa: E402
+from uwb_mitigation.positioning.online.initialization import snapshot  # noqa: E402
+from uwb_mitigation.positioning.track_errors import track_errors  # noqa: E402
 from uwb_mitigation.simulation.simulated import SimulatedSource  # noqa: E402
-from uwb_mitigation.types.anchors import dump_anchors, load_anchors  # noqa: E402
+from uwb_mitigation.types.anchors import dump_anchors  # noqa: E402
+from uwb_mitigation.types.offsets import Offsets  # noqa: E402
+from uwb_mitigation.types.stamps import NS_PER_S  # noqa: E402
+from uwb_mitigation.types.tracks import Track  # noqa: E402
 from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, VERMILLION  # noqa: E402
 
 PICTURES = REPOSITORY / "docs" / "pictures"
@@ -46,9 +48,9 @@ FILLED_S = 7.0
 
 
 SHOWN_S = 60.0
-"""Duration of the drive that the map shows: one round through the flat."""
-SETTLED_S = 3.0
-"""Time of the first plotted position."""
+"""Duration of the drives that the maps show: one round through the flat."""
+SHOWN_SEED = 906
+SHOWN_BUILDINGS = {"brick": "Brick walls", "open": "Open space"}
 
 
 def reduce_colours(path: Path) -> None:
@@ -67,64 +69,44 @@ def save(browser: Browser, name: str) -> None:
 
 
 def plot_raw_and_corrected() -> None:
-    """Plot a map of a simulated drive, with the same filter on raw and on corrected ranges."""
-    command = [sys.executable, "-m", "uwb_mitigation.commands.cli"]
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        raw, corrected = folder / "drive.mcap", folder / "corrected.mcap"
-        simulate = ["data", "simulate", "--like", "drive", "--ranges", "1300", "-o", str(raw)]
-        subprocess.run([*command, *simulate], check=True)
-        subprocess.run([*command, "process", str(raw), "--offsets", "0.22", "-o", str(corrected)], check=True)
-        anchors = load_anchors(folder / "drive.anchors.yaml")
-        (recording,) = read_ranges(corrected, anchors).tags
-    config = EstimatorConfig(anchors, height=Height(0.0))
-    corrected_tracks = track_tag(recording, config)
-    raw_tracks = track_tag(replace(recording, ranges=recording.raw, corrected=False), config)
-    figure, axes = plt.subplots(figsize=(9.0, 6.2), dpi=90)
-    for wall in FLAT.walls:
-        (x0, y0), (x1, y1) = wall.start, wall.end
-        axes.add_patch(
-            Rectangle(
-                (x0 - wall.thickness_m / 2, y0 - wall.thickness_m / 2), x1 - x0 + wall.thickness_m, y1 - y0 + wall.thickness_m,
-                color=GREY, lw=0,
-            )
-        )  # fmt: skip
-    for screen in FLAT.screens:
-        axes.plot(*zip(screen.start, screen.end, strict=True), color=GREY, lw=3, ls=(0, (2, 1)))
-    axes.add_patch(Rectangle((0, 0), *FLAT.size, fill=False, color=GREY, lw=4))
-    truth, begin_ns = recording.truth, recording.truth.stamp_ns[0]
-    shown: list[tuple[Any, str, dict[str, Any]]] = [
-        (
-            raw_tracks.snapshot,
-            "raw ranges, least squares",
-            {"color": VERMILLION, "lw": 0, "marker": "+", "ms": 4},
-        ),
-        (raw_tracks.live, "raw ranges, locator", {"color": VERMILLION, "lw": 1.5}),
-        (corrected_tracks.live, "corrected ranges, locator", {"color": BLUE, "lw": 3.0}),
-        (truth, "true path", {"color": NIGHT, "lw": 1.5, "ls": "--"}),
-    ]
-    for track, label, style in shown:
-        time_s = (track.stamp_ns - begin_ns) / 1e9
-        part = (time_s > SETTLED_S) & (time_s < SHOWN_S)
-        position = track.position[part, :2]
-        if track is not truth:
-            true = np.stack(
-                [
-                    np.interp(time_s[part], (truth.stamp_ns - begin_ns) / 1e9, axis)
-                    for axis in truth.position.T[:2]
-                ],
-                axis=1,
-            )
-            rmse_m = np.sqrt(np.mean(np.sum((position - true) ** 2, axis=1)))
-            label += f"\nRMSE {rmse_m:.2f} m"
-        axes.plot(*position.T, label=label, **style)
-    axes.plot(*anchors.position[:, :2].T, "^", color=NIGHT, ms=12, label="anchor")
-    axes.plot([], [], color=GREY, lw=5, label="wall")
-    axes.plot([], [], color=GREY, lw=3, ls=(0, (2, 1)), label="metal cabinet")
-    axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(-1.2, 8.8), ylim=(-0.4, 8.0))
-    axes.set_title("Simulated drive through a flat with concrete walls")
-    axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    figure.tight_layout()
+    """Plot maps of simulated drives: where the correction matters, and where it does not."""
+    figure, panels = plt.subplots(1, 2, figsize=(9.0, 4.9), dpi=90, sharey=True)
+    for axes, (building, title) in zip(panels, SHOWN_BUILDINGS.items(), strict=True):
+        plan = FLATS[building]
+        for wall in plan.walls:
+            (x0, y0), (x1, y1) = wall.start, wall.end
+            size = x1 - x0 + wall.thickness_m, y1 - y0 + wall.thickness_m
+            corner = x0 - wall.thickness_m / 2, y0 - wall.thickness_m / 2
+            axes.add_patch(Rectangle(corner, *size, color=GREY, lw=0))
+        for screen in plan.screens:
+            axes.plot(*zip(screen.start, screen.end, strict=True), color=GREY, lw=3, ls=(0, (2, 1)))
+        axes.add_patch(Rectangle((0, 0), *plan.size, fill=False, color=GREY, lw=3))
+        drive = Drive(SHOWN_SEED, 0, 6, SHOWN_S, plan)
+        run = simulated_run(building, "", drive)
+        offsets = Offsets(anchors={anchor: float(m) for anchor, m in enumerate(drive.offset_m, 1)})
+        raw = replace(
+            run.ranges, range_m=np.maximum(run.ranges.range_m - drive.offset_m[run.ranges.anchor], 0.0)
+        )
+        shown: list[tuple[Track, str, dict[str, Any]]] = [
+            (snapshot(run.anchors, raw, run.height), "raw ranges, least squares", {"color": VERMILLION, "lw": 0, "marker": "+", "ms": 3}),
+            (locate(run, raw), "raw ranges, locator", {"color": VERMILLION, "lw": 1.2}),
+            (locate(run, run.corrected(offsets=offsets)), "corrected ranges, locator", {"color": BLUE, "lw": 2.2}),
+        ]  # fmt: skip
+        truth = run.truth.take(run.truth.stamp_ns >= run.truth.stamp_ns[0] + round(WARM_UP_S * NS_PER_S))
+        errors = []
+        for track, label, style in shown:
+            after = track.position[track.stamp_ns >= truth.stamp_ns[0], :2]
+            axes.plot(*after.T, label=label, **style)
+            errors.append(f"{track_errors(track, truth).rmse:.2f}")
+        axes.plot(*truth.position[:, :2].T, color=NIGHT, lw=1.2, ls="--", label="true path")
+        axes.plot(*run.anchors.position[:, :2].T, "^", color=NIGHT, ms=9, label="anchor")
+        axes.set(aspect="equal", xlabel="x, m", xlim=(-0.7, 8.3), ylim=(-0.5, 7.7))
+        axes.set_title(f"{title}\nRMSE {errors[0]} / {errors[1]} / {errors[2]} m", fontsize=11)
+    panels[0].set_ylabel("y, m")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), fontsize=9, loc="lower center", ncols=5, frameon=False
+    )
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
     path = PICTURES / "raw_and_corrected.png"
     figure.savefig(path)
     reduce_colours(path)
