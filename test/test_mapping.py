@@ -687,7 +687,7 @@ def test_single_impossible_values_are_dropped_and_counted(tmp_path: Path):
 
 
 def test_the_median_of_a_rule_is_that_of_all_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("uwb_mitigation.recordings.mapping.text_files.BLOCK_CHARS", 8)
+    monkeypatch.setattr("uwb_mitigation.recordings.text_blocks.BLOCK_CHARS", 8)
     write(tmp_path / "a.csv", "t,a,r,z\n0,1,2,5\n1,1,3,5\n")
     write(tmp_path / "b.csv", "t,a,r,z\n2,1,4,1\n3,1,5,1\n4,1,6,1.2\n5,1,7,0.9\n6,1,8,\n")
     source = read(PLAIN | {"drop": [{"column": "z", "from_median": 0.5}]}, tmp_path)
@@ -733,7 +733,7 @@ def test_a_truncated_compressed_file_gives_what_is_before_the_damage(
 ):
     import lzma
 
-    monkeypatch.setattr("uwb_mitigation.recordings.mapping.text_files.BLOCK_CHARS", 10_000)
+    monkeypatch.setattr("uwb_mitigation.recordings.text_blocks.BLOCK_CHARS", 10_000)
     rows = "t,a,r\n" + "".join(f"{n},1,{np.sin(n) + 3:.15f}\n" for n in range(20_000))
     data = lzma.compress(rows.encode())
     (tmp_path / "x.csv.xz").write_bytes(data[: len(data) - 1000])

@@ -292,7 +292,7 @@ def test_dry_run_shows_extent_outliers_names_and_missing_levels(tmp_path: Path):
 
 
 def test_chunks_without_rows_do_not_change_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("uwb_mitigation.recordings.mapping.text_files.BLOCK_CHARS", 8)
+    monkeypatch.setattr("uwb_mitigation.recordings.text_blocks.BLOCK_CHARS", 8)
     write(
         tmp_path / "x.csv",
         "t,a,r\n" + "".join(f"{n / 10},1,{-1 if n in (0, 1, 5) else n}\n" for n in range(8)),

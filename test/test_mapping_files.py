@@ -15,8 +15,8 @@ from command_line import run
 from test_mapping import PLAIN, ranges_of, read, with_fields, write
 
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
+from uwb_mitigation.recordings import text_blocks
 from uwb_mitigation.recordings.formats import open_mapped
-from uwb_mitigation.recordings.mapping import text_files
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import TableFormat
 from uwb_mitigation.recordings.mapping.messages import MessageRows
@@ -118,7 +118,7 @@ def test_large_ids_are_exact_in_a_column_with_missing_ids(tmp_path: Path):
 
 
 def test_decompression_bomb_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(text_files, "MIN_BOMB_CHARS", 1 << 22)
+    monkeypatch.setattr(text_blocks, "MIN_BOMB_CHARS", 1 << 22)
     with pytest.raises(RecordingError, match="expands to more than 500 times its size"):
         of(gzip.compress(b"t,a,r\n" + b"\n" * 20_000_000), tmp_path / "x.csv.gz")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
-import lzma
+import io
 import math
 import re
 from collections import Counter
@@ -22,7 +22,7 @@ import numpy as np
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.recordings.mapping.conversion import ColumnDict
-from uwb_mitigation.recordings.mapping.csv_tables import read_csv
+from uwb_mitigation.recordings.text_blocks import UpToDamage
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import (
     DEVICE_TICK_HZ,
@@ -149,8 +149,8 @@ class DecaRangingLog(Source):
 
     def start_ns(self) -> int:
         """Return the start time in the first line, ns since the epoch; 0 if it is missing or unreadable."""
-        with contextlib.suppress(OSError, EOFError, lzma.LZMAError), _open(self.path) as stream:
-            return _start_ns(stream.readline(4096))
+        with contextlib.suppress(OSError), UpToDamage(self.path) as stream:
+            return _start_ns(stream.read(4096))
         return 0
 
     def _after(self, text: bytes) -> str:
@@ -245,25 +245,20 @@ class DecaRangingLog(Source):
         return math.nan
 
 
-def _open(path: Path) -> lzma.LZMAFile:
-    return lzma.open(path) if path.suffix == ".xz" else path.open("rb")  # type: ignore[return-value]
-
-
 def _read(path: Path) -> tuple[bytes, str]:
     """Return the complete lines of a log, with line feeds only, and a description of the damage (empty: none)."""
     blocks: list[bytes] = []
-    fault = ""
     try:
-        with _open(path) as stream:
-            # Read small blocks, so that all data before a damage is kept.
-            while block := stream.read(1 << 13):
+        with io.BufferedReader(source := UpToDamage(path)) as stream:
+            while block := stream.read(1 << 16):
                 blocks.append(block)
-                if len(blocks) << 13 > MAX_BYTES:
+                if len(blocks) << 16 > MAX_BYTES:
                     raise RecordingError(f"more than {MAX_BYTES} bytes", where=str(path))
-    except (OSError, EOFError, lzma.LZMAError) as error:
-        if not blocks:
-            raise RecordingError(f"cannot be read: {error}", where=str(path)) from error
-        fault = str(error)
+    except OSError as error:
+        raise RecordingError(f"cannot be read: {error}", where=str(path)) from error
+    fault = str(source.damage or "")
+    if fault and not blocks:
+        raise RecordingError(f"cannot be read: {fault}", where=str(path))
     text = b"".join(blocks).replace(b"\r\n", b"\n")
     complete = text[: text.rfind(b"\n") + 1]
     return complete, fault or ("ends in the middle of a line" if len(complete) < len(text) else "")
@@ -365,6 +360,9 @@ def find_survey(folder: Path) -> Survey | None:
     folder = folder if (folder / "pairs.csv").is_file() else folder.parent
     if not (folder / "pairs.csv").is_file():
         return None
+
+    # It imports pandas, which logs without a survey do not need.
+    from uwb_mitigation.recordings.csv_tables import read_csv
 
     def table(name: str, *ids: str, axes: str = "", texts: tuple[str, ...] = ()) -> ColumnDict:
         columns = read_csv(folder / name, ids, dict.fromkeys(axes, (-1e6, 1e6)), texts)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.csv_tables import read_csv
+from uwb_mitigation.recordings.csv_tables import read_csv
 from uwb_mitigation.types.measurement import Record, Truth
 
 MAX_RANGE_M = 1e6

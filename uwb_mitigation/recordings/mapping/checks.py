@@ -6,18 +6,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError, format_id
-from uwb_mitigation.recordings.mapping.conversion import UNKNOWN_ID, UNKNOWN_STAMP, ColumnDict
+from uwb_mitigation.recordings.mapping.conversion import ColumnDict
 from uwb_mitigation.recordings.mapping.mapping import LENGTHS, TIME, FieldRule
 from uwb_mitigation.types.stamps import FIRST_DATE_NS, NS_PER_S
 
 MAX_PLAUSIBLE_M, MIN_PLAUSIBLE_M = 300.0, 0.03
 """A median range outside of these limits shows a wrong unit: UWB reaches 300 m."""
-
-MAX_POSSIBLE = 10_000.0
-"""Rows with a larger range (m), level (dBm) or first-path index are not used."""
 
 MAX_INTERVAL_S, MAX_RATE_HZ = 5.0, 1000.0
 """Plausible median interval between ranges, and plausible mean rate."""
@@ -40,7 +38,6 @@ MAX_NEGATIVE, MAX_RATIO = 0.25, 20.0
 MAX_INDEX = 1016
 _LARGE_M, _LARGE_ERROR_M = 100.0, 5.0
 _MAX_LISTED = 12
-_LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 _PLACES = ("row", "file", "cir")
 _NO_RANGE_M = (0.0, 32.767, 65.535, 327.67, 655.35)
 """Ranges that radios report without a measurement: zero, and the largest 16-bit numbers of mm and cm."""
@@ -59,15 +56,6 @@ def median(numbers: NDArray[np.float64]) -> float:
 # Rows that are dropped -------------------------------------------------------------------------------------------
 
 
-def unknown_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
-    """Return {reason: rows} without a range, stamp or id."""
-    return {
-        "range is not a number": ~np.isfinite(values["range"]),
-        "stamp is not a number": values["stamp"] == UNKNOWN_STAMP,
-        "tag or anchor is unknown": (values["tag"] == UNKNOWN_ID) | (values["anchor"] == UNKNOWN_ID),
-    }
-
-
 def no_measurements(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     """Return {reason: rows} with a number that means that there is no range."""
     rules = {}
@@ -82,18 +70,11 @@ def no_measurements(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     return rules
 
 
-def impossible_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
-    """Return {reason: rows} with a number above `MAX_POSSIBLE`."""
-    return {f"{name} is above {MAX_POSSIBLE:g}": np.abs(values[name]) > MAX_POSSIBLE for name in _LIMITED}
-
-
 def repeated_rows(values: ColumnDict) -> tuple[int, NDArray[np.bool_]]:
     """Return the number of ranges with the stamp of another range of the pair, and which of them are equal rows.
 
     Rows with a coarse clock may be equal: if some of the pair's ranges with the same stamp differ, none is returned.
     """
-    import pandas as pd
-
     keys = ["stamp", "tag", "anchor"]
     # Constant columns have no strides.
     names = [name for name, column in values.items() if column.strides != (0,) and name not in _PLACES]
@@ -153,8 +134,6 @@ def _boots(values: ColumnDict) -> NDArray[np.int64] | None:
 
     Rows that are sorted by pairs, and files of different pairs, have one clock.
     """
-    import pandas as pd
-
     stamps = values["stamp"]
     if len(stamps) == 0 or stamps.max() >= FIRST_DATE_NS:
         return None
@@ -209,8 +188,6 @@ def _unit_of_time(interval_s: float, rule: FieldRule) -> str:
 
 def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> None:
     """Raise RecordingError for wrong units of lengths or of the first-path index, or for differences of ranges."""
-    import pandas as pd
-
     ranges, true = np.abs(values["range"]), values["true range"]
     negative = float((values["range"] < 0).mean())
     if len(ranges) >= 20 and negative > MAX_NEGATIVE:
@@ -312,8 +289,6 @@ def _listed(texts: list[str]) -> str:
 
 def value_warnings(values: ColumnDict, *, errors_measured: bool) -> Iterator[str]:
     """Yield warnings of implausible values; `errors_measured`: the recording has errors, but no true ranges."""
-    import pandas as pd
-
     ranges, errors = values["range"], values["range"] - values["true range"]
     errors = errors[np.isfinite(errors)]
     for name, numbers, limit in (("ranges", ranges, _LARGE_M), ("errors", np.abs(errors), _LARGE_ERROR_M)):

@@ -6,6 +6,7 @@ import tempfile
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
@@ -87,8 +88,6 @@ def join_by_time(ranges: ColumnDict, rows: NDArray[Any], cirs: ColumnDict, join:
     Returns:
         A sentence for the user, and whether it is a warning.
     """
-    import pandas as pd
-
     keys = ("stamp", "tag", "anchor")
     targets = pd.DataFrame({name: ranges[name][rows] for name in keys} | {"target": rows})
     sources = pd.DataFrame({name: cirs[name] for name in (*keys, "cir", "first_path_index")})

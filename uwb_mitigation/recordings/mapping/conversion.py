@@ -6,7 +6,7 @@ import contextlib
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -43,6 +43,11 @@ NO_CIR = Cir(np.zeros(0, np.int16))
 _TIME_OF_DAY = r"\d{1,2}:\d\d:\d\d(\.\d+)?"
 _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
 """Constant A of the DW1000's levels by PRF in MHz (user manual, section 4.7)."""
+
+MAX_POSSIBLE = 10_000.0
+"""Rows with a larger range (m), level (dBm) or first-path index are not used."""
+
+_LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 
 ColumnDict = dict[str, NDArray[Any]]
 """{name: array (n,)} in SI units. `stamp`: ns, int64; `tag`, `anchor`: uint64; `label`, `configuration`: texts; others, such
@@ -162,11 +167,18 @@ def _read_texts(value: FieldRule | None, chunk: Chunk, name: str) -> NDArray[Any
     """Return a value as texts (n,), after `pattern` and `values`; empty: unknown."""
     if value is None or (raw := _raw(value, chunk)) is None:
         return np.broadcast_to(np.array([""], object), chunk.count)
-    texts: dict[Any, str] = {}
+    return _map_distinct(raw, chunk, lambda cell, where: _text(value, cell, name, where), object)
+
+
+def _map_distinct(
+    raw: NDArray[Any], chunk: Chunk, read: Callable[[Any, str], Any], kind: type
+) -> NDArray[Any]:
+    """Apply a function to each distinct value of a column and its first location."""
+    results: dict[Any, Any] = {}
     for row, cell in enumerate(cells := raw.tolist()):
-        if cell not in texts:
-            texts[cell] = _text(value, cell, name, chunk.where(row))
-    return np.array([texts[cell] for cell in cells], object)
+        if cell not in results:
+            results[cell] = read(cell, chunk.where(row))
+    return np.array([results[cell] for cell in cells], kind)
 
 
 def _cell_text(cell: Any) -> str:
@@ -310,28 +322,23 @@ def _read_ids(value: FieldRule, chunk: Chunk, name: str, names: dict[str, int]) 
     raw = _raw(value, chunk)
     if raw is None:
         raise RecordingError(f"no column {value.source} for the {name}", where=str(chunk.path))
-    if raw.dtype.kind in "iu" and value.is_plain_id and (len(raw) == 0 or raw.min() >= 0):
+    is_converted = value.is_text or value.hex or value.names or value.offset or value.scale != 1
+    if raw.dtype.kind in "iu" and not is_converted and raw.min(initial=0) >= 0:
         return np.asarray(raw, np.uint64)
-    numbers: dict[Any, int] = {}
-    for row, item in enumerate(items := raw.tolist()):
-        if item in numbers:
-            continue
-        text = _text(value, item, name, chunk.where(row))
+
+    def read(item: Any, where: str) -> int:
+        text = _text(value, item, name, where)
         if text.lower() in _MISSING:
-            numbers[item] = UNKNOWN_ID
-            continue
-        try:
-            # A float64 merges larger ids.
-            if isinstance(item, float) and abs(item) >= 2**53:
-                raise ValueError(item)
+            return UNKNOWN_ID
+        with contextlib.suppress(ValueError):
             number = names.setdefault(text, len(names) + 1) if value.names else _id(text, value.hex)
-            numbers[item] = round(number * value.scale if value.scale != 1 else number) + round(value.offset)
-            if not 0 <= numbers[item] < UNKNOWN_ID:
-                raise ValueError(text)
-        except ValueError as error:
-            what, where = f"{name} = {item!r:.40} is not an id", chunk.where(row)
-            raise RecordingError(what, where=where, valid=_VALID_IDS) from error
-    return np.array([numbers[item] for item in items], np.uint64)
+            number = round(number * value.scale if value.scale != 1 else number) + round(value.offset)
+            # A float64 merges larger ids.
+            if 0 <= number < (2**53 if isinstance(item, float) else UNKNOWN_ID):
+                return number
+        raise RecordingError(f"{name} = {item!r:.40} is not an id", where=where, valid=_VALID_IDS)
+
+    return _map_distinct(raw, chunk, read, np.uint64)
 
 
 def _id(text: str, is_hex: bool) -> int:
@@ -392,10 +399,24 @@ def filter_rows(
             bad |= np.array([re.search(rule.matches, cell) is not None for cell in cells], bool)
         if rule.below is not None or rule.above is not None:
             numbers = _floats(raw, chunk, rule.column, rule.column)
-            below, above = (math.nan if limit is None else limit for limit in (rule.below, rule.above))
-            bad |= (numbers < below) | (numbers > above)
+            bad |= numbers < (-math.inf if rule.below is None else rule.below)
+            bad |= numbers > (math.inf if rule.above is None else rule.above)
         mask &= ~count_bad(bad & mask, dropped, f"{prefix}{rule}")
     return mask
+
+
+def unknown_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+    """Return {reason: rows} without a range, stamp or id."""
+    return {
+        "range is not a number": ~np.isfinite(values["range"]),
+        "stamp is not a number": values["stamp"] == UNKNOWN_STAMP,
+        "tag or anchor is unknown": (values["tag"] == UNKNOWN_ID) | (values["anchor"] == UNKNOWN_ID),
+    }
+
+
+def impossible_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+    """Return {reason: rows} with a number above `MAX_POSSIBLE`."""
+    return {f"{name} is above {MAX_POSSIBLE:g}": np.abs(values[name]) > MAX_POSSIBLE for name in _LIMITED}
 
 
 def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDArray[np.bool_]:

@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.recordings.mapping.checks import impossible_rows, unknown_rows
 from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
 from uwb_mitigation.recordings.mapping.conversion import (
     NO_CIR,
     Converter,
     count_bad,
     filter_rows,
+    impossible_rows,
     measurement,
     samples_of,
+    unknown_rows,
 )
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TOPIC, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError, format_id
@@ -78,7 +79,7 @@ class MappedRecording(Source):
         self._files = find_files(mapping, path)
         inline = mapping.cir if mapping.cir and not mapping.cir.files else None
         self.values = values = self._read(mapping, self._files, mapping.values, cir=inline)
-        self._drop(checks.unknown_rows(values))
+        self._drop(conversion.unknown_rows(values))
         del values
         stamp = mapping.fields.stamp or FieldRule(constant=0)
         if not stamp.rate_hz:
@@ -101,7 +102,7 @@ class MappedRecording(Source):
         self._add_truth(self._anchor_positions())
         truth = mapping.truth.ranges.range if mapping.truth.ranges else mapping.truth.range
         checks.check_units(self.values, self.name, mapping.fields.range.unit, truth.unit if truth else "")
-        self._drop(checks.impossible_rows(self.values))
+        self._drop(conversion.impossible_rows(self.values))
         self._warn()
         self.motion = self._read_motion()
         self._shift_stamps()
@@ -234,8 +235,6 @@ class MappedRecording(Source):
 
     def _separate_placements(self, rate_hz: float) -> None:
         """Put the ranges of each placement one after the other, with pauses between placements."""
-        import pandas as pd
-
         values = self.values
         names = ["tag", *_TAG] if np.isfinite(_stacked(values, _TAG)).all() else ["tag", "configuration"]
         groups = pd.DataFrame({name: values[name] for name in names}).groupby(names, sort=False).ngroup()
@@ -251,8 +250,6 @@ class MappedRecording(Source):
 
     def _anchor_positions(self) -> dict[int, NDArray[np.float64]]:
         """Return the positions from the ranges or from another file, and set `anchors`."""
-        import pandas as pd
-
         rows, sources, sd = self.values, self._mapping.anchors, 0.02
         for source in sources:
             sd = source.sd

@@ -12,7 +12,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, WrapValidator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    WrapValidator,
+    model_validator,
+)
 
 from uwb_mitigation.errors import ParameterError, did_you_mean
 from uwb_mitigation.files import read_bounded
@@ -72,11 +80,26 @@ def _texts(values: Any) -> Any:
     return {str(key): str(value) for key, value in values.items()} if isinstance(values, dict) else values
 
 
-def _compiled(text: str) -> re.Pattern[str]:
-    try:
-        return re.compile(text)
-    except re.error as error:
-        raise ValueError(f"not a regular expression: {text!r}: {error}") from error
+def _expression(groups: str = "") -> AfterValidator:
+    """Return a check of a regular expression; `groups`: attribute of the compiled expression that must not be empty."""
+
+    def check(text: str) -> str:
+        try:
+            compiled = re.compile(text)
+        except re.error as error:
+            raise ValueError(f"not a regular expression: {text!r}: {error}") from error
+        if text and groups and not getattr(compiled, groups):
+            raise ValueError(
+                f"{text!r} has no {'group (...)' if groups == 'groups' else 'named group (?P<name>...)'}"
+            )
+        return text
+
+    return AfterValidator(check)
+
+
+Expression = Annotated[str, _expression()]
+GroupExpression = Annotated[str, _expression("groups")]
+NamedExpression = Annotated[str, _expression("groupindex")]
 
 
 class FieldRule(_Strict):
@@ -102,10 +125,10 @@ class FieldRule(_Strict):
     column: str = ""
     constant: float | int | str | None = None
     sum: dict[str, float] = {}
-    file_name: str = ""
-    topic_name: str = ""
+    file_name: GroupExpression = ""
+    topic_name: GroupExpression = ""
     rate_hz: float = Field(default=0.0, ge=0.0)
-    pattern: str = ""
+    pattern: GroupExpression = ""
     values: Annotated[dict[str, str], BeforeValidator(_texts)] = {}
     hex: bool = False
     names: bool = False
@@ -120,9 +143,6 @@ class FieldRule(_Strict):
         sources = (self.column, self.sum, self.file_name, self.topic_name, self.rate_hz)
         if sum(map(bool, sources)) + (self.constant is not None) != 1:
             raise ValueError("give one of column, constant, sum, file_name, topic_name, rate_hz")
-        for text in filter(None, (self.pattern, self.file_name, self.topic_name)):
-            if not _compiled(text).groups:
-                raise ValueError(f"the pattern {text!r} has no group (...)")
         if (self.unit == "iso8601" or "%" in self.unit) and self.scale != 1:
             raise ValueError("a date has no scale")
         return self
@@ -136,11 +156,6 @@ class FieldRule(_Strict):
     def is_text(self) -> bool:
         """Return whether the value is a part of a text, or replaced."""
         return bool(self.pattern or self.values or self.file_name or self.topic_name)
-
-    @property
-    def is_plain_id(self) -> bool:
-        """Return whether integers are ids without a conversion."""
-        return not (self.is_text or self.hex or self.names or self.offset) and self.scale == 1
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -182,7 +197,7 @@ class RowFilter(_Strict):
     column: str
     equals: list[str | float] | str | float | None = None
     differs: list[str | float] | str | float | None = None
-    matches: str | None = None
+    matches: Expression | None = None
     below: float | None = None
     above: float | None = None
     from_median: float | None = None
@@ -191,7 +206,6 @@ class RowFilter(_Strict):
     def _check(self) -> RowFilter:
         if not self.model_fields_set - {"column"}:
             raise ValueError("a rule needs equals, differs, matches, below, above or from_median")
-        _compiled(self.matches or "")
         return self
 
     def __str__(self) -> str:
@@ -230,31 +244,27 @@ class TableFormat(_Strict):
     columns: Annotated[list[str], BeforeValidator(_expanded)] = []
     skip: int = Field(default=0, ge=0)
     comment: str = Field(default="", max_length=1)
-    pattern: str = ""
-    file_name: str = ""
+    pattern: NamedExpression = ""
+    file_name: NamedExpression = ""
     group: str = ""
     topics: list[str] = []
     type: str = ""
     text: Literal["", "json", "pairs"] = ""
-    unpivot: dict[str, str] = {}
+    unpivot: dict[str, Expression] = {}
     drop: list[RowFilter] = []
 
-    @model_validator(mode="after")
-    def _check_unpivot(self) -> TableFormat:
-        for text in self.unpivot.values():
-            _compiled(text)
-        for text in filter(None, (self.pattern, self.file_name)):
-            if not _compiled(text).groupindex:
-                raise ValueError(f"the expression {text!r} has no named group (?P<name>...)")
-        return self
 
-
-class Fields(_Strict):
-    """The values of a range. Required: `anchor` and `range`; without a stamp the time of the message is used."""
+class _Stamped(_Strict):
+    """Stamp and ids of a range or CIR."""
 
     stamp: Time | None = None
     tag: Number = FieldRule(constant=1)
     anchor: Number
+
+
+class Fields(_Stamped):
+    """The values of a range. Required: `anchor` and `range`; without a stamp the time of the message is used."""
+
     range: Length
     sequence: Number | None = None
     rx_power: Level | None = None
@@ -275,12 +285,10 @@ class Registers(_Strict):
     prf: Number = FieldRule(constant=64)
 
 
-class Join(_Strict):
+class Join(_Stamped):
     """Stamp and ids of a CIR in another file; the nearest range of the pair within the tolerance gets it."""
 
     stamp: Time
-    tag: Number = FieldRule(constant=1)
-    anchor: Number
     tolerance_s: float = Field(default=0.02, gt=0.0)
 
 
@@ -318,16 +326,13 @@ class Poses(TableFormat):
     lever_arm: tuple[float, float, float] | dict[int, tuple[float, float, float]] = (0.0, 0.0, 0.0)
 
 
-class TrueRanges(TableFormat):
+class TrueRanges(TableFormat, _Stamped):
     """True ranges of pairs in another file, interpolated at the stamps of the ranges in gaps of at most 1 s.
 
     Attributes:
         stamp: without it, each pair has one true range.
     """
 
-    stamp: Time | None = None
-    tag: Number = FieldRule(constant=1)
-    anchor: Number
     range: Length
 
 
@@ -390,16 +395,10 @@ class StartDialogue(_Strict):
     """
 
     wake: str = ""
-    ready: str = ""
+    ready: Expression = ""
     command: str
-    unknown: str = ""
+    unknown: Expression = ""
     reset: str = ""
-
-    @model_validator(mode="after")
-    def _check(self) -> StartDialogue:
-        _compiled(self.ready)
-        _compiled(self.unknown)
-        return self
 
 
 class Mapping(TableFormat):
@@ -437,13 +436,17 @@ class Mapping(TableFormat):
     @property
     def values(self) -> dict[str, FieldRule | None]:
         """Return everything that is in a row of the ranges, by the names of `conversion.Columns`."""
-        truth, registers = self.truth, self.registers
-        rules: dict[str, FieldRule | None] = dict(self.fields)
-        rules |= {"true range": truth.range, "error": truth.error}
+        truth = self.truth
+        rules: dict[str, FieldRule | None] = {
+            **dict(self.fields),
+            "true range": truth.range,
+            "error": truth.error,
+        }
         rules |= {"label": truth.label, "configuration": truth.configuration}
-        if registers:
-            rules |= {"cir_power": registers.cir_power, "prf": registers.prf}
-            rules |= {f"amplitude {n}": value for n, value in enumerate(registers.amplitudes, 1)}
+        if self.registers:
+            amplitudes = enumerate(self.registers.amplitudes, 1)
+            rules |= {"cir_power": self.registers.cir_power, "prf": self.registers.prf}
+            rules |= {f"amplitude {n}": value for n, value in amplitudes}
         anchors = next((source.position for source in self.anchors if not source.files), None)
         return rules | axes("tag", truth.tag_position) | axes("anchor", anchors)
 

@@ -6,21 +6,23 @@ import contextlib
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import yaml
 
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError, did_you_mean
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
+from uwb_mitigation.recordings.mapping.csv_rows import CsvRows, Rows
 from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
-from uwb_mitigation.recordings.mapping.text_files import CsvRows, OnWarning, Rows, TextBlocks
+from uwb_mitigation.recordings.text_blocks import OnWarning, TextBlocks
 
 CHUNK_ROWS, CHUNK_VALUES = 100_000, 4_000_000
 """Largest number of rows, and of values in columns, of a chunk."""
@@ -99,6 +101,7 @@ class TableFile:
     file: str = ""
     dropped: Counter[str] = field(default_factory=Counter)
     on_warning: OnWarning | None = None
+    _damage: DamagedRecordingError | None = field(default=None, init=False)
 
     def chunks(self, before: int = 0) -> Iterator[Chunk]:
         """Yield the rows, only the needed columns and those of the rules to drop rows.
@@ -123,23 +126,38 @@ class TableFile:
             if kind in ("messages", "lines", "json", "yaml"):
                 rows = self._messages(kind)
             elif kind == "csv":
-                rows = iter(CsvRows(table, path, self._choose, self.ids, self.dropped, self.on_warning))
+                arguments = self._choose, self.ids, self.dropped, self.on_warning
+                rows = iter(CsvRows(table, path, self._text('"'), *arguments))
             elif kind:
                 rows = self._arrays(is_matlab=kind == "matlab")
             else:
                 valid = "csv, hdf5, json, matlab, messages, yaml; lines with `pattern` or `text`; save others as CSV"
                 raise RecordingError(f"unknown format {path.suffix}", where=str(path), valid=valid)
+            last = 0
             for values, numbers in rows:
+                last = int(numbers.max(initial=last - 1)) + 1
                 values |= {name: np.full(len(numbers), text, object) for name, text in constants.items()}
                 if table.unpivot:
                     values, repeats = _unpivot(table, values, len(numbers))
                     numbers = np.repeat(numbers, repeats)
                 yield Chunk(values, len(numbers), path, numbers, before)
+            if self._damage:
+                raise DamagedRecordingError(self._damage.what, where=f"{path}: after row {last}")
         except (RecordingError, MissingDependencyError):
             raise
         except Exception as error:
             # For damaged files the libraries raise many other types, such as BadZipFile or ZeroDivisionError.
             raise RecordingError(f"cannot be read: {error!s:.200}", where=str(path)) from error
+
+    def _up_to_damage(self, items: Iterable[Any]) -> Iterator[Any]:
+        """Yield items; `chunks` raises the error after the rows before."""
+        try:
+            yield from items
+        except DamagedRecordingError as error:
+            self._damage = error
+
+    def _text(self, quote: str = "") -> Iterator[str]:
+        return self._up_to_damage(TextBlocks(self.path, self.on_warning, quote))
 
     def _choose(self, names: Sequence[str]) -> dict[str, str]:
         """Return {column: column of the file, also with other case}; raise RecordingError if a required one is missing."""
@@ -207,8 +225,6 @@ class TableFile:
             return content
         if np.ndim(content) > 1 and not table.columns:
             return {"": content}
-        import pandas as pd
-
         # The fields of a structure, or the columns of a matrix.
         content = content if isinstance(content, list) else np.asarray(content)
         frame = pd.DataFrame(content, columns=table.columns or None)
@@ -225,9 +241,12 @@ class TableFile:
         table, path, limit = self.table, self.path, MAX_DOCUMENT_ROWS
         messages: Iterator[tuple[dict[str, Any], Any]]
         if kind == "messages":
-            messages, limit = _bag(path, table), MAX_ROWS
+            from uwb_mitigation.recordings.bag.foreign_messages import read_messages
+
+            limit, bag = MAX_ROWS, self._up_to_damage(read_messages(path, table.topics))
+            messages = (({TOPIC: topic, LOG_TIME: stamp_ns}, message) for topic, stamp_ns, message in bag)
         elif kind == "lines":
-            messages = _lines(path, self.on_warning)
+            messages = (({}, line) for block in self._text() for line in block.removesuffix("\n").split("\n"))
         elif kind == "json":
             messages = iter([({}, json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError)))])
         else:
@@ -235,50 +254,24 @@ class TableFile:
             messages = iter([({}, _entries(self._group(document)))])
             table = table.model_copy(update={"group": "[]"})
         reader, first, reason = MessageRows(table, self.columns), 0, ""
-        damage: DamagedRecordingError | None = None
-        while damage is None:
-            rows, last = defaultdict[str, list[Any]](list), None
-            try:
-                for last in islice(messages, 1000):
-                    (constants, message), values, problem = last, dict[str, list[Any]](), ""
-                    try:
-                        values = reader.rows(message, limit)
-                    except RecordingError as error:
-                        where, problem = ": ".join([str(path), *constants.values()][:2]), f" ({error.what})"
-                        if kind != "lines":
-                            raise RecordingError(error.what, where=where, valid=error.valid) from error
-                    repeats = len(values.get(LIST_INDEX, ()))
-                    if kind == "lines" and not repeats and message.strip():
-                        reason = reason or f"lines without a range, such as {message.strip()!r:.60}{problem}"
-                        self.dropped[reason] += 1
-                    values |= {name: [cell] * repeats for name, cell in constants.items()}
-                    for name, cells in values.items():
-                        rows[name] += cells
-            except DamagedRecordingError as error:
-                damage = error
-            if last is None:
-                break
-            yield rows, np.arange(first, first + len(rows[LIST_INDEX]))
-            first += len(rows[LIST_INDEX])
-        if damage:
-            raise damage
-
-
-def _bag(path: Path, table: TableFormat) -> Iterator[tuple[dict[str, Any], Any]]:
-    from uwb_mitigation.recordings.bag.foreign_messages import read_messages
-
-    for topic, stamp_ns, message in read_messages(path, table.topics):
-        yield {TOPIC: topic, LOG_TIME: stamp_ns}, message
-
-
-def _lines(path: Path, on_warning: OnWarning | None) -> Iterator[tuple[dict[str, Any], Any]]:
-    blocks = TextBlocks(path)
-    for block in blocks:
-        yield from (({}, line) for line in block.removesuffix("\n").split("\n"))
-    if blocks.damage:
-        raise DamagedRecordingError(f"truncated or corrupt: {blocks.damage}", where=str(path))
-    if blocks.unread.strip() and on_warning:
-        on_warning(f"{path.name}: the file does not end with a line break; the last line is not used")
+        while batch := list(islice(messages, 1000)):
+            rows = defaultdict[str, list[Any]](list)
+            for constants, message in batch:
+                values, problem = dict[str, list[Any]](), ""
+                try:
+                    values = reader.rows(message, limit)
+                except RecordingError as error:
+                    where, problem = ": ".join([str(path), *constants.values()][:2]), f" ({error.what})"
+                    if kind != "lines":
+                        raise RecordingError(error.what, where=where, valid=error.valid) from error
+                repeats = len(values.get(LIST_INDEX, ()))
+                if kind == "lines" and not repeats and message.strip():
+                    reason = reason or f"lines without a range, such as {message.strip()!r:.60}{problem}"
+                    self.dropped[reason] += 1
+                values |= {name: [cell] * repeats for name, cell in constants.items()}
+                for name, cells in values.items():
+                    rows[name] += cells
+            yield rows, np.arange(first, first := first + len(rows[LIST_INDEX]))
 
 
 def _entries(document: Any) -> list[dict[str, Any]]:
