@@ -26,8 +26,8 @@ from uwb_mitigation.radios.port import (
     StreamPort,
 )
 from uwb_mitigation.radios.settings import ValueReader, read_baud, read_ports
+from uwb_mitigation.recordings.live_ranges import LiveConverter
 from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
-from uwb_mitigation.recordings.mapping.live import LiveConverter
 from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
 from uwb_mitigation.types.measurement import RangeMeasurement
 

@@ -249,6 +249,17 @@ class Odometry(TimeSeries):
     twist: NDArray[np.float64]
     twist_covariance: NDArray[np.float64]
 
+    @classmethod
+    def integrated(cls, stamp_ns: NDArray[np.int64], twist: NDArray[np.float64]) -> Odometry:
+        """Return the motion of velocities (n, 3), each of the interval that ends at its stamp, without covariances."""
+        step = np.diff(stamp_ns, prepend=stamp_ns[:1]) / 1e9
+        yaw = np.cumsum(twist[:, 2] * step)
+        middle = yaw - twist[:, 2] * step / 2
+        x = np.cumsum((twist[:, 0] * np.cos(middle) - twist[:, 1] * np.sin(middle)) * step)
+        y = np.cumsum((twist[:, 0] * np.sin(middle) + twist[:, 1] * np.cos(middle)) * step)
+        unknown = np.zeros((len(stamp_ns), 3, 3))
+        return cls(stamp_ns, np.stack([x, y, yaw], axis=1), unknown, twist, unknown)
+
     def reversed(self, end_ns: int) -> Odometry:
         """Return the motion backwards in time, from `end_ns` on."""
         return replace(TimeSeries.reversed(self, end_ns), twist=-self.twist[::-1])

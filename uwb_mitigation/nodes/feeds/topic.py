@@ -12,8 +12,8 @@ from rclpy.subscription import Subscription
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
+from uwb_mitigation.recordings.live_ranges import LiveConverter
 from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
-from uwb_mitigation.recordings.mapping.live import LiveConverter
 from uwb_mitigation.recordings.mapping.mapping import Mapping
 from uwb_mitigation.types.measurement import RangeMeasurement
 

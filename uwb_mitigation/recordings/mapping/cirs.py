@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.mapping.chunks import UNREADABLE, Chunk
-from uwb_mitigation.recordings.mapping.conversion import ColumnDict, samples_of
+from uwb_mitigation.recordings.mapping.conversion import ColumnDict, read_cir
 from uwb_mitigation.recordings.mapping.mapping import CirSource, Join, series
-from uwb_mitigation.types.measurement import LINEAR_MAGNITUDES, Cir, Encoding, is_logarithmic
+from uwb_mitigation.types.measurement import Cir, Encoding
 
 MAX_DELAY_S = 1.0
 """Largest delay of a CIR that is searched."""
@@ -48,17 +48,17 @@ class CirFile:
             if values is None or isinstance(values, float):
                 continue
             try:
-                samples, encoding, scale = samples_of(values, source.samples)
-            except UNREADABLE as error:
-                what, where = f"not a CIR: {error}", chunk.where(row)
-                raise RecordingError(what, where=where, valid=source.samples) from error
-            if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
-                raise RecordingError("a CIR in dB", where=chunk.where(row), valid=LINEAR_MAGNITUDES)
-            if len(samples):
+                cir = read_cir(values, source.samples)
+            except (RecordingError, *UNREADABLE) as error:
+                what, valid = (
+                    getattr(error, "what", f"not a CIR: {error}"),
+                    getattr(error, "valid", source.samples),
+                )
+                raise RecordingError(what, where=chunk.where(row), valid=valid) from error
+            if len(cir):
                 numbers[row] = len(self._rows)
-                start = self._file.seek(0, 2)
-                self._file.write(samples.tobytes())
-                self._rows.append((start, len(samples), encoding, scale))
+                self._rows.append((self._file.seek(0, 2), len(cir.samples), cir.encoding, cir.scale))
+                self._file.write(cir.samples.tobytes())
         return numbers
 
     def read(self, number: int) -> Cir:

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, UNREADABLE, Chunk
 from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter
-from uwb_mitigation.types.measurement import Cir, Encoding, RangeMeasurement
+from uwb_mitigation.types.measurement import (
+    LINEAR_MAGNITUDES,
+    Cir,
+    Encoding,
+    RangeMeasurement,
+    is_logarithmic,
+)
 from uwb_mitigation.types.stamps import NS_PER_S
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
@@ -352,10 +358,11 @@ def _id(text: str, is_hex: bool) -> int:
     return int(match[1])
 
 
-def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, float]:
-    """Return int16 samples of one CIR, their encoding, and the scale that restores the values.
+def read_cir(values: Any, form: str) -> Cir:
+    """Return one CIR as int16 samples with the scale that restores the values; NaN: without samples.
 
     Raises:
+        RecordingError: the values are in dB.
         ValueError: the values are not numbers.
     """
     if isinstance(values, str):
@@ -376,18 +383,19 @@ def samples_of(values: Any, form: str) -> tuple[NDArray[np.int16], Encoding, flo
         array = np.abs(array)
     flat = array.reshape(-1).astype(np.float64)
     if not np.isfinite(flat).all():
-        return NO_CIR.samples, encoding, 1.0
+        return NO_CIR
     largest = float(np.abs(flat).max()) if len(flat) else 0.0
     exact = largest <= 32767 and bool(np.all(flat == np.rint(flat)))
     scale = 1.0 if exact or largest == 0.0 else largest / 32767
-    return np.rint(flat / scale).astype(np.int16), encoding, scale
+    samples = np.rint(flat / scale).astype(np.int16)
+    if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
+        raise RecordingError("a CIR in dB", valid=LINEAR_MAGNITUDES)
+    return Cir(samples, encoding, scale=scale)
 
 
-def filter_rows(
-    rules: list[RowFilter], chunk: Chunk, dropped: Counter[str], prefix: str = ""
-) -> NDArray[np.bool_]:
-    """Return which rows no rule drops, and count the others by rule; `from_median` needs all files and is ignored."""
-    mask = np.ones(chunk.count, bool)
+def filter_rows(rules: list[RowFilter], chunk: Chunk, prefix: str = "") -> dict[str, NDArray[np.bool_]]:
+    """Return {rule: rows that it drops}; `from_median` needs all files and is ignored."""
+    dropped = {}
     for rule in rules:
         raw = np.asarray(chunk.columns[rule.column])
         bad, cells = np.zeros(chunk.count, bool), [_cell_text(cell) for cell in raw.tolist()]
@@ -401,8 +409,8 @@ def filter_rows(
             numbers = _floats(raw, chunk, rule.column, rule.column)
             bad |= numbers < (-math.inf if rule.below is None else rule.below)
             bad |= numbers > (math.inf if rule.above is None else rule.above)
-        mask &= ~count_bad(bad & mask, dropped, f"{prefix}{rule}")
-    return mask
+        dropped[f"{prefix}{rule}"] = bad
+    return dropped
 
 
 def unknown_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
@@ -419,8 +427,13 @@ def impossible_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     return {f"{name} is above {MAX_POSSIBLE:g}": np.abs(values[name]) > MAX_POSSIBLE for name in _LIMITED}
 
 
-def count_bad(bad: NDArray[np.bool_], dropped: Counter[str], reason: str) -> NDArray[np.bool_]:
-    """Count the rows that are not used, by reason; return `bad`."""
-    if bad.any():
-        dropped[reason] += int(np.count_nonzero(bad))
-    return bad
+def count_kept(
+    rules: Mapping[str, NDArray[np.bool_]], count: int, dropped: Counter[str]
+) -> NDArray[np.bool_]:
+    """Return which of `count` rows no rule drops, and count each other one with the first rule that drops it."""
+    kept = np.ones(count, bool)
+    for reason, bad in rules.items():
+        if found := int(np.count_nonzero(bad & kept)):
+            dropped[reason] += found
+        kept &= ~bad
+    return kept

@@ -156,7 +156,8 @@ class MappedRecording(Source):
                     before += chunk.count
                     if before > MAX_RANGES:
                         raise RecordingError(f"more than {MAX_RANGES} rows", where=str(path))
-                    chunk = chunk.take(conversion.filter_rows(table.drop, chunk, self.dropped, what))
+                    rules = conversion.filter_rows(table.drop, chunk, what)
+                    chunk = chunk.take(conversion.count_kept(rules, chunk.count, self.dropped))
                     cirs = self._cirs.add(cir, chunk) if cir else np.broadcast_to(-1, chunk.count)
                     places = {"cir": cirs, "row": chunk.rows, "file": np.full(chunk.count, number, np.int32)}
                     tables.append(converter.convert(chunk) | places)
@@ -167,11 +168,11 @@ class MappedRecording(Source):
         if not tables:
             raise self._damage or RecordingError("no rows", where=str(paths[0]))
         rows = conversion.concat(tables)
-        mask = np.ones(len(rows["row"]), bool)
-        for name, rule in medians.items():
-            is_outlier = np.abs(rows[name] - median(rows.pop(name))) > rule.from_median
-            mask &= ~conversion.count_bad(is_outlier, self.dropped, name)
-        return take(rows, mask)
+        numbers = {name: rows.pop(name) for name in medians}
+        outliers = {
+            n: np.abs(column - median(column)) > medians[n].from_median for n, column in numbers.items()
+        }
+        return take(rows, conversion.count_kept(outliers, len(rows["row"]), self.dropped))
 
     def _read_complete(self, table: TableFormat, paths: _Paths, rules: _Rules, what: str) -> ColumnDict:
         """Return the rows of files in which all values are known, in the order of their stamps."""
@@ -200,9 +201,7 @@ class MappedRecording(Source):
 
     def _drop(self, rules: dict[str, _Mask]) -> None:
         """Drop and count the ranges to which a rule applies."""
-        mask = np.ones(len(self), bool)
-        for what, bad in rules.items():
-            mask &= ~conversion.count_bad(bad & mask, self.dropped, what)
+        mask = conversion.count_kept(rules, len(self), self.dropped)
         if not mask.any():
             where, valid = str(self._files[0]), f"dropped: {dict(self.dropped) or 'none'}"
             raise self._damage or RecordingError("no ranges", where=where, valid=valid)
@@ -377,13 +376,7 @@ class MappedRecording(Source):
         rows = self._read_complete(source, self._files_of(source, self._files[0]), rules, "odometry ")
         stamp, first = np.unique(rows["stamp"], return_index=True)
         twist = _stacked(rows, tuple(speeds))[first]
-        step = np.diff(stamp, prepend=stamp[:1]) / 1e9
-        yaw = np.cumsum(twist[:, 2] * step)
-        middle = yaw - twist[:, 2] * step / 2
-        x = np.cumsum((twist[:, 0] * np.cos(middle) - twist[:, 1] * np.sin(middle)) * step)
-        y = np.cumsum((twist[:, 0] * np.sin(middle) + twist[:, 1] * np.cos(middle)) * step)
-        unknown = np.zeros((len(stamp), 3, 3))
-        return Odometry(stamp, np.stack([x, y, yaw], axis=1), unknown, twist, unknown)
+        return Odometry.integrated(stamp, twist)
 
 
 def _stacked(columns: ColumnDict, names: Sequence[str]) -> NDArray[np.float64]:

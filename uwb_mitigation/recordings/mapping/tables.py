@@ -187,8 +187,7 @@ class TableFile:
             chosen = self._choose([str(name) for name in arrays if not str(name).startswith("__")])
             # Slices of large files are read later, other values are arrays of one row at least.
             columns = {name: arrays[column] for name, column in chosen.items()}
-            single = {name: array for name, array in columns.items() if not getattr(array, "ndim", 0)}
-            columns |= {name: np.atleast_1d(array) for name, array in single.items()}
+            columns = {n: a if getattr(a, "ndim", 0) else np.atleast_1d(a) for n, a in columns.items()}
             lengths = {name: len(array) for name, array in columns.items()}
             if len(set(lengths.values())) > 1:
                 raise RecordingError("columns of different length", where=str(self.path), valid=str(lengths))

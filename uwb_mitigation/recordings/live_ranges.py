@@ -7,27 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.recordings.mapping import conversion
 from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
-from uwb_mitigation.recordings.mapping.conversion import (
-    NO_CIR,
-    Converter,
-    count_bad,
-    filter_rows,
-    impossible_rows,
-    measurement,
-    samples_of,
-    unknown_rows,
-)
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TOPIC, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows
-from uwb_mitigation.types.measurement import (
-    LINEAR_MAGNITUDES,
-    Cir,
-    Encoding,
-    RangeMeasurement,
-    is_logarithmic,
-)
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement
 
 
 class LiveConverter:
@@ -57,7 +42,7 @@ class LiveConverter:
         stamp = mapping.fields.stamp
         # The number of a row is a time in recordings only.
         untimed = {"stamp": None} if stamp is not None and stamp.rate_hz else {}
-        self._converter = Converter(mapping.values | untimed)
+        self._converter = conversion.Converter(mapping.values | untimed)
         extra_columns = [*mapping.cir_columns, *(rule.column for rule in mapping.drop)]
         self._rows = MessageRows(mapping, self._converter.columns | dict.fromkeys(extra_columns, False))
 
@@ -72,34 +57,29 @@ class LiveConverter:
         rows |= {LOG_TIME: [now_ns] * count, TOPIC: [where] * count}
         columns = {column: _array(values) for column, values in rows.items()}
         chunk = Chunk(columns, count, where, np.arange(count))
-        chunk = chunk.take(filter_rows(self._mapping.drop, chunk, self.counts))
+        rules = conversion.filter_rows(self._mapping.drop, chunk)
+        chunk = chunk.take(conversion.count_kept(rules, count, self.counts))
         if not chunk.count:
             return []
         values = self._converter.convert(chunk)
         # Radios without a synchronised clock send a zero stamp.
         values["stamp"][values["stamp"] <= 0] = now_ns
-        reasons = unknown_rows(values) | impossible_rows(values)
-        unknown = [count_bad(bad, self.counts, reason) for reason, bad in reasons.items()]
-        rows_used = np.flatnonzero(~np.any(unknown, axis=0)).tolist()
-        self._rows_seen += chunk.count
-        first = self._rows_seen - chunk.count
-        return [measurement(values, row, self._cir(chunk, row), first + row) for row in rows_used]
+        rules = conversion.unknown_rows(values) | conversion.impossible_rows(values)
+        rows_used = np.flatnonzero(conversion.count_kept(rules, chunk.count, self.counts)).tolist()
+        first, self._rows_seen = self._rows_seen, self._rows_seen + chunk.count
+        return [conversion.measurement(values, row, self._cir(chunk, row), first + row) for row in rows_used]
 
     def _cir(self, chunk: Chunk, row: int) -> Cir:
-        source = self._mapping.cir
-        if source is None or source.files:
-            return NO_CIR
-        samples, encoding, scale = samples_of(chunk.columns[source.column][row], source.samples)
-        if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
-            self.counts[f"CIR in dB; valid: {LINEAR_MAGNITUDES}"] += 1
-            return NO_CIR
-        return Cir(samples, encoding, scale=scale)
+        if (source := self._mapping.cir) is None or source.files:
+            return conversion.NO_CIR
+        try:
+            return conversion.read_cir(chunk.columns[source.column][row], source.samples)
+        except (RecordingError, ValueError) as error:
+            self.counts[f"not a CIR: {error!s:.80}"] += 1
+            return conversion.NO_CIR
 
 
-def _array(values: Any) -> Any:
+def _array(values: list[Any]) -> Any:
     """Return single values as an array, and lists unchanged."""
-    return (
-        values
-        if len(values) and hasattr(values[0], "__len__") and not isinstance(values[0], str)
-        else np.asarray(values)
-    )
+    is_list = values and hasattr(values[0], "__len__") and not isinstance(values[0], str)
+    return values if is_list else np.asarray(values)
