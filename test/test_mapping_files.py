@@ -92,6 +92,7 @@ def test_rows_that_are_all_longer_than_the_header_are_refused(tmp_path: Path):
     [
         ("t,a,r,r\n0,1,2,3\n", r"several columns have the name r \(columns: \[t, a, r, r.1\] and skip: 1"),
         ("t,a,r\n0,1,2\n# note\n1,1,2\n", "row 2: .* set comment: '#'"),
+        ("# note\nt,a,r\n0,1,2\n", "the first line is '# note'; set comment: '#', or skip: 1"),
         ('t,a,r\n0,1,2\n1,1,"2\n2,1,3\n', "a closing quote or a line break is missing after '1,1"),
         ("t,a,r\n0,1,2.5 m\n", r"set pattern: '\(\[-\\d.\]\+\)'"),
         ("t,a,r\n31/12/2023 10:00:00,1,2\n", "set unit: '%d/%m/%Y %H:%M:%S', in the order of the file"),

@@ -175,7 +175,9 @@ class TableFile:
         for name, column in chosen.items():
             if not column and name not in names and not self.columns[name]:
                 valid, suggestion = f"columns: {', '.join(names[:40])}", did_you_mean(name, names)
-                if len(names) == 1 and (mark := next((mark for mark in ";\t|," if mark in names[0]), "")):
+                if names and names[0][:1] in tuple("#%;"):
+                    valid = f"the first line is {names[0]!r:.60}; set comment: {names[0][0]!r}, or skip: 1"
+                elif len(names) == 1 and (mark := next((mark for mark in ";\t|," if mark in names[0]), "")):
                     valid = f"there is one column {names[0]!r:.60}; set separator: {mark!r}"
                 raise RecordingError(f"no column {name}", where=where, valid=valid, suggestion=suggestion)
         return {name: column for name, column in chosen.items() if column in names}
