@@ -35,7 +35,10 @@ UNKNOWN_STAMP = np.iinfo(np.int64).min
 _HINTS = (
     (r"[-+]?[\d.]*,\d+$", "decimal commas: set decimal: ','"),
     (r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d", "dates: set unit: iso8601"),
-    (r"\d{1,2}([/.-])\d{1,2}\1\d{2,4}", "dates: set unit: '%d/%m/%Y %H:%M:%S', in the order of the file; with a fraction %S.%f"),
+    (
+        r"\d{1,2}([/.-])\d{1,2}\1\d{2,4}",
+        "dates: set unit: '%d/%m/%Y %H:%M:%S', in the order of the file; with a fraction %S.%f",
+    ),
     (r"[#%;]|//", "comments: set comment: '#'; other lines: drop them with `matches`"),
     (r"[-+]?\d[\d.]*\s*[^\d.]", r"a number in a text: set pattern: '([-\d.]+)'"),
 )
