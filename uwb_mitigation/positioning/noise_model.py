@@ -189,17 +189,6 @@ class Regressors:
         """Return the parameters for the ranges at `index`."""
         return replace(self, rows=self.rows[index], noise_group=self.noise_group[index])
 
-    def select_columns(self, is_selected: NDArray[np.bool_]) -> Regressors:
-        """Return only these parameters, bool (q,)."""
-        names = tuple(name for name, selected in zip(self.names, is_selected, strict=True) if selected)
-        return replace(
-            self,
-            names=names,
-            rows=self.rows[:, is_selected],
-            mean=self.mean[is_selected],
-            sd=self.sd[is_selected],
-        )
-
     def concat(self, appended: Regressors) -> Regressors:
         """Return these parameters followed by the others; `noise_group` is unchanged."""
         return Regressors(

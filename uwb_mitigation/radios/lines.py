@@ -24,6 +24,7 @@ from uwb_mitigation.radios.port import (
     PortMessage,
     PortReport,
     StreamPort,
+    started,
 )
 from uwb_mitigation.radios.settings import ValueReader, read_baud, read_ports
 from uwb_mitigation.recordings.live_ranges import LiveConverter
@@ -150,10 +151,7 @@ def open(
     """
     path = settings[0].capture
     capture = CaptureWriter(path, "lines", len(settings)) if path is not None else None
-    ports = [LinePort(board, capture, on_event, stamp_clock) for board in settings]
-    for port in ports:
-        port.start()
-    return ports
+    return started([LinePort(board, capture, on_event, stamp_clock) for board in settings])
 
 
 def open_capture(path: Path, value: ValueReader) -> Capture:
@@ -204,7 +202,9 @@ class LineSession:
             tag = tag.model_copy(update={"constant": tag.constant + number})
             fields = mapping.fields.model_copy(update={"tag": tag})
             mapping = mapping.model_copy(update={"fields": fields})
-        self.mapping, self._start, self._has_datagrams = mapping, mapping.start, has_datagrams
+        # Datagrams are only received.
+        self._start = None if has_datagrams else mapping.start
+        self.mapping, self._has_datagrams = mapping, has_datagrams
         self._converter = LiveConverter(mapping, "lines")
         self.counts = self._converter.counts
         self.example, self.stamp_offset_s = "", 0.0
@@ -309,6 +309,8 @@ class LinePort(StreamPort):
         session: the state of the board.
     """
 
+    session: LineSession
+
     def __init__(
         self,
         settings: LineSettings,
@@ -386,10 +388,3 @@ class LinePort(StreamPort):
             text = f"{self.session.mapping.name} at {self.device}: ranges of tag {measurements[0].tag_id}"
             return [PortMessage(logging.INFO, text), *measurements]
         return measurements
-
-    def _outgoing(self) -> bytes:
-        data = self.session.outgoing()
-        return b"" if self._is_udp else data
-
-    def _closed(self, now_ns: int) -> list[Any]:
-        return []

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import serial
 from serial.tools import list_ports
@@ -253,6 +253,16 @@ class RadioPort(ABC):
             retry_s = min(2 * retry_s, MAX_RETRY_S)
 
 
+_Port = TypeVar("_Port", bound=RadioPort)
+
+
+def started(ports: list[_Port]) -> list[_Port]:
+    """Start the ports and return them."""
+    for port in ports:
+        port.start()
+    return ports
+
+
 class StreamPort(RadioPort):
     """A serial port whose bytes a session encodes and decodes.
 
@@ -263,7 +273,12 @@ class StreamPort(RadioPort):
         baud, dtr: see `PortAddress.open`.
         capture: stores the raw bytes, as those of board `number`; None = not stored.
         tick_s: maximum time between two calls of the session.
+
+    Attributes:
+        session: the state of the board, whose `outgoing` returns the bytes to send.
     """
+
+    session: Any
 
     def __init__(
         self,
@@ -297,13 +312,9 @@ class StreamPort(RadioPort):
             LinkError: the port must be opened again.
         """
 
-    @abstractmethod
-    def _outgoing(self) -> bytes:
-        """Return the bytes to send."""
-
-    @abstractmethod
     def _closed(self, now_ns: int) -> list[Any]:
         """End the session after the port was lost; return events."""
+        return []
 
     def _is_stopped(self, now_ns: int) -> bool:
         """Return whether the port may be closed; called after `close`, until it returns true."""
@@ -353,7 +364,7 @@ class StreamPort(RadioPort):
                 events = self._received(data, now_ns, stamp_ns)
                 # While the port accepts no bytes, requests wait in the bounded queue of the session.
                 if not outgoing:
-                    outgoing += self._outgoing()
+                    outgoing += self.session.outgoing()
             if outgoing:
                 with contextlib.suppress(BlockingIOError):
                     written = os.write(fd, outgoing)

@@ -20,6 +20,7 @@ from uwb_mitigation.radios.port import (
     PortReport,
     StreamPort,
     processes_using,
+    started,
 )
 from uwb_mitigation.radios.settings import (
     DEFAULT_RADIO,
@@ -106,10 +107,7 @@ def open(
         on_event: called with measurements, corrections, events of the session and `PortMessage`.
         stamp_clock: the clock of the stamps, ns.
     """
-    ports = [BoardPort(board, on_event, stamp_clock) for board in settings]
-    for port in ports:
-        port.start()
-    return ports
+    return started([BoardPort(board, on_event, stamp_clock) for board in settings])
 
 
 class BoardPort(StreamPort):
@@ -118,6 +116,8 @@ class BoardPort(StreamPort):
     Attributes:
         session: the state of the board.
     """
+
+    session: BoardSession
 
     _range_types = (RangeMeasurement, Correction)
 
@@ -229,9 +229,6 @@ class BoardPort(StreamPort):
         if self.session.idle_ns(now_ns) > REOPEN_TIMEOUT_NS:
             raise LinkError("sends no data", where=str(self._address))
         return observed
-
-    def _outgoing(self) -> bytes:
-        return self.session.outgoing()
 
     def _closed(self, now_ns: int) -> list[Any]:
         self._was_connected = self.session.counts.connections > self._connections

@@ -24,6 +24,7 @@ from uwb_mitigation.radios.port import (
     PortMessage,
     PortReport,
     StreamPort,
+    started,
 )
 from uwb_mitigation.radios.settings import PREFIX, Role, ValueReader, read_addresses, read_ports
 
@@ -104,10 +105,7 @@ def open(
     """
     path = settings[0].capture
     capture = CaptureWriter(path, "UCI", len(settings)) if path is not None else None
-    ports = [UciPort(board, number, capture, on_event, stamp_clock) for number, board in enumerate(settings)]
-    for port in ports:
-        port.start()
-    return ports
+    return started([UciPort(board, n, capture, on_event, stamp_clock) for n, board in enumerate(settings)])
 
 
 def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
@@ -133,6 +131,8 @@ class UciPort(StreamPort):
     Attributes:
         session: the state of the board.
     """
+
+    session: UciSession
 
     def __init__(
         self,
@@ -255,9 +255,6 @@ class UciPort(StreamPort):
         if now_ns - self._worked_ns > REOPEN_NS:
             raise LinkError(session.state, where=str(self._address))
         return messages + measurements if session.settings.delivers else messages
-
-    def _outgoing(self) -> bytes:
-        return self.session.outgoing()
 
     def _closed(self, now_ns: int) -> list[Any]:
         self.session.closed()

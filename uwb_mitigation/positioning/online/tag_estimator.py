@@ -205,11 +205,6 @@ class TagEstimator:
         self.restart()
 
     @property
-    def is_initialized(self) -> bool:
-        """Whether the position is known."""
-        return self.filter is not None and not self.is_ambiguous
-
-    @property
     def is_ambiguous(self) -> bool:
         """Whether positions with another x and y explain the ranges: the position is not published."""
         return self.ambiguity in (Ambiguity.MIRROR, Ambiguity.CIRCLE)

@@ -11,7 +11,7 @@ from typing import Any
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
-from uwb_mitigation.radios.port import PERIOD_S, ExchangeMonitor, OnEvent, PortReport, RadioPort
+from uwb_mitigation.radios.port import PERIOD_S, ExchangeMonitor, OnEvent, PortReport, RadioPort, started
 from uwb_mitigation.radios.settings import (
     EXCHANGE_REMEDIES,
     PREFIX,
@@ -57,10 +57,7 @@ def open_chips(
     stamp_clock: Callable[[], int],
 ) -> list[ChipPort]:
     """Open radios, each with its name, the function that opens its bus, and its settings; see `ChipPort`."""
-    ports = [ChipPort(*chip, on_event, stamp_clock) for chip in chips]
-    for port in ports:
-        port.start()
-    return ports
+    return started([ChipPort(*chip, on_event, stamp_clock) for chip in chips])
 
 
 class ChipPort(RadioPort):
