@@ -44,8 +44,6 @@ class Chunk:
         """Return the chosen rows."""
         if mask.all():
             return self
-        columns: dict[str, Any] = {
-            name: values[mask] if isinstance(values, np.ndarray) else list(compress(values, mask))
-            for name, values in self.columns.items()
-        }
+        items = self.columns.items()
+        columns = {n: v[mask] if isinstance(v, np.ndarray) else [*compress(v, mask)] for n, v in items}
         return Chunk(columns, int(mask.sum()), self.path, self.rows[mask], self.before)

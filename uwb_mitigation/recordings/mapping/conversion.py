@@ -58,6 +58,7 @@ MAX_POSSIBLE = 10_000.0
 
 _LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 
+Mask = NDArray[np.bool_]
 ColumnDict = dict[str, NDArray[Any]]
 """{name: array (n,)} in SI units. `stamp`: ns, int64; `tag`, `anchor`: uint64; `label`, `configuration`: texts; others, such
 as `range`, `true range` and `tag x`: float64, NaN: unknown."""
@@ -305,7 +306,7 @@ def read_stamps(value: FieldRule | None, chunk: Chunk) -> NDArray[np.int64]:
     return np.where(possible, stamps + offset, UNKNOWN_STAMP)
 
 
-def _dates(raw: NDArray[Any], unit: str, chunk: Chunk) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _dates(raw: NDArray[Any], unit: str, chunk: Chunk) -> tuple[NDArray[np.int64], Mask]:
     """Return the stamps of dates in ns, and which are known; times without a date are on 1970-01-01."""
     import pandas as pd
 
@@ -396,7 +397,7 @@ def read_cir(values: Any, form: str) -> Cir:
     return Cir(samples, encoding, scale=scale)
 
 
-def filter_rows(rules: list[RowFilter], chunk: Chunk, prefix: str = "") -> dict[str, NDArray[np.bool_]]:
+def filter_rows(rules: list[RowFilter], chunk: Chunk, prefix: str = "") -> dict[str, Mask]:
     """Return {rule: rows that it drops}; `from_median` needs all files and is ignored."""
     dropped = {}
     for rule in rules:
@@ -416,7 +417,7 @@ def filter_rows(rules: list[RowFilter], chunk: Chunk, prefix: str = "") -> dict[
     return dropped
 
 
-def unknown_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+def unknown_rows(values: ColumnDict) -> dict[str, Mask]:
     """Return {reason: rows} without a range, stamp or id."""
     return {
         "range is not a number": ~np.isfinite(values["range"]),
@@ -425,14 +426,12 @@ def unknown_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
     }
 
 
-def impossible_rows(values: ColumnDict) -> dict[str, NDArray[np.bool_]]:
+def impossible_rows(values: ColumnDict) -> dict[str, Mask]:
     """Return {reason: rows} with a number above `MAX_POSSIBLE`."""
     return {f"{name} is above {MAX_POSSIBLE:g}": np.abs(values[name]) > MAX_POSSIBLE for name in _LIMITED}
 
 
-def count_kept(
-    rules: Mapping[str, NDArray[np.bool_]], count: int, dropped: Counter[str]
-) -> NDArray[np.bool_]:
+def count_kept(rules: Mapping[str, Mask], count: int, dropped: Counter[str]) -> Mask:
     """Return which of `count` rows no rule drops, and count each other one with the first rule that drops it."""
     kept = np.ones(count, bool)
     for reason, bad in rules.items():

@@ -19,7 +19,7 @@ from uwb_mitigation.errors import DamagedRecordingError, RecordingError, format_
 from uwb_mitigation.recordings.mapping import checks, conversion
 from uwb_mitigation.recordings.mapping.checks import median
 from uwb_mitigation.recordings.mapping.cirs import CirFile, join_by_row, join_by_time
-from uwb_mitigation.recordings.mapping.conversion import NO_CIR, UNKNOWN_ID, ColumnDict, Converter, take
+from uwb_mitigation.recordings.mapping.conversion import NO_CIR, UNKNOWN_ID, ColumnDict, Converter, Mask, take
 from uwb_mitigation.recordings.mapping.mapping import CirSource, FieldRule, Mapping, TableFormat, axes, series
 from uwb_mitigation.recordings.mapping.tables import TableFile, find_files
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
@@ -34,7 +34,6 @@ MAX_STAMP_NS = 2**31 * NS_PER_S
 
 _Rules = Columns[str, FieldRule | None]
 _Paths = Sequence[Path]
-_Mask = NDArray[np.bool_]
 _TAG, _ANCHOR, _POSE = (tuple(axes(name, None)) for name in ("tag", "anchor", "pose"))
 
 
@@ -103,7 +102,10 @@ class MappedRecording(Source):
         truth = mapping.truth.ranges.range if mapping.truth.ranges else mapping.truth.range
         checks.check_units(self.values, self.name, mapping.fields.range.unit, truth.unit if truth else "")
         self._drop(conversion.impossible_rows(self.values))
-        self._warn()
+        errors_measured = bool(mapping.truth.error and not mapping.truth.range)
+        self.warnings += checks.value_warnings(self.values, errors_measured=errors_measured)
+        if mapping.truth.poses and not np.isfinite(self.values["tag x"]).any():
+            self.warnings.append("no range is within the times of the true poses: compare the stamps")
         self.motion = self._read_motion()
         self._shift_stamps()
 
@@ -190,7 +192,7 @@ class MappedRecording(Source):
             return find_files(table, file.parent, file)
         return []
 
-    def _by_files(self, table: TableFormat, optional: bool = False) -> Iterator[tuple[list[Path], _Mask]]:
+    def _by_files(self, table: TableFormat, optional: bool = False) -> Iterator[tuple[list[Path], Mask]]:
         """Yield files of a table, and which ranges they belong to."""
         groups = defaultdict[tuple[Path, ...], list[int]](list)
         for number, file in enumerate(self._files):
@@ -199,7 +201,7 @@ class MappedRecording(Source):
             if paths:
                 yield list(paths), np.isin(self.values["file"], numbers)
 
-    def _drop(self, rules: dict[str, _Mask]) -> None:
+    def _drop(self, rules: dict[str, Mask]) -> None:
         """Drop and count the ranges to which a rule applies."""
         mask = conversion.count_kept(rules, len(self), self.dropped)
         if not mask.any():
@@ -310,8 +312,8 @@ class MappedRecording(Source):
         rules["stamp"] = source.stamp or FieldRule(constant=0)
         for paths, mask in self._by_files(source):
             rows = self._read_complete(source, paths, rules, "true range ")
-            for tag, anchor in set(zip(rows["tag"].tolist(), rows["anchor"].tolist(), strict=True)):
-                is_pair = (rows["tag"] == tag) & (rows["anchor"] == anchor)
+            pairs = pd.DataFrame({"tag": rows["tag"], "anchor": rows["anchor"]}).groupby(["tag", "anchor"])
+            for (tag, anchor), is_pair in pairs.indices.items():
                 is_target = mask & (values["tag"] == tag) & (values["anchor"] == anchor)
                 if not source.stamp and np.ptp(rows["range"][is_pair]) > 0:
                     what = f"tag {format_id(tag)} and anchor {format_id(anchor)} have several true ranges"
@@ -344,14 +346,6 @@ class MappedRecording(Source):
                 selected = mask & (values["tag"] == tag)
                 for name, coordinate in zip(_TAG, path.position_at(values["stamp"][selected]).T, strict=True):
                     values[name][selected] = coordinate
-
-    def _warn(self) -> None:
-        """Collect warnings of implausible values."""
-        truth = self._mapping.truth
-        errors_measured = bool(truth.error and not truth.range)
-        self.warnings += checks.value_warnings(self.values, errors_measured=errors_measured)
-        if truth.poses and not np.isfinite(self.values["tag x"]).any():
-            self.warnings.append("no range is within the times of the true poses: compare the stamps")
 
     def _shift_stamps(self) -> None:
         """Shift all stamps if ROS cannot represent them."""
