@@ -183,6 +183,32 @@ def test_offsets_alone_need_no_check_and_keep_the_default_standard_deviation(sit
     assert 0.12 < card.interval95_sigmas * card.variance_m2**0.5 < 0.5, "the errors include those of the line"
 
 
+@pytest.fixture(scope="module")
+def calibrate_with():
+    """Return a function that calibrates the first anchors of a drive whose ranges have these offsets."""
+    ranges, _ = drive(seconds=100, rate_hz=20.0, offset_m=0.0)
+    universal = load_bundle(default_model_path())
+
+    def calibrate(own):
+        some = ranges.take(ranges.anchor < len(own))
+        records = records_of(some, np.full(len(some), np.nan), some.range_m + own[some.anchor])
+        solved = read_site([records], HALL, universal)
+        solution = solve_without_truth(solved, height=Height(1.0), area=None)
+        return calibrate_site(solved, universal, solution)
+
+    return calibrate
+
+
+def test_offsets_of_single_anchors_need_five_anchors(calibrate_with):
+    chosen = {len(own): calibrate_with(own).chosen for own in (OWN[:4], OWN)}
+    assert chosen == {4: "common offset", 5: "offsets"}
+
+
+def test_common_offset_that_is_not_that_of_an_anchor_is_refused(calibrate_with):
+    calibration = calibrate_with(np.array([0.1, 0.1, 0.1, 0.7]))
+    assert re.search("the offset of tag 7 and anchor [1-4] is unknown", calibration.refusal)
+
+
 @pytest.mark.parametrize("truth", [False, True])
 def test_errors_of_a_half_are_computed_with_the_offsets_of_the_other(truth):
     ranges, path = drive(seconds=100, rate_hz=20.0, offset_m=0.0)
