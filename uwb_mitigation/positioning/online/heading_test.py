@@ -2,7 +2,8 @@
 
 Over the last metres, the path of the odometry is fitted to the positions from ranges only by a rotation, once as it is and once for each
 fault in `_FAULTS`. The log likelihood ratios of the fits, for errors of unknown variance, are summed (Wald, Sequential Analysis, 1947).
-Until a fault is excluded, the variance of the heading contains the heading that it implies.
+A heading is confirmed when the faults are excluded. Late stamps are excluded by changes of the yaw rate only: until then, the variance
+of the heading contains a turn that the odometry does not show yet.
 """
 
 from __future__ import annotations
@@ -23,29 +24,26 @@ class _Fault(NamedTuple):
         gain: true displacements are turned, relative to those of the odometry, by its yaw multiplied by this.
         sign: of the yaw of the odometry in the true heading.
         delay_s: of its stamps.
-        excluded: sum of log likelihood ratios from which the fault is excluded.
     """
 
     gain: float = 0.0
     sign: float = 1.0
     delay_s: float = 0.0
-    excluded: float = 4.0
 
 
-_WORLD_AXES = _Fault(gain=-1.0)
-_FAULTS = (_Fault(), _WORLD_AXES, _Fault(gain=-2.0, sign=-1.0), _Fault(delay_s=1.0, excluded=2.0))
+_FAULTS = (_Fault(), _Fault(gain=-1.0), _Fault(gain=-2.0, sign=-1.0), _Fault(delay_s=1.0))
 """None; velocities in the axes of the world, whose relation to the heading is unknown; yaw rates with the wrong sign; late stamps."""
 
 _GAINS, _SIGNS = np.array([[fault.gain, fault.sign] for fault in _FAULTS]).T
 _MAX_DELAY_S = max(fault.delay_s for fault in _FAULTS)
 
-IDENTIFIED, MOST_EVIDENCE = -2.0, 15.0
-"""The odometry has a fault if the sum of its log likelihood ratios is smaller; upper limit of the sum."""
+IDENTIFIED, EXCLUDED, MOST_EVIDENCE = -2.0, 2.5, 15.0
+"""The odometry has a fault if the sum of its log likelihood ratios is smaller; the sum from which it is excluded; limit of the sum."""
 
 MOST_OF_FIT = 2.0
 """Limit of the contribution of one fit: errors of ranges persist."""
 
-WINDOW_SD, WINDOW_M = 20.0, (6.0, 25.0)
+WINDOW_SD, WINDOW_M = 40.0, (6.0, 40.0)
 """Length of the path that is fitted: this many standard deviations of the positions, within limits in m."""
 
 STEP_M, EVERY_M, SHORTEST_M, FEWEST = 0.2, 1.5, 3.0, 8
@@ -66,9 +64,9 @@ FIT_SD = 1.5
 MAX_FIT_SD = math.radians(8.0)
 """A fit with a larger standard deviation confirms no heading."""
 
-IMPLIED, IMPLIED_SD = math.radians(22.5), 3.0
-"""The heading is not confirmed if a fault that is not excluded implies another one that differs by more; smaller differences are within
-this many standard deviations of the published one."""
+LATE_SD, LATE_YAW_RATE = math.radians(14.9), math.radians(18.0)
+"""Until late stamps are excluded: smallest standard deviation of a heading, and the largest yaw rate (rad/s) with which one is confirmed.
+In simulated drives, turns of more than 2.5 times the largest rate before are rare."""
 
 RATE_S = 0.5
 """Averaging time of yaw rates."""
@@ -87,15 +85,14 @@ class HeadingTest:
 
     def __init__(self, lever_arm: tuple[float, float, float], *, is_verified: bool = False) -> None:
         self._arm = complex(*lever_arm[:2])
-        self._evidence = np.array([0.0, *(is_verified * fault.excluded for fault in _FAULTS[1:])])
-        self._rate, self._fastest, self.contradicts = 0.0, 0.0, False
-        self._remaining, self._has_fault = list[tuple[_Fault, float]](), False
+        self._evidence = np.full(len(_FAULTS) - 1, is_verified * EXCLUDED)
+        self._fastest, self._turned, self.contradicts = 0.0, (0.0, 0.0), False
         # Time, distance driven, variance, drift and turn of the odometry, position, and position relative to the start of the path for each fault.
         self._samples: deque[tuple[complex, ...]] = deque(maxlen=400)
         self._last: PathPoint | None = None
         self._path = np.zeros(len(_FAULTS), complex)
-        self._turned = (0.0, 0.0)
-        self._fitted_m, self._rotations, self._variance, self._drift = 0.0, list[float](), math.inf, 0.0
+        self._fitted_m, self._variance, self._drift = 0.0, math.inf, 0.0
+        self._rotation: float | None = None
 
     def forget_positions(self) -> None:
         """Start again with other positions, but keep the evidence and the latest fit: faults of odometry stay."""
@@ -108,13 +105,12 @@ class HeadingTest:
         if last is not None and last.segment != point.segment:
             # Both paths have no known relative rotation.
             self.forget_positions()
-            self._rotations, last = [], None
+            self._rotation = last = None
         begin_s, yaw = self._turned
         if time_s - begin_s >= RATE_S or last is None:
             self._turned = time_s, point.yaw
             if last is not None:
-                self._rate = (point.yaw - yaw) / (time_s - begin_s)
-                self._fastest = max(self._fastest, abs(self._rate))
+                self._fastest = max(self._fastest, abs(point.yaw - yaw) / (time_s - begin_s))
         return last is None or point.distance_m - last.distance_m >= STEP_M
 
     def add(self, time_s: float, position: complex, variance: float, point: PathPoint) -> None:
@@ -141,7 +137,7 @@ class HeadingTest:
             self._fit()
 
     def variance(self, yaw: float, variance: float, point: PathPoint) -> float:
-        """Return the variance of a heading, rad^2, with all faults that are not excluded; inf: it is not confirmed.
+        """Return the variance of a heading, rad^2; inf: it is not confirmed.
 
         Args:
             yaw: heading of the base, rad, from odometry and ranges.
@@ -149,22 +145,18 @@ class HeadingTest:
             point: of the odometry at this time.
         """
         self.contradicts = False
-        if not self._rotations:
+        if self._rotation is None:
             return math.inf
-        difference = math.remainder(self._rotations[0] + point.yaw - yaw, math.tau)
+        difference = math.remainder(self._rotation + point.yaw - yaw, math.tau)
         limit = CONTRADICTION**2 * (variance + self._variance + self._drift)
-        self.contradicts = self._has_fault or difference**2 > limit
-        if self.contradicts:
+        *others, late = self._evidence.tolist()
+        self.contradicts = min(*others, late) < IDENTIFIED or difference**2 > limit
+        if self.contradicts or min(others) < EXCLUDED or self._variance > MAX_FIT_SD**2:
             return math.inf
-        largest = 0.0
-        for fault, rotation in self._remaining:
-            if fault is _WORLD_AXES:
-                return math.inf
-            implied = rotation + fault.sign * point.yaw + self._rate * fault.delay_s - yaw
-            largest = max(largest, abs(math.remainder(implied, math.tau)), self._fastest * fault.delay_s)
-        if largest > IMPLIED or self._variance > MAX_FIT_SD**2:
-            return math.inf
-        return max(variance, self._variance, (difference / FIT_SD) ** 2, (largest / IMPLIED_SD) ** 2)
+        least = 0.0
+        if late < EXCLUDED:
+            least = LATE_SD**2 if self._fastest < LATE_YAW_RATE else math.inf
+        return max(variance, self._variance, (difference / FIT_SD) ** 2, least)
 
     def _fit(self) -> None:
         """Fit the latest path for each fault, and add the log likelihood ratios."""
@@ -193,15 +185,16 @@ class HeadingTest:
         rotation = product / np.maximum(np.abs(product), 1e-12)
         fit = (np.clip(scale, *SCALE_LIMITS) * rotation)[:, None] * paths
         square = np.mean(np.abs(position - fit) ** 2, axis=1)
+        # How far the other paths are from that without a fault: one that hardly turns is no evidence.
+        norm = np.sum(np.abs(paths) ** 2, axis=1)
+        distance = (norm - np.abs(paths @ paths[0].conj()) ** 2 / max(float(norm[0]), 1e-9)) / len(position)
         # One independent position for each metre of the path.
         driven_m = min(float(distance_m[-1]) - self._fitted_m, length_m)
         gain = driven_m * np.log((square + ERROR_M**2) / (square[0] + ERROR_M**2))
-        self._evidence += np.clip(gain, -MOST_OF_FIT, MOST_OF_FIT)
-        self._evidence = np.minimum(self._evidence, MOST_EVIDENCE)
-        self._fitted_m, self._rotations = float(distance_m[-1]), np.angle(rotation).tolist()
-        faults = zip(_FAULTS, self._evidence.tolist(), self._rotations, strict=True)
-        self._remaining = [(fault, angle) for fault, one, angle in faults if one < fault.excluded][1:]
-        self._has_fault = float(self._evidence.min()) < IDENTIFIED
+        expected = driven_m * np.log1p(distance / (np.minimum(square, square[0]) + ERROR_M**2))
+        most = np.minimum(expected, MOST_OF_FIT)
+        self._evidence = np.minimum(self._evidence + np.clip(gain, -most, most)[1:], MOST_EVIDENCE)
+        self._fitted_m, self._rotation = float(distance_m[-1]), float(np.angle(rotation[0]))
         # Errors of ranges persist: averaging does not reduce the variance of the rotation.
         self._variance = float(square[0] + UNSEEN_M**2) / (2.0 * float(np.mean(np.abs(position) ** 2)))
         # From the beginning of the fitted path until now.
