@@ -20,9 +20,10 @@ from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, RangeFilter
+from uwb_mitigation.positioning.online.heading_test import HeadingTest
 from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
-from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
+from uwb_mitigation.positioning.online.robot_estimator import KNOWN_YAW_SD, RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import RobotData, TagEstimator
 from uwb_mitigation.types.tracks import Imu, Odometry
 
@@ -435,6 +436,17 @@ def test_wrong_headings_are_not_published(fault: str):
     wrong = replace(robot.config, robot=RobotData(odometry_faults(robot.odometry)[fault]))
     _, of_yaw, sd = robot.errors(RobotEstimator(wrong).run(robot.ranges()))
     assert np.sum(np.abs(of_yaw) > 3.29 * sd) <= 0.01 * len(of_yaw)
+
+
+def test_heading_on_a_circle_contains_the_turn_that_late_odometry_would_hide():
+    heading_test, point = HeadingTest((0.0, 0.0, 0.0)), PathPoint(1)
+    for time_s in np.arange(0.0, 60.0, 0.1).tolist():
+        yaw = 0.1 * time_s
+        point = PathPoint(1, 5.0 * math.sin(yaw), 5.0 - 5.0 * math.cos(yaw), yaw, 0.5 * time_s)
+        if heading_test.is_due(time_s, point):
+            heading_test.add(time_s, complex(point.x, point.y), 0.01, point)
+    sd = math.sqrt(heading_test.variance(point.yaw, 1e-4, point))
+    assert math.radians(16.0) < 3.29 * sd < 3.29 * KNOWN_YAW_SD
 
 
 @pytest.mark.parametrize("is_white", [False, True])

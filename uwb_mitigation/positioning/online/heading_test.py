@@ -64,9 +64,9 @@ FIT_SD = 1.5
 MAX_FIT_SD = math.radians(8.0)
 """A fit with a larger standard deviation confirms no heading."""
 
-LATE_SD, LATE_YAW_RATE = math.radians(14.9), math.radians(18.0)
-"""Until late stamps are excluded: smallest standard deviation of a heading, and the largest yaw rate (rad/s) with which one is confirmed.
-In simulated drives, turns of more than 2.5 times the largest rate before are rare."""
+LATE_SD, MIN_CHANGE, CHANGES = 3.0, math.radians(16.0), 2.3
+"""Until late stamps are excluded, a change of the yaw rate that the odometry does not show yet is within this many standard deviations of
+the heading: in the time of the delay at least this rotation, and this multiple of the range of yaw rates before."""
 
 RATE_S = 0.5
 """Averaging time of yaw rates."""
@@ -86,7 +86,8 @@ class HeadingTest:
     def __init__(self, lever_arm: tuple[float, float, float], *, is_verified: bool = False) -> None:
         self._arm = complex(*lever_arm[:2])
         self._evidence = np.full(len(_FAULTS) - 1, is_verified * EXCLUDED)
-        self._fastest, self._turned, self.contradicts = 0.0, (0.0, 0.0), False
+        self._slowest, self._fastest = math.inf, -math.inf
+        self._turned, self.contradicts = (0.0, PathPoint(0)), False
         # Time, distance driven, variance, drift and turn of the odometry, position, and position relative to the start of the path for each fault.
         self._samples: deque[tuple[complex, ...]] = deque(maxlen=400)
         self._last: PathPoint | None = None
@@ -106,11 +107,12 @@ class HeadingTest:
             # Both paths have no known relative rotation.
             self.forget_positions()
             self._rotation = last = None
-        begin_s, yaw = self._turned
+        begin_s, begin = self._turned
         if time_s - begin_s >= RATE_S or last is None:
-            self._turned = time_s, point.yaw
-            if last is not None:
-                self._fastest = max(self._fastest, abs(point.yaw - yaw) / (time_s - begin_s))
+            self._turned = time_s, point
+            if last is not None and point.distance_m > begin.distance_m:
+                rate = (point.yaw - begin.yaw) / (time_s - begin_s)
+                self._slowest, self._fastest = min(self._slowest, rate), max(self._fastest, rate)
         return last is None or point.distance_m - last.distance_m >= STEP_M
 
     def add(self, time_s: float, position: complex, variance: float, point: PathPoint) -> None:
@@ -153,10 +155,10 @@ class HeadingTest:
         self.contradicts = min(*others, late) < IDENTIFIED or difference**2 > limit
         if self.contradicts or min(others) < EXCLUDED or self._variance > MAX_FIT_SD**2:
             return math.inf
-        least = 0.0
+        change = 0.0
         if late < EXCLUDED:
-            least = LATE_SD**2 if self._fastest < LATE_YAW_RATE else math.inf
-        return max(variance, self._variance, (difference / FIT_SD) ** 2, least)
+            change = max(CHANGES * (self._fastest - self._slowest) * _MAX_DELAY_S, MIN_CHANGE)
+        return max(variance, self._variance, (difference / FIT_SD) ** 2, (change / LATE_SD) ** 2)
 
     def _fit(self) -> None:
         """Fit the latest path for each fault, and add the log likelihood ratios."""
