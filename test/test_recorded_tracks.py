@@ -18,8 +18,8 @@ from drives import HALL, drive
 from benchmarks.position_data import real_runs
 from uwb_mitigation.commands.offline.track import mitigation, read_anchors, read_config
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.recorded_tracks import TrackSettings
 from uwb_mitigation.positioning.tag_locator import TagLocator
 from uwb_mitigation.recordings.bag.writer import BagWriter

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from uwb_mitigation.calibration.joint_fit import KNOT_S
 from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.initialization import CandidatePosition, candidate_positions
 from uwb_mitigation.positioning.online.robot_estimator import live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 

@@ -47,10 +47,10 @@ from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.robot_estimator import live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of

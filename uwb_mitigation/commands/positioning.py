@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from uwb_mitigation.calibration.survey import SurveyResult
     from uwb_mitigation.commands.offline.track import HoldoutErrors
     from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+    from uwb_mitigation.positioning.config import EstimatorConfig
     from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap

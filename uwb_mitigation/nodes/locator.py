@@ -29,11 +29,11 @@ from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
 from uwb_mitigation.nodes.support.respawn import StateFile
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, TagState
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.ros import topics

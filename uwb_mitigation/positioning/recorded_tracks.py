@@ -13,6 +13,7 @@ import numpy as np
 
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
 from uwb_mitigation.positioning.batch.smoother import smooth
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.determination import (
     UNKNOWN_POSITION,
     Determination,
@@ -23,7 +24,7 @@ from uwb_mitigation.positioning.geometry import Area, Height, dop
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.initialization import snapshot
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator, live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets

@@ -15,7 +15,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.positioning.batch.smoother import Smoother
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
 from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odometry
