@@ -50,7 +50,7 @@ from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.robot_estimator import live_track
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
@@ -393,7 +393,8 @@ class _Fold:
             ranges, heights = corrected.take(rows), None
             if site.height_m is not None:
                 heights = Heights(ranges.stamp_ns, site.height_m[rows], np.full(len(rows), HEIGHT_SD_M**2))
-            track = live_track(EstimatorConfig(site.anchors, height=height, heights=heights), ranges)
+            config = EstimatorConfig(site.anchors, height=height, heights=heights)
+            track = TagEstimator(config).run(ranges)
             if not len(track):
                 continue
             index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1

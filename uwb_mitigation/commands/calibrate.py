@@ -31,11 +31,10 @@ if TYPE_CHECKING:
     from uwb_mitigation.calibration.site_data import SiteData
     from uwb_mitigation.calibration.solution import Localisation
     from uwb_mitigation.mitigation.model.bundle import Bundle
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.types.anchors import AnchorMap
 
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
-MAX_STAMP_OFFSET_S = 3600.0
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
 
@@ -129,10 +128,10 @@ def calibrate(
     """
     from uwb_mitigation.calibration.site import calibrate_site
     from uwb_mitigation.calibration.solution import solve_with_truth, solve_without_truth
-    from uwb_mitigation.commands.offline.track import read_anchors
     from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
+    from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
 
     _check_files(output, report, force)
     pose_options = _PoseOptions(
@@ -209,6 +208,8 @@ class _PoseOptions:
                 "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
                 valid="with --truth-topic",
             )
+        from uwb_mitigation.positioning.track_settings import MAX_STAMP_OFFSET_S
+
         if self.time_offset_s is not None and not abs(self.time_offset_s) <= MAX_STAMP_OFFSET_S:
             raise ParameterError(f"time offset {self.time_offset_s}", valid="-3600 to 3600 s")
 

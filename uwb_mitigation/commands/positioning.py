@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from uwb_mitigation.commands.offline.track import HoldoutErrors
     from uwb_mitigation.mitigation.correction import Mitigation
     from uwb_mitigation.positioning.config import EstimatorConfig
-    from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings
+    from uwb_mitigation.positioning.recorded_tracks import TagTracks
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap
 
@@ -107,7 +108,8 @@ def track(
     from uwb_mitigation.commands.offline.track import tum as tum_text
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings, track_tag
+    from uwb_mitigation.positioning.recorded_tracks import track_tag
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
     from uwb_mitigation.types.offsets import NO_OFFSETS
@@ -188,7 +190,7 @@ def survey(
     """
     from uwb_mitigation.calibration.survey import survey_anchors
     from uwb_mitigation.positioning.geometry import Area
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.types.anchors import save_anchors
 
     if not 0.0 < off <= 100.0:
@@ -219,8 +221,9 @@ def survey(
 def _read(
     bag: Path, anchors: Path | None, settings: TrackSettings, mitigation: Mitigation | None = None
 ) -> tuple[EstimatorConfig, RecordedRanges]:
-    from uwb_mitigation.commands.offline.track import read_anchors, read_config
+    from uwb_mitigation.commands.offline.track import read_config
     from uwb_mitigation.positioning.recorded_tracks import check_one_tag
+    from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
 

@@ -90,7 +90,7 @@ def view(
 
     from uwb_mitigation.commands.offline.track import mitigation, read_config
     from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
     from uwb_mitigation.types.offsets import NO_OFFSETS

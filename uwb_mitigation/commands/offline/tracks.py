@@ -20,7 +20,8 @@ from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings, check_one_tag, track_tag
+from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
+from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mcap import McapRecording
