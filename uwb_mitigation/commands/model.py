@@ -146,9 +146,6 @@ def quantise(
         ),
     ],
     output: OutputOption,
-    percentile: Annotated[
-        float, typer.Option(help="Percentile of each activation that is quantised to 255; 100: the maximum.")
-    ] = 100.0,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -161,12 +158,12 @@ def quantise(
     from uwb_mitigation.training.fit import quantisation
 
     source = load_bundle(model)
-    quantisation.check(source, percentile)
+    quantisation.check(source)
     check_output(output, force)
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
     console.show_skipped(dataset.skipped)
-    quantised = quantisation.quantise_bundle(source, dataset, percentile, output)
+    quantised = quantisation.quantise_bundle(source, dataset, output)
     bundle, difference = quantised.bundle, quantised.difference_m
     model_tables.show_bundle(bundle)
     console.out.print(
