@@ -98,7 +98,7 @@ class Observations:
     def without(self, left_out: NDArray[np.bool_]) -> Observations:
         """Return the same knots without those observations (n,); `observation_index` becomes invalid."""
         is_used = ~left_out
-        columns = (
+        columns = [
             "knot",
             "anchor",
             "ahead_s",
@@ -107,7 +107,7 @@ class Observations:
             "relative_height",
             "rows",
             "noise_group",
-        )
+        ]
         return replace(self, **{name: getattr(self, name)[is_used] for name in columns})
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import check_output
+from uwb_mitigation.commands.support.checks import check_output, check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.commands.support.position_options import (
     AnchorsOption,
@@ -48,13 +48,7 @@ def calibrate(
         ),
     ],
     output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE",
-            help="Bundle to write; the offsets are written next to it as X.offsets.yaml.",
-        ),
+        Path, output_option("FILE", "Bundle to write; the offsets are written next to it as X.offsets.yaml.")
     ],
     anchors: AnchorsOption = None,
     height: HeightOption = None,
@@ -106,8 +100,7 @@ def calibrate(
     height_topic: HeightTopicOption = None,
     stamp_offset: OffsetOption = 0.0,
     report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write an HTML page with the results."),
+        Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with the results.")
     ] = None,
     force: Annotated[
         bool,
@@ -218,9 +211,7 @@ def _check_files(output: Path, report: Path | None, force: bool) -> None:
     from uwb_mitigation.calibration.site import offsets_file
 
     check_output(output)
-    for file in (output, offsets_file(output), *([report] if report else [])):
-        if file.exists() and not force:
-            raise ParameterError("the file exists", where=str(file), valid="--force replaces it")
+    check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
 
 
 def _fine_tune(source: Bundle) -> FineTune | None:

@@ -11,7 +11,13 @@ import typer
 
 from uwb_mitigation.commands.support import console, model_tables
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption, ScalingName, check_output, needs_torch
+from uwb_mitigation.commands.support.checks import (
+    OffsetsOption,
+    ScalingName,
+    check_output,
+    needs_torch,
+    output_option,
+)
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
@@ -22,7 +28,7 @@ if TYPE_CHECKING:
 DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
 ]
-OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
+OutputOption = Annotated[Path, output_option("FILE", "Bundle to write.")]
 # Options for one mode of `train` or `evaluate`; they are errors in the other mode.
 _DATA_OPTIONS = {
     "recipe_name": "--recipe",
@@ -38,8 +44,7 @@ def train(
     context: typer.Context,
     output: OutputOption,
     data: Annotated[
-        Path | None,
-        typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs."),
+        Path | None, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
     ] = None,
     from_bag: Annotated[
         Path | None,
@@ -191,7 +196,7 @@ def evaluate(
         Literal["configuration", "tag", "half"] | None,
         typer.Option(
             help="Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out "
-            "placements (configuration), locations (tag) or half of the anchors.",
+            "placements (configuration), locations (tag) or half of the anchors."
         ),
     ] = None,
     seeds: Annotated[

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from uwb_mitigation.commands.support import console, model_tables
-from uwb_mitigation.commands.support.checks import ScalingName, check_output, needs_torch
+from uwb_mitigation.commands.support.checks import ScalingName, check_output, needs_torch, output_option
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
@@ -18,7 +18,7 @@ MAX_BLOCKS = 10_000
 
 
 def train_universal(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="int8 bundle to write.")],
+    output: Annotated[Path, output_option("FILE", "int8 bundle to write.")],
     seed: Annotated[int, typer.Option(help="Seed of the simulated buildings and of the network.")] = 0,
     samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[

@@ -5,7 +5,7 @@ The same `TrackSettings` give the same tracks in every command, on the page of t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
 
 import numpy as np
@@ -80,6 +80,28 @@ def check_one_tag(config: EstimatorConfig, recordings: Sequence[TagRecording]) -
     if option and len(recordings) > 1:
         tags = ", ".join(format_id(recording.tag_id) for recording in recordings)
         raise ParameterError(f"{option} with the tags {tags}", valid="a bag with one tag")
+
+
+def track_tags(
+    recordings: Sequence[TagRecording],
+    config: EstimatorConfig,
+    on_tag: Callable[[TagRecording], None] = lambda recording: None,
+) -> tuple[list[TagTracks], list[DatasetError]]:
+    """Return the tracks of the tags, and the errors of those without a position; `on_tag` is called before each tag.
+
+    Raises:
+        DatasetError: no position of any tag can be determined.
+    """
+    tracks, failures = list[TagTracks](), list[DatasetError]()
+    for recording in recordings:
+        on_tag(recording)
+        try:
+            tracks.append(track_tag(recording, config))
+        except DatasetError as error:
+            failures.append(error)
+    if not tracks:
+        raise failures[0]
+    return tracks, failures
 
 
 def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:

@@ -292,13 +292,7 @@ def block_of(
     delay_factor = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, MAX_DELAY_FACTOR)
     fields = draw_fields(environments, PLACEMENTS, rng, delay_factor)
     pairs = AntennaPairs(
-        anchor,
-        tag,
-        path.take(chosen),
-        environments,
-        fields,
-        np.arange(PLACEMENTS),
-        stationary=True,
+        anchor, tag, path.take(chosen), environments, fields, np.arange(PLACEMENTS), stationary=True
     )
     return Block(kind.name, chosen // per_building, pairs, boards.take(chosen)), rng
 

@@ -204,12 +204,7 @@ class Receiver:
 
     def boards(self, n: int) -> Boards:
         """Return the properties of n pairs between identical boards."""
-        values = (
-            self.noise_figure_db,
-            self.preamble_symbols,
-            self.self_noise_db,
-            self.noise_multiplier,
-        )
+        values = (self.noise_figure_db, self.preamble_symbols, self.self_noise_db, self.noise_multiplier)
         return Boards(np.zeros(n), *(np.full(n, float(value)) for value in values))
 
     @staticmethod

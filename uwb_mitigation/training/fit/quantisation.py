@@ -40,10 +40,7 @@ def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
 
 
 def quantise_network(
-    weights: FloatWeights,
-    calibration: NDArray[np.float32],
-    *,
-    exact: bool = True,
+    weights: FloatWeights, calibration: NDArray[np.float32], *, exact: bool = True
 ) -> Int8Weights:
     """Quantise a network to int8.
 
