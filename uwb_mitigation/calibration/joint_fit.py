@@ -8,7 +8,7 @@ independent ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,16 +98,8 @@ class Observations:
     def without(self, left_out: NDArray[np.bool_]) -> Observations:
         """Return the same knots without those observations (n,); `observation_index` becomes invalid."""
         is_used = ~left_out
-        columns = [
-            "knot",
-            "anchor",
-            "ahead_s",
-            "range_m",
-            "independent",
-            "relative_height",
-            "rows",
-            "noise_group",
-        ]
+        of_knots = ("observation_index", "knot_segment", "time_s", "is_stationary")
+        columns = [field.name for field in fields(self) if field.name not in of_knots]
         return replace(self, **{name: getattr(self, name)[is_used] for name in columns})
 
 

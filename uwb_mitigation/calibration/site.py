@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration import models
 from uwb_mitigation.calibration.held_out import (
     BLOCK_S,
     MAX_INCREASE,
@@ -20,16 +21,6 @@ from uwb_mitigation.calibration.held_out import (
     HeldOut,
     decisive,
     select,
-)
-from uwb_mitigation.calibration.models import (
-    FINE_TUNED,
-    LINE,
-    NETWORK,
-    NETWORK_LINE,
-    NO_MODEL,
-    FineTune,
-    SiteModel,
-    fit_model,
 )
 from uwb_mitigation.calibration.site_data import SiteData, read_site
 from uwb_mitigation.calibration.solution import (
@@ -96,7 +87,7 @@ class SiteCalibration:
     held_out: tuple[HeldOut, ...]
     chosen: str
     level: str
-    model: SiteModel
+    model: models.SiteModel
     notes: tuple[str, ...]
 
     @property
@@ -317,7 +308,7 @@ def calibrate_site(
     solution: SiteSolution,
     *,
     check: Sequence[SiteData] = (),
-    fine_tune: FineTune | None = None,
+    fine_tune: models.FineTune | None = None,
     on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteCalibration:
     """Select a correction for the ranges of a solution, see `held_out.select`.
@@ -353,7 +344,11 @@ class _Fold:
     training: tuple[SiteData, SiteSolution]
 
     def evaluate(
-        self, corrections: Mapping[str, tuple[str, str]], fine_tune: FineTune | None, *, is_separate: bool
+        self,
+        corrections: Mapping[str, tuple[str, str]],
+        fine_tune: models.FineTune | None,
+        *,
+        is_separate: bool,
     ) -> HeldOut:
         """Return the errors of `RAW` and of corrections, {name: (level of the offsets, kind of the model)}."""
         site, (training_site, solution) = self.site, self.training
@@ -362,7 +357,7 @@ class _Fold:
         block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         for name, (level, kind) in corrections.items():
             data, _ = _labelled(training_site, solution, level)
-            model = fit_model(kind, data, training_site.universal_m[solution.rows], fine_tune)
+            model = models.fit_model(kind, data, training_site.universal_m[solution.rows], fine_tune)
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
             corrected_m = np.maximum(raw_m - _offsets_m(site, solution.offsets(level)) - predicted_m, 0.0)
             residual_m[name] = self.reference.errors_of(corrected_m)
@@ -370,7 +365,7 @@ class _Fold:
                 variance_m2 = fit_intervals(residual_m[name], predicted_m, block.astype(str)).variance_of(
                     predicted_m
                 )
-                if kind == NO_MODEL:
+                if kind == models.NO_MODEL:
                     variance_m2 = np.minimum(variance_m2, MAX_SD_M**2)
                 live_m[name] = self._live_errors_m(corrected_m, variance_m2)
         # Without ground truth the reference of the raw ranges contains no common offset, because the locator estimates it.
@@ -412,7 +407,7 @@ class _HeldOutTest:
         site: SiteData,
         solution: SiteSolution,
         check: Sequence[SiteData],
-        fine_tune: FineTune | None,
+        fine_tune: models.FineTune | None,
         on_progress: Progress,
     ) -> None:
         self._site, self._solution, self._fine_tune = site, solution, fine_tune
@@ -431,20 +426,20 @@ class _HeldOutTest:
     def calibration(self) -> SiteCalibration:
         """Return the calibration with the selected correction."""
         site, solution = self._site, self._solution
-        levels = {COMMON: (ONE, NO_MODEL), OFFSETS: (PAIR, NO_MODEL)}
+        levels = {COMMON: (ONE, models.NO_MODEL), OFFSETS: (PAIR, models.NO_MODEL)}
         # Errors that persist for metres look like offsets in each half of a drive.
         needs_separate = [] if solution.offsets_differ else [OFFSETS]
         base = select(self._evaluate(levels), list(levels), needs_separate)
-        kinds, notes = [LINE], list(solution.notes)
+        kinds, notes = [models.LINE], list(solution.notes)
         if site.has_cirs:
-            kinds = [NETWORK, NETWORK_LINE, *([FINE_TUNED] if self._fine_tune else [])]
+            kinds = [models.NETWORK, models.NETWORK_LINE, *([models.FINE_TUNED] if self._fine_tune else [])]
             if without_cir := int((~site.is_usable).sum()):
                 notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
         else:
             notes.append("no networks: the recording has no CIRs that the universal model was trained for")
         corrections = levels | {f"{base} + {kind}": (levels[base][0], kind) for kind in kinds}
         if solution.truth is None:
-            needs_separate = [name for name, (_, kind) in corrections.items() if kind == LINE]
+            needs_separate = [name for name, (_, kind) in corrections.items() if kind == models.LINE]
         held_out = self._evaluate(corrections)
         candidates = [base, *list(corrections)[2:]]
         chosen = select(held_out, candidates, needs_separate)
@@ -459,7 +454,7 @@ class _HeldOutTest:
             held_out=tuple(held_out),
             chosen=chosen,
             level=level,
-            model=fit_model(kind, data, site.universal_m[solution.rows], self._fine_tune),
+            model=models.fit_model(kind, data, site.universal_m[solution.rows], self._fine_tune),
             notes=tuple(notes),
         )
 

@@ -13,16 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support import position_options as options
 from uwb_mitigation.commands.support.checks import check_output, check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.position_options import (
-    AnchorsOption,
-    AreaOption,
-    HeightOption,
-    HeightSdOption,
-    HeightTopicOption,
-    OffsetOption,
-)
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -50,10 +43,10 @@ def calibrate(
     output: Annotated[
         Path, output_option("FILE", "Bundle to write; the offsets are written next to it as X.offsets.yaml.")
     ],
-    anchors: AnchorsOption = None,
-    height: HeightOption = None,
-    height_sd: HeightSdOption = 0.1,
-    area: AreaOption = None,
+    anchors: options.AnchorsOption = None,
+    height: options.HeightOption = None,
+    height_sd: options.HeightSdOption = 0.1,
+    area: options.AreaOption = None,
     truth_topic: Annotated[
         str | None,
         typer.Option(
@@ -97,8 +90,8 @@ def calibrate(
             "Without CIRs and ground truth, a line in the received power is used only if it improves this drive.",
         ),
     ] = None,
-    height_topic: HeightTopicOption = None,
-    stamp_offset: OffsetOption = 0.0,
+    height_topic: options.HeightTopicOption = None,
+    stamp_offset: options.OffsetOption = 0.0,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with the results.")
     ] = None,
@@ -195,8 +188,8 @@ class _PoseOptions:
 
     def check(self) -> None:
         """Raise a ParameterError if the options contradict each other."""
-        options = (self.frames, self.time_offset_s, self.lever_arm_m, self.estimate_lever_arm or None)
-        if self.topic is None and any(option is not None for option in options):
+        values = (self.frames, self.time_offset_s, self.lever_arm_m, self.estimate_lever_arm or None)
+        if self.topic is None and any(value is not None for value in values):
             raise ParameterError(
                 "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
                 valid="with --truth-topic",
@@ -266,7 +259,7 @@ def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle, settings: Trac
     return site
 
 
-def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOptions) -> Localisation:
+def _localisation(bags: list[Path], site: SiteData, topic: str, pose: _PoseOptions) -> Localisation:
     """Read for each tag the poses of its body in each bag, and its lever arm."""
     import numpy as np
 
@@ -274,14 +267,14 @@ def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOp
     from uwb_mitigation.recordings.bag.pose_paths import read_bodies
     from uwb_mitigation.types.ros.poses import UWB_TAG, tag_of_frame
 
-    lever_arm_m = options.lever_arm_m
+    lever_arm_m = pose.lever_arm_m
 
     if lever_arm_m is not None and len(site.tags) > 1:
         raise ParameterError(
             f"one --lever-arm for {len(site.tags)} tags",
             valid="transforms to the frames of the tags in the bag",
         )
-    bodies = [read_bodies(bag, topic, options.frames) for bag in bags]
+    bodies = [read_bodies(bag, topic, pose.frames) for bag in bags]
     paths, lever_arms_m = [], np.zeros((len(site.tags), 3))
     for number, tag in enumerate(site.tags):
         names = [
@@ -300,7 +293,7 @@ def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOp
                     "antenna; the lever arm is 0. Set --lever-arm"
                 )
     ids = [tag.tag_id for tag in site.tags]
-    return Localisation(topic, ids, paths, options.time_offset_s, lever_arms_m, options.estimate_lever_arm)
+    return Localisation(topic, ids, paths, pose.time_offset_s, lever_arms_m, pose.estimate_lever_arm)
 
 
 def _body_of_tag(tag_id: int, bodies: Iterable[str], where: str) -> str:

@@ -10,21 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support import position_options as options
 from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 from uwb_mitigation.commands.support.checks import OffsetsOption, check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.position_options import (
-    AccelerationOption,
-    AnchorsOption,
-    AreaOption,
-    HeightOption,
-    HeightSdOption,
-    HeightTopicOption,
-    ImuOption,
-    LeverArmOption,
-    OdometryOption,
-    OffsetOption,
-)
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 
 if TYPE_CHECKING:
@@ -66,20 +55,20 @@ BagArgument = Annotated[
 def track(
     bag: BagArgument,
     output: Annotated[Path, output_option("OUT", "OUT.mcap for one file, any other name for a folder.")],
-    anchors: AnchorsOption = None,
+    anchors: options.AnchorsOption = None,
     tum: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also write the smoothed track in TUM's format, as evo reads it."),
     ] = None,
-    height: HeightOption = None,
-    height_sd: HeightSdOption = 0.1,
-    height_topic: HeightTopicOption = None,
-    area: AreaOption = None,
-    odometry: OdometryOption = None,
-    imu: ImuOption = None,
-    lever_arm: LeverArmOption = None,
-    stamp_offset: OffsetOption = 0.0,
-    acceleration: AccelerationOption = 0.8,
+    height: options.HeightOption = None,
+    height_sd: options.HeightSdOption = 0.1,
+    height_topic: options.HeightTopicOption = None,
+    area: options.AreaOption = None,
+    odometry: options.OdometryOption = None,
+    imu: options.ImuOption = None,
+    lever_arm: options.LeverArmOption = None,
+    stamp_offset: options.OffsetOption = 0.0,
+    acceleration: options.AccelerationOption = 0.8,
     model: ModelOption = None,
     offsets: OffsetsOption = None,
     report: Annotated[
@@ -154,7 +143,7 @@ def track(
 def survey(
     bag: BagArgument,
     output: Annotated[Path, output_option("FILE", "The anchors file to write.")],
-    anchors: AnchorsOption = None,
+    anchors: options.AnchorsOption = None,
     off: Annotated[
         float, typer.Option(help="Standard deviation of the guesses in FILE, m in each coordinate.")
     ] = 1.0,
@@ -162,12 +151,12 @@ def survey(
         list[str] | None,
         typer.Option("--fixed", metavar="ID", help="An anchor that is where FILE says; may be repeated."),
     ] = None,
-    height: HeightOption = None,
-    height_sd: HeightSdOption = 0.1,
-    height_topic: HeightTopicOption = None,
-    area: AreaOption = None,
-    stamp_offset: OffsetOption = 0.0,
-    acceleration: AccelerationOption = 0.8,
+    height: options.HeightOption = None,
+    height_sd: options.HeightSdOption = 0.1,
+    height_topic: options.HeightTopicOption = None,
+    area: options.AreaOption = None,
+    stamp_offset: options.OffsetOption = 0.0,
+    acceleration: options.AccelerationOption = 0.8,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, label, place
-from uwb_mitigation.simulation.buildings import PLACEMENTS, block_of
+from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
-from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, DiffuseField, check_range
+from uwb_mitigation.simulation.channel import DiffuseField, check_range
 from uwb_mitigation.simulation.odometry import SimulatedMotion, simulate_motion, yaw_along_route
 from uwb_mitigation.simulation.radio import Boards, Receiver, Reception
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point, along_route
@@ -48,8 +48,6 @@ ROBOT_FRAME = "base_link"
 
 FIRST_TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
-
-RESIDENTIAL = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
 
 SURVEY_RATE_HZ = 20.0
 
