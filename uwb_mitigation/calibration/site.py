@@ -331,8 +331,55 @@ def calibrate_site(
             valid=f"at least {MIN_LABELLED}",
         )
     _check_offsets(solution.pairs)
-    test = _HeldOutTest(site, solution, check, fine_tune, on_progress)
-    return test.calibration()
+    on_test = functools.partial(on_progress, "testing on held-out ranges")
+    on_test(0.1)
+    is_first, is_separate = site.halves()
+    halves = [site.select(mask) for mask in (is_first, ~is_first)]
+    try:
+        solved = [solution.solve_part(half) for half in halves]
+    except DatasetError as error:
+        raise DatasetError(f"a half of the drive: {error}", valid="a longer drive") from error
+    first, second = zip(halves, solved, strict=True)
+    folds = _Fold(*first, second), _Fold(*second, first)
+    checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
+
+    def evaluate(corrections: Mapping[str, tuple[str, str]]) -> list[HeldOut]:
+        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, on the halves and on each drive."""
+        one, other = (fold.evaluate(corrections, fine_tune, is_separate=is_separate) for fold in folds)
+        drives = (fold.evaluate(corrections, fine_tune, is_separate=True) for fold in checks)
+        return [one.merged(other, is_first), *drives]
+
+    levels = {COMMON: (ONE, models.NO_MODEL), OFFSETS: (PAIR, models.NO_MODEL)}
+    # Errors that persist for metres look like offsets in each half of a drive.
+    needs_separate = [] if solution.offsets_differ else [OFFSETS]
+    base = select(evaluate(levels), list(levels), needs_separate)
+    kinds, notes = [models.LINE], list(solution.notes)
+    if site.has_cirs:
+        kinds = [models.NETWORK, models.NETWORK_LINE, *([models.FINE_TUNED] if fine_tune else [])]
+        if without_cir := int((~site.is_usable).sum()):
+            notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
+    else:
+        notes.append("no networks: the recording has no CIRs that the universal model was trained for")
+    corrections = levels | {f"{base} + {kind}": (levels[base][0], kind) for kind in kinds}
+    if solution.truth is None:
+        needs_separate = [name for name, (_, kind) in corrections.items() if kind == models.LINE]
+    held_out = evaluate(corrections)
+    candidates = [base, *list(corrections)[2:]]
+    chosen = select(held_out, candidates, needs_separate)
+    level, kind = corrections[chosen]
+    data, raw_error_m = _labelled(site, solution, level)
+    on_test(1.0)
+    return SiteCalibration(
+        site=site,
+        solution=solution,
+        data=data,
+        raw_error_m=raw_error_m,
+        held_out=tuple(held_out),
+        chosen=chosen,
+        level=level,
+        model=models.fit_model(kind, data, site.universal_m[solution.rows], fine_tune),
+        notes=tuple(notes),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -397,77 +444,6 @@ class _Fold:
             has_position = track.stamp_ns[index] == ranges.stamp_ns
             error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
         return error_m
-
-
-class _HeldOutTest:
-    """Fits corrections to one part of the data and tests them on another one."""
-
-    def __init__(
-        self,
-        site: SiteData,
-        solution: SiteSolution,
-        check: Sequence[SiteData],
-        fine_tune: models.FineTune | None,
-        on_progress: Progress,
-    ) -> None:
-        self._site, self._solution, self._fine_tune = site, solution, fine_tune
-        self._on_progress = functools.partial(on_progress, "testing on held-out ranges")
-        self._on_progress(0.1)
-        self._is_first, self._is_separate = site.halves()
-        halves = [site.select(mask) for mask in (self._is_first, ~self._is_first)]
-        try:
-            solved = [solution.solve_part(half) for half in halves]
-        except DatasetError as error:
-            raise DatasetError(f"a half of the drive: {error}", valid="a longer drive") from error
-        first, second = zip(halves, solved, strict=True)
-        self._halves = _Fold(*first, second), _Fold(*second, first)
-        self._checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
-
-    def calibration(self) -> SiteCalibration:
-        """Return the calibration with the selected correction."""
-        site, solution = self._site, self._solution
-        levels = {COMMON: (ONE, models.NO_MODEL), OFFSETS: (PAIR, models.NO_MODEL)}
-        # Errors that persist for metres look like offsets in each half of a drive.
-        needs_separate = [] if solution.offsets_differ else [OFFSETS]
-        base = select(self._evaluate(levels), list(levels), needs_separate)
-        kinds, notes = [models.LINE], list(solution.notes)
-        if site.has_cirs:
-            kinds = [models.NETWORK, models.NETWORK_LINE, *([models.FINE_TUNED] if self._fine_tune else [])]
-            if without_cir := int((~site.is_usable).sum()):
-                notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
-        else:
-            notes.append("no networks: the recording has no CIRs that the universal model was trained for")
-        corrections = levels | {f"{base} + {kind}": (levels[base][0], kind) for kind in kinds}
-        if solution.truth is None:
-            needs_separate = [name for name, (_, kind) in corrections.items() if kind == models.LINE]
-        held_out = self._evaluate(corrections)
-        candidates = [base, *list(corrections)[2:]]
-        chosen = select(held_out, candidates, needs_separate)
-        level, kind = corrections[chosen]
-        data, raw_error_m = _labelled(site, solution, level)
-        self._on_progress(1.0)
-        return SiteCalibration(
-            site=site,
-            solution=solution,
-            data=data,
-            raw_error_m=raw_error_m,
-            held_out=tuple(held_out),
-            chosen=chosen,
-            level=level,
-            model=models.fit_model(kind, data, site.universal_m[solution.rows], self._fine_tune),
-            notes=tuple(notes),
-        )
-
-    def _evaluate(self, corrections: Mapping[str, tuple[str, str]]) -> list[HeldOut]:
-        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, on the halves and on each drive."""
-        halves = [
-            fold.evaluate(corrections, self._fine_tune, is_separate=self._is_separate)
-            for fold in self._halves
-        ]
-        return [
-            halves[0].merged(halves[1], self._is_first),
-            *(fold.evaluate(corrections, self._fine_tune, is_separate=True) for fold in self._checks),
-        ]
 
 
 def _check_offsets(pairs: Pairs) -> None:

@@ -78,7 +78,7 @@ def train(
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
     per_configuration: Annotated[
-        int, typer.Option(help="With --data: use at most this number of ranges of each placement.")
+        int, typer.Option(min=1, help="With --data: use at most this number of ranges of each placement.")
     ] = 20,
     seed: Annotated[
         int, typer.Option(help="Seed of the splits, the initial weights and the order of the data.")
@@ -110,8 +110,6 @@ def train(
             valid="only with --data: with --from-bag the source model determines these options",
         )
     chosen_scaling = Scaling(scaling)
-    if per_configuration < 1:
-        raise ParameterError(f"per-configuration = {per_configuration}", valid="at least 1")
     set_options: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
     set_options = {key: value for key, value in set_options.items() if value is not None}
     options = FitOptions(**set_options)
@@ -200,7 +198,12 @@ def evaluate(
         ),
     ] = None,
     seeds: Annotated[
-        int, typer.Option(help="With --cross-validate: number of repetitions with other splits and networks.")
+        int,
+        typer.Option(
+            min=1,
+            max=100,
+            help="With --cross-validate: number of repetitions with other splits and networks.",
+        ),
     ] = 3,
     folds: Annotated[int, typer.Option(help="With --cross-validate configuration: number of folds.")] = 6,
     scaling: Annotated[
@@ -239,14 +242,11 @@ def evaluate(
 
 def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
     from uwb_mitigation.mitigation.model.architecture import Remnet
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import default_model_path
     from uwb_mitigation.mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.data import splits
     from uwb_mitigation.training.fit.options import FitOptions
-
-    if not 1 <= seeds <= 100:
-        raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
-    from uwb_mitigation.mitigation.model.bundle import load_bundle
-    from uwb_mitigation.mitigation.model.shipped import default_model_path
 
     with needs_torch():
         from uwb_mitigation.training import comparison
