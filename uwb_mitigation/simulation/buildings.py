@@ -46,26 +46,15 @@ class BuildingType:
 
 KINDS = (
     BuildingType("flat", 0.55, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
-    BuildingType(
-        "office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08
-    ),
-    BuildingType(
-        "corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06
-    ),
+    BuildingType("office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08),
+    BuildingType("corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06),
     BuildingType("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
-)
+)  # fmt: skip
 
+_OPEN = ((RESIDENTIAL, 0.35), (OFFICE, 0.25), (INDUSTRIAL, 0.2), (OUTDOOR, 0.2))
 WIDE_KINDS = (
     *(replace(kind, share=0.7 * kind.share) for kind in KINDS),
-    BuildingType(
-        "open",
-        0.3,
-        (5.0, 40.0),
-        (4.0, 30.0),
-        (60.0, 60.0),
-        ((RESIDENTIAL, 0.35), (OFFICE, 0.25), (INDUSTRIAL, 0.2), (OUTDOOR, 0.2)),
-        0.02,
-    ),
+    BuildingType("open", 0.3, (5.0, 40.0), (4.0, 30.0), (60.0, 60.0), _OPEN, 0.02),
 )
 """Open sites have no inner walls: laboratories, arenas, halls, and places outdoors. About half of the placements are LOS."""
 
