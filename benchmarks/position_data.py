@@ -22,8 +22,8 @@ from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.config import RobotData
 from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank
-from uwb_mitigation.positioning.online.tag_estimator import RobotData
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import load_mapping, shipped_mappings
 from uwb_mitigation.simulation.odometry import RATE_HZ, motion_along, stamps_s

@@ -24,11 +24,11 @@ from benchmarks.baselines import run_ekf
 from benchmarks.position_data import Run, RunSource, geometry_runs, real_runs, simulated_runs
 from uwb_mitigation.errors import DatasetError, UwbMitigationError
 from uwb_mitigation.positioning.batch.smoother import smooth
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.initialization import snapshot
 from uwb_mitigation.positioning.online.robot_estimator import make_estimator
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S

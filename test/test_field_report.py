@@ -189,7 +189,7 @@ def test_earlier_report_is_not_replaced(tmp_path: Path):
     path = tmp_path / "report.zip"
     path.touch()
     command = ["field-report", "--source", "uci", "--port", "/dev/a", "--distance", "3", "-o", str(path)]
-    assert "the file exists" in str(CliRunner().invoke(cli.app, command).exception)
+    assert "exists already" in str(CliRunner().invoke(cli.app, command).exception)
     assert "is not there" in str(CliRunner().invoke(cli.app, [*command, "--force"]).exception)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +24,6 @@ from uwb_mitigation.types.measurement import Record, Truth
 pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.mitigation.model.floating import float_network
 from uwb_mitigation.training.data import recordings
-from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.fit import candidates, selection
 from uwb_mitigation.training.fit.candidates import Candidate, FittedModel, Recipe, network_m
 from uwb_mitigation.training.fit.options import FitOptions
@@ -34,19 +33,11 @@ SHAPE = Remnet(samples=8)
 RECIPE = Recipe(SHAPE, FitOptions(epochs=1))
 
 
-@dataclass(frozen=True, eq=False)
-class FixedOffset(Candidate):
-    offset_m: float
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        return FittedModel(LinearBiasModel(self.offset_m))
+def fixed_offset(name: str, offset_m: float, trains: bool = False) -> Candidate:
+    return Candidate(name, lambda data, seed: FittedModel(LinearBiasModel(offset_m)), trains)
 
 
-class TrainedOffset(FixedOffset):
-    trains = True
-
-
-CONSTANTS = [FixedOffset("none", 0.0), FixedOffset("half", 0.5), FixedOffset("quarter", 0.25)]
+CONSTANTS = [fixed_offset("none", 0.0), fixed_offset("half", 0.5), fixed_offset("quarter", 0.25)]
 
 
 def numbered(error_of):
@@ -86,7 +77,7 @@ def test_nested_error_is_from_configurations_outside_the_selection():
 
 def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
     data = numbered(lambda number: 0.3)
-    offered = [*CONSTANTS[:2], TrainedOffset("quarter", 0.25)]
+    offered = [*CONSTANTS[:2], fixed_offset("quarter", 0.25, trains=True)]
     assert selection.select_nested(data, offered, 3, 0).chosen == "quarter"
     prefer = selection.select_simplest
 
@@ -241,7 +232,7 @@ def test_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
 
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):
     loads(monkeypatch, dataset(6, 3, samples=157))
-    far_off = FixedOffset("far off", 9.0)
+    far_off = fixed_offset("far off", 9.0)
     monkeypatch.setattr(candidates, "new_models", lambda recipe: [far_off])
     output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
     printed = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)

@@ -15,6 +15,7 @@ from benchmarks.position_data import simulated_runs
 from benchmarks.positions import ambiguous_drives, evaluate
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.batch.smoother import smooth
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.determination import current_determination, determination, drive_determination
 from uwb_mitigation.positioning.geometry import (
     AnchorRank,
@@ -27,16 +28,12 @@ from uwb_mitigation.positioning.geometry import (
 )
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.online.ambiguity import Ambiguity
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import candidate_positions
 from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.robust_update import SCALE, RobustUpdate
-from uwb_mitigation.positioning.online.tag_estimator import (
-    RANGE_TIMEOUT_S,
-    Ambiguity,
-    EstimatorConfig,
-    TagEstimator,
-)
+from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track, TruePath

@@ -16,12 +16,13 @@ from command_line import run, succeed
 from drives import HALL, drive
 
 from benchmarks.position_data import real_runs
-from uwb_mitigation.commands.offline.track import mitigation, read_anchors, read_config
+from uwb_mitigation.commands.offline.track import mitigation, read_config
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
-from uwb_mitigation.positioning.recorded_tracks import TrackSettings
 from uwb_mitigation.positioning.tag_locator import TagLocator
+from uwb_mitigation.positioning.track_settings import TrackSettings
+from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import (
     Cir,

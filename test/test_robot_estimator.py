@@ -15,6 +15,7 @@ from drives import HALL, NANOSECONDS, Robot, drive, wrapped
 from benchmarks.position_data import real_runs
 from benchmarks.positions import evaluate, odometry_faults
 from uwb_mitigation.positioning.batch.smoother import smooth
+from uwb_mitigation.positioning.config import RobotData
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
 from uwb_mitigation.positioning.noise_model import NoiseModel
@@ -24,7 +25,7 @@ from uwb_mitigation.positioning.online.heading_test import HeadingTest
 from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.online.robot_estimator import KNOWN_YAW_SD, RobotEstimator
-from uwb_mitigation.positioning.online.tag_estimator import RobotData, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.tracks import Imu, Odometry
 
 

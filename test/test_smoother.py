@@ -9,8 +9,9 @@ from scipy.optimize import least_squares
 
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares
 from uwb_mitigation.positioning.batch.smoother import Smoother, knots_of, smooth
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.tracks import Track, TruePath

@@ -10,8 +10,8 @@ from drives import HALL, NANOSECONDS, circuit, drive
 
 from uwb_mitigation.calibration.survey import displacements, survey_anchors
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Area, Height
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 
 LEVEL = Height(1.0)

@@ -22,9 +22,9 @@ from uwb_mitigation.commands import positioning
 from uwb_mitigation.commands.offline.track import held_out
 from uwb_mitigation.nodes.support.parameter_tables import TABLES
 from uwb_mitigation.positioning import recorded_tracks as tracking
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.recorded_tracks import track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter

@@ -24,9 +24,10 @@ from PIL import Image
 
 from benchmarks.equipment.page_clients import PageClients
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer import health

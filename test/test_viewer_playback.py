@@ -27,7 +27,7 @@ from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import anchors_path, dump_anchors, load_anchors

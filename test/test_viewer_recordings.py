@@ -17,7 +17,7 @@ from bag_material import START_NS, corrected, record
 from browser import Browser
 from drives import HALL, drive
 
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.recordings import recorded_ranges
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import Status

@@ -37,8 +37,8 @@ from uwb_mitigation.calibration.solution import solve_without_truth
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.robot_estimator import live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.tracks import Ranges

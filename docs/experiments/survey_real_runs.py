@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.position_data import HEIGHTS, hanyang_run
 from uwb_mitigation.calibration.survey import displacements, survey_anchors
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.config import EstimatorConfig
 
 OFF_M = 1.5
 

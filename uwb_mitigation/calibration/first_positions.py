@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from uwb_mitigation.calibration.joint_fit import KNOT_S
 from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.initialization import CandidatePosition, candidate_positions
-from uwb_mitigation.positioning.online.robot_estimator import live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 
@@ -54,7 +54,7 @@ def first_positions(
             continue
         ranges = segments.ranges.take(rows)
         corrected = replace(ranges, range_m=np.maximum(ranges.range_m - expected_m[rows], 0.0))
-        track = live_track(config, corrected)
+        track = TagEstimator(config).run(corrected)
         if len(track) >= 2:
             position.append(_at_knots(track, ranges))
             has_position[number] = True

@@ -18,8 +18,8 @@ from uwb_mitigation.calibration.first_positions import first_positions
 from uwb_mitigation.calibration.joint_fit import JointFit, Start, fit_joint, observations_of
 from uwb_mitigation.calibration.motion_segments import GAP_S, Segments
 from uwb_mitigation.errors import DatasetError
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.noise_model import MAD_TO_SD, Regressors
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges
@@ -32,7 +32,7 @@ class HypothesisLimits:
     Attributes:
         displacement_m: a smaller displacement looks like reflections.
         gain: minimum gain in log likelihood (chi-squared of two unknowns: e^-12 by chance).
-        share: minimum share of the anchor's misfit that a displacement explains. Obstacles that fit one explain 0.39 to 0.62 of it
+        explained_share: minimum share of the anchor's misfit that a displacement explains. Obstacles that fit one explain 0.39 to 0.62 of it
             (simulated sites 4, 7, 8 and 9); a true one by 1 m explains 0.72 to 0.86 (sites 3 and 6).
         independent_share: the same if the positions do not depend on the anchors, or if the accusation holds without each of the
             other anchors: errors of these cannot look like a displacement then.

@@ -8,7 +8,7 @@ independent ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution, gauss_newton
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.noise_model import CORRECTED_SLOW_SD_M, NoiseModel, Regressors, scatter_of
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.stamps import NS_PER_S
 
 KNOT_S = 0.15
@@ -98,16 +98,8 @@ class Observations:
     def without(self, left_out: NDArray[np.bool_]) -> Observations:
         """Return the same knots without those observations (n,); `observation_index` becomes invalid."""
         is_used = ~left_out
-        columns = (
-            "knot",
-            "anchor",
-            "ahead_s",
-            "range_m",
-            "independent",
-            "relative_height",
-            "rows",
-            "noise_group",
-        )
+        of_knots = ("observation_index", "knot_segment", "time_s", "is_stationary")
+        columns = [field.name for field in fields(self) if field.name not in of_knots]
         return replace(self, **{name: getattr(self, name)[is_used] for name in columns})
 
 

@@ -60,14 +60,9 @@ class Segments:
     def select_ranges(self, is_selected: NDArray[np.bool_]) -> Segments:
         """Return only these ranges, bool (n,), and the segments that contain them."""
         numbers, segment = np.unique(self.segment[is_selected], return_inverse=True)
-        columns = (
-            self.tag[is_selected],
-            self.row[is_selected],
-            segment,
-            self.is_stationary[numbers],
-            self.relative_height[is_selected],
-        )
-        return Segments(self.ranges.take(is_selected), *columns)
+        ranges, is_stationary = self.ranges.take(is_selected), self.is_stationary[numbers]
+        tag, row = self.tag[is_selected], self.row[is_selected]
+        return Segments(ranges, tag, row, segment, is_stationary, self.relative_height[is_selected])
 
 
 def find_segments(tags: Sequence[Ranges]) -> Segments:

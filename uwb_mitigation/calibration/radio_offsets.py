@@ -323,8 +323,7 @@ def _combined(
         )
     if (ranges := sum(placement.ranges for placement in accepted)) < MIN_RANGES:
         raise DatasetError(
-            f"only {ranges} ranges are in line of sight",
-            valid=f"at least {MIN_RANGES}, better some hundred",
+            f"only {ranges} ranges are in line of sight", valid=f"at least {MIN_RANGES}, better some hundred"
         )
     offset, noise = np.array([(placement.offset_m, placement.noise_sd_m) for placement in accepted]).T
     spread = max(_spread(offset), PLACEMENT_SD_M)

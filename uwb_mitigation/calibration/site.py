@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.calibration import models
 from uwb_mitigation.calibration.held_out import (
     BLOCK_S,
     MAX_INCREASE,
@@ -20,16 +21,6 @@ from uwb_mitigation.calibration.held_out import (
     HeldOut,
     decisive,
     select,
-)
-from uwb_mitigation.calibration.models import (
-    FINE_TUNED,
-    LINE,
-    NETWORK,
-    NETWORK_LINE,
-    NO_MODEL,
-    FineTune,
-    SiteModel,
-    fit_model,
 )
 from uwb_mitigation.calibration.site_data import SiteData, read_site
 from uwb_mitigation.calibration.solution import (
@@ -47,10 +38,10 @@ from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.robot_estimator import live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
@@ -96,7 +87,7 @@ class SiteCalibration:
     held_out: tuple[HeldOut, ...]
     chosen: str
     level: str
-    model: SiteModel
+    model: models.SiteModel
     notes: tuple[str, ...]
 
     @property
@@ -317,7 +308,7 @@ def calibrate_site(
     solution: SiteSolution,
     *,
     check: Sequence[SiteData] = (),
-    fine_tune: FineTune | None = None,
+    fine_tune: models.FineTune | None = None,
     on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteCalibration:
     """Select a correction for the ranges of a solution, see `held_out.select`.
@@ -340,8 +331,55 @@ def calibrate_site(
             valid=f"at least {MIN_LABELLED}",
         )
     _check_offsets(solution.pairs)
-    test = _HeldOutTest(site, solution, check, fine_tune, on_progress)
-    return test.calibration()
+    on_test = functools.partial(on_progress, "testing on held-out ranges")
+    on_test(0.1)
+    is_first, is_separate = site.halves()
+    halves = [site.select(mask) for mask in (is_first, ~is_first)]
+    try:
+        solved = [solution.solve_part(half) for half in halves]
+    except DatasetError as error:
+        raise DatasetError(f"a half of the drive: {error}", valid="a longer drive") from error
+    first, second = zip(halves, solved, strict=True)
+    folds = _Fold(*first, second), _Fold(*second, first)
+    checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
+
+    def evaluate(corrections: Mapping[str, tuple[str, str]]) -> list[HeldOut]:
+        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, on the halves and on each drive."""
+        one, other = (fold.evaluate(corrections, fine_tune, is_separate=is_separate) for fold in folds)
+        drives = (fold.evaluate(corrections, fine_tune, is_separate=True) for fold in checks)
+        return [one.merged(other, is_first), *drives]
+
+    levels = {COMMON: (ONE, models.NO_MODEL), OFFSETS: (PAIR, models.NO_MODEL)}
+    # Errors that persist for metres look like offsets in each half of a drive.
+    needs_separate = [] if solution.offsets_differ else [OFFSETS]
+    base = select(evaluate(levels), list(levels), needs_separate)
+    kinds, notes = [models.LINE], list(solution.notes)
+    if site.has_cirs:
+        kinds = [models.NETWORK, models.NETWORK_LINE, *([models.FINE_TUNED] if fine_tune else [])]
+        if without_cir := int((~site.is_usable).sum()):
+            notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
+    else:
+        notes.append("no networks: the recording has no CIRs that the universal model was trained for")
+    corrections = levels | {f"{base} + {kind}": (levels[base][0], kind) for kind in kinds}
+    if solution.truth is None:
+        needs_separate = [name for name, (_, kind) in corrections.items() if kind == models.LINE]
+    held_out = evaluate(corrections)
+    candidates = [base, *list(corrections)[2:]]
+    chosen = select(held_out, candidates, needs_separate)
+    level, kind = corrections[chosen]
+    data, raw_error_m = _labelled(site, solution, level)
+    on_test(1.0)
+    return SiteCalibration(
+        site=site,
+        solution=solution,
+        data=data,
+        raw_error_m=raw_error_m,
+        held_out=tuple(held_out),
+        chosen=chosen,
+        level=level,
+        model=models.fit_model(kind, data, site.universal_m[solution.rows], fine_tune),
+        notes=tuple(notes),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -353,7 +391,11 @@ class _Fold:
     training: tuple[SiteData, SiteSolution]
 
     def evaluate(
-        self, corrections: Mapping[str, tuple[str, str]], fine_tune: FineTune | None, *, is_separate: bool
+        self,
+        corrections: Mapping[str, tuple[str, str]],
+        fine_tune: models.FineTune | None,
+        *,
+        is_separate: bool,
     ) -> HeldOut:
         """Return the errors of `RAW` and of corrections, {name: (level of the offsets, kind of the model)}."""
         site, (training_site, solution) = self.site, self.training
@@ -362,7 +404,7 @@ class _Fold:
         block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         for name, (level, kind) in corrections.items():
             data, _ = _labelled(training_site, solution, level)
-            model = fit_model(kind, data, training_site.universal_m[solution.rows], fine_tune)
+            model = models.fit_model(kind, data, training_site.universal_m[solution.rows], fine_tune)
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
             corrected_m = np.maximum(raw_m - _offsets_m(site, solution.offsets(level)) - predicted_m, 0.0)
             residual_m[name] = self.reference.errors_of(corrected_m)
@@ -370,7 +412,7 @@ class _Fold:
                 variance_m2 = fit_intervals(residual_m[name], predicted_m, block.astype(str)).variance_of(
                     predicted_m
                 )
-                if kind == NO_MODEL:
+                if kind == models.NO_MODEL:
                     variance_m2 = np.minimum(variance_m2, MAX_SD_M**2)
                 live_m[name] = self._live_errors_m(corrected_m, variance_m2)
         # Without ground truth the reference of the raw ranges contains no common offset, because the locator estimates it.
@@ -393,7 +435,8 @@ class _Fold:
             ranges, heights = corrected.take(rows), None
             if site.height_m is not None:
                 heights = Heights(ranges.stamp_ns, site.height_m[rows], np.full(len(rows), HEIGHT_SD_M**2))
-            track = live_track(EstimatorConfig(site.anchors, height=height, heights=heights), ranges)
+            config = EstimatorConfig(site.anchors, height=height, heights=heights)
+            track = TagEstimator(config).run(ranges)
             if not len(track):
                 continue
             index = np.searchsorted(track.stamp_ns, ranges.stamp_ns, side="right").clip(1) - 1
@@ -401,77 +444,6 @@ class _Fold:
             has_position = track.stamp_ns[index] == ranges.stamp_ns
             error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
         return error_m
-
-
-class _HeldOutTest:
-    """Fits corrections to one part of the data and tests them on another one."""
-
-    def __init__(
-        self,
-        site: SiteData,
-        solution: SiteSolution,
-        check: Sequence[SiteData],
-        fine_tune: FineTune | None,
-        on_progress: Progress,
-    ) -> None:
-        self._site, self._solution, self._fine_tune = site, solution, fine_tune
-        self._on_progress = functools.partial(on_progress, "testing on held-out ranges")
-        self._on_progress(0.1)
-        self._is_first, self._is_separate = site.halves()
-        halves = [site.select(mask) for mask in (self._is_first, ~self._is_first)]
-        try:
-            solved = [solution.solve_part(half) for half in halves]
-        except DatasetError as error:
-            raise DatasetError(f"a half of the drive: {error}", valid="a longer drive") from error
-        first, second = zip(halves, solved, strict=True)
-        self._halves = _Fold(*first, second), _Fold(*second, first)
-        self._checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
-
-    def calibration(self) -> SiteCalibration:
-        """Return the calibration with the selected correction."""
-        site, solution = self._site, self._solution
-        levels = {COMMON: (ONE, NO_MODEL), OFFSETS: (PAIR, NO_MODEL)}
-        # Errors that persist for metres look like offsets in each half of a drive.
-        needs_separate = [] if solution.offsets_differ else [OFFSETS]
-        base = select(self._evaluate(levels), list(levels), needs_separate)
-        kinds, notes = [LINE], list(solution.notes)
-        if site.has_cirs:
-            kinds = [NETWORK, NETWORK_LINE, *([FINE_TUNED] if self._fine_tune else [])]
-            if without_cir := int((~site.is_usable).sum()):
-                notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
-        else:
-            notes.append("no networks: the recording has no CIRs that the universal model was trained for")
-        corrections = levels | {f"{base} + {kind}": (levels[base][0], kind) for kind in kinds}
-        if solution.truth is None:
-            needs_separate = [name for name, (_, kind) in corrections.items() if kind == LINE]
-        held_out = self._evaluate(corrections)
-        candidates = [base, *list(corrections)[2:]]
-        chosen = select(held_out, candidates, needs_separate)
-        level, kind = corrections[chosen]
-        data, raw_error_m = _labelled(site, solution, level)
-        self._on_progress(1.0)
-        return SiteCalibration(
-            site=site,
-            solution=solution,
-            data=data,
-            raw_error_m=raw_error_m,
-            held_out=tuple(held_out),
-            chosen=chosen,
-            level=level,
-            model=fit_model(kind, data, site.universal_m[solution.rows], self._fine_tune),
-            notes=tuple(notes),
-        )
-
-    def _evaluate(self, corrections: Mapping[str, tuple[str, str]]) -> list[HeldOut]:
-        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, on the halves and on each drive."""
-        halves = [
-            fold.evaluate(corrections, self._fine_tune, is_separate=self._is_separate)
-            for fold in self._halves
-        ]
-        return [
-            halves[0].merged(halves[1], self._is_first),
-            *(fold.evaluate(corrections, self._fine_tune, is_separate=True) for fold in self._checks),
-        ]
 
 
 def _check_offsets(pairs: Pairs) -> None:

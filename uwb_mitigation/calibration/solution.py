@@ -377,9 +377,7 @@ def _check_lever_arm(site: SiteData, align: Callable[..., PoseAlignment], alignm
     """Refuse a given lever arm if the ranges determine another one."""
     try:
         estimated = align(
-            time_offset_s=alignment.time_offset_s,
-            lever_arms_m=alignment.lever_arm_m,
-            estimate_lever_arm=True,
+            time_offset_s=alignment.time_offset_s, lever_arms_m=alignment.lever_arm_m, estimate_lever_arm=True
         )
     except DatasetError:
         # The drive does not determine it.

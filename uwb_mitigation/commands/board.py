@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.checks import output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line
 from uwb_mitigation.errors import ModelError, ParameterError
 
@@ -21,12 +22,7 @@ app = typer.Typer(help="Build firmware.", no_args_is_help=True)
 
 @app.command()
 def export_c(
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="DIR", help="Folder for uwb_model.h; created if it does not exist."
-        ),
-    ],
+    output: Annotated[Path, output_option("DIR", "Folder for uwb_model.h; created if it does not exist.")],
     model: ModelOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -58,10 +54,7 @@ def export_c(
 @app.command()
 def build_image(
     output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="FILE.hex", help="Image file; copy it to the USB drive of the board."
-        ),
+        Path, output_option("FILE.hex", "Image file; copy it to the USB drive of the board.")
     ] = Path("dwm1001-dev.hex"),
     model: ModelOption = None,
     json: JsonOption = None,

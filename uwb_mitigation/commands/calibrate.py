@@ -13,16 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import check_output
+from uwb_mitigation.commands.support import position_options as options
+from uwb_mitigation.commands.support.checks import check_output, check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.position_options import (
-    AnchorsOption,
-    AreaOption,
-    HeightOption,
-    HeightSdOption,
-    HeightTopicOption,
-    OffsetOption,
-)
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
@@ -31,11 +24,10 @@ if TYPE_CHECKING:
     from uwb_mitigation.calibration.site_data import SiteData
     from uwb_mitigation.calibration.solution import Localisation
     from uwb_mitigation.mitigation.model.bundle import Bundle
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.types.anchors import AnchorMap
 
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
-MAX_STAMP_OFFSET_S = 3600.0
 BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
 
@@ -49,18 +41,12 @@ def calibrate(
         ),
     ],
     output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE",
-            help="Bundle to write; the offsets are written next to it as X.offsets.yaml.",
-        ),
+        Path, output_option("FILE", "Bundle to write; the offsets are written next to it as X.offsets.yaml.")
     ],
-    anchors: AnchorsOption = None,
-    height: HeightOption = None,
-    height_sd: HeightSdOption = 0.1,
-    area: AreaOption = None,
+    anchors: options.AnchorsOption = None,
+    height: options.HeightOption = None,
+    height_sd: options.HeightSdOption = 0.1,
+    area: options.AreaOption = None,
     truth_topic: Annotated[
         str | None,
         typer.Option(
@@ -104,11 +90,10 @@ def calibrate(
             "Without CIRs and ground truth, a line in the received power is used only if it improves this drive.",
         ),
     ] = None,
-    height_topic: HeightTopicOption = None,
-    stamp_offset: OffsetOption = 0.0,
+    height_topic: options.HeightTopicOption = None,
+    stamp_offset: options.OffsetOption = 0.0,
     report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write an HTML page with the results."),
+        Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with the results.")
     ] = None,
     force: Annotated[
         bool,
@@ -129,10 +114,10 @@ def calibrate(
     """
     from uwb_mitigation.calibration.site import calibrate_site
     from uwb_mitigation.calibration.solution import solve_with_truth, solve_without_truth
-    from uwb_mitigation.commands.offline.track import read_anchors
     from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
+    from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
 
     _check_files(output, report, force)
     pose_options = _PoseOptions(
@@ -203,12 +188,14 @@ class _PoseOptions:
 
     def check(self) -> None:
         """Raise a ParameterError if the options contradict each other."""
-        options = (self.frames, self.time_offset_s, self.lever_arm_m, self.estimate_lever_arm or None)
-        if self.topic is None and any(option is not None for option in options):
+        values = (self.frames, self.time_offset_s, self.lever_arm_m, self.estimate_lever_arm or None)
+        if self.topic is None and any(value is not None for value in values):
             raise ParameterError(
                 "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
                 valid="with --truth-topic",
             )
+        from uwb_mitigation.positioning.track_settings import MAX_STAMP_OFFSET_S
+
         if self.time_offset_s is not None and not abs(self.time_offset_s) <= MAX_STAMP_OFFSET_S:
             raise ParameterError(f"time offset {self.time_offset_s}", valid="-3600 to 3600 s")
 
@@ -217,9 +204,7 @@ def _check_files(output: Path, report: Path | None, force: bool) -> None:
     from uwb_mitigation.calibration.site import offsets_file
 
     check_output(output)
-    for file in (output, offsets_file(output), *([report] if report else [])):
-        if file.exists() and not force:
-            raise ParameterError("the file exists", where=str(file), valid="--force replaces it")
+    check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
 
 
 def _fine_tune(source: Bundle) -> FineTune | None:
@@ -274,7 +259,7 @@ def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle, settings: Trac
     return site
 
 
-def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOptions) -> Localisation:
+def _localisation(bags: list[Path], site: SiteData, topic: str, pose: _PoseOptions) -> Localisation:
     """Read for each tag the poses of its body in each bag, and its lever arm."""
     import numpy as np
 
@@ -282,14 +267,14 @@ def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOp
     from uwb_mitigation.recordings.bag.pose_paths import read_bodies
     from uwb_mitigation.types.ros.poses import UWB_TAG, tag_of_frame
 
-    lever_arm_m = options.lever_arm_m
+    lever_arm_m = pose.lever_arm_m
 
     if lever_arm_m is not None and len(site.tags) > 1:
         raise ParameterError(
             f"one --lever-arm for {len(site.tags)} tags",
             valid="transforms to the frames of the tags in the bag",
         )
-    bodies = [read_bodies(bag, topic, options.frames) for bag in bags]
+    bodies = [read_bodies(bag, topic, pose.frames) for bag in bags]
     paths, lever_arms_m = [], np.zeros((len(site.tags), 3))
     for number, tag in enumerate(site.tags):
         names = [
@@ -308,7 +293,7 @@ def _localisation(bags: list[Path], site: SiteData, topic: str, options: _PoseOp
                     "antenna; the lever arm is 0. Set --lever-arm"
                 )
     ids = [tag.tag_id for tag in site.tags]
-    return Localisation(topic, ids, paths, options.time_offset_s, lever_arms_m, options.estimate_lever_arm)
+    return Localisation(topic, ids, paths, pose.time_offset_s, lever_arms_m, pose.estimate_lever_arm)
 
 
 def _body_of_tag(tag_id: int, bodies: Iterable[str], where: str) -> str:

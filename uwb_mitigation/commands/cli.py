@@ -29,16 +29,8 @@ from uwb_mitigation.commands.support import console
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
 
 PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
-    "Recordings": {
-        "data": data.app,
-        "process": process.process,
-        "view": view.view,
-    },
-    "Positions": {
-        "track": positioning.track,
-        "survey": positioning.survey,
-        "calibrate": calibrate.calibrate,
-    },
+    "Recordings": {"data": data.app, "process": process.process, "view": view.view},
+    "Positions": {"track": positioning.track, "survey": positioning.survey, "calibrate": calibrate.calibrate},
     "Models": {
         "train": model.train,
         "train-universal": universal.train_universal,
@@ -46,13 +38,8 @@ PANELS: dict[str, dict[str, typer.Typer | Callable[..., None]]] = {
         "evaluate": model.evaluate,
         "offset": offset.offset,
     },
-    "Boards": {
-        "board": board.app,
-        "field-report": field_report.field_report,
-    },
-    "Installation": {
-        "doctor": doctor.doctor,
-    },
+    "Boards": {"board": board.app, "field-report": field_report.field_report},
+    "Installation": {"doctor": doctor.doctor},
 }
 """Panel of each command in `--help` and docs/reference/commands.md. Add new commands here; the text shown is the
 first line of the docstring."""
@@ -90,8 +77,7 @@ def _print_version(is_set: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version."),
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     pass

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.checks import output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -33,9 +34,7 @@ _LONGEST_PAUSE_S = 5.0
 CirOption = Annotated[
     Literal["final", "poll"], typer.Option(help="Frame of a DecaRanging exchange whose CIR is used.")
 ]
-OUTPUT = typer.Option(
-    "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a bag folder."
-)
+OUTPUT = output_option("OUT", "OUT.mcap for one file, any other name for a bag folder.")
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace OUT if it exists.")]
 
 
@@ -299,11 +298,7 @@ def _save_anchors(source: Source, bag: Path) -> None:
         print_line(f"Wrote {len(source.anchors)} anchors to {path}.")
 
 
-_KINDS = {
-    True: "simulated",
-    False: "measured by radios",
-    None: "unknown whether measured or simulated",
-}
+_KINDS = {True: "simulated", False: "measured by radios", None: "unknown whether measured or simulated"}
 
 
 def _show_source(source: Source) -> None:

@@ -21,6 +21,7 @@ import typer
 
 import uwb_mitigation
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support.checks import check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line
 from uwb_mitigation.errors import LinkError, ParameterError
 
@@ -39,9 +40,9 @@ def field_report(
         ),
     ],
     distance: Annotated[float, typer.Option(help="Distance between the antennas, m.")],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE.zip", help="File to attach to an issue.")
-    ] = Path("field_report.zip"),
+    output: Annotated[Path, output_option("FILE.zip", "File to attach to an issue.")] = Path(
+        "field_report.zip"
+    ),
     mapping: Annotated[
         str, typer.Option("--map", metavar="MAPPING", help="Mapping for the source lines, as for the driver.")
     ] = "",
@@ -65,8 +66,7 @@ def field_report(
         raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")
     if output.suffix != ".zip" or output.is_dir() or not output.absolute().parent.is_dir():
         raise ParameterError(f"-o {output}", valid="a file .zip in a folder that exists")
-    if output.exists() and not force:
-        raise ParameterError("the file exists", where=str(output), valid="another path, or --force")
+    check_replaceable([output], force)
     ports = [name.strip() for name in port.split(",") if name.strip()]
     for name in ports:
         if name.startswith("/") and not Path(name).exists():
@@ -79,17 +79,8 @@ def field_report(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with console.share_bar("ranging") as advance:
-            unplug_request = _ask if unplug else None
-            observe(
-                source,
-                ports,
-                mapping,
-                observation,
-                folder / "capture.txt",
-                unplug_request,
-                advance,
-                console.warn,
-            )
+            capture, unplug_request = folder / "capture.txt", _ask if unplug else None
+            observe(source, ports, mapping, observation, capture, unplug_request, advance, console.warn)
         _correct(observation)
         observation.problem = anonymise(observation.problem, ports)
         observation.warnings = [anonymise(text, ports) for text in observation.warnings]

@@ -11,7 +11,13 @@ import typer
 
 from uwb_mitigation.commands.support import console, model_tables
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption, ScalingName, check_output, needs_torch
+from uwb_mitigation.commands.support.checks import (
+    OffsetsOption,
+    ScalingName,
+    check_output,
+    needs_torch,
+    output_option,
+)
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 
@@ -22,7 +28,7 @@ if TYPE_CHECKING:
 DataOption = Annotated[
     Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
 ]
-OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Bundle to write.")]
+OutputOption = Annotated[Path, output_option("FILE", "Bundle to write.")]
 # Options for one mode of `train` or `evaluate`; they are errors in the other mode.
 _DATA_OPTIONS = {
     "recipe_name": "--recipe",
@@ -38,8 +44,7 @@ def train(
     context: typer.Context,
     output: OutputOption,
     data: Annotated[
-        Path | None,
-        typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs."),
+        Path | None, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
     ] = None,
     from_bag: Annotated[
         Path | None,
@@ -73,7 +78,7 @@ def train(
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
     per_configuration: Annotated[
-        int, typer.Option(help="With --data: use at most this number of ranges of each placement.")
+        int, typer.Option(min=1, help="With --data: use at most this number of ranges of each placement.")
     ] = 20,
     seed: Annotated[
         int, typer.Option(help="Seed of the splits, the initial weights and the order of the data.")
@@ -105,8 +110,6 @@ def train(
             valid="only with --data: with --from-bag the source model determines these options",
         )
     chosen_scaling = Scaling(scaling)
-    if per_configuration < 1:
-        raise ParameterError(f"per-configuration = {per_configuration}", valid="at least 1")
     set_options: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
     set_options = {key: value for key, value in set_options.items() if value is not None}
     options = FitOptions(**set_options)
@@ -146,9 +149,6 @@ def quantise(
         ),
     ],
     output: OutputOption,
-    percentile: Annotated[
-        float, typer.Option(help="Percentile of each activation that is quantised to 255; 100: the maximum.")
-    ] = 100.0,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -161,12 +161,12 @@ def quantise(
     from uwb_mitigation.training.fit import quantisation
 
     source = load_bundle(model)
-    quantisation.check(source, percentile)
+    quantisation.check(source)
     check_output(output, force)
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
     console.show_skipped(dataset.skipped)
-    quantised = quantisation.quantise_bundle(source, dataset, percentile, output)
+    quantised = quantisation.quantise_bundle(source, dataset, output)
     bundle, difference = quantised.bundle, quantised.difference_m
     model_tables.show_bundle(bundle)
     console.out.print(
@@ -194,11 +194,16 @@ def evaluate(
         Literal["configuration", "tag", "half"] | None,
         typer.Option(
             help="Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out "
-            "placements (configuration), locations (tag) or half of the anchors.",
+            "placements (configuration), locations (tag) or half of the anchors."
         ),
     ] = None,
     seeds: Annotated[
-        int, typer.Option(help="With --cross-validate: number of repetitions with other splits and networks.")
+        int,
+        typer.Option(
+            min=1,
+            max=100,
+            help="With --cross-validate: number of repetitions with other splits and networks.",
+        ),
     ] = 3,
     folds: Annotated[int, typer.Option(help="With --cross-validate configuration: number of folds.")] = 6,
     scaling: Annotated[
@@ -237,14 +242,11 @@ def evaluate(
 
 def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
     from uwb_mitigation.mitigation.model.architecture import Remnet
+    from uwb_mitigation.mitigation.model.bundle import load_bundle
+    from uwb_mitigation.mitigation.model.shipped import default_model_path
     from uwb_mitigation.mitigation.preprocessing import Preprocessing
     from uwb_mitigation.training.data import splits
     from uwb_mitigation.training.fit.options import FitOptions
-
-    if not 1 <= seeds <= 100:
-        raise ParameterError(f"seeds = {seeds}", valid="1 to 100")
-    from uwb_mitigation.mitigation.model.bundle import load_bundle
-    from uwb_mitigation.mitigation.model.shipped import default_model_path
 
     with needs_torch():
         from uwb_mitigation.training import comparison

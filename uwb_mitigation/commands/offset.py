@@ -11,6 +11,7 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
+from uwb_mitigation.commands.support.checks import check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import DatasetError, ParameterError, parse_id
 
@@ -39,11 +40,8 @@ def offset(
     model: ModelOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE",
-            help="File of offsets to write, for --offsets and the parameter `offsets` of the nodes.",
+        output_option(
+            "FILE", "File of offsets to write, for --offsets and the parameter `offsets` of the nodes."
         ),
     ] = None,
     common: Annotated[
@@ -85,8 +83,7 @@ def offset(
     for path in filter(None, (output, bundle)):
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise ParameterError("cannot be written", where=str(path), valid="a file in an existing folder")
-        if path.exists() and not force:
-            raise ParameterError("the file exists", where=str(path), valid="--force replaces it")
+        check_replaceable([path], force)
     anchor_id, tag_id = (
         _id(name, text) if text is not None else None for name, text in (("anchor", anchor), ("tag", tag))
     )

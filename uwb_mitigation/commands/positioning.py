@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,31 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support import position_options as options
 from uwb_mitigation.commands.support.bundles import ModelOption, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption
+from uwb_mitigation.commands.support.checks import OffsetsOption, check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
-from uwb_mitigation.commands.support.position_options import (
-    AccelerationOption,
-    AnchorsOption,
-    AreaOption,
-    HeightOption,
-    HeightSdOption,
-    HeightTopicOption,
-    ImuOption,
-    LeverArmOption,
-    OdometryOption,
-    OffsetOption,
-)
-from uwb_mitigation.errors import DatasetError, ParameterError, check_name, format_id
+from uwb_mitigation.errors import ParameterError, check_name, format_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.calibration.survey import SurveyResult
     from uwb_mitigation.commands.offline.track import HoldoutErrors
     from uwb_mitigation.mitigation.correction import Mitigation
-    from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
-    from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings
+    from uwb_mitigation.positioning.config import EstimatorConfig
+    from uwb_mitigation.positioning.recorded_tracks import TagTracks
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap
+    from uwb_mitigation.types.tracks import TagRecording
 
 TRACK_NAMES = {
     "snapshot": "least squares, raw",
@@ -62,26 +54,21 @@ BagArgument = Annotated[
 
 def track(
     bag: BagArgument,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="OUT.mcap for one file, any other name for a folder."
-        ),
-    ],
-    anchors: AnchorsOption = None,
+    output: Annotated[Path, output_option("OUT", "OUT.mcap for one file, any other name for a folder.")],
+    anchors: options.AnchorsOption = None,
     tum: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also write the smoothed track in TUM's format, as evo reads it."),
     ] = None,
-    height: HeightOption = None,
-    height_sd: HeightSdOption = 0.1,
-    height_topic: HeightTopicOption = None,
-    area: AreaOption = None,
-    odometry: OdometryOption = None,
-    imu: ImuOption = None,
-    lever_arm: LeverArmOption = None,
-    stamp_offset: OffsetOption = 0.0,
-    acceleration: AccelerationOption = 0.8,
+    height: options.HeightOption = None,
+    height_sd: options.HeightSdOption = 0.1,
+    height_topic: options.HeightTopicOption = None,
+    area: options.AreaOption = None,
+    odometry: options.OdometryOption = None,
+    imu: options.ImuOption = None,
+    lever_arm: options.LeverArmOption = None,
+    stamp_offset: options.OffsetOption = 0.0,
+    acceleration: options.AccelerationOption = 0.8,
     model: ModelOption = None,
     offsets: OffsetsOption = None,
     report: Annotated[
@@ -107,7 +94,8 @@ def track(
     from uwb_mitigation.commands.offline.track import tum as tum_text
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings, track_tag
+    from uwb_mitigation.positioning.recorded_tracks import track_tags
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
     from uwb_mitigation.types.offsets import NO_OFFSETS
@@ -123,22 +111,16 @@ def track(
     show_models(corrector.used)
     several = len(recorded.tags) > 1
     tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
-    for file in (*tum_files.values(), *([report] if report else [])):
-        if file.exists() and not force:
-            raise ParameterError("exists already", where=str(file), valid="--force replaces it")
-    tracks, failures = [], list[DatasetError]()
+    check_replaceable((*tum_files.values(), *([report] if report else [])), force)
     origin = {"source": f"track of {bag.name}", "simulated": "false"}
     with BagWriter(output, origin, force=force) as out, console.progress() as bar:
-        task = bar.add_task("tracking", total=len(recorded.tags))
-        for tag in recorded.tags:
-            bar.update(task, description=f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges")
-            try:
-                tracks.append(track_tag(tag, config))
-            except DatasetError as error:
-                failures.append(error)
-            bar.advance(task)
-        if not tracks:
-            raise failures[0]
+        task, number = bar.add_task("tracking", total=len(recorded.tags)), itertools.count()
+
+        def on_tag(tag: TagRecording) -> None:
+            name = f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges"
+            bar.update(task, completed=next(number), description=name)
+
+        tracks, failures = track_tags(recorded.tags, config, on_tag)
         write_tracks(out, tracks)
     for failure in failures:
         warn(f"{failure}.")
@@ -160,10 +142,8 @@ def track(
 
 def survey(
     bag: BagArgument,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE", help="The anchors file to write.")
-    ],
-    anchors: AnchorsOption = None,
+    output: Annotated[Path, output_option("FILE", "The anchors file to write.")],
+    anchors: options.AnchorsOption = None,
     off: Annotated[
         float, typer.Option(help="Standard deviation of the guesses in FILE, m in each coordinate.")
     ] = 1.0,
@@ -171,12 +151,12 @@ def survey(
         list[str] | None,
         typer.Option("--fixed", metavar="ID", help="An anchor that is where FILE says; may be repeated."),
     ] = None,
-    height: HeightOption = None,
-    height_sd: HeightSdOption = 0.1,
-    height_topic: HeightTopicOption = None,
-    area: AreaOption = None,
-    stamp_offset: OffsetOption = 0.0,
-    acceleration: AccelerationOption = 0.8,
+    height: options.HeightOption = None,
+    height_sd: options.HeightSdOption = 0.1,
+    height_topic: options.HeightTopicOption = None,
+    area: options.AreaOption = None,
+    stamp_offset: options.OffsetOption = 0.0,
+    acceleration: options.AccelerationOption = 0.8,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -188,13 +168,12 @@ def survey(
     """
     from uwb_mitigation.calibration.survey import survey_anchors
     from uwb_mitigation.positioning.geometry import Area
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.types.anchors import save_anchors
 
     if not 0.0 < off <= 100.0:
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
-    if output.exists() and not force:
-        raise ParameterError("exists already", where=str(output), valid="--force replaces it")
+    check_replaceable([output], force)
     motion = None, None, None, stamp_offset, acceleration
     settings = TrackSettings(height, height_sd, height_topic, Area.parse(area), *motion)
     config, recorded = _read(bag, anchors, settings)
@@ -219,8 +198,9 @@ def survey(
 def _read(
     bag: Path, anchors: Path | None, settings: TrackSettings, mitigation: Mitigation | None = None
 ) -> tuple[EstimatorConfig, RecordedRanges]:
-    from uwb_mitigation.commands.offline.track import read_anchors, read_config
+    from uwb_mitigation.commands.offline.track import read_config
     from uwb_mitigation.positioning.recorded_tracks import check_one_tag
+    from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
     from uwb_mitigation.recordings.formats import open_recording
     from uwb_mitigation.recordings.recorded_ranges import read_ranges
 

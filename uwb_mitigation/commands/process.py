@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption
+from uwb_mitigation.commands.support.checks import OffsetsOption, output_option
 from uwb_mitigation.commands.support.console import JsonOption, show_table
 from uwb_mitigation.errors import ParameterError, RecordingError, UwbMitigationError
 
@@ -27,12 +27,9 @@ def process(
     ],
     output: Annotated[
         Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="OUT",
-            help="For one bag: OUT.mcap for one file, any other name for a bag folder. For several bags: a "
-            "folder.",
+        output_option(
+            "OUT",
+            "For one bag: OUT.mcap for one file, any other name for a bag folder. For several bags: a folder.",
         ),
     ],
     model: ModelOption = None,

@@ -10,16 +10,15 @@ from typing import Annotated, Literal
 import typer
 
 from uwb_mitigation.commands.support import console, model_tables
-from uwb_mitigation.commands.support.checks import ScalingName, check_output, needs_torch
+from uwb_mitigation.commands.support.checks import ScalingName, check_output, needs_torch, output_option
 from uwb_mitigation.commands.support.console import JsonOption
-from uwb_mitigation.errors import ParameterError
-
-MAX_BLOCKS = 10_000
 
 
 def train_universal(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="int8 bundle to write.")],
-    seed: Annotated[int, typer.Option(help="Seed of the simulated buildings and of the network.")] = 0,
+    output: Annotated[Path, output_option("FILE", "int8 bundle to write.")],
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31, help="Seed of the simulated buildings and of the network.")
+    ] = 0,
     samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[
         ScalingName, typer.Option(help="max: for windows without preamble counts.")
@@ -28,13 +27,16 @@ def train_universal(
         Literal["dw1000", "dw3000"], typer.Option(help="dw3000: for windows of an STS.")
     ] = "dw1000",
     blocks: Annotated[
-        int | None, typer.Option(help="Number of blocks of 256 placements for training.")
+        int | None, typer.Option(min=1, max=10_000, help="Number of blocks of 256 placements for training.")
     ] = None,
     float_output: Annotated[
         Path | None, typer.Option("--float", metavar="FILE", help="Also write the float bundle.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Number of processes for the simulation; default: one per processor.")
+        int | None,
+        typer.Option(
+            min=1, max=256, help="Number of processes for the simulation; default: one per processor."
+        ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
     json: JsonOption = None,
@@ -57,7 +59,6 @@ def train_universal(
 
     preprocessing = Preprocessing(samples, Scaling(scaling))
     radios = {"dw1000": RADIO, "dw3000": DW3000_STS}
-    _check_options(seed, blocks, workers)
     for path in (output, *([float_output] if float_output else [])):
         check_output(path, force)
     with needs_torch():
@@ -95,13 +96,3 @@ def train_universal(
             },
         },
     )
-
-
-def _check_options(seed: int, blocks: int | None, workers: int | None) -> None:
-    for name, value, low, high in (
-        ("seed", seed, 0, 2**31),
-        ("blocks", blocks, 1, MAX_BLOCKS),
-        ("workers", workers, 1, 256),
-    ):
-        if value is not None and not low <= value <= high:
-            raise ParameterError(f"{name} = {value}", valid=f"{low} to {high}")

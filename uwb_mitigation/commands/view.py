@@ -12,20 +12,9 @@ from typing import Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
+from uwb_mitigation.commands.support import position_options as options
 from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 from uwb_mitigation.commands.support.checks import OffsetsOption
-from uwb_mitigation.commands.support.position_options import (
-    AccelerationOption,
-    AnchorsOption,
-    AreaOption,
-    HeightOption,
-    HeightSdOption,
-    HeightTopicOption,
-    ImuOption,
-    LeverArmOption,
-    OdometryOption,
-    OffsetOption,
-)
 
 
 def view(
@@ -42,16 +31,16 @@ def view(
             metavar="[SECOND]", help="A bag of the same drive with another correction, to compare."
         ),
     ] = None,
-    anchors: AnchorsOption = None,
-    height: HeightOption = None,
-    height_sd: HeightSdOption = 0.1,
-    height_topic: HeightTopicOption = None,
-    area: AreaOption = None,
-    odometry: OdometryOption = None,
-    imu: ImuOption = None,
-    lever_arm: LeverArmOption = None,
-    stamp_offset: OffsetOption = 0.0,
-    acceleration: AccelerationOption = 0.8,
+    anchors: options.AnchorsOption = None,
+    height: options.HeightOption = None,
+    height_sd: options.HeightSdOption = 0.1,
+    height_topic: options.HeightTopicOption = None,
+    area: options.AreaOption = None,
+    odometry: options.OdometryOption = None,
+    imu: options.ImuOption = None,
+    lever_arm: options.LeverArmOption = None,
+    stamp_offset: options.OffsetOption = 0.0,
+    acceleration: options.AccelerationOption = 0.8,
     floor_plan: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Floor plan: the YAML file of a map of map_server.")
     ] = None,
@@ -90,7 +79,7 @@ def view(
 
     from uwb_mitigation.commands.offline.track import mitigation, read_config
     from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.recorded_tracks import TrackSettings
+    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
     from uwb_mitigation.types.offsets import NO_OFFSETS

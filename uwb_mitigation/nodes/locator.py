@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import math
 import time
 from collections.abc import Callable, Collection
 from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, TransformStamped, Vector3
@@ -29,11 +30,11 @@ from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
 from uwb_mitigation.nodes.support.respawn import StateFile
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator, TagState
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
 from uwb_mitigation.types.ros import topics
@@ -54,6 +55,10 @@ from uwb_mitigation.types.ros.poses import (
 )
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heading
+
+if TYPE_CHECKING:
+    from uwb_mitigation.nodes.feeds.topic import TopicFeed
+    from uwb_mitigation.recordings.mapping.mapping import Mapping
 
 BATCH = 64
 """Maximum number of queued ranges that one callback processes."""
@@ -214,12 +219,10 @@ class Locator(ManagedNode):
     def _subscribe_to_mapping(self, name: str) -> bool:
         """Subscribe to the topics of a mapping; return False if `name` is that of a topic."""
         # Mapping files need pandas and pydantic, which other ranges do not.
-        from uwb_mitigation.nodes.feeds.topic import TopicFeed
-        from uwb_mitigation.recordings.mapping.mapping import load_mapping, shipped_mappings
-
-        if name not in shipped_mappings() and not name.endswith((".yaml", ".yml")):
+        topic = importlib.import_module("uwb_mitigation.nodes.feeds.topic")
+        mapping: Mapping | None = topic.find_mapping(name)
+        if mapping is None:
             return False
-        mapping = load_mapping(name)
         variance_m2 = mapping.range_sd**2 or math.nan
 
         def on_range(measurement: RangeMeasurement) -> None:
@@ -227,8 +230,8 @@ class Locator(ManagedNode):
                 self._update_lever_arm(measurement.tag_id, lambda: measurement.frame_id)
                 self._add(self._estimator, *_uncorrected(measurement, variance_m2), has_variance=True)
 
-        feed = TopicFeed(self, mapping, "", on_range, self.now_ns)
-        self.destroy_at_close(feed, TopicFeed.stop).start()
+        feed: TopicFeed = topic.TopicFeed(self, mapping, "", on_range, self.now_ns)
+        self.destroy_at_close(feed, lambda feed: feed.stop()).start()
         return True
 
     def _subscribe_to_ranges(self, source: str) -> None:

@@ -10,14 +10,8 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.geometry import Area, Symmetry, dop, separation, unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.tag_estimator import (
-    EXCLUDED_SD,
-    LEVEL,
-    RANGE_ERROR_M,
-    RANGE_TIMEOUT_S,
-    Ambiguity,
-    TagEstimator,
-)
+from uwb_mitigation.positioning.online.ambiguity import EXCLUDED_SD, LEVEL, RANGE_ERROR_M, Ambiguity
+from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
 from uwb_mitigation.types.tracks import Ranges, Track
 
 UNIQUE, UNKNOWN = Ambiguity.NONE.value, "unknown"
@@ -118,7 +112,7 @@ def current_determination(estimator: TagEstimator) -> Determination:
         ambiguity,
         estimator.dims,
         area=estimator.config.area,
-        sd_m=estimator.error_sd_m,
+        sd_m=estimator.images.error_sd_m,
         is_weak=estimator.undetermined,
     )
 
@@ -131,14 +125,14 @@ def drive_determination(estimator: TagEstimator, ranges: Ranges, track: Track) -
         ranges: of the drive.
         track: positions of the drive; empty: the statement is that for the latest ranges.
     """
-    ambiguities = estimator.ambiguities.most_common(1)
+    ambiguities = estimator.images.counts.most_common(1)
     if not len(track) or not ambiguities:
         return current_determination(estimator)
     config, anchors = estimator.config, estimator.anchors.position[np.unique(ranges.anchor)]
     dims = 2 if config.heights is not None else config.dims
     sample = track.position[:: max(len(track) // 200, 1)]
     order = np.argsort([dop(anchors, position, level=dims == 2).hdop for position in sample])
-    position, sd_m = sample[order[len(order) // 2]], estimator.error_sd_m
+    position, sd_m = sample[order[len(order) // 2]], estimator.images.error_sd_m
     return determination(anchors, position, ambiguities[0][0], dims, area=config.area, sd_m=sd_m)
 
 

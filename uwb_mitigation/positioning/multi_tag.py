@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError, format_id
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.determination import current_determination
 from uwb_mitigation.positioning.geometry import protection_levels
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track
 

@@ -5,29 +5,26 @@ The same `TrackSettings` give the same tracks in every command, on the page of t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
-from pathlib import Path
 
 import numpy as np
 
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
 from uwb_mitigation.positioning.batch.smoother import smooth
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.determination import (
     UNKNOWN_POSITION,
     Determination,
     current_determination,
     drive_determination,
 )
-from uwb_mitigation.positioning.geometry import Area, Height, dop
-from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.positioning.online.initialization import snapshot
 from uwb_mitigation.positioning.online.robot_estimator import RobotEstimator, live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
-from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
-from uwb_mitigation.types.tracks import Heights, TagRecording, Track
+from uwb_mitigation.types.tracks import TagRecording, Track
 
 KINDS = ("snapshot", "raw_live", "live", "smoothed")
 MAX_WITHOUT_POSITION = 0.1
@@ -37,63 +34,6 @@ MIN_HEIGHT_RMSE_M = 0.1
 """If the truth is known, a warning is given if the RMSE of the smoothed track, horizontal or of the height, exceeds `WORSE`
 times the live one (heights: and this minimum); another one if its 95 % ellipses contain a smaller share of the true positions
 than `MIN_COVERAGE`."""
-
-
-MAX_STAMP_OFFSET_S = 3600.0
-
-
-@dataclass(frozen=True, slots=True)
-class TrackSettings:
-    """All options that decide the tracks of a recording.
-
-    Attributes:
-        height_m: constant height of the tags in the anchors' frame, m; None: unknown.
-        height_sd_m: its standard deviation, and that of measured heights without a variance, m.
-        height_topic: topic of measured heights; None: none.
-        area: box that contains the tags; None: unknown.
-        odometry, imu: topics of the motion of the robot that carries the tag; None: none.
-        lever_arm_m: antenna in the frame of the robot, m; None: from the transforms of the recording.
-        stamp_offset_s: added to the stamps of the ranges.
-        acceleration: of the motion model, see `NoiseModel`.
-        model, offsets: correct raw ranges: file or name of a model (None: the shipped ones), and offsets of the radios.
-
-    Raises:
-        ParameterError: a value is out of its range, or two options exclude each other.
-    """
-
-    height_m: float | None = None
-    height_sd_m: float = 0.1
-    height_topic: str | None = None
-    area: Area | None = None
-    odometry: str | None = None
-    imu: str | None = None
-    lever_arm_m: tuple[float, float, float] | None = None
-    stamp_offset_s: float = 0.0
-    acceleration: float = NoiseModel().acceleration
-    model: Path | None = None
-    offsets: Offsets | float | str | Path = NO_OFFSETS
-
-    def __post_init__(self) -> None:
-        if not abs(self.stamp_offset_s) <= MAX_STAMP_OFFSET_S:
-            raise ParameterError(f"stamp offset {self.stamp_offset_s}", valid="-3600 to 3600 s")
-        if self.height_m is not None and self.height_topic is not None:
-            raise ParameterError("--height and --height-topic", valid="either of them")
-        if self.odometry is None and (self.imu is not None or self.lever_arm_m is not None):
-            raise ParameterError("--imu or --lever-arm without --odometry", valid="with --odometry TOPIC")
-        # This also checks the standard deviation of measured heights, and the acceleration.
-        Height(self.height_m or 0.0, self.height_sd_m)
-        NoiseModel(self.acceleration)
-
-    @property
-    def height(self) -> Height | None:
-        """The constant height with its standard deviation."""
-        return None if self.height_m is None else Height(self.height_m, self.height_sd_m)
-
-    def config(
-        self, anchors: AnchorMap, heights: Heights | None = None, robot: RobotData | None = None
-    ) -> EstimatorConfig:
-        """Return the configuration of the estimators, with what a recording contains of measured heights and motion."""
-        return EstimatorConfig(anchors, NoiseModel(self.acceleration), self.height, self.area, heights, robot)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,6 +80,28 @@ def check_one_tag(config: EstimatorConfig, recordings: Sequence[TagRecording]) -
     if option and len(recordings) > 1:
         tags = ", ".join(format_id(recording.tag_id) for recording in recordings)
         raise ParameterError(f"{option} with the tags {tags}", valid="a bag with one tag")
+
+
+def track_tags(
+    recordings: Sequence[TagRecording],
+    config: EstimatorConfig,
+    on_tag: Callable[[TagRecording], None] = lambda recording: None,
+) -> tuple[list[TagTracks], list[DatasetError]]:
+    """Return the tracks of the tags, and the errors of those without a position; `on_tag` is called before each tag.
+
+    Raises:
+        DatasetError: no position of any tag can be determined.
+    """
+    tracks, failures = list[TagTracks](), list[DatasetError]()
+    for recording in recordings:
+        on_tag(recording)
+        try:
+            tracks.append(track_tag(recording, config))
+        except DatasetError as error:
+            failures.append(error)
+    if not tracks:
+        raise failures[0]
+    return tracks, failures
 
 
 def track_tag(recording: TagRecording, config: EstimatorConfig) -> TagTracks:

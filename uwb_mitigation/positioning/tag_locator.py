@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.multi_tag import MultiTagEstimator
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.anchors import AnyAnchors, as_anchors
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement
 from uwb_mitigation.types.tracks import Estimate

@@ -52,15 +52,9 @@ class AntennaPairs:
     def take(self, fields: NDArray[np.intp], field_of: NDArray[np.intp]) -> AntennaPairs:
         """Return pairs over some of the fields, with new row numbers in `field_of`; field k is that of link k here."""
         pairs, (los, nlos) = fields[field_of], self.fields
-        return AntennaPairs(
-            self.anchor[pairs],
-            self.tag[pairs],
-            self.path.take(pairs),
-            self.environments,
-            (los.take(fields), nlos.take(fields)),
-            field_of,
-            self.stationary,
-        )
+        ends, drawn = (self.anchor[pairs], self.tag[pairs]), (los.take(fields), nlos.take(fields))
+        path = self.path.take(pairs)
+        return AntennaPairs(*ends, path, self.environments, drawn, field_of, self.stationary)
 
     def multipath(self, rng: np.random.Generator) -> Multipath:
         """Return the received paths of each link; a link without obstacles uses the LOS environment."""

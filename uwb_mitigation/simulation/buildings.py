@@ -12,38 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.simulation import channel, scene
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, place
-from uwb_mitigation.simulation.channel import (
-    INDUSTRIAL_LOS,
-    INDUSTRIAL_NLOS,
-    MAX_DECAY_NS,
-    OFFICE_LOS,
-    OFFICE_NLOS,
-    OUTDOOR_LOS,
-    PATTERN_LOSS_DB,
-    RESIDENTIAL_LOS,
-    RESIDENTIAL_NLOS,
-    Environment,
-    direct_power_db,
-)
+from uwb_mitigation.simulation.channel import Environment
 from uwb_mitigation.simulation.radio import Boards, Receiver
-from uwb_mitigation.simulation.scene import (
-    BRICK,
-    CONCRETE,
-    FLAT,
-    GLASS,
-    PLASTERBOARD,
-    WOOD,
-    Building,
-    DirectPath,
-    Screen,
-    Wall,
-)
+from uwb_mitigation.simulation.scene import FLAT, Building, DirectPath, Screen, Wall
 
-RESIDENTIAL: Environments = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
-OFFICE: Environments = (OFFICE_LOS, OFFICE_NLOS)
-INDUSTRIAL: Environments = (INDUSTRIAL_LOS, INDUSTRIAL_NLOS)
-OUTDOOR: Environments = (OUTDOOR_LOS, RESIDENTIAL_NLOS)
+RESIDENTIAL: Environments = (channel.RESIDENTIAL_LOS, channel.RESIDENTIAL_NLOS)
+OFFICE: Environments = (channel.OFFICE_LOS, channel.OFFICE_NLOS)
+INDUSTRIAL: Environments = (channel.INDUSTRIAL_LOS, channel.INDUSTRIAL_NLOS)
+OUTDOOR: Environments = (channel.OUTDOOR_LOS, channel.RESIDENTIAL_NLOS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,31 +46,20 @@ class BuildingType:
 
 KINDS = (
     BuildingType("flat", 0.55, (5.0, 14.0), (4.0, 10.0), (2.5, 5.0), ((RESIDENTIAL, 1.0),), 0.12),
-    BuildingType(
-        "office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08
-    ),
-    BuildingType(
-        "corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06
-    ),
+    BuildingType("office", 0.2, (10.0, 30.0), (8.0, 18.0), (3.0, 7.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.08),
+    BuildingType("corridor", 0.15, (12.0, 40.0), (6.0, 14.0), (3.0, 6.0), ((RESIDENTIAL, 0.3), (OFFICE, 0.7)), 0.06),
     BuildingType("hall", 0.1, (10.0, 40.0), (8.0, 30.0), (10.0, 25.0), ((INDUSTRIAL, 1.0),), 0.06),
-)
+)  # fmt: skip
 
+_OPEN = ((RESIDENTIAL, 0.35), (OFFICE, 0.25), (INDUSTRIAL, 0.2), (OUTDOOR, 0.2))
 WIDE_KINDS = (
     *(replace(kind, share=0.7 * kind.share) for kind in KINDS),
-    BuildingType(
-        "open",
-        0.3,
-        (5.0, 40.0),
-        (4.0, 30.0),
-        (60.0, 60.0),
-        ((RESIDENTIAL, 0.35), (OFFICE, 0.25), (INDUSTRIAL, 0.2), (OUTDOOR, 0.2)),
-        0.02,
-    ),
+    BuildingType("open", 0.3, (5.0, 40.0), (4.0, 30.0), (60.0, 60.0), _OPEN, 0.02),
 )
 """Open sites have no inner walls: laboratories, arenas, halls, and places outdoors. About half of the placements are LOS."""
 
-HEAVY = ((CONCRETE, (0.15, 0.40)), (BRICK, (0.20, 0.50)))
-LIGHT = ((PLASTERBOARD, (0.02, 0.05)), (WOOD, (0.03, 0.06)), (GLASS, (0.006, 0.02)))
+HEAVY = ((scene.CONCRETE, (0.15, 0.40)), (scene.BRICK, (0.20, 0.50)))
+LIGHT = ((scene.PLASTERBOARD, (0.02, 0.05)), (scene.WOOD, (0.03, 0.06)), (scene.GLASS, (0.006, 0.02)))
 """Materials of ITU-R P.2040-1 with bounds of their thickness, m: load-bearing walls, and partitions."""
 
 HEAVY_SHARE = 0.85
@@ -292,13 +259,7 @@ def block_of(
     delay_factor = np.minimum(np.hypot(*(tag - anchor).T) / DETOUR_M, MAX_DELAY_FACTOR)
     fields = draw_fields(environments, PLACEMENTS, rng, delay_factor)
     pairs = AntennaPairs(
-        anchor,
-        tag,
-        path.take(chosen),
-        environments,
-        fields,
-        np.arange(PLACEMENTS),
-        stationary=True,
+        anchor, tag, path.take(chosen), environments, fields, np.arange(PLACEMENTS), stationary=True
     )
     return Block(kind.name, chosen // per_building, pairs, boards.take(chosen)), rng
 
@@ -307,8 +268,8 @@ def _with_decay(environment: Environment, factor: float) -> Environment:
     """Return an environment with decay times of clusters and rays that are multiplied by `factor`, within the valid limits."""
     return replace(
         environment,
-        cluster_decay_ns=min(factor * environment.cluster_decay_ns, MAX_DECAY_NS),
-        ray_decay_ns=min(factor * environment.ray_decay_ns, MAX_DECAY_NS),
+        cluster_decay_ns=min(factor * environment.cluster_decay_ns, channel.MAX_DECAY_NS),
+        ray_decay_ns=min(factor * environment.ray_decay_ns, channel.MAX_DECAY_NS),
     )
 
 
@@ -355,7 +316,7 @@ def _mean_powers_db(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the power of the direct path and of all others relative to the transmit power."""
     distance = np.hypot(*(tag - anchor).T)
-    direct = direct_power_db(distance, path.loss_db + math.prod(PATTERN_LOSS_DB))
+    direct = channel.direct_power_db(distance, path.loss_db + math.prod(channel.PATTERN_LOSS_DB))
     diffuse = -np.where(path.crossings > 0, *(e.path_loss_db(distance) for e in environments[::-1]))
     return direct, diffuse
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.simulation.channel import SPEED_OF_LIGHT_M_PER_NS, Multipath, check_range
+from uwb_mitigation.simulation.channel import SPEED_OF_LIGHT_M_PER_NS, Multipath
 from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, RadioType, Segment
 
 TAPS = 1016
@@ -165,9 +165,6 @@ class Receiver:
             `PULSE_SPACING_TAPS`; 0: a preamble, whose periodic correlation is perfect.
         kind, segment: source of the CIRs.
         false_peak_share: share of frames with a peak before the direct path that is no path (`FALSE_PEAK_M`).
-
-    Raises:
-        ParameterError: a value is not finite or is out of its range.
     """
 
     tx_power_dbm: float = -14.3
@@ -186,30 +183,9 @@ class Receiver:
     segment: Segment = Segment.IPATOV
     false_peak_share: float = 0.0
 
-    def __post_init__(self) -> None:
-        for name, value, low, high in (
-            ("tx_power_dbm", self.tx_power_dbm, -60, 20),
-            ("noise_figure_db", self.noise_figure_db, 0, 40),
-            ("compression_dbm", self.compression_dbm, -90, 0),
-            ("self_noise_db", self.self_noise_db, -120, -30),
-            ("sensitivity_dbm", self.sensitivity_dbm, -130, 0),
-            ("accumulator_limit", self.accumulator_limit, 1000, 65536),
-            ("noise_multiplier", self.noise_multiplier, 1, 31),
-            ("range_offset_m", self.range_offset_m, -10, 10),
-            ("timestamp_std_m", self.timestamp_std_m, 0, 1),
-            ("false_peak_share", self.false_peak_share, 0, 1),
-        ):
-            check_range("radio", name, value, low, high)
-        check_range("radio", "preamble_symbols", self.preamble_symbols, 16, 4096, whole=True)
-
     def boards(self, n: int) -> Boards:
         """Return the properties of n pairs between identical boards."""
-        values = (
-            self.noise_figure_db,
-            self.preamble_symbols,
-            self.self_noise_db,
-            self.noise_multiplier,
-        )
+        values = (self.noise_figure_db, self.preamble_symbols, self.self_noise_db, self.noise_multiplier)
         return Boards(np.zeros(n), *(np.full(n, float(value)) for value in values))
 
     @staticmethod

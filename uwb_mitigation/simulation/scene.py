@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.simulation.channel import CENTRE_FREQUENCY_HZ, WAVELENGTH_M, check_range
+from uwb_mitigation.simulation.channel import CENTRE_FREQUENCY_HZ, WAVELENGTH_M
 
 Point = tuple[float, float]
 
@@ -28,10 +27,6 @@ class Material:
     name: str
     permittivity: float
     conductivity: float
-
-    def __post_init__(self) -> None:
-        check_range(f"material {self.name}", "permittivity", self.permittivity, 1, 100)
-        check_range(f"material {self.name}", "conductivity", self.conductivity, 0, 10)
 
 
 def _at_centre(c: float, d: float) -> float:
@@ -55,10 +50,6 @@ class Wall:
     material: Material
     thickness_m: float
 
-    def __post_init__(self) -> None:
-        check_range(f"wall of {self.material.name}", "thickness_m", self.thickness_m, 0, 2)
-        _check_points(f"wall of {self.material.name}", self.start, self.end)
-
 
 @dataclass(frozen=True, slots=True)
 class Screen:
@@ -67,14 +58,6 @@ class Screen:
     name: str
     start: Point
     end: Point
-
-    def __post_init__(self) -> None:
-        _check_points(f"screen {self.name}", self.start, self.end)
-
-
-def _check_points(where: str, start: Point, end: Point) -> None:
-    if not all(math.isfinite(v) for v in (*start, *end)) or start == end:
-        raise ParameterError(f"from {start} to {end}", where=where, valid="two different finite points")
 
 
 @dataclass(frozen=True, slots=True)

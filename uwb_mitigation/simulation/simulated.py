@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, label, place
-from uwb_mitigation.simulation.buildings import PLACEMENTS, block_of
+from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
-from uwb_mitigation.simulation.channel import RESIDENTIAL_LOS, RESIDENTIAL_NLOS, DiffuseField, check_range
+from uwb_mitigation.simulation.channel import DiffuseField, check_range
 from uwb_mitigation.simulation.odometry import SimulatedMotion, simulate_motion, yaw_along_route
 from uwb_mitigation.simulation.radio import Boards, Receiver, Reception
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point, along_route
@@ -48,8 +48,6 @@ ROBOT_FRAME = "base_link"
 
 FIRST_TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
-
-RESIDENTIAL = (RESIDENTIAL_LOS, RESIDENTIAL_NLOS)
 
 SURVEY_RATE_HZ = 20.0
 
@@ -262,37 +260,15 @@ class SimulatedSurvey(Simulated):
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         placements = -(-BATCH // self._exchanges)
-        size = placements * self._exchanges
-        for batch in range(-(-self._count // size)):
+        rows = np.arange(placements)
+        for batch in range(-(-self._count // (placements * self._exchanges))):
             rng = np.random.default_rng([self._seed, batch])
             fields = draw_fields(RESIDENTIAL, placements, rng)
             anchor, tag = place(self._plan.size, placements, rng)
-            pair_index = np.repeat(np.arange(placements), self._exchanges)
-            names = [
-                f"simulated survey seed {self._seed}/placement {batch * placements + k}"
-                for k in pair_index.tolist()
-            ]
-            sequence = batch * size + np.arange(size)
-            ids = np.ones(size, np.int64)
-            path = self._plan.direct_path(anchor, tag).take(pair_index)
-            yield (
-                TwrBatch(
-                    sequence,
-                    ids,
-                    FIRST_TAG_ID * ids,
-                    names,
-                    AntennaPairs(
-                        anchor[pair_index],
-                        tag[pair_index],
-                        path,
-                        RESIDENTIAL,
-                        fields,
-                        pair_index,
-                        stationary=True,
-                    ),
-                ),
-                rng,
-            )
+            path, first = self._plan.direct_path(anchor, tag), batch * placements
+            pairs = AntennaPairs(anchor, tag, path, RESIDENTIAL, fields, rows, stationary=True)
+            names = [f"simulated survey seed {self._seed}/placement {first + k}" for k in rows.tolist()]
+            yield _static(pairs, rows, self._exchanges, first, names), rng
 
 
 class SimulatedBuildings(Simulated):
@@ -320,28 +296,44 @@ class SimulatedBuildings(Simulated):
         self._exchanges = exchanges
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
-        exchanges_per_placement = self._exchanges
-        together = max(1, BATCH // exchanges_per_placement)
-        for number in range(-(-self._count // (PLACEMENTS * exchanges_per_placement))):
+        together = max(1, BATCH // self._exchanges)
+        for number in range(-(-self._count // (PLACEMENTS * self._exchanges))):
             block, rng = block_of(self._seed, number)
             for first in range(0, PLACEMENTS, together):
                 rows = np.arange(first, min(first + together, PLACEMENTS))
-                pair_index = np.repeat(np.arange(len(rows)), exchanges_per_placement)
-                pairs = block.pairs.take(rows, pair_index)
                 names = [block.configuration(self._seed, number, k) for k in rows.tolist()]
-                ids = np.ones(len(pair_index), np.int64)
-                sequence = (number * PLACEMENTS + first) * exchanges_per_placement + np.arange(
-                    len(pair_index)
-                )
-                exchanges = TwrBatch(
-                    sequence,
-                    ids,
-                    FIRST_TAG_ID * ids,
-                    [names[k] for k in pair_index.tolist()],
-                    pairs,
-                    block.boards.take(rows[pair_index]),
-                )
-                yield exchanges, rng
+                of_all = number * PLACEMENTS + first
+                yield _static(block.pairs, rows, self._exchanges, of_all, names, block.boards), rng
+
+
+def _static(
+    pairs: AntennaPairs,
+    rows: NDArray[np.intp],
+    exchanges: int,
+    first: int,
+    names: list[str],
+    boards: Boards | None = None,
+) -> TwrBatch:
+    """Return exchanges over some of the static pairs.
+
+    Args:
+        pairs: with one field each.
+        rows: int (n,), the pairs that are used.
+        exchanges: number of exchanges of each.
+        first: number of the first of them among all placements.
+        names: their n configurations.
+        boards: those of `pairs`; None: identical ones.
+    """
+    index = np.repeat(np.arange(len(rows)), exchanges)
+    ids = np.ones(len(index), np.int64)
+    return TwrBatch(
+        first * exchanges + np.arange(len(index)),
+        ids,
+        FIRST_TAG_ID * ids,
+        [names[k] for k in index.tolist()],
+        pairs.take(rows, index),
+        None if boards is None else boards.take(rows[index]),
+    )
 
 
 def _cir(reception: Reception, i: int) -> Cir:

@@ -118,12 +118,7 @@ def train_universal_model(
         wide_share=WIDE_SHARES[plan.scaling],
     )
     held_out = building_dataset(
-        plan.seed + HELD_OUT_SEED,
-        plan.held_out_blocks,
-        preprocessing,
-        workers,
-        count_block,
-        radio=plan.radio,
+        plan.seed + HELD_OUT_SEED, plan.held_out_blocks, preprocessing, workers, count_block, radio=plan.radio
     )
     count_epoch = step_counter(plan.fit.epochs, lambda fraction: on_share(0.2 + 0.75 * fraction, "training"))
     options = replace(plan.fit, seed=plan.seed)

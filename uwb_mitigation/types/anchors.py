@@ -10,7 +10,6 @@ ranges, decimal or 0x... . Other fields are errors.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -147,18 +146,15 @@ def parse_anchors(text: str, where: str) -> AnchorMap:
 
 def dump_anchors(anchors: AnchorMap, comment: str = "") -> str:
     """Return the text of an anchors file, after the lines of `comment`."""
-    out = io.StringIO()
-    for line in comment.splitlines():
-        out.write(f"# {line}\n")
-    out.write("anchors:\n")
+    lines = [*(f"# {line}" for line in comment.splitlines()), "anchors:"]
     for anchor in anchors.anchors:
         x, y, z = (round(value, 6) for value in anchor.position)
         entry: dict[str, object] = {"x": x, "y": y, "z": z, "sd": round(anchor.sd, 6)}
         if anchor.name:
             entry["name"] = anchor.name
         fields = yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, width=1 << 16)
-        out.write(f"  - {{id: {format_id(anchor.id)}, {fields.removeprefix('{')}")
-    return out.getvalue()
+        lines.append(f"  - {{id: {format_id(anchor.id)}, {fields.removeprefix('{').rstrip()}")
+    return "\n".join(lines) + "\n"
 
 
 def _anchor_at(identity: object, position: Any, where: str) -> Anchor:

@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -198,25 +197,17 @@ def _from_sections(document: Mapping[Any, Any], where: str) -> Offsets:
 
 def dump_offsets(offsets: Offsets, comment: str = "") -> str:
     """Return the text of an offsets file for `parse_offsets`; each line of `comment` precedes it."""
-    text_out = io.StringIO()
-    for line in comment.splitlines():
-        text_out.write(f"# {line}\n")
-    text_out.write(f"default: {round(offsets.default, 6)}\n")
+    lines = [*(f"# {line}" for line in comment.splitlines()), f"default: {round(offsets.default, 6)}"]
     for name, entries in (("anchors", offsets.anchors), ("tags", offsets.tags)):
         if entries:
-            text_out.write(
-                f"{name}:\n"
-                + "".join(f"  {format_id(i)}: {round(m, 6)}\n" for i, m in sorted(entries.items()))
-            )
+            lines += [f"{name}:", *(f"  {format_id(i)}: {round(m, 6)}" for i, m in sorted(entries.items()))]
     if offsets.pairs:
-        text_out.write("pairs:\n")
-        for (tag, anchor), value in sorted(offsets.pairs.items()):
-            sd = offsets.pair_sd.get((tag, anchor))
-            sd_text = "" if sd is None else f", sd: {round(sd, 6)}"
-            text_out.write(
-                f"  - {{anchor: {format_id(anchor)}, tag: {format_id(tag)}, offset: {round(value, 6)}{sd_text}}}\n"
-            )
-    return text_out.getvalue()
+        lines.append("pairs:")
+    for (tag, anchor), value in sorted(offsets.pairs.items()):
+        sd = offsets.pair_sd.get((tag, anchor))
+        entry = f"anchor: {format_id(anchor)}, tag: {format_id(tag)}, offset: {round(value, 6)}"
+        lines.append(f"  - {{{entry}{'' if sd is None else f', sd: {round(sd, 6)}'}}}")
+    return "\n".join(lines) + "\n"
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

@@ -19,7 +19,7 @@ import numpy as np
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.mitigation.model.choice import Choice
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW

@@ -12,7 +12,7 @@ from bokeh.resources import INLINE
 
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.correction import Corrector
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.viewer.drawing import Figures
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.models import FIGURES, Models

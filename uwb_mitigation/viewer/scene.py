@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
 from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, CorrectedRange, Encoding, Status, Truth
 from uwb_mitigation.types.ros.poses import tag_frame

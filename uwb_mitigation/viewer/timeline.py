@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 from uwb_mitigation.mitigation.correction import Corrector
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.robot_estimator import live_track
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match

@@ -15,13 +15,13 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.positioning.batch.smoother import Smoother
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig, RobotData
-from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings
-from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
+from uwb_mitigation.positioning.recorded_tracks import TagTracks
+from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.odometry import BASE_LINK, read_imu, read_odometry
 from uwb_mitigation.recordings.bag.pose_paths import read_heights, read_lever_arm, read_range_frame
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.anchors import AnchorMap, anchors_path, load_anchors
+from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.ros.poses import (
     BodyTwist,
     encode_odometry,
@@ -45,15 +45,6 @@ def mitigation(settings: TrackSettings) -> Mitigation:
         ModelError: the model cannot be loaded.
     """
     return Mitigation(load_model(settings.model), settings.offsets, median_at_rest=True)
-
-
-def read_anchors(bag: Path, file: Path | None = None) -> AnchorMap:
-    """Return the anchors of a file, else those of the bag.
-
-    Raises:
-        ParameterError: there are none.
-    """
-    return (None if file else recorded_anchors(bag)) or load_anchors(file or anchors_path(bag))
 
 
 def read_config(

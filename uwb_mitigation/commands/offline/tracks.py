@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -13,14 +12,15 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from uwb_mitigation.commands.offline.track import read_config, tum, tum_file
-from uwb_mitigation.errors import DatasetError, ParameterError, check_name, format_id
+from uwb_mitigation.errors import ParameterError, check_name, format_id
 from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.recorded_tracks import TagTracks, TrackSettings, check_one_tag, track_tag
+from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tags
+from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.recordings.mcap import McapRecording
@@ -224,12 +224,7 @@ def track(
         recorded.check(anchor_map)
         config = settings.config(anchor_map)
     check_one_tag(config, recorded.tags)
-    tags, failures = [], list[DatasetError]()
-    for recorded_tag in recorded.tags:
-        with _collected(failures):
-            tags.append(track_tag(recorded_tag, config))
-    if not tags:
-        raise failures[0]
+    tags, failures = track_tags(recorded.tags, config)
     warnings = [
         f"{count} ranges of the unknown anchor {format_id(i)}"
         for i, count in recorded.unknown_anchors.items()
@@ -238,15 +233,6 @@ def track(
     warnings += [str(failure) for failure in failures]
     warnings += [f"tag {format_id(tag.recording.tag_id)}: {text}" for tag in tags for text in tag.warnings]
     return Tracks(tags, anchor_map, warnings)
-
-
-@contextmanager
-def _collected(failures: list[DatasetError]) -> Iterator[None]:
-    """Append the error of a tag, because the others may have positions."""
-    try:
-        yield
-    except DatasetError as error:
-        failures.append(error)
 
 
 def _read_records(

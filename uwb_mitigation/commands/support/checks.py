@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -24,6 +24,11 @@ OffsetsOption = Annotated[
 ]
 
 
+def output_option(metavar: str, description: str) -> Any:
+    """Return the option `-o` for what a command writes."""
+    return typer.Option("-o", "--output", metavar=metavar, help=description)
+
+
 @contextmanager
 def needs_torch() -> Iterator[None]:
     """Wrap imports: if torch is missing, the error names the command that installs it."""
@@ -33,6 +38,13 @@ def needs_torch() -> Iterator[None]:
         if error.name != "torch":
             raise
         raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
+
+
+def check_replaceable(files: Iterable[Path], force: bool) -> None:
+    """Raise a ParameterError if one of the files exists, unless `force` is set."""
+    for file in files:
+        if file.exists() and not force:
+            raise ParameterError("exists already", where=str(file), valid="--force replaces it")
 
 
 def check_output(output: Path, force: bool = True) -> None:
@@ -45,5 +57,4 @@ def check_output(output: Path, force: bool = True) -> None:
         raise ParameterError(
             "not a path for a bundle", where=str(output), valid="a file .onnx in an existing folder"
         )
-    if output.exists() and not force:
-        raise ParameterError("the file exists", where=str(output), valid="another path, or --force")
+    check_replaceable([output], force)

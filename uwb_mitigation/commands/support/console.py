@@ -252,9 +252,6 @@ def _check_json_target(path: Path | None) -> Path | None:
 JsonOption = Annotated[
     Path | None,
     typer.Option(
-        "--json",
-        metavar="FILE",
-        callback=_check_json_target,
-        help="Also write the result to FILE as JSON.",
+        "--json", metavar="FILE", callback=_check_json_target, help="Also write the result to FILE as JSON."
     ),
 ]

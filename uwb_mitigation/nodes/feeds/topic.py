@@ -14,10 +14,15 @@ from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.recordings.live_ranges import LiveConverter
 from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
-from uwb_mitigation.recordings.mapping.mapping import Mapping
+from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shipped_mappings
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 _WARNING_PERIOD_S = 10.0
+
+
+def find_mapping(name: str) -> Mapping | None:
+    """Return the mapping of a file, or a shipped one; None: it is the name of a topic."""
+    return load_mapping(name) if name in shipped_mappings() or name.endswith((".yaml", ".yml")) else None
 
 
 class TopicFeed:

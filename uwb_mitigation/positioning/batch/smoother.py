@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.least_squares import LeastSquares, Solution, gauss_newton
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import unit_vectors
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.robot_estimator import make_estimator
-from uwb_mitigation.positioning.online.tag_estimator import EstimatorConfig
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 

@@ -16,17 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.heading_test import HeadingTest
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.odometry_filter import YAW, OdometryFilter
-from uwb_mitigation.positioning.online.tag_estimator import (
-    EstimatorConfig,
-    RobotData,
-    TagEstimator,
-    run_estimator,
-)
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator, run_estimator
 from uwb_mitigation.types.tracks import Estimate, Heading, Ranges, Track, rows_of
 
 NUM_YAWS = 8

@@ -1,41 +1,31 @@
-"""The position of one tag from its first range: initialisation, tracking, and ambiguity of its position.
+"""The position of one tag from its first range: initialisation and tracking.
 
-While several positions explain the ranges, each is followed by a filter, and no position is published, unless they differ in
-height only. If the anchors of the last second do not exclude a mirror image of the position, an area or the time before can do so.
-Otherwise the position is withheld if the image has another x and y, and else published with a variance that contains the image.
+While several positions explain the ranges of the last second, each is followed by a filter, and no position is published. It is
+withheld also if the anchors do not exclude its image with another x and y (`ambiguity.py`).
 """
 
 from __future__ import annotations
 
-import enum
 import math
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.geometry import (
-    Area,
-    Dop,
-    Height,
-    Symmetry,
-    constant_error_gain,
-    dop,
-    separation,
-)
-from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.filter import OFFSET, RangeFilter
+from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.geometry import Dop, Height, dop
+from uwb_mitigation.positioning.online.ambiguity import SAME_M, Ambiguity, AmbiguityCheck
+from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.positioning.online.initialization import (
     IMPLAUSIBLE,
     CandidatePosition,
     candidate_positions,
 )
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
-from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.stamps import NS_PER_S
-from uwb_mitigation.types.tracks import Estimate, Heights, Imu, Odometry, Ranges, Track, rows_of
+from uwb_mitigation.types.tracks import Estimate, Heights, Ranges, Track, rows_of
 
 WINDOW_S = 1.0
 """A position is searched from the ranges of this time: every anchor had its turn, and a robot has moved by a metre."""
@@ -54,88 +44,15 @@ SURPRISE = 1.0
 
 HEIGHT_AGE_NS = 200_000_000
 
-MIRROR_SD, EXCLUDED_SD = 2.0, 3.0
-"""Within `MIRROR_SD` standard deviations of the mirror the side of a tag is unknown; an image that is outside the area by more
-than `EXCLUDED_SD`, or whose ranges differ by more than that, is excluded."""
-
-EVIDENCE_RATE, EVIDENCE = 0.01, 1.0
-"""The loss of each anchor's ranges is averaged over about a hundred ranges, in which persisting errors change a few times. The
-image is used if the sum over the anchors is smaller by `EVIDENCE`."""
-
 MAX_AMBIGUOUS_S = 2.0
 """For this time the velocity determines on which side of a mirror a tag continues; after it, the position is searched again."""
-
-RANGE_ERROR_M = 0.17
-"""Ranges of positions are compared with this standard deviation at least: also errors persist, and obstacles."""
-
-FEW_ANCHORS = 3.0
-"""Factor of a variance that is estimated from few anchors: that of Student's t-distribution with three degrees of freedom."""
 
 _UNDETERMINED_M = 5.0
 """A position with a larger horizontal standard deviation is not determined by the ranges."""
 
-LEVEL = 0.9
-"""A mirror with a larger vertical component of its normal reflects heights."""
-
-_HALF_WAY = np.array([[1.0], [0.5]])
-_SAME_M = 0.3
-_MAX_ARC_M = 0.5
 _RETAINED_RANGES = 400
 _MAX_CANDIDATES = 12
 _RETRY_S = 0.25
-
-
-class Ambiguity(enum.Enum):
-    """Which other positions explain the ranges of a tag; `WEAK`: nearby ones in one direction."""
-
-    NONE = "unique"
-    WEAK = "weak direction"
-    HEIGHT = "mirrored height"
-    ARC = "arc"
-    MIRROR = "mirrored position"
-    CIRCLE = "circle"
-
-
-_GEOMETRY_S = {Ambiguity.NONE: 1.0, Ambiguity.WEAK: 0.5, Ambiguity.HEIGHT: 0.5}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RobotData:
-    """Recorded motion of a robot, and its antenna.
-
-    Attributes:
-        odometry, imu: recorded; None: none, or live.
-        lever_arm: the antenna in the frame of the base, m.
-        is_verified: the heading was confirmed before, so that the odometry has no fault.
-    """
-
-    odometry: Odometry | None = None
-    imu: Imu | None = None
-    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    is_verified: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EstimatorConfig:
-    """Prior knowledge: anchors, error model, and of the tags a constant height, an area or measured heights, if any.
-
-    Attributes:
-        robot: motion of the robot that carries the tag, if it has odometry.
-        widens: published covariances contain constant errors of ranges, and other positions that explain the ranges.
-    """
-
-    anchors: AnchorMap
-    model: NoiseModel = field(default_factory=NoiseModel)
-    height: Height | None = None
-    area: Area | None = None
-    heights: Heights | None = None
-    robot: RobotData | None = None
-    widens: bool = True
-
-    @property
-    def dims(self) -> int:
-        """The number of unknown coordinates of a position."""
-        return 2 if self.height is not None else 3
 
 
 @dataclass(slots=True)
@@ -169,21 +86,13 @@ class TagEstimator:
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
             its square (1 is ideal).
         filter: the filter that follows the tag; None: its position is searched.
-        ambiguity: which other positions explain the ranges. ambiguities: how often it was found, four times per second.
-        error_sd_m: standard deviation with which the ranges of positions were compared.
+        images: other positions that explain the ranges; checked four times per second.
         undetermined: the ranges do not determine the horizontal position at all.
     """
 
     filter: RangeFilter | None
     _hypotheses: list[_PositionHypothesis]
     _origin_ns: int | None
-    ambiguity: Ambiguity
-    _symmetry: Symmetry | None
-    _shift: NDArray[np.float64]
-    _is_side_known: bool
-    _evidence: float
-    _checked: list[int]
-    _checked_s: float
     _time_s: float
     _search_began_s: float
     _next_check_s: float
@@ -196,18 +105,22 @@ class TagEstimator:
         self.counts: Counter[str] = Counter()
         self.innovation_mean, self.innovation_square = 0.0, 1.0
         self.config, self._model = config, config.model
-        self.ambiguities, self.error_sd_m = Counter[Ambiguity](), RANGE_ERROR_M
+        self.images = AmbiguityCheck(config)
         self._height, self._area = config.height, config.area
         self._states = [_AnchorState() for _ in range(len(self.anchors))]
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_RETAINED_RANGES)
-        self._symmetries: dict[tuple[int, ...], tuple[Symmetry, bool]] = {}
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_RETAINED_RANGES)
         self.restart()
 
     @property
+    def ambiguity(self) -> Ambiguity:
+        """Which other positions explain the ranges."""
+        return self.images.ambiguity
+
+    @property
     def is_ambiguous(self) -> bool:
         """Whether positions with another x and y explain the ranges: the position is not published."""
-        return self.ambiguity in (Ambiguity.MIRROR, Ambiguity.CIRCLE)
+        return self.images.is_ambiguous
 
     @property
     def candidates(self) -> int:
@@ -327,8 +240,8 @@ class TagEstimator:
         filter_.predict(self._time_s)
         # The first position contains the errors of the ranges of its window.
         filter_.state.estimates_errors = self._time_s >= self._found_s + WINDOW_S
-        if self._symmetry is not None:
-            self._compare_image(filter_, self._symmetry, measurement)
+        if self.images.mirror and self.images.compare(filter_, measurement, len(self.received_anchors())):
+            self._next_check_s = -math.inf
         z, _ = filter_.update(*measurement[1:])
         self._confine(filter_)
         limited = max(-10.0, min(10.0, z))
@@ -345,129 +258,17 @@ class TagEstimator:
                 self.counts["lost"] += 1
                 self._restart_search(self._time_s - WINDOW_S)
                 return
-            valid_s = _GEOMETRY_S.get(self.ambiguity, 0.0) if received == self._checked else 0.0
-            if self._time_s >= self._checked_s + valid_s:
-                self._checked, self._checked_s = received, self._time_s
-                self._check_ambiguity(filter_)
-            self.ambiguities[self.ambiguity] += 1
+            self.images.update(filter_, received, self.dims, self._time_s)
             if self.is_ambiguous and not was_ambiguous:
                 self._ambiguous_s = self._time_s
             if was_ambiguous and not self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
                 self._restart_search(self._time_s - WINDOW_S)
 
-    def _compare_image(self, filter_: RangeFilter, mirror: Symmetry, measurement: TagRange) -> None:
-        """Average how much better the position explains the ranges than its image, and swap both if the image is better."""
-        # Python numbers are faster here than NumPy.
-        x, y, z, _, _, _, offset = filter_.state.x[: OFFSET + 1].tolist()
-        (a, b, c), (u, v, w) = mirror.axis.tolist(), mirror.center.tolist()
-        twice = 2.0 * (a * (x - u) + b * (y - v) + c * (z - w))
-        u, v, w = self.anchors.position[measurement.anchor].tolist()
-        x, y, z = x - u, y - v, z - w
-        expected, model = measurement.range_m - offset, self._model
-        sd = math.sqrt(model.variance(measurement.variance_m2))
-        of_position = model.student_loss((expected - math.hypot(x, y, z)) / sd)
-        image_m = math.hypot(x - twice * a, y - twice * b, z - twice * c)
-        of_image = model.student_loss((expected - image_m) / sd)
-        difference = len(self.received_anchors()) * (of_image - of_position)
-        self._evidence += EVIDENCE_RATE * (difference - self._evidence)
-        if self._evidence < -EVIDENCE:
-            filter_.reflect(mirror)
-            self._evidence, self._next_check_s = -self._evidence, -math.inf
-
-    def _check_ambiguity(self, filter_: RangeFilter) -> None:
-        """Find other positions that explain the ranges."""
-        position, dims, rows = filter_.position, self.dims, self.received_anchors()
-        if not rows:
-            return
-        anchors, state = self.anchors.position[rows], filter_.state
-        gain, redundancy = constant_error_gain(anchors, position, dims, self._model.offset_sd)
-        variance = state.persisting_variance(redundancy)
-        excess = FEW_ANCHORS * max(variance - state.modelled_variance, 0.0)
-        filter_.unseen = self.config.widens * (excess * gain + state.hidden_offset_covariance())
-        sd_m, scale = math.sqrt(max(FEW_ANCHORS * variance, RANGE_ERROR_M**2)), state.covariance_scale()
-        self.error_sd_m = sd_m
-        offset_sd_m = math.sqrt(float(state.P[OFFSET, OFFSET]))
-        covariance = scale * state.P[:3, :3] + excess * gain
-        key = dims, *rows
-        if key not in self._symmetries:
-            symmetry = Symmetry.of(anchors, dims, RANGE_ERROR_M)
-            self._symmetries[key] = symmetry, self._is_one_sided(symmetry)
-        symmetry, is_one_sided = self._symmetries[key]
-        self.ambiguity, self._symmetry, self._shift = Ambiguity.NONE, None, np.zeros(3)
-        if symmetry.is_rotation:
-            self._check_circle(filter_, symmetry, covariance)
-            return
-        if is_one_sided:
-            self._is_side_known = True
-            return
-        # The image, and the position half-way.
-        images = (symmetry.images(position) - position) * _HALF_WAY
-        places = position + images
-        separations = separation(anchors, position, places, sd_m, offset_sd_m, dims)
-        is_possible = (separations < EXCLUDED_SD) & self._area_contains(places, covariance)
-        same_m = max(_SAME_M, EXCLUDED_SD * math.sqrt(max(covariance[0, 0], covariance[1, 1])))
-        if dims == 3 and abs(symmetry.axis[2]) > LEVEL and math.hypot(*images[0, :2]) < same_m:
-            self._is_side_known = not is_possible[0]
-            images, weight = images[is_possible], np.exp(-0.5 * separations[is_possible] ** 2)
-            filter_.unseen += self.config.widens * (images.T @ images) / (len(images) + 1)
-            self._shift[:2] = (weight @ images)[:2] / (1.0 + weight.sum())
-            if len(images):
-                is_apart = is_possible[0] and separations[0] < separations[1]
-                self.ambiguity = Ambiguity.HEIGHT if is_apart else Ambiguity.WEAK
-                self._symmetry = symmetry
-        elif not is_possible[0]:
-            self._is_side_known = True
-        elif separations[0] < separations[1] and not self._knows_side(images[:1], covariance):
-            # If the position half-way is better, all three are one solution with a large covariance.
-            self.ambiguity, self._symmetry = Ambiguity.MIRROR, symmetry
-
-    def _check_circle(self, filter_: RangeFilter, circle: Symmetry, covariance: NDArray[np.float64]) -> None:
-        position = filter_.position
-        images = circle.images(position) - position
-        is_possible = self._area_contains(position + images, np.eye(3) * (_SAME_M / EXCLUDED_SD) ** 2)
-        images = images[is_possible]
-        if not len(images):
-            self._is_side_known = True
-        elif not self._knows_side(images, covariance):
-            # From the position on, around the circle.
-            is_inside = np.append(True, is_possible)
-            is_arc = np.count_nonzero(is_inside != np.roll(is_inside, 1)) == 2
-            spread = images.T @ images / (len(images) + 1)
-            filter_.unseen += self.config.widens * spread
-            is_short = np.trace(spread[:2, :2]) < _MAX_ARC_M**2
-            self.ambiguity = Ambiguity.ARC if is_arc and is_short else Ambiguity.CIRCLE
-
-    def _knows_side(self, images: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
-        """Return whether the position was known before its `images` (n, 3) relative to it appeared, and is far from them."""
-        squared = np.einsum("ni,ni->n", images, images)
-        variance = np.einsum("ni,ij,nj->n", images, covariance, images)
-        self._is_side_known &= bool((squared**2 > (2.0 * MIRROR_SD) ** 2 * variance).all())
-        return self._is_side_known
-
-    def _is_one_sided(self, mirror: Symmetry) -> bool:
-        """Whether the area is on one side of a mirror."""
-        if self._area is None:
-            return False
-        corners = np.stack(np.meshgrid(*zip(self._area.low, self._area.high, strict=True)), axis=-1)
-        sides = (corners - mirror.center) @ mirror.axis
-        return bool(sides.min() >= 0.0 or sides.max() <= 0.0)
-
-    def _area_contains(
-        self, images: NDArray[np.float64], covariance: NDArray[np.float64]
-    ) -> NDArray[np.bool_]:
-        """Return which images (n, 3) the area does not exclude in any axis, with the variance of this axis."""
-        if self._area is None:
-            return np.ones(len(images), np.bool_)
-        excess = np.abs(images - self._area.clip(images))
-        contains: NDArray[np.bool_] = np.all(excess <= EXCLUDED_SD * np.sqrt(np.diag(covariance)), axis=1)
-        return contains
-
     def _estimate(self, filter_: RangeFilter, stamp_ns: int) -> Estimate:
         """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
         estimate = filter_.estimate(stamp_ns)
         covariance, position = estimate.covariance, estimate.position
-        if self._symmetry is not None:
-            position += self._shift
+        position += self.images.shift
         if self._height is not None:
             # Constant errors of ranges would move it in the filter.
             position[2] = self._height.value
@@ -498,10 +299,8 @@ class TagEstimator:
         self.filter, self._hypotheses = None, []
         for state in self._states:
             state.outliers = 0.0
-        self.ambiguity, self._symmetry = Ambiguity.NONE, None
-        self._shift = np.zeros(3)
-        self._is_side_known, self._evidence, self.undetermined = False, 0.0, False
-        self._checked, self._checked_s = [], -math.inf
+        self.images.reset()
+        self.undetermined = False
         self._search_began_s, self._next_check_s, self._found_s = time_s, -math.inf, math.inf
 
     def _search(self, measurement: TagRange) -> None:
@@ -568,16 +367,16 @@ class TagEstimator:
         for hypothesis in sorted(self._hypotheses, key=lambda hypothesis: hypothesis.loss):
             position = hypothesis.filter.position
             if hypothesis.loss <= best + IMPLAUSIBLE and all(
-                np.linalg.norm(position - better.filter.position) > _SAME_M for better in plausible
+                np.linalg.norm(position - better.filter.position) > SAME_M for better in plausible
             ):
                 plausible.append(hypothesis)
         self._hypotheses = plausible
         leader = plausible[0].filter
         self.undetermined = leader.horizontal_sd > _UNDETERMINED_M
         differences = [hypothesis.filter.position - leader.position for hypothesis in plausible[1:]]
-        if not self.undetermined and all(math.hypot(x, y) < _SAME_M for x, y, _ in differences):
-            self._is_side_known = False
-            self._check_ambiguity(leader)
+        if not self.undetermined and all(math.hypot(x, y) < SAME_M for x, y, _ in differences):
+            self.images.reset()
+            self.images.check(leader, self.received_anchors(), self.dims)
             if not self.is_ambiguous:
                 self.filter, self._hypotheses, self._found_s = leader, [], self._time_s
                 self.counts["found"] += 1

@@ -6,18 +6,20 @@ import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.recordings.bag.reader import BagReader
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap, anchors_path, load_anchors
 from uwb_mitigation.types.ros import schemas
 from uwb_mitigation.types.ros.poses import MAP
 from uwb_mitigation.types.ros.topics import ANCHORS, MARKERS_TYPE
 from uwb_mitigation.types.stamps import NS_PER_S
+
+if TYPE_CHECKING:
+    from uwb_mitigation.recordings.bag.writer import BagWriter
 
 MAX_NAME = 100
 SPHERE = 2
@@ -55,6 +57,15 @@ def recorded_anchors(bag: Path) -> AnchorMap | None:
                 if anchors:
                     return AnchorMap([*anchors.values()][:MAX_ANCHORS], str(bag))
     return None
+
+
+def read_anchors(bag: Path, file: Path | None = None) -> AnchorMap:
+    """Return the anchors of a file, else those of the bag.
+
+    Raises:
+        ParameterError: there are none.
+    """
+    return (None if file else recorded_anchors(bag)) or load_anchors(file or anchors_path(bag))
 
 
 def write_anchors(bag: BagWriter, anchors: AnchorMap, stamp_ns: int) -> None:

@@ -29,16 +29,8 @@ ROOMS = ("cross-room", "big room", "medium room", "small room", "outdoor")
 """Index: the value of the column `Room`."""
 
 MATERIALS = (
-    "wall",
-    "polystyrene plate",
-    "plastic",
-    "plywood plate",
-    "cardboard box",
-    "LCD TV",
-    "metal plate",
-    "wood door",
-    "glass plate",
-    "metal window",
+    *("wall", "polystyrene plate", "plastic", "plywood plate", "cardboard box", "LCD TV", "metal plate"),
+    *("wood door", "glass plate", "metal window"),
 )
 """Index: the position of the character in the column `Obstacles`. All characters 0: LOS."""
 

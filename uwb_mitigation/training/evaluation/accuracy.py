@@ -53,9 +53,7 @@ class Accuracy:
 
 
 def evaluate_accuracy(
-    mitigation: Mitigation,
-    records: Iterable[Record],
-    on_record: Callable[[], None] = lambda: None,
+    mitigation: Mitigation, records: Iterable[Record], on_record: Callable[[], None] = lambda: None
 ) -> Accuracy:
     """Correct every measurement that has a true range and a valid range, and compare it with the truth.
 

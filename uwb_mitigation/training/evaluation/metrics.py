@@ -56,9 +56,7 @@ def mae_by_group(
     for name in dict.fromkeys(names.tolist()):
         rows = names == name
         groups[name] = GroupMae(
-            int(rows.sum()),
-            float(np.abs(raw_m[rows]).mean()),
-            float(np.abs(corrected_m[rows]).mean()),
+            int(rows.sum()), float(np.abs(raw_m[rows]).mean()), float(np.abs(corrected_m[rows]).mean())
         )
     return groups
 

@@ -6,10 +6,9 @@ universal network and an offset (`with_cold_start`). Only candidates that train 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,21 +56,19 @@ class FittedModel:
         return np.where(np.isfinite(predicted), predicted, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate(ABC):
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
     """A candidate model.
 
     Attributes:
         name: Name in tables.
+        fit: fits the model to a dataset, with a seed.
         trains: whether it trains a network. Such a model is kept only if the nested error shows a gain.
     """
 
     name: str
-    trains: ClassVar[bool] = False
-
-    @abstractmethod
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """Fit the model to a dataset."""
+    fit: Callable[[Dataset, int], FittedModel]
+    trains: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,114 +200,72 @@ def fit_line(data: Dataset) -> LinearBiasModel:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Constant(Candidate):
-    """One offset for all ranges."""
-
-    name: str = CONSTANT
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        return FittedModel(_constant(data))
+def _fit_network(recipe: Recipe, data: Dataset, seed: int) -> FittedModel:
+    return fit_new_model(data, recipe, seed)
 
 
-@dataclass(frozen=True, eq=False)
-class Line(Candidate):
-    """A line in both powers."""
-
-    name: str = LINE
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        return FittedModel(fit_line(data))
-
-
-@dataclass(frozen=True, eq=False)
-class NewNetwork(Candidate):
-    """A network with random initial weights, with a line (LINE_NETWORK) or without (NETWORK)."""
-
-    recipe: Recipe
-    trains: ClassVar[bool] = True
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        return fit_new_model(data, self.recipe.for_candidate(self.name), seed)
+def _with_new_offset(
+    linear_bias: LinearBiasModel, network: FloatWeights, data: Dataset, seed: int
+) -> FittedModel:
+    """Return a model with an offset of the data."""
+    residual = data.error_m - linear_bias_m(linear_bias, data) - network_m(network, data.inputs)
+    is_finite = np.isfinite(residual)
+    shift = 0.0
+    if is_finite.any():
+        shift = linear_fit.fit_constant(data.configurations[is_finite], residual[is_finite]).offset_m
+    return FittedModel(
+        replace(linear_bias, offset_m=float(np.float32(linear_bias.offset_m + shift))), network
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class Unchanged(Candidate):
-    """The model of a bundle."""
-
-    linear_bias: LinearBiasModel
-    network: FloatWeights
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        return FittedModel(self.linear_bias, self.network)
-
-
-@dataclass(frozen=True, eq=False)
-class NewOffset(Unchanged):
-    """The model of a bundle with an offset of the data."""
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        residual = data.error_m - linear_bias_m(self.linear_bias, data) - network_m(self.network, data.inputs)
-        is_finite = np.isfinite(residual)
-        shift = 0.0
-        if is_finite.any():
-            shift = linear_fit.fit_constant(data.configurations[is_finite], residual[is_finite]).offset_m
-        offset_m = float(np.float32(self.linear_bias.offset_m + shift))
-        return FittedModel(replace(self.linear_bias, offset_m=offset_m), self.network)
+def _fine_tuned(
+    network: FloatWeights, options: FitOptions, has_line: bool, data: Dataset, seed: int
+) -> FittedModel:
+    """Return a network that is trained further on the residuals of a line or of an offset."""
+    linear_bias = fit_line(data) if has_line else _offset(data, network)
+    options = replace(options, seed=seed)
+    return FittedModel(
+        linear_bias, _fit_residuals(data, linear_bias, PER_CONFIGURATION, options, start=network)
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class FineTuned(Unchanged):
-    """The network of a bundle, trained further on the residuals of a line if the bundle has one, otherwise of an offset."""
-
-    options: FitOptions
-    trains: ClassVar[bool] = True
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        linear_bias = fit_line(data) if self.linear_bias.needs_power else _offset(data, self.network)
-        options = replace(self.options, seed=seed)
-        network = _fit_residuals(data, linear_bias, PER_CONFIGURATION, options, start=self.network)
-        return FittedModel(linear_bias, network)
+def _cold_start_mean(network: FloatWeights, data: Dataset, seed: int) -> FittedModel:
+    """Return the mean of line and cold start: it reduces both the scatter of the line and the network's errors at a site."""
+    line, offset = fit_line(data), _offset(data, network).offset_m
+    total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
+    linear_bias = LinearBiasModel(*(float(np.float32(value / 2)) for value in total))
+    return FittedModel(linear_bias, scaled(network, 0.5))
 
 
-@dataclass(frozen=True, eq=False)
-class ColdStartMean(Candidate):
-    """The mean of line and cold start: it reduces both the scatter of the line and the network's errors at a site."""
-
-    network: FloatWeights
-
-    def fit(self, data: Dataset, seed: int) -> FittedModel:
-        """See `Candidate`."""
-        line, offset = fit_line(data), _offset(data, self.network).offset_m
-        total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
-        linear_bias = LinearBiasModel(*(float(np.float32(value / 2)) for value in total))
-        return FittedModel(linear_bias, scaled(self.network, 0.5))
+_WITHOUT_NETWORK = (
+    Candidate(CONSTANT, lambda data, seed: FittedModel(_constant(data))),
+    Candidate(LINE, lambda data, seed: FittedModel(fit_line(data))),
+)
 
 
 def new_models(recipe: Recipe) -> list[Candidate]:
     """Return a constant, a line, a network on the residuals of the line, and a network without a line."""
-    return [Constant(), Line(), NewNetwork(LINE_NETWORK, recipe), NewNetwork(NETWORK, recipe)]
+    networks = (
+        Candidate(name, partial(_fit_network, recipe.for_candidate(name)), trains=True)
+        for name in (LINE_NETWORK, NETWORK)
+    )
+    return [*_WITHOUT_NETWORK, *networks]
 
 
 def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
     """Return the unchanged model of a bundle, the same with another offset, a constant, a line, and a fine-tuned network.
 
+    The network is fine-tuned on the residuals of a line if the bundle has one, otherwise of an offset.
+
     Raises:
         ModelError: the network is not a REMNet.
     """
-    model = source.linear_bias, float_network(source)
+    linear_bias, network = source.linear_bias, float_network(source)
     return [
-        Unchanged(AS_SHIPPED, *model),
-        NewOffset(NEW_OFFSET, *model),
-        Constant(),
-        Line(),
-        FineTuned(FINE_TUNED, *model, options),
+        Candidate(AS_SHIPPED, lambda data, seed: FittedModel(linear_bias, network)),
+        Candidate(NEW_OFFSET, partial(_with_new_offset, linear_bias, network)),
+        *_WITHOUT_NETWORK,
+        Candidate(FINE_TUNED, partial(_fine_tuned, network, options, linear_bias.needs_power), trains=True),
     ]
 
 
@@ -323,13 +278,13 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
     if data.preprocessing != universal.preprocessing:
         return list(candidates)
     network = float_network(universal)
-    start = NewOffset(COLD_START, LinearBiasModel(0.0), network)
+    start = Candidate(COLD_START, partial(_with_new_offset, LinearBiasModel(0.0), network))
     if has_few_configurations(data):
         return [start, *candidates]
     has_powers = np.isfinite(data.rx_power_dbm - data.first_path_power_dbm)
     has_line = len(data.rows(has_powers).names) >= MIN_CONFIGURATIONS_FOR_MEAN
-    mean = [ColdStartMean(COLD_START_MEAN, network)] if has_line else []
-    inserted: dict[str, list[Candidate]] = {CONSTANT: [start], LINE: [*mean]}
+    mean = [Candidate(COLD_START_MEAN, partial(_cold_start_mean, network))] if has_line else []
+    inserted = {CONSTANT: [start], LINE: mean}
     return [item for old in candidates for item in (old, *inserted.get(old.name, ()))]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import DatasetError, ModelError, ParameterError
+from uwb_mitigation.errors import DatasetError, ModelError
 from uwb_mitigation.mitigation.model import floating, graph
 from uwb_mitigation.mitigation.model.architecture import HEAD
 from uwb_mitigation.mitigation.model.bundle import Bundle, save_bundle
@@ -25,9 +25,6 @@ from uwb_mitigation.training.data.dataset import Dataset
 
 WEIGHT_LIMIT = 63
 """Largest magnitude of an integer weight: 7 bits."""
-
-MSE = None
-"""Instead of a percentile: choose the scale of each activation with the least mean squared rounding error."""
 
 MIN_SCALE_RATIO = 2.0**-12
 """Minimum ratio of the scales of a sum's operands: below 2^-14 of the result's scale, ONNX Runtime on ARM differs."""
@@ -43,19 +40,13 @@ def calibration_inputs(dataset: Dataset, seed: int) -> NDArray[np.float32]:
 
 
 def quantise_network(
-    weights: FloatWeights,
-    calibration: NDArray[np.float32],
-    percentile: float | None = 100.0,
-    *,
-    exact: bool = True,
+    weights: FloatWeights, calibration: NDArray[np.float32], *, exact: bool = True
 ) -> Int8Weights:
     """Quantise a network to int8.
 
     Args:
         weights: float network.
         calibration: inputs from which the scales are computed, float32 (n, K).
-        percentile: percentile of each activation that maps to the largest integer; 100 is the maximum. `MSE`
-            minimises the sum of clipping and rounding errors.
         exact: move scales by a few ulps where the integer arithmetic of the firmware needs it for bit-exact
             results (see `nudge`). Takes seconds and does not affect the accuracy.
 
@@ -73,7 +64,7 @@ def quantise_network(
         raise DatasetError("calibration inputs with values that are not finite")
     weight_scale = {name: _weight_scale(name, weight) for name, weight in weights.weight.items()}
     reads = layer_inputs(architecture)
-    scale = _activation_scales(_peaks(weights, calibration, percentile), weight_scale, reads)
+    scale = _activation_scales(_peaks(weights, calibration), weight_scale, reads)
     integers, biases = {}, {}
     limits = np.iinfo(np.int32)
     for name, weight in weights.weight.items():
@@ -94,7 +85,7 @@ class Quantised:
     difference_m: NDArray[np.float32]
 
 
-def check(source: Bundle, percentile: float) -> None:
+def check(source: Bundle) -> None:
     """Check the arguments of `quantise_bundle` before data is read; raises the same errors."""
     if source.quantised:
         raise ModelError("already quantised", where=str(source.path), valid="the float bundle it was made of")
@@ -102,20 +93,18 @@ def check(source: Bundle, percentile: float) -> None:
         raise ModelError(
             "there is no network to quantise", where=str(source.path), valid="the bundle without quantisation"
         )
-    if not 90 <= percentile <= 100:
-        raise ParameterError(f"percentile = {percentile}", valid="90 to 100")
 
 
-def quantise_bundle(source: Bundle, dataset: Dataset, percentile: float, output: Path) -> Quantised:
+def quantise_bundle(source: Bundle, dataset: Dataset, output: Path) -> Quantised:
     """Quantise a float bundle with the data that it was trained on, and write it.
 
     Raises:
-        ModelError: it is quantised already; see also `quantise_network`. ParameterError: `percentile` is below 90.
+        ModelError: it is quantised already; see also `quantise_network`.
     """
-    check(source, percentile)
+    check(source)
     inputs = calibration_inputs(dataset, seed=0)
     network = graph.float_weights(source.model, source.architecture)
-    integers = quantise_network(network, inputs, percentile)
+    integers = quantise_network(network, inputs)
     difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
     card = replace(source.card, name=output.stem, quantised=True)
     return Quantised(save_bundle(output, graph.int8_model(integers), card), difference)
@@ -135,33 +124,14 @@ def _by_output(scale: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArr
     return scale.reshape(-1, *[1] * (weight.ndim - 1))
 
 
-def _peaks(
-    weights: FloatWeights, calibration: NDArray[np.float32], percentile: float | None
-) -> dict[str, float]:
+def _peaks(weights: FloatWeights, calibration: NDArray[np.float32]) -> dict[str, float]:
     """Return the value of each activation that maps to the largest integer: the maximum over chunks."""
     peaks: dict[str, float] = {}
     for start in range(0, len(calibration), floating.CHUNK):
         chunk = calibration[start : start + floating.CHUNK]
         for tensor, values in floating.activations(weights, chunk).items():
-            peak = _mse_peak(values) if percentile is None else float(np.percentile(values, percentile))
-            peaks[tensor] = max(peaks.get(tensor, 0.0), peak)
+            peaks[tensor] = max(peaks.get(tensor, 0.0), float(values.max()))
     return peaks
-
-
-def _mse_peak(values: NDArray[np.float32]) -> float:
-    """Return the share of the maximum that quantises `values` with the least mean squared error."""
-    maximum = float(values.max())
-    if maximum <= 0:
-        return 0.0
-    # A histogram makes the cost of the search independent of the number of values.
-    counts, edges = np.histogram(values, bins=2048, range=(0.0, maximum))
-    centres = (edges[:-1] + edges[1:]) / 2
-    candidates = maximum * np.linspace(0.3, 1.0, 71)
-    errors = [
-        float((counts * (centres - np.clip(np.rint(centres * 255 / peak), 0, 255) * peak / 255) ** 2).sum())
-        for peak in candidates
-    ]
-    return float(candidates[int(np.argmin(errors))])
 
 
 def _activation_scales(

@@ -27,11 +27,7 @@ UWB_TAG = "uwb_tag"
 UNOBSERVED = 1e6
 """Variance of unobservable values, rad^2 and rad^2/s^2."""
 
-POSITION_TYPES = (
-    ODOMETRY_TYPE,
-    "geometry_msgs/msg/PoseStamped",
-    POSE_TYPE,
-)
+POSITION_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", POSE_TYPE)
 """Message types with a position."""
 
 _TAG_FRAME = "tag_"
@@ -81,10 +77,7 @@ class BodyTwist:
 
 
 def encode_odometry(
-    estimate: Estimate,
-    frame_id: str = MAP,
-    child_frame_id: str = UWB_TAG,
-    twist: BodyTwist | None = None,
+    estimate: Estimate, frame_id: str = MAP, child_frame_id: str = UWB_TAG, twist: BodyTwist | None = None
 ) -> bytes:
     """Return `nav_msgs/Odometry` in CDR.
 

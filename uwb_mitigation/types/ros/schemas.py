@@ -21,11 +21,7 @@ PACKAGE = "uwb_mitigation_msgs"
 SEPARATOR = "=" * 80
 """Separator of the sections of a `ros2msg` schema (MCAP format registry, "ros2msg")."""
 
-_NESTED = {
-    RANGE_CIR_TYPE: ("Cir",),
-    RANGE_TRUTH_TYPE: (),
-    RANGE_CORRECTED_TYPE: (),
-}
+_NESTED = {RANGE_CIR_TYPE: ("Cir",), RANGE_TRUTH_TYPE: (), RANGE_CORRECTED_TYPE: ()}
 
 _OPTIONAL = {(f"{PACKAGE}/Cir", "radio"), (f"{PACKAGE}/Cir", "segment")}
 """Section and name of fields that bags of earlier versions do not contain."""
