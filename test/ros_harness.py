@@ -29,6 +29,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from uwb_mitigation_msgs.msg import RangeCir
 
+from uwb_mitigation.types.stamps import to_ns
+
 TIMEOUT_S, RESPONSE_TIMEOUT_S = 240.0, 20.0
 STATE_AFTER = {
     Transition.TRANSITION_CONFIGURE: "inactive",
@@ -59,6 +61,11 @@ def set_expiry(monkeypatch: pytest.MonkeyPatch, folder: Path, seconds: int) -> N
     """Let nodes that are started later disappear for others so soon after they are killed, instead of after 20 s."""
     (folder / "expiry.xml").write_text(EXPIRY.format(seconds))
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(folder / "expiry.xml"))
+
+
+def stamped_after(messages: list, time_ns: int) -> list:
+    """Return the messages with a later stamp: those that were published before may arrive at any time."""
+    return [message for message in messages if to_ns(message.header.stamp) > time_ns]
 
 
 class Process:
@@ -153,6 +160,13 @@ class Ros:
     def wait_for_subscribers(self, topic: str, count: int) -> None:
         self.spin_until(lambda: self.node.count_subscribers(topic) >= count)
 
+    def wait_until_active(self, node: str) -> None:
+        """Wait until a node is active and has discovered the subscriptions of this client.
+
+        A client announces its endpoints in order, and the receiver of the answer is created last.
+        """
+        self.spin_until(lambda: self.state_of(node) == "active")
+
     def find_each_other(self, publisher: Publisher, question: RangeCir, answers: list) -> None:
         """Call a node until it has answered all calls: then both sides have discovered each other."""
         numbers = itertools.count(1)
@@ -167,13 +181,9 @@ class Ros:
         answers.clear()
 
     def play(self, driver: str = "driver") -> None:
-        """Start the replay of a `PAUSED` driver when the subscriptions of this client are connected.
-
-        The process of the driver has discovered them when it answers, because a client announces its endpoints
-        in order and the receiver of the answer is created last.
-        """
+        """Start the replay of a `PAUSED` driver when the subscriptions of this client are connected."""
         self.spin_until(lambda: all(made.get_publisher_count() for made in self.node.subscriptions))
-        self.spin_until(lambda: self.state_of(driver) == "active")
+        self.wait_until_active(driver)
         assert self.set_parameter(driver, "paused", False).successful
 
     def call(self, kind: type, name: str, request: object) -> object:

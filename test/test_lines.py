@@ -325,7 +325,7 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
         node = ros.start(
             "driver", "source:=pans", f"port:={tmp_path}/b0,{tmp_path}/b1", f"capture:={tmp_path}/c.txt"
         )
-        ros.spin_until(lambda: {message.tag_id for message in raw} == {1, 2} and len(raw) > 40, 60.0)
+        ros.spin_until(lambda: {message.tag_id for message in raw} == {1, 2} and len(raw) > 40)
         message = next(message for message in raw if message.anchor_id == 0x9280)
         assert message.range == pytest.approx(boards.true_ranges_m[1], abs=0.15)
         assert (len(message.cir.samples), message.header.stamp.sec >= int(began)) == (0, True)
@@ -335,7 +335,7 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
         assert node.signal(signal.SIGINT) == 0, node.output
     raw.clear()
     ros.start("driver", "source:=pans", f"path:={tmp_path}/c.txt", "rate:=20.0")
-    ros.spin_until(lambda: len(raw) > 40, 60.0)
+    ros.spin_until(lambda: len(raw) > 40)
 
 
 def test_field_report_of_a_board_without_cirs(tmp_path: Path):

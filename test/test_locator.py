@@ -48,6 +48,9 @@ class Drive:
         self.start_ns = ros.node.get_clock().now().nanoseconds - int(self.ranges.stamp_ns[-1])
         self._ros = ros
         self._publisher = ros.node.create_publisher(RangeCorrected, CORRECTED, QoSProfile(depth=10_000))
+        ros.wait_for_subscribers(CORRECTED, 1)
+        # Its first poses would be lost.
+        ros.wait_until_active("locator")
 
     def send(self, rows: range, tag: int = 7, **changes) -> None:
         for i in rows:
@@ -97,7 +100,6 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
     second = ros.collect(PoseWithCovarianceStamped, "/uwb/tag_9/pose")
     run = Drive(ros, seconds=20)
-    ros.wait_for_subscribers(CORRECTED, 1)
     half = len(run.ranges) // 2
     run.send(range(half))
     ros.spin_until(lambda: len(smoothed) > 0)
@@ -142,7 +144,6 @@ def test_gap_is_bridged_by_predictions_with_growing_covariance(ros: Ros, anchors
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
     clock = ros.node.create_publisher(Clock, "/clock", 10)
     run = Drive(ros, seconds=10)
-    ros.wait_for_subscribers(CORRECTED, 1)
 
     def spread_at(row: int, silent_s: float) -> float:
         """Return the variance reported at the given time after a range."""
@@ -209,6 +210,7 @@ def test_tf_contains_only_the_frames_of_the_tags_below_the_map(ros: Ros, anchors
     }
     run = Drive(ros, seconds=10)
     ros.wait_for_subscribers(CORRECTED, 2)
+    ros.wait_until_active("left/locator")
     for step in range(0, len(run.ranges), 20):
         rows = range(step, min(step + 20, len(run.ranges)))
         run.send(rows)

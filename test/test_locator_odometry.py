@@ -49,7 +49,7 @@ UNKNOWN_YAW = math.pi**2 / 3.0
 """Variance of a uniform distribution over all yaws, rad^2."""
 
 LEVER = (0.3, 0.1, 0.2)
-RELIABLE = "qos_overrides.{}/odom.subscription.reliability:=reliable"
+RELIABLE = [f"qos_overrides.{{}}/{name}.subscription.reliability:=reliable" for name in ("odom", "imu")]
 CHUNK_S = 0.2
 
 
@@ -60,7 +60,7 @@ def stamp_ns(header: Header) -> int:
 class LiveRobot:
     """Publishes ranges and odometry of a robot in chunks, and waits until the locator has processed each.
 
-    The odometry is a chunk ahead, because messages of two topics arrive in any order, and the locator's subscription is
+    The odometry is a chunk ahead, because messages of two topics arrive in any order, and the locator's subscriptions are
     `RELIABLE`, because best-effort messages can be lost under load.
     """
 
@@ -86,6 +86,7 @@ class LiveRobot:
     def wait(self) -> None:
         self._ros.wait_for_subscribers(f"{self._namespace}/uwb/range_corrected", 1)
         self._ros.wait_for_subscribers(f"{self._namespace}/odom", 1)
+        self._ros.wait_until_active(f"{self._namespace}/locator".removeprefix("/"))
 
     def header(self, stamp: int, frame: str = "") -> Header:
         stamp += self.start_ns
@@ -187,7 +188,7 @@ def start(ros: Ros, anchors: Path, *parameters: str):
         "level:=true",
         height,
         "odometry:=/odom",
-        RELIABLE.format(""),
+        *(one.format("") for one in RELIABLE),
         *parameters,
     )
 
@@ -292,7 +293,7 @@ def test_namespace_contains_the_topics_and_transforms_of_a_robot(ros: Ros, ancho
     )
     static.publish(TFMessage(transforms=[antenna]))
     parameters = (f"anchors:={anchors}", "level:=true", f"height:={1.0 + LEVER[2]}", "odometry:=odom")
-    parameters += (RELIABLE.format("/robot1"),)
+    parameters += (RELIABLE[0].format("/robot1"),)
     locator = ros.start(
         "locator", *parameters, "rate:=0.0", "publish_tf:=true", arguments=("-r", "__ns:=/robot1")
     )
@@ -321,6 +322,7 @@ def test_transform_is_repeated_while_there_is_no_position(ros: Ros, anchors: Pat
     live.play(16.0)
     # One range after a gap does not determine a position.
     live.send_range(len(live.ranges) - 1)
+    ros.state_of("locator")
     now = live.header(25 * NANOSECONDS)
     ros.spin_until(
         lambda: clock.publish(Clock(clock=now.stamp)) or live.values().get("tag 7 candidates") == "0"
@@ -348,13 +350,14 @@ def test_predictions_and_transforms_end_30_s_after_the_last_range(ros: Ros, anch
                 or (bool(markers) and stamp_ns(markers[-1].markers[0].header) == stamp_ns(now))
             )
         )
-        ros.spin_for(0.2)
         return stamp_ns(now)
 
     predicted_ns = wait_for_timer(16.35)
-    assert stamp_ns(live.poses[-1].header) == predicted_ns
-    assert stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS
-    wait_for_timer(46.2)
+    ros.spin_until(lambda: stamp_ns(live.poses[-1].header) == predicted_ns)
+    ros.spin_until(lambda: stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS)
+    for seconds in (46.2, 46.3, 46.4):
+        wait_for_timer(seconds)
+    ros.spin_for(0.2)
     assert stamp_ns(live.poses[-1].header) == predicted_ns
     assert stamp_ns(live.transforms[-1].transforms[0].header) == predicted_ns + NANOSECONDS
 
@@ -388,12 +391,10 @@ def test_respawned_locator_continues_with_transform_and_heading(
     assert before in latest
     live.poses.clear()
     live.wait()
-    # Its answer shows that it also knows the publishers, which were announced before.
-    assert ros.state_of("locator") == "active"
     live.skip(18.6)
     live.send_odometry(18.4, 18.8)
-    # Ranges are a topic of their own, and are also received before.
-    ros.spin_for(0.5)
+    # Ranges are a topic of their own, and are also received before: a node handles messages in order of arrival.
+    ros.state_of("locator")
     # Tag 9 is of another robot: its ranges arrive first.
     live.send_range(int(np.searchsorted(live.ranges.stamp_ns, round(18.6 * NANOSECONDS))), 9)
     live.play(26.0)

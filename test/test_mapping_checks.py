@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import pytest
 import yaml
 from command_line import ENVIRONMENT, command, run, succeed
 from mcap.writer import Writer as McapWriter
+from port_events import wait_until
 from test_mapping import PLAIN, _message_store, _write_bag, read, with_fields, write
 
 from uwb_mitigation.errors import DamagedRecordingError, RecordingError
@@ -313,13 +313,9 @@ def test_sigterm_removes_the_partial_file(tmp_path: Path):
     arguments = command("data", "simulate", "-o", "x.mcap", "--ranges", "200000")
     process = subprocess.Popen(arguments, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.DEVNULL)
     try:
-        for _ in range(600):
-            if (tmp_path / "x.mcap.part").exists():
-                break
-            time.sleep(0.1)
-        assert (tmp_path / "x.mcap.part").exists()
+        wait_until((tmp_path / "x.mcap.part").exists)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=60) == 128 + signal.SIGTERM
+        assert process.wait(timeout=240) == 128 + signal.SIGTERM
     finally:
         process.kill()
     assert list(tmp_path.iterdir()) == []

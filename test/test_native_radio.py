@@ -90,7 +90,7 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(boards: tuple[EmulatedEvb
         emulated.plug(1)
         events.wait_for(RangeMeasurement, 2)
         assert anchor.openings > openings
-        assert not tag.report().warning
+        wait_until(lambda: not tag.report().warning)
 
         tag.apply(settings(f"{prefix}0", window=16))
         events.wait_for(lambda event: isinstance(event, RangeMeasurement) and len(event.cir) == 16)

@@ -24,13 +24,14 @@ from rclpy.serialization import deserialize_message
 from ros_harness import PAUSED, Process, Ros, set_expiry
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
+from uwb_mitigation.errors import DamagedRecordingError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.types.measurement import Status
+from uwb_mitigation.types.measurement import Record, Status
 from uwb_mitigation.types.ros.codec import encode_range
 
 pytestmark = pytest.mark.ros
@@ -121,11 +122,14 @@ def test_driver_without_a_source_exits_with_an_error(ros: Ros, parameters: tuple
 def test_damaged_bag_is_replayed_up_to_the_damage(ros: Ros, bag: Path, tmp_path: Path):
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(bag.read_bytes()[: bag.stat().st_size * 9 // 10])
+    records: list[Record] = []
+    with open_recording(torn) as source, pytest.raises(DamagedRecordingError):
+        records.extend(source)
+    assert 0 < len(records) < 300
     received = ros.collect(RangeCir, RAW)
     driver = ros.start("driver", "source:=mcap", f"path:={torn}", "rate:=20.0", "start_delay:=0.5")
     assert driver.wait() == 1
-    ros.spin_for(0.3)
-    assert 0 < len(received) < 300
+    ros.spin_until(lambda: len(received) == len(records))
     assert "torn.mcap" in driver.output
 
 
@@ -192,9 +196,9 @@ def test_duplicate_node_names_are_reported_except_for_a_killed_node(
 
     killed = start()
     first = start()
-    ros.spin_until(lambda: named() == 2, 60.0)
+    ros.spin_until(lambda: named() == 2)
     killed.signal(signal.SIGKILL)
-    ros.spin_until(lambda: named() == 1, 60.0)
+    ros.spin_until(lambda: named() == 1)
     assert "another node has the name" not in first.output
     second = start()
     ros.diagnosis("mitigator", lambda status: "another node has the name" in status.message)

@@ -53,8 +53,7 @@ def test_tag_ranges_with_two_anchors(ros: ros_harness.Ros, boards: EmulatedEvb10
     ports = ",".join(str(tmp_path / f"radio{number}") for number in range(3))
     ros.start("driver", "source:=evb1000", f"port:={ports}")
     ros.spin_until(
-        lambda: len({message.anchor_id for message in corrected}) == 2 and len(corrected) >= 6 and bool(raw),
-        120.0,
+        lambda: len({message.anchor_id for message in corrected}) == 2 and len(corrected) >= 6 and bool(raw)
     )
     message = raw[0]
     assert len(message.cir.samples) == 2 * 157
@@ -69,12 +68,12 @@ def test_tag_ranges_with_two_anchors(ros: ros_harness.Ros, boards: EmulatedEvb10
 def test_settings_are_applied_live(ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     ros.start("driver", "source:=evb1000", f"port:={tmp_path / 'radio0'},{tmp_path / 'radio1'}")
-    ros.spin_until(lambda: bool(raw), 120.0)
+    ros.spin_until(lambda: bool(raw))
     refused = ros.set_parameter("driver", "radio.channel", 6)
     assert not refused.successful
     assert "channel" in refused.reason
     assert ros.set_parameter("driver", "radio.window", 32).successful
-    ros.spin_until(lambda: len(raw[-1].cir.samples) == 64, 120.0)
+    ros.spin_until(lambda: len(raw[-1].cir.samples) == 64)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +154,7 @@ def test_radio_of_a_serial_board_is_configured_and_reports_its_status(ros: ros_h
     board = ModelledBoard(tmp_path / "board")
     try:
         driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.window:=40")
-        ros.spin_until(lambda: bool(raw) and len(raw[-1].cir.samples) == 80, 120.0)
+        ros.spin_until(lambda: bool(raw) and len(raw[-1].cir.samples) == 80)
         assert abs(raw[-1].range - 5) < 0.1
         status = ros.diagnosis(
             "driver", lambda status: int(diagnostic_values(status).get("radio: ranged", 0)) > 0
@@ -169,7 +168,7 @@ def test_radio_of_a_serial_board_is_configured_and_reports_its_status(ros: ros_h
         driver.wait_for_output("channel 5, 6800 kbit/s")
         for name, value in (("radio.prf", 16), ("radio.channel", 2)):
             assert ros.set_parameter("driver", name, value).successful
-        ros.spin_until(lambda: raw[-1].cir.prf == 16, 120.0)
+        ros.spin_until(lambda: raw[-1].cir.prf == 16)
         assert abs(raw[-1].range - 9) < 0.1
         driver.wait_for_output("channel 2, 6800 kbit/s")
     finally:

@@ -46,7 +46,7 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     capture = tmp_path / "capture.txt"
     options = ("radio.window:=16", "radio.anchors:=[2, 3]", f"capture:={capture}")
     node = ros.start("driver", "source:=uci", f"port:={ports}", *options)
-    ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in raw} and len(raw) > 20, 60.0)
+    ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in raw} and len(raw) > 20)
     assert {len(message.cir.samples) for message in raw} == {32}
     assert all(abs(message.range - 3.0) < 0.2 for message in raw)
 
@@ -75,17 +75,17 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
 
     boards.unplug(1)
     ros.diagnosis("driver", lambda status: "uci1" in status.message)
-    ros.spin_until(lambda: raw[-1].anchor_id == 3 and len({m.anchor_id for m in raw[-10:]}) == 1, 30.0)
+    ros.spin_until(lambda: raw[-1].anchor_id == 3 and len({m.anchor_id for m in raw[-10:]}) == 1)
     boards.plug(1)
-    ros.spin_until(lambda: len({m.anchor_id for m in raw[-10:]}) == 2, 30.0)
+    ros.spin_until(lambda: len({m.anchor_id for m in raw[-10:]}) == 2)
     boards.set_faults(UciFaults(empty_cir=True))
-    ros.spin_until(lambda: not raw[-1].cir.samples, 30.0)
+    ros.spin_until(lambda: not raw[-1].cir.samples)
     assert node.signal(signal.SIGINT) == 0
 
     measured = {(m.anchor_id, m.sequence): m.range for m in raw}
     raw.clear()
     ros.start("driver", "source:=uci", f"path:={capture}", "rate:=50.0")
-    ros.spin_until(lambda: len(raw) > 50, 60.0)
+    ros.spin_until(lambda: len(raw) > 50)
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
 
 
@@ -105,13 +105,13 @@ def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
     with tag:
         with anchor:
             tag.wait_for(RangeMeasurement, 5)
-            assert tag.port.report().warning == ""
+            wait_until(lambda: tag.port.report().warning == "")
             boards.set_faults(UciFaults(offset_m=-3.0))
             wait_until(lambda: "negative distance" in tag.port.report().warning)
             assert "antenna delay" in tag.port.report().warning
             boards.set_faults(UciFaults())
             wait_until(lambda: tag.port.report().warning == "")
-        wait_until(lambda: tag.port.report().warning.startswith("no range for 1."))
+        wait_until(lambda: re.match(r"no range for \d", tag.port.report().warning))
         assert "reception timeout: are the other boards on" in tag.port.report().warning
 
 

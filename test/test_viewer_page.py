@@ -196,8 +196,11 @@ def test_map_view_is_fixed_until_changed(browser: Browser, view: View, server: V
     def settled() -> list[float] | None:
         """Return the view after the final layout of the page."""
         seen = view_of_map()
-        time.sleep(0.5)
-        return seen if view_of_map() == seen else None
+        for _ in range(4):
+            time.sleep(0.5)
+            if view_of_map() != seen:
+                return None
+        return seen
 
     first = browser.wait("a view", settled)
     assert first[0] < 0 < 8 < first[1], "both anchors"
