@@ -179,14 +179,24 @@ def test_sketch_survives_a_host_that_does_not_read_for_10_s(
     assert lost - status.measurements_lost in ((0,) if host == "silent" else (0, 1))
 
 
-@NEEDS_CXX
-@pytest.mark.parametrize("with_model", [False, True], ids=["without a model", "with one"])
-@pytest.mark.parametrize("host", ["reads", "silent", "closed"])
-def test_sketch_with_a_radio_ranges_on_a_modelled_chip(tmp_path: Path, with_model: bool, host: str):
-    if with_model:
-        export_bundle(load_bundle(default_model_path()), tmp_path)
+@pytest.fixture(scope="module", params=[False, True], ids=["without a model", "with one"])
+def radio_sketch(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, bool]:
+    """Return UwbRanger, compiled, and whether it has a model."""
+    folder = tmp_path_factory.mktemp("radio")
+    if request.param:
+        export_bundle(load_bundle(default_model_path()), folder)
     files = (str(STUB / "radio_main.cpp"), *library_objects(), *model_objects(), "-lm", "-lpthread")
-    program = compile_sketch("UwbRanger", tmp_path, "gnu++17", *files)
+    return compile_sketch("UwbRanger", folder, "gnu++17", *files), request.param
+
+
+@NEEDS_CXX
+@pytest.mark.parametrize("host", ["reads", "silent", "closed"])
+def test_sketch_with_a_radio_ranges_on_a_modelled_chip(
+    tmp_path: Path, radio_sketch: tuple[Path, bool], host: str
+):
+    program, with_model = radio_sketch
     command = [program, f"{tmp_path}/session", host, "0.2", "10.2", "10.5"]
     done = subprocess.run(command, capture_output=True, timeout=240, check=False)
 

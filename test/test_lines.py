@@ -209,7 +209,8 @@ def test_a_board_vanishes_and_returns(tmp_path: Path, kind: str):
         wait_until(lambda: not events.port.problem)
         measured = events.wait_for(RangeMeasurement, 8)
         assert {round(m.range_m) for m in measured} <= {round(true) for true in boards.true_ranges_m}
-        assert events.port.report().warning == ""
+        # Ranges that were received before may have waited in a queue.
+        wait_until(lambda: events.port.report().warning == "")
 
 
 @pytest.mark.parametrize("state", ["generic", "shell", "lec", "les"])

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import itertools
 import os
+import re
 import select
 import sys
 import threading
@@ -85,8 +86,8 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(boards: tuple[EmulatedEvb
         before = tag.status
         wait_until(lambda: tag.status.no_answer > before.no_answer)
         wait_until(lambda: tag.status.state is RadioState.RUNNING)
-        wait_until(lambda: "no range for" in tag.report().warning)
-        assert "no answer: no anchor answers" in tag.report().warning
+        silent = "no range for.*no answer: no anchor answers"
+        wait_until(lambda: re.search(silent, tag.report().warning, re.DOTALL))
         emulated.plug(1)
         events.wait_for(RangeMeasurement, 2)
         assert anchor.openings > openings
