@@ -17,11 +17,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 from browser import Browser, chromium
+from drives import HALL
 from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
 from real_logs import import_once, read_once
 
 from benchmarks.equipment.dw1000_model.air import Air
+from uwb_mitigation.types.anchors import dump_anchors
 
 if TYPE_CHECKING:
     from ros_harness import Ros
@@ -121,6 +123,14 @@ def air() -> Iterator[Air]:
     """Return an environment for modelled chips; it needs a C compiler."""
     with Air(1) as air:
         yield air
+
+
+@pytest.fixture
+def anchors(tmp_path: Path) -> Path:
+    """Return a file with the anchors of `HALL`."""
+    path = tmp_path / "hall anchors.yaml"
+    path.write_text(dump_anchors(HALL))
+    return path
 
 
 @pytest.fixture

@@ -172,12 +172,11 @@ def test_delayed_localisation_provides_the_truth(site):
     assert (wrong.returncode, "/odom (nav_msgs/msg/Odometry)" in wrong.stderr) == (1, True)
 
 
-def test_offsets_alone_need_no_check_and_keep_the_default_standard_deviation(site):
+def test_offsets_alone_need_no_check_and_keep_the_default_standard_deviation(site, clean):
     """A line in the power needs a separate drive."""
-    result, _ = figures(site, "drive.mcap", "--height 1.0")
-    assert result["chosen"] == "offsets"
-    assert np.abs(np.array(list(result["offsets_m"].values())) - OWN).max() < 0.1
-    card = load_bundle(site / "f.onnx").card
+    assert clean["chosen"] == "offsets"
+    assert np.abs(np.array(list(clean["offsets_m"].values())) - OWN).max() < 0.1
+    card = load_bundle(site / "clean.onnx").card
     assert not card.linear_bias.needs_power
     assert card.variance_m2 <= NoiseModel().range_sd ** 2 * 1.0001
     assert 0.12 < card.interval95_sigmas * card.variance_m2**0.5 < 0.5, "the errors include those of the line"
@@ -263,11 +262,11 @@ def test_localisation_needs_few_ranges(site):
 @pytest.fixture(scope="module")
 def clean(site):
     """The result of a drive without outliers, calibrated with a constant height."""
-    return figures(site, "drive.mcap", "--height 1.0")[0]
+    return figures(site, "drive.mcap", "--height 1.0", "clean.onnx")[0]
 
 
-def figures(site, bag, options):
-    words = f"calibrate {bag} --anchors anchors.yaml {options} -o f.onnx --json f.json --force"
+def figures(site, bag, options, model="f.onnx"):
+    words = f"calibrate {bag} --anchors anchors.yaml {options} -o {model} --json f.json --force"
     done = succeed(words, folder=site)
     return json.loads((site / "f.json").read_text()), done
 

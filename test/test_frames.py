@@ -26,7 +26,6 @@ from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.recordings.bag.odometry import encode_imu_row, encode_odometry_row, encode_transform_row
 from uwb_mitigation.simulation.odometry import RATE_HZ, simulate_motion
-from uwb_mitigation.types.anchors import dump_anchors
 from uwb_mitigation.types.ros.poses import yaw_of
 
 pytestmark = pytest.mark.ros
@@ -70,9 +69,7 @@ class Buffer:
 
 
 @pytest.mark.slow
-def test_no_lookup_fails_and_the_yaw_error_fits_its_variance(ros: Ros, tmp_path: Path):
-    anchors = tmp_path / "anchors.yaml"
-    anchors.write_text(dump_anchors(HALL))
+def test_no_lookup_fails_and_the_yaw_error_fits_its_variance(ros: Ros, anchors: Path):
     # Best-effort messages can be lost under load.
     reliable = [f"qos_overrides./{name}.subscription.reliability:=reliable" for name in ("odom", "imu")]
     parameters = ("odometry:=/odom", "imu:=/imu", "publish_tf:=true", "rate:=0.0", "level:=true", *reliable)

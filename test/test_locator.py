@@ -33,13 +33,6 @@ SHARED = ("-r", f"uwb/range_corrected:={CORRECTED}")
 NANOSECONDS = 1_000_000_000
 
 
-@pytest.fixture
-def anchors(tmp_path: Path) -> Path:
-    path = tmp_path / "hall anchors.yaml"
-    path.write_text(dump_anchors(HALL))
-    return path
-
-
 class Drive:
     """Publishes a drive at a given speed, with stamps from the current time on."""
 

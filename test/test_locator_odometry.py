@@ -39,7 +39,6 @@ from visualization_msgs.msg import MarkerArray
 from uwb_mitigation.nodes.robot_motion import MotionState, OdometryInput
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
-from uwb_mitigation.types.anchors import dump_anchors
 from uwb_mitigation.types.ros.poses import yaw_of
 from uwb_mitigation.types.tracks import Estimate, Heading
 
@@ -170,13 +169,6 @@ class LiveRobot:
         yaw = np.array([yaw_of(pose.pose.pose.orientation) for pose in poses])
         away = position - self.robot.base(time_s)[:, :2]
         return np.hypot(*away.T), wrapped(yaw - self.robot.yaw(time_s))
-
-
-@pytest.fixture
-def anchors(tmp_path: Path) -> Path:
-    path = tmp_path / "anchors.yaml"
-    path.write_text(dump_anchors(HALL))
-    return path
 
 
 def start(ros: Ros, anchors: Path, *parameters: str):

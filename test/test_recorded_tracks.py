@@ -60,17 +60,20 @@ def imported(source: Path, folder: Path) -> Path:
     return folder / "raw.mcap"
 
 
-@pytest.mark.parametrize("processed", [False, True])
+SIMULATED = (None, ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
+             TrackSettings(0.0, odometry="/odom", imu="/imu"))  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("source", "options", "settings"),
+    ("source", "options", "settings", "processed"),
     [
         (HANYANG / "NLOS_A1", ["--stamp-offset=-0.2", "--height", "1", "--area=-20,-60,-2,80,60,4"],
-         TrackSettings(1.0, area=BOX, stamp_offset_s=-0.2)),
-        (LABYRINTH, ["--height", "0", "--odometry", "/odom"], TrackSettings(0.0, odometry="/odom")),
-        (None, ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
-         TrackSettings(0.0, odometry="/odom", imu="/imu")),
+         TrackSettings(1.0, area=BOX, stamp_offset_s=-0.2), False),
+        (LABYRINTH, ["--height", "0", "--odometry", "/odom"], TrackSettings(0.0, odometry="/odom"), True),
+        (*SIMULATED, False),
+        (*SIMULATED, True),
     ],
-    ids=["hanyang", "labyrinth", "simulated"],
+    ids=["hanyang", "labyrinth processed", "simulated", "simulated processed"],
 )  # fmt: skip
 def test_track_and_view_give_the_same_figures(
     tmp_path: Path, source: Path | None, options: list[str], settings: TrackSettings, processed: bool
@@ -103,8 +106,8 @@ def test_track_and_view_give_the_same_figures(
     assert [text for text in shown if text in tag["warnings"]] == tag["warnings"]
 
 
-def test_placements_have_no_positions_in_track_and_view(tmp_path: Path):
-    bag = imported(DATA / "evk1000_apartment", tmp_path)
+def test_placements_have_no_positions_in_track_and_view(apartment_imported: Path, tmp_path: Path):
+    bag = apartment_imported / "apartment.mcap"
     refused = run("track", bag, "-o", "track.mcap", folder=tmp_path).stderr
     timeline = viewed(bag, TrackSettings())
     assert timeline.notices

@@ -27,7 +27,6 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from uwb_mitigation.types.anchors import dump_anchors
 from uwb_mitigation.types.stamps import to_ns
 
 pytestmark = pytest.mark.ros
@@ -42,13 +41,6 @@ STATES = {
     "finalized": (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,),
 }
 SIMULATED = ("source:=simulated", "simulated_rate:=100.0", "start_delay:=0.0")
-
-
-@pytest.fixture
-def anchors(tmp_path: Path) -> Path:
-    path = tmp_path / "anchors.yaml"
-    path.write_text(dump_anchors(HALL))
-    return path
 
 
 def stamp(time_ns: int) -> Time:

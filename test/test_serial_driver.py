@@ -23,9 +23,11 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import SerialSettings
@@ -212,19 +214,19 @@ def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, s
 
 
 @pytest.mark.parametrize(
-    ("parameters", "named"),
+    ("name", "value", "named"),
     [
-        (("source:=serial",), "port"),
-        (("source:=serial", "port:=COM1"), "usb:VENDOR:PRODUCT"),
-        (("source:=serial", "port:=/dev/ttyACM0", "board_model:=xyz"), "eight hexadecimal digits"),
-        (("source:=serial", "port:=/dev/ttyACM0", "baud:=3"), "baud"),
+        ("port", "", "port"),
+        ("port", "COM1", "usb:VENDOR:PRODUCT"),
+        ("board_model", "xyz", "eight hexadecimal digits"),
+        ("baud", 3, "baud"),
     ],
 )
-def test_malformed_port_is_refused(ros: Ros, parameters: tuple[str, ...], named: str):
-    driver = ros.start("driver", *parameters)
-    assert driver.wait() == 1
-    assert named in driver.output
-    assert "Traceback" not in driver.output
+def test_malformed_port_is_refused(name: str, value: object, named: str):
+    """`test_nodes` shows that the driver exits with the error."""
+    values = {row.name: row.default for row in DRIVER} | {"port": "/dev/ttyACM0", name: value}
+    with pytest.raises(ParameterError, match=named):
+        serial_source.read_settings(values.__getitem__)
 
 
 def test_board_subtracts_the_offsets_of_the_driver(ros: Ros, link: Path):
