@@ -36,6 +36,7 @@ from tf2_msgs.msg import TFMessage
 from uwb_mitigation_msgs.msg import RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes.robot_motion import MotionState, OdometryInput
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning
@@ -420,10 +421,11 @@ def test_lever_arm_of_zero_is_not_read_from_tf(ros: Ros, anchors: Path):
     assert ros.node.count_subscribers("/tf_static") == 0
 
 
-def test_base_frame_that_is_the_map_is_refused(ros: Ros, anchors: Path):
-    locator = start(ros, anchors, "base_frame:=map")
-    locator.wait_for_output("base_frame = 'map'")
-    assert locator.exit_code() is None
+def test_base_frame_that_is_the_map_is_refused():
+    node = MagicMock()
+    node.value.side_effect = {"map_frame": "map", "base_frame": "map", "odometry": "odom"}.get
+    with pytest.raises(ParameterError, match="base_frame = 'map'"):
+        OdometryInput(node, DeadReckoning())
 
 
 class Continuation:

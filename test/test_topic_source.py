@@ -17,17 +17,18 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseWithCovarianceStamped
 from message_package import build
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from ros_harness import Ros, diagnostic_values
 from sensor_msgs.msg import Range
 from std_msgs.msg import String
 from test_mapping import FRAME2, NODE2
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import Marker
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError
 from uwb_mitigation.nodes.feeds.topic import TopicFeed
-from uwb_mitigation.nodes.support.endpoints import message_type
+from uwb_mitigation.nodes.markers import ANCHOR_TYPES, anchors_in
+from uwb_mitigation.nodes.support.endpoints import LATCHED, message_type
 from uwb_mitigation.recordings.mapping.mapping import FieldRule, Mapping, RowFilter, load_mapping
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -104,20 +105,24 @@ def test_ranges_of_linktrack_give_poses_and_pass_the_mitigator(publisher: Ros, a
     )
 
 
+PLACES = [Pose(position=Point(x=x, y=y, z=z)) for x, y, z in CORNERS.values()]
+
+
 @pytest.mark.ros
-@pytest.mark.parametrize("kind", ["markers", "poses"])
-def test_locator_takes_a_mapping_and_anchors_from_a_topic(publisher: Ros, kind: str):
+def test_locator_takes_a_mapping_and_anchors_from_a_topic(publisher: Ros):
     ros = publisher
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
-    ros.start("locator", "ranges:=nlink_nodeframe2", f"anchors:={kind}:/site/anchors", *LEVEL)
-    places = [Pose(position=Point(x=x, y=y, z=z)) for x, y, z in CORNERS.values()]
-    markers = MarkerArray(markers=[Marker(id=number, pose=place) for number, place in enumerate(places)])
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    sender = ros.node.create_publisher(
-        MarkerArray if kind == "markers" else PoseArray, "/site/anchors", latched
-    )
-    sender.publish(markers if kind == "markers" else PoseArray(poses=places))
+    ros.start("locator", "ranges:=nlink_nodeframe2", "anchors:=poses:/site/anchors", *LEVEL)
+    sender = ros.node.create_publisher(PoseArray, "/site/anchors", LATCHED)
+    sender.publish(PoseArray(poses=PLACES))
     wait_for_position(ros, poses)
+
+
+def test_anchors_are_markers_or_poses():
+    shown = [Marker(id=number, pose=place) for number, place in enumerate(PLACES)]
+    for kind, fields in (("markers", {"markers": shown}), ("poses", {"poses": PLACES})):
+        found = anchors_in(ANCHOR_TYPES[kind](**fields))
+        assert {anchor.id: anchor.position for anchor in found.anchors} == CORNERS
 
 
 @pytest.mark.ros
