@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from array import array
@@ -204,16 +202,3 @@ def test_duplicate_node_names_are_reported_except_for_a_killed_node(
     ros.diagnosis("mitigator", lambda status: "another node has the name" in status.message)
     for process in (first, second):
         process.wait_for_output("another node has the name /mitigator")
-
-
-def run_demo(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "benchmarks", "demo", *arguments]
-    environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
-    return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
-
-
-def test_demo_replays_a_log_and_prints_a_summary(apartment: Path):
-    result = run_demo("--recording", str(apartment / "logs" / "19.log.xz"), "--rate", "40")
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert "0 lost" in result.stdout
-    assert "corrected MAE" in result.stdout
