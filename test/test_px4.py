@@ -257,7 +257,7 @@ def test_ranges_are_sent_as_ekf2_accepts_them(
 
     def send_round() -> None:
         """Publish ranges of four anchors with the same stamp, as a DWM1001 with PANS, and invalid ones."""
-        number = next(rounds)
+        number, before = next(rounds), len(received())
         for anchor, place in [*ANCHORS.items(), (7, (0, 0, 0))]:
             for range_m, variance in [
                 (math.nan, 0.01),
@@ -275,9 +275,9 @@ def test_ranges_are_sent_as_ekf2_accepts_them(
                     "variance": variance,
                 }
                 publisher.publish(RangeCorrected(header=header, **fields))
-        if before := len(received()):
-            # A lost round would change the variances.
-            ros.spin_until(lambda: len(received()) >= before + len(ANCHORS))
+        # Rounds that wait for a busy node would change the variances.
+        if before:
+            ros.spin_until(lambda: len(received()) > before)
         ros.spin_for(0.1)
 
     def received() -> list[dict[str, float]]:

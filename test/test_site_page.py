@@ -150,7 +150,8 @@ def test_commands_of_the_page_lead_from_boards_to_positions(terminals: Terminals
         if "view track" in text:
             terminals.wait_for("viewer", "shows track")
         if "pipeline" in text:
-            ros.spin_until(lambda: len(poses) > 5)
+            # Emulated boards in real time range rarely on a busy machine.
+            ros.spin_until(lambda: len(poses) > 5, 600.0)
     anchors = load_anchors(folder / "anchors.yaml")
     # The anchors on the page are those that its boards find.
     recorded = read_ranges(folder / "first", anchors)
