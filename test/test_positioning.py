@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from uwb_mitigation.positioning.online.ambiguity import Ambiguity
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import candidate_positions
 from uwb_mitigation.positioning.online.measurements import TagRange
-from uwb_mitigation.positioning.online.robust_update import SCALE, RobustUpdate
+from uwb_mitigation.positioning.online.robust_update import CONSTANT_SD, MAX_CONSTANT, SCALE, RobustUpdate
 from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
@@ -58,19 +59,22 @@ def test_filter_agrees_with_filterpy():
     kalman = pytest.importorskip("filterpy.kalman")
     own_filter = RangeFilter(HALL, PLAIN, 0.0, np.array([6.0, 4.0, 1.0]), np.eye(3))
     own_filter.state.estimates_errors = True
-    n = len(own_filter.x)
+    constant = len(own_filter.x)
+    n = constant + len(HALL)
     filterpy_filter = kalman.ExtendedKalmanFilter(dim_x=n, dim_z=1)
-    filterpy_filter.x, filterpy_filter.P = own_filter.x.copy()[:, None], own_filter.P.copy()
+    filterpy_filter.x = np.pad(own_filter.x, (0, len(HALL)))[:, None]
+    filterpy_filter.P = np.pad(own_filter.P, (0, len(HALL)))
+    filterpy_filter.P[range(constant, n), range(constant, n)] = CONSTANT_SD**2
     ranges, _ = drive(seconds=3)
     variance = PLAIN.range_sd**2
-    claimed = np.diag(filterpy_filter.P)[FIRST_ERROR:].copy()
+    claimed = np.diag(filterpy_filter.P)[FIRST_ERROR:constant].copy()
     previous = 0.0
     for stamp, row, range_m in zip(ranges.stamp_ns / 1e9, ranges.anchor, ranges.range_m, strict=True):
         dt, previous = stamp - previous, stamp
         kept = math.exp(-dt / PLAIN.persistence_s)
         f, q = np.eye(n), np.zeros((n, n))
-        f[range(FIRST_ERROR, n), range(FIRST_ERROR, n)] = kept
-        q[range(FIRST_ERROR, n), range(FIRST_ERROR, n)] = (1 - kept**2) * claimed
+        f[range(FIRST_ERROR, constant), range(FIRST_ERROR, constant)] = kept
+        q[range(FIRST_ERROR, constant), range(FIRST_ERROR, constant)] = (1 - kept**2) * claimed
         for axis in range(3):
             f[axis, axis + 3] = dt
             block = np.ix_([axis, axis + 3], [axis, axis + 3])
@@ -81,19 +85,44 @@ def test_filter_agrees_with_filterpy():
         def slope(x, row=row):
             away = x[:3, 0] - HALL.position[row]
             h = np.zeros((1, n))
-            h[0, :3], h[0, OFFSET], h[0, FIRST_ERROR + row] = away / np.linalg.norm(away), 1, 1
+            h[0, :3] = away / np.linalg.norm(away)
+            h[0, [OFFSET, FIRST_ERROR + row, constant + row]] = 1
             return h
 
         def expected(x, row=row):
-            return np.linalg.norm(x[:3, 0] - HALL.position[row]) + x[OFFSET] + x[FIRST_ERROR + row]
+            distance = np.linalg.norm(x[:3, 0] - HALL.position[row])
+            return distance + x[OFFSET] + x[FIRST_ERROR + row] + x[constant + row]
 
         white = max(PLAIN.white * variance, variance - claimed[row])
+        distance = np.linalg.norm(filterpy_filter.x[:3, 0] - HALL.position[row])
+        white += 0.5 * (np.trace(filterpy_filter.P[:2, :2]) / distance) ** 2
         filterpy_filter.update(np.array([[range_m]]), slope, expected, R=np.array([[white]]))
         claimed[row] += 0.1 * ((1 - PLAIN.white) * variance - claimed[row])
         own_filter.predict(stamp)
         own_filter.update(row, range_m, variance)
         np.testing.assert_allclose(own_filter.x, filterpy_filter.x[:, 0], atol=1e-8)
-        np.testing.assert_allclose(own_filter.P, filterpy_filter.P, atol=1e-8)
+    np.testing.assert_allclose(own_filter.P, filterpy_filter.P, atol=1e-8)
+
+
+def test_constant_errors_of_corrected_ranges_are_estimated():
+    ranges, truth = drive(seconds=60)
+    ranges.range_m[:] += np.array([0.2, -0.2, 0.2, -0.2, 0.0])[ranges.anchor]
+    with_variance = TagEstimator(EstimatorConfig(HALL, height=Height(1.0)))
+    without = TagEstimator(EstimatorConfig(HALL, height=Height(1.0)))
+    unknown = replace(ranges, variance_m2=np.full(len(ranges), np.nan))
+    last = slice(len(ranges) // 2, None)
+    corrected_rmse = track_errors(with_variance.run(ranges).take(last), truth).rmse
+    assert corrected_rmse < 0.8 * track_errors(without.run(unknown).take(last), truth).rmse
+
+
+def test_number_of_constant_errors_is_bounded():
+    anchors = AnchorMap([Anchor(n, (float(n), 5.0 * (n % 2), 2.0), 0.01) for n in range(1, MAX_CONSTANT + 5)])
+    own_filter = RangeFilter(anchors, PLAIN, 0.0, np.zeros(3), np.eye(3))
+    for time_s, row in enumerate([*range(len(anchors))] * 2):
+        own_filter.predict(0.1 * time_s)
+        own_filter.update(row, float(np.linalg.norm(anchors.position[row])), 0.01)
+    assert len(own_filter.x) == FIRST_ERROR + len(anchors) + MAX_CONSTANT
+    assert np.linalg.eigvalsh(own_filter.P).min() > -1e-9
 
 
 @settings(max_examples=40)
@@ -123,6 +152,7 @@ def test_covariances_of_live_estimates_are_consistent():
     for seed in range(6):
         offset = np.random.default_rng(seed).normal(0, NoiseModel().offset_sd)
         ranges, truth = drive(seconds=25, seed=seed, offset_m=offset)
+        ranges.range_m[:] += np.random.default_rng(seed).normal(0, CONSTANT_SD, len(HALL))[ranges.anchor]
         errors = track_errors(TagEstimator(EstimatorConfig(HALL)).run(ranges), truth)
         assert errors.rmse < 0.25
         found.append(errors)

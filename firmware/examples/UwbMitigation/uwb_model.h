@@ -1,4 +1,4 @@
-/* universal, model f5794e80, written by `uwb-mitigation board export-c`. */
+/* universal, model 853786ea, written by `uwb-mitigation board export-c`. */
 #ifndef UWB_MODEL_H
 #define UWB_MODEL_H
 
@@ -421,15 +421,15 @@ static const uwb_ood_bands uwb_model_ood_bands = {0.0f, {
 }};
 
 static const uwb_scale_line uwb_model_scale[] = {
-    {0.0f, 0.150390625f, 0.0f}, {0.015625f, 0.150390625f, 0.0f}, {0.03125f, 0.137695312f, 0.40625f},
-    {0.0625f, 0.102539062f, 0.96875f}, {0.125f, 0.168945312f, 0.4375f},
-    {0.25f, 0.0830078125f, 0.78125f}, {0.5f, -0.015625f, 0.978515625f}, {1.0f, 0.962890625f, 0.0f},
-    {2.0f, 0.962890625f, 0.0f}, {4.0f, 0.797851562f, 0.0412597656f},
-    {8.0f, 0.977539062f, 0.0187988281f}, {16.0f, 1.27832031f, 0.0f},
+    {0.0f, 0.080078125f, 0.0f}, {0.015625f, 0.033203125f, 3.0f},
+    {0.03125f, 0.0810546875f, 1.46875f}, {0.0625f, 0.124023438f, 0.78125f},
+    {0.125f, 0.165039062f, 0.453125f}, {0.25f, 0.0830078125f, 0.78125f},
+    {0.5f, -0.00390625f, 0.955078125f}, {1.0f, 0.951171875f, 0.0f}, {2.0f, 0.951171875f, 0.0f},
+    {4.0f, -1.79882812f, 0.6875f}, {8.0f, 3.62109375f, 0.0100097656f}, {16.0f, 3.78125f, 0.0f},
 };
 
 static const uwb_model uwb_model_data = {
-    0xf5794e80u, 157u, UWB_SCALE_PREAMBLE, 0.00991764199f, 3u, 3u, uwb_first_weights, uwb_first,
+    0x853786eau, 157u, UWB_SCALE_PREAMBLE, 0.00991764199f, 3u, 3u, uwb_first_weights, uwb_first,
     uwb_modules, 0u, NULL, uwb_head_weights, 384u, 1105, 2.45213469e-05f, 0.0f, 0.0f, 0.0f,
     -12.5251331f, 36.5019951f, 0.104561187f, uwb_model_scale, 12u, &uwb_model_ood_bands, 1,
 };

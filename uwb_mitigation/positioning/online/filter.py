@@ -14,15 +14,12 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.geometry import Symmetry
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.online.robust_update import RobustUpdate
+from uwb_mitigation.positioning.online.robust_update import SHORTEST_M, RobustUpdate
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Estimate
 
 OFFSET = 6
 FIRST_ERROR = 7
-
-SHORTEST_M = 0.05
-"""Closer to an anchor, a range has no defined direction."""
 
 
 class RangeFilter:
@@ -88,9 +85,9 @@ class RangeFilter:
         if dt <= 0.0:
             return
         self.time_s = time_s
-        if not self._views:
+        x, P = self.state.x, self.state.P
+        if not self._views or self._views[0].base is not x:
             # They are made once: new ones would take much of the time.
-            x, P = self.state.x, self.state.P
             positions, velocities = slice(2 if self._level else 3), slice(3, 5 if self._level else 6)
             self._views = (
                 *(x[:3], x[3:6], P[:3], P[3:6], P[:, :3], P[:, 3:6]),
@@ -121,7 +118,7 @@ class RangeFilter:
         distance = math.sqrt(x * x + y * y + z * z)
         divisor, H = max(distance, SHORTEST_M), state.H
         H[0], H[1], H[2] = x / divisor, y / divisor, z / divisor
-        return state.update_range(anchor, range_m - distance, variance_m2)
+        return state.update_range(anchor, range_m, distance, variance_m2)
 
     def update_height(self, height_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with the height of the tag; return as `RobustUpdate.update_range`."""

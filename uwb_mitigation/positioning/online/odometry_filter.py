@@ -16,7 +16,8 @@ import numpy as np
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, PathPoint
-from uwb_mitigation.positioning.online.filter import SHORTEST_M, RangeFilter
+from uwb_mitigation.positioning.online.filter import RangeFilter
+from uwb_mitigation.positioning.online.robust_update import SHORTEST_M
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Estimate, Heading
 
@@ -123,7 +124,7 @@ class OdometryFilter:
         H = self.state.H
         H[:3] = vector / max(distance, SHORTEST_M)
         H[YAW] = H[1] * arm_x - H[0] * arm_y
-        return self.state.update_range(anchor, range_m - distance, variance_m2)
+        return self.state.update_range(anchor, range_m, distance, variance_m2)
 
     def set_height(self, height_m: float, variance_m2: float) -> None:
         """Set the height of the antenna: the odometry is horizontal, so that ranges only determine it, unless it is constant."""

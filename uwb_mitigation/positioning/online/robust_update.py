@@ -1,10 +1,11 @@
 """State of a tag or robot with the errors of its ranges, and the robust Kalman update that all filters share.
 
-State: motion (0 to k - 1), the offset that the tag's ranges have in common (k), and the persisting error of each anchor's ranges
-(k + 1, ...). While the position is searched, offset and errors are only considered (S. F. Schmidt, 1966): they keep their
-uncertainty and their correlations, so that no candidate position explains its ranges by wrong offsets. Afterwards they are
-estimated. Constant errors of anchors are no states: they would follow errors that change slowly. Their variance is
-estimated from residuals, see `persisting_variance`, and widens the published covariance.
+State: motion (0 to k - 1), the offset that the tag's ranges have in common (k), the persisting error of each anchor's ranges
+(k + 1, ...), and behind them the constant errors of up to `MAX_CONSTANT` anchors. While the position is searched, offset and
+errors are only considered (S. F. Schmidt, 1966): they keep their uncertainty and their correlations, so that no candidate
+position explains its ranges by wrong offsets. Afterwards they are estimated. Only ranges with a variance, i.e. corrected ones,
+have constant errors as states: those of other ranges would follow obstacles. The variance of what remains is estimated from
+residuals, see `persisting_variance`, and widens the published covariance.
 """
 
 from __future__ import annotations
@@ -18,8 +19,17 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.types.anchors import AnchorMap
 
+SHORTEST_M = 0.05
+"""Closer to an anchor, a range has no defined direction."""
+
 MIN_VARIANCE_M2 = 1e-6
 """Of white noise: measurements with less would make the covariance singular."""
+
+CONSTANT_SD = 0.07
+"""Standard deviation of the constant error of an anchor's corrected ranges, m: antenna delay, position, reflections."""
+
+MAX_CONSTANT = 16
+"""With more anchors, the one whose constant error has been estimated for longest is forgotten: the state remains small."""
 
 CONSISTENCY_RATE = 0.01
 """Share of a new range in the running mean `consistency`: it includes about a hundred ranges."""
@@ -57,6 +67,7 @@ class RobustUpdate:
     __slots__ = (
         "H",
         "P",
+        "_constant_rows",
         "_error_variance",
         "_errors",
         "_last_residual",
@@ -75,6 +86,7 @@ class RobustUpdate:
         self._error_variance = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
         self.estimates_errors, self.consistency = False, 1.0
         self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
+        self._constant_rows: dict[int, int] = {}
         self.H, self.x, self.P = np.zeros(n), np.zeros(n), np.zeros((n, n))
         self.x[: len(motion)] = motion
         self.P[self._offset, self._offset] = model.offset_sd**2
@@ -84,13 +96,15 @@ class RobustUpdate:
 
     def _bind(self) -> None:
         """Set views of the errors in state and covariance: new ones for every prediction would take much of its time."""
-        x, P, first = self.x, self.P, self._offset + 1
-        self._errors = x[first:], P[first:], P[:, first:], P.reshape(-1)[first * (len(P) + 1) :: len(P) + 1]
+        x, P, n, first = self.x, self.P, len(self.x), self._offset + 1
+        end = first + len(self._error_variance)
+        variances = P.reshape(-1)[first * (n + 1) : end * n : n + 1]
+        self._errors = x[first:end], P[first:end], P[:, first:end], variances
 
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
         twin = copy.copy(self)
-        for name in ("H", "P", "_error_variance", "_last_residual", "x"):
+        for name in ("H", "P", "_constant_rows", "_error_variance", "_last_residual", "x"):
             setattr(twin, name, getattr(self, name).copy())
         twin._bind()
         return twin
@@ -105,8 +119,27 @@ class RobustUpdate:
         retained = np.r_[0:3, k:n]
         before = np.r_[0:3, old : len(self.x)]
         twin.P[np.ix_(retained, retained)] = self.P[np.ix_(before, before)]
+        twin._constant_rows = {anchor: row + k - old for anchor, row in self._constant_rows.items()}
         twin._bind()
         return twin
+
+    def _constant_row(self, anchor: int) -> int:
+        """Return the state of an anchor's constant error; it replaces the oldest one if there are too many."""
+        rows = self._constant_rows
+        if anchor in rows:
+            return rows[anchor]
+        if not rows:
+            size = min(MAX_CONSTANT, len(self._error_variance))
+            self.x, self.H = np.pad(self.x, (0, size)), np.pad(self.H, (0, size))
+            self.P = np.pad(self.P, (0, size))
+            self._bind()
+        x, P = self.x, self.P
+        free = self._offset + 1 + len(self._error_variance) + len(rows)
+        row = free if free < len(x) else rows.pop(next(iter(rows)))
+        x[row] = P[row] = P[:, row] = 0.0
+        P[row, row] = CONSTANT_SD**2
+        rows[anchor] = row
+        return row
 
     def predict_errors(self, elapsed: float) -> None:
         """Predict the persisting errors after `elapsed` time constants."""
@@ -116,18 +149,23 @@ class RobustUpdate:
         columns *= decay
         variances += (1.0 - decay * decay) * self._error_variance
 
-    def update_range(self, anchor: int, residual_m: float, variance_m2: float) -> tuple[float, float]:
+    def update_range(
+        self, anchor: int, range_m: float, distance_m: float, variance_m2: float
+    ) -> tuple[float, float]:
         """Update with a range; `H` is set.
 
         Args:
             anchor: a row of the anchors.
-            residual_m: measured range minus distance, m.
+            range_m: measured range, m.
+            distance_m: predicted distance, m.
             variance_m2: of its error, including the persisting part; NaN: unknown.
 
         Returns:
             The innovation divided by its standard deviation, and this standard deviation in m.
         """
-        model, x, H, k = self._model, self.x, self.H, self._offset
+        has_constant = variance_m2 > 0.0
+        constant = self._constant_row(anchor) if has_constant else 0
+        model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
         row = k + 1 + anchor
         variance, error_variance = model.variance(variance_m2), float(self._error_variance[anchor])
         # The part of the variance that the persisting error does not explain is white noise.
@@ -137,14 +175,21 @@ class RobustUpdate:
         )
         H[k:] = 0.0
         H[k] = H[row] = 1.0
-        residual = residual_m - x.item(k)
+        residual = range_m - distance_m - x.item(k)
+        if has_constant:
+            H[constant] = 1.0
+            residual -= x.item(constant)
+            # Near an anchor the distance is not linear in the position: variance of its second-order term (Bar-Shalom, Li,
+            # Kirubarajan, 10.3.2). Otherwise the filter may continue on the other side of an anchor that it passes.
+            curvature = (P.item(0, 0) + P.item(1, 1)) / max(distance_m, SHORTEST_M)
+            white += 0.5 * curvature * curvature
         z, sd = self.update(H, residual - x.item(row), white)
         residual /= math.sqrt(model.inflation(z))
         # White noise does not contribute to the mean of this product.
         square = residual * self._last_residual[anchor]
         self._last_residual[anchor] = residual
         self.residual_square += RESIDUAL_RATE * (square - self.residual_square)
-        ratio = (x.item(row) ** 2 + self.P.item(row, row)) / error_variance
+        ratio = (x.item(row) ** 2 + P.item(row, row)) / error_variance
         self.consistency += CONSISTENCY_RATE * (min(ratio, MAX_RATIO) - self.consistency)
         return z, sd
 
