@@ -33,7 +33,13 @@ from uwb_mitigation.positioning.online.ambiguity import Ambiguity
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, OFFSET, RangeFilter
 from uwb_mitigation.positioning.online.initialization import candidate_positions
 from uwb_mitigation.positioning.online.measurements import TagRange
-from uwb_mitigation.positioning.online.robust_update import CONSTANT_SD, MAX_CONSTANT, SCALE, RobustUpdate
+from uwb_mitigation.positioning.online.robust_update import (
+    CONSTANT_SD,
+    CORRECTED_WHITE,
+    MAX_CONSTANT,
+    SCALE,
+    RobustUpdate,
+)
 from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
 from uwb_mitigation.positioning.track_errors import errors_of, track_errors
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
@@ -93,11 +99,11 @@ def test_filter_agrees_with_filterpy():
             distance = np.linalg.norm(x[:3, 0] - HALL.position[row])
             return distance + x[OFFSET] + x[FIRST_ERROR + row] + x[constant + row]
 
-        white = max(PLAIN.white * variance, variance - claimed[row])
+        white = max(CORRECTED_WHITE * variance, variance - claimed[row])
         distance = np.linalg.norm(filterpy_filter.x[:3, 0] - HALL.position[row])
         white += 0.5 * (np.trace(filterpy_filter.P[:2, :2]) / distance) ** 2
         filterpy_filter.update(np.array([[range_m]]), slope, expected, R=np.array([[white]]))
-        claimed[row] += 0.1 * ((1 - PLAIN.white) * variance - claimed[row])
+        claimed[row] += 0.1 * ((1 - CORRECTED_WHITE) * variance - claimed[row])
         own_filter.predict(stamp)
         own_filter.update(row, range_m, variance)
         np.testing.assert_allclose(own_filter.x, filterpy_filter.x[:, 0], atol=1e-8)
@@ -151,7 +157,7 @@ def test_covariances_of_live_estimates_are_consistent():
     found = []
     for seed in range(6):
         offset = np.random.default_rng(seed).normal(0, NoiseModel().offset_sd)
-        ranges, truth = drive(seconds=25, seed=seed, offset_m=offset)
+        ranges, truth = drive(seconds=25, seed=seed, offset_m=offset, model=NoiseModel(white=CORRECTED_WHITE))
         ranges.range_m[:] += np.random.default_rng(seed).normal(0, CONSTANT_SD, len(HALL))[ranges.anchor]
         errors = track_errors(TagEstimator(EstimatorConfig(HALL)).run(ranges), truth)
         assert errors.rmse < 0.25

@@ -223,7 +223,9 @@ class Locator(ManagedNode):
         mapping: Mapping | None = topic.find_mapping(name)
         if mapping is None:
             return False
-        variance_m2 = mapping.range_sd**2 or math.nan
+        # Constant errors are estimated for corrected ranges only: a default of the data sheet is no variance.
+        is_default = mapping.range_sd in (0.0, self.value("range_sd"))
+        variance_m2 = math.nan if is_default else mapping.range_sd**2
 
         def on_range(measurement: RangeMeasurement) -> None:
             if self._estimator is not None and self.is_active:

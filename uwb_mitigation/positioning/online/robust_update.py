@@ -25,6 +25,9 @@ SHORTEST_M = 0.05
 MIN_VARIANCE_M2 = 1e-6
 """Of white noise: measurements with less would make the covariance singular."""
 
+CORRECTED_WHITE = 0.6
+"""As `NoiseModel.white`, for ranges whose constant error is a state."""
+
 CONSTANT_SD = 0.07
 """Standard deviation of the constant error of an anchor's corrected ranges, m: antenna delay, position, reflections."""
 
@@ -169,10 +172,9 @@ class RobustUpdate:
         row = k + 1 + anchor
         variance, error_variance = model.variance(variance_m2), float(self._error_variance[anchor])
         # The part of the variance that the persisting error does not explain is white noise.
-        white = max(model.white * variance, variance - error_variance)
-        self._error_variance[anchor] = error_variance + 0.1 * (
-            (1.0 - model.white) * variance - error_variance
-        )
+        share = CORRECTED_WHITE if has_constant else model.white
+        white = max(share * variance, variance - error_variance)
+        self._error_variance[anchor] = error_variance + 0.1 * ((1.0 - share) * variance - error_variance)
         H[k:] = 0.0
         H[k] = H[row] = 1.0
         residual = range_m - distance_m - x.item(k)
