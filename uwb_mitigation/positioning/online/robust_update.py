@@ -178,14 +178,15 @@ class RobustUpdate:
         H[k:] = 0.0
         H[k] = H[row] = 1.0
         residual = range_m - distance_m - x.item(k)
+        innovation = residual - x.item(row)
         if has_constant:
             H[constant] = 1.0
-            residual -= x.item(constant)
+            innovation -= x.item(constant)
             # Near an anchor the distance is not linear in the position: variance of its second-order term (Bar-Shalom, Li,
             # Kirubarajan, 10.3.2). Otherwise the filter may continue on the other side of an anchor that it passes.
             curvature = (P.item(0, 0) + P.item(1, 1)) / max(distance_m, SHORTEST_M)
             white += 0.5 * curvature * curvature
-        z, sd = self.update(H, residual - x.item(row), white)
+        z, sd = self.update(H, innovation, white)
         residual /= math.sqrt(model.inflation(z))
         # White noise does not contribute to the mean of this product.
         square = residual * self._last_residual[anchor]
