@@ -25,6 +25,7 @@ from uwb_mitigation.positioning import recorded_tracks as tracking
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
+from uwb_mitigation.positioning.online.robust_update import CONSTANT_SD
 from uwb_mitigation.positioning.recorded_tracks import track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.writer import BagWriter
@@ -75,7 +76,10 @@ def write_drive(
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a 40 s drive past five anchors with raw ranges 0.6 m too long, and its anchors file."""
-    return write_drive(tmp_path_factory.mktemp("hall") / "hall.mcap", *drive(seconds=40), too_long_m=0.6)
+    ranges, truth = drive(seconds=40)
+    # Corrected ranges have constant errors.
+    ranges.range_m[:] += np.random.default_rng(1).normal(0.0, CONSTANT_SD, len(HALL))[ranges.anchor]
+    return write_drive(tmp_path_factory.mktemp("hall") / "hall.mcap", ranges, truth, too_long_m=0.6)
 
 
 def test_track_is_written_evaluated_and_read_by_evo(hall: Path, tmp_path: Path):
