@@ -142,15 +142,8 @@ def test_better_verdict_is_held_back_and_a_seek_is_not():
 def test_state_of_an_anchor_needs_evidence_and_has_hysteresis(
     changes: dict[str, float], before: str, expected: str
 ):
-    means = {
-        "rate": 10.0,
-        "nlos": 0.0,
-        "lost": 0.0,
-        "not_ok": 0.0,
-        "residual": 0.0,
-        "stopped": 0.0,
-        "evidence": 100.0,
-    }
+    means = dict.fromkeys(("nlos", "lost", "not_ok", "residual", "stopped"), 0.0)
+    means |= {"rate": 10.0, "evidence": 100.0}
     assert health.state(means | changes, before) == expected
 
 
@@ -209,13 +202,8 @@ def test_controls_without_effect_are_disabled():
 def test_labels_of_colour_bars_and_of_the_outermost_bins_are_distinct():
     document = shown(driven()[0])
     bars = [bar for bar in document.get_model_by_name("map").right if hasattr(bar, "color_mapper")]
-    assert list(bars[1].major_label_overrides.values()) == [
-        "\u2264 0.1",
-        "\u2264 0.2",
-        "\u2264 0.5",
-        "\u2264 1",
-        "\u2264 10",
-    ]
+    steps = [f"\u2264 {limit}" for limit in ("0.1", "0.2", "0.5", "1", "10")]
+    assert list(bars[1].major_label_overrides.values()) == steps
     assert document.get_model_by_name("errors").xaxis[0].major_label_overrides == {
         -1: "-1 or less",
         2: "2 or more",

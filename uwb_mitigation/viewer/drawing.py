@@ -339,10 +339,11 @@ class Figures:
         is_nlos = np.where(np.isfinite(gap_db), gap_db >= LINE_OF_SIGHT_DB, np.nan)
         rate_hz, nlos = 1.0 / _rolling_mean(interval_s), 100.0 * _rolling_mean(is_nlos)
         table = _thin(np.column_stack([age_s, residual_m, rate_hz, nlos]), MAX_POINTS)
-        table = with_gaps(table, NO_DATA_S if history is None else history.max_gap_s).astype(np.float32)
+        table = with_gaps(table, NO_DATA_S if history is None else history.max_gap_s)
         none = "No residuals of this pair yet."
-        self._models.show_empty("history", "" if np.isfinite(table[:, 1]).any() else none)
-        self._models.history.data = dict(zip(self._models.history.data, table.T, strict=True))
+        self._models.fill(
+            "history", self._models.history, table, "" if np.isfinite(table[:, 1]).any() else none
+        )
 
     def _draw_positions(self, scene: Scene) -> None:
         """Draw the errors of the positions of the selected tag, with two standard deviations."""
@@ -357,9 +358,9 @@ class Figures:
         elif self._player is None:
             table = live_positions(scene, tag_id).error_columns()
             table[:, 0] -= table[-1:, 0]
-        self._models.show_empty("positions", "" if np.isfinite(table[:, 1:]).any() else "No positions.")
-        table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S).astype(np.float32)
-        self._models.positions.data = dict(zip(self._models.positions.data, table.T, strict=True))
+        message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
+        table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S)
+        self._models.fill("positions", self._models.positions, table, message)
 
 
 def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:

@@ -32,6 +32,7 @@ from bokeh.models import (
 from bokeh.palettes import cividis
 from bokeh.plotting import figure
 from bokeh.transform import factor_mark
+from numpy.typing import NDArray
 
 from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.headline import WHOLE
@@ -235,6 +236,13 @@ class Models:
         if self.controls.empty.get(name) != message:
             self.controls.empty = self.controls.empty | {name: message}
 
+    def fill(self, name: str, source: ColumnDataSource, table: NDArray[np.float64], message: str) -> None:
+        """Set the columns of a figure, which at no moment has neither data nor corners."""
+        if message:
+            self.show_empty(name, message)
+        source.data = dict(zip(source.data, table.T.astype(np.float32), strict=True))
+        self.show_empty(name, message)
+
     def update_legend(self) -> None:
         """Show the entries of the map's legend that the map contains."""
         for item in self._legend.items:
@@ -416,6 +424,7 @@ class Models:
 
     def _distribution(self) -> figure:
         plot = _figure(230, "measured - true, m", "share of ranges, %", y_range=Range1d(0, 100))
+        plot.x_range = Range1d(float(ERROR_EDGES_M[0]), float(ERROR_EDGES_M[-1]))
         names = self._lines(plot, self.errors, "right", *self._kinds, suffix="_share")
         return _finished(plot, "right", *names)
 
