@@ -70,6 +70,7 @@ setup(
             "models/*",
             "types/ros/interfaces/*.msg",
             "recordings/mappings/*.yaml",
+            "calibration/templates/*.j2",
             "viewer/templates/*",
         ]
     },

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from benchmarks.paper import figures, published, tables
 from benchmarks.paper.data import TEST_ROOM
-from benchmarks.paper.html import render_page
 from benchmarks.paper.results import (
     Box,
     ExperimentResults,
@@ -24,6 +23,7 @@ from benchmarks.paper.results import (
 )
 from benchmarks.paper.rooms import ROOM_ROWS, has_rooms, parse_configuration
 from benchmarks.paper.tables import Cell, Provenance, ReportTable
+from uwb_mitigation.calibration.html import render_page
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.deepuwb import ROOMS
 from uwb_mitigation.training.evaluation.baselines import scikit_learn
@@ -79,8 +79,12 @@ class Report:
         return content
 
     def html(self) -> str:
-        """Return one page without external resources."""
-        return render_page("report.html.j2", report=self)
+        """Return one page without external resources.
+
+        Raises:
+            MissingDependencyError: jinja2 is not installed.
+        """
+        return render_page("report.html.j2", Path(__file__).parent / "templates", report=self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -226,7 +226,7 @@ def _write(
     bundle, offsets_path = calibration.write(output, source, name)
     print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     if report is not None:
-        from uwb_mitigation.commands.support.site_page import site_page
+        from uwb_mitigation.calibration.page import site_page
         from uwb_mitigation.files import write_atomically
 
         write_atomically(report, site_page(calibration, name, bundle, (str(output), str(offsets_path))))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from bokeh.models import (
     ColorBar,
     ColumnDataSource,
     DataRange1d,
-    FactorRange,
     FixedTicker,
     HoverTool,
     Legend,
@@ -427,27 +425,6 @@ class Models:
         plot.x_range = Range1d(float(ERROR_EDGES_M[0]), float(ERROR_EDGES_M[-1]))
         names = self._lines(plot, self.errors, "right", *self._kinds, suffix="_share")
         return _finished(plot, "right", *names)
-
-
-def interval_figure(name: str, x: str, rows: Mapping[Any, Sequence[float]]) -> figure:
-    """Return a figure of distributions, one in each row.
-
-    Args:
-        name: of the figure.
-        x: title of the axis.
-        rows: {label, or (label, "raw" or another kind): ends of the line, of the box and its middle, increasing}; first at the top.
-    """
-    plot = _figure(80 + 24 * len(rows), x, "", y_range=FactorRange(factors=[*rows][::-1]), name=name)
-    columns = np.array([*rows.values()]).reshape(-1, 5).T
-    colours = [VERMILLION if row[-1] == "raw" else BLUE for row in rows]
-    data = dict(zip(("low", "left", "middle", "right", "high"), columns, strict=True))
-    source = ColumnDataSource(data | {"row": [*rows], "colour": colours})
-    style = {"source": source, "color": "colour", "line_width": 2}
-    plot.segment("low", "row", "high", "row", **style)
-    plot.hbar("row", left="left", right="right", height=0.6, fill_alpha=0.35, **style)
-    plot.scatter("middle", "row", marker="dash", angle=math.pi / 2, size=14, **style)
-    plot.vspan(0.0, line_color=GREY)
-    return plot
 
 
 _SAMPLES, _AGE = "samples (1 ns) from the first path", "time before now, s"
