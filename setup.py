@@ -71,7 +71,6 @@ setup(
             "types/ros/interfaces/*.msg",
             "recordings/mappings/*.yaml",
             "calibration/templates/*.j2",
-            "commands/field/templates/*.j2",
             "viewer/templates/*",
         ]
     },

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_material import record
+from browser import Browser
 from command_line import run, succeed
 from drives import HALL, drive
 
@@ -37,6 +38,8 @@ from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, interval_cards
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Scene
+from uwb_mitigation.viewer.server import ViewerServer
+from uwb_mitigation.viewer.state import View
 from uwb_mitigation.viewer.timeline import Timeline
 
 DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -44,12 +47,20 @@ HANYANG, LABYRINTH = DATA / "hanyang_outdoor", DATA / "chemnitz_labyrinth"
 BOX = Area((-20.0, -60.0, -2.0), (80.0, 60.0, 4.0))
 
 
+def indexed(bag: Path, settings: TrackSettings) -> tuple[BagPlayer, SceneUpdater]:
+    """Return the player of a bag after its index is complete."""
+    feed, anchors = SceneUpdater(Scene(), threading.Lock()), read_anchors(bag)
+    player = BagPlayer(bag, feed, lambda: mitigation(settings))
+    feed.anchors(anchors)
+    player.index(read_config(bag, anchors, settings), settings.stamp_offset_s).join()
+    return player, feed
+
+
 def viewed(bag: Path, settings: TrackSettings) -> Timeline:
     """Return what `view` estimates of a bag."""
-    player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(settings))
-    player.index(read_config(bag, read_anchors(bag), settings), settings.stamp_offset_s).join()
-    assert player.timeline is not None
-    return player.timeline
+    timeline = indexed(bag, settings)[0].timeline
+    assert timeline is not None
+    return timeline
 
 
 def imported(source: Path, folder: Path) -> Path:
@@ -104,6 +115,30 @@ def test_track_and_view_give_the_same_figures(
             assert live == raw, "nothing was corrected"
     shown = [notice.split(": ", 1)[1] for notice in timeline.notices]
     assert [text for text in shown if text in tag["warnings"]] == tag["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("source", "settings"),
+    [
+        (HANYANG / "NLOS_A1", TrackSettings(1.0, area=BOX, stamp_offset_s=-0.2)),
+        (LABYRINTH, TrackSettings(0.0, odometry="/odom")),
+    ],
+    ids=["hanyang", "labyrinth"],
+)
+def test_public_recording_is_shown_in_a_browser(
+    browser: Browser, tmp_path: Path, source: Path, settings: TrackSettings
+):
+    player, feed = indexed(imported(source, tmp_path), settings)
+    with ViewerServer(View(feed.scene, feed.lock, player=player), port=0) as server:
+        browser.open(f"{server.url}#t=20")
+        browser.wait("the errors", lambda: "Position RMSE, whole recording" in browser.cards())
+        value, text = browser.cards()["Ranges corrected, whole recording"]
+        assert (value, "ranges corrected: no CIRs" in text) == ("none", True)
+        browser.wait("the tag", lambda: any("tag" in name for name in browser.column("map", "name")))
+        assert len(browser.column("positions", "bound")) > 100
+        browser.click("button", "Next range")
+        browser.wait("it", lambda: player.position_s > 20.0)
+        assert browser.console_messages() == []
 
 
 def test_placements_have_no_positions_in_track_and_view(apartment_imported: Path, tmp_path: Path):
@@ -165,12 +200,13 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
 def test_report_is_one_file_with_the_figures_of_track(tmp_path: Path):
     bag, page = tmp_path / "drive.mcap", tmp_path / "drive.html"
     succeed("data simulate --like drive --ranges 300 -o", bag, folder=tmp_path)
-    options = ("--height", "0", "--json", "track.json", "--report", page)
+    options = ("--height", "0", "--json", "track.json", "--report", page, "--png", tmp_path / "map.png")
     succeed("track", bag, "-o", "track.mcap", *options, folder=tmp_path)
     rmse_m = json.loads((tmp_path / "track.json").read_text())["live"]["horizontal_rmse_m"]
     text = page.read_text()
     assert f"<td>Position RMSE, whole recording</td><td>{rmse_m:.3f} m</td>" in text
     assert "<strong>Position " in text
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     assert not re.search(r"<(script|link)[^>]+(src|href)=", text)
     assert "exists already" in run("track", bag, "-o", "other.mcap", *options, folder=tmp_path).stderr
 

@@ -25,9 +25,10 @@ from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Pose, Sample, Scene
+from uwb_mitigation.viewer.scene import Pose, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -36,7 +37,11 @@ BAD = 700
 
 
 def write_drive(
-    path: Path, delays_s: dict[int, float], latency_s: float = 0.05, gap_s: tuple[float, float] = (0.0, 0.0)
+    path: Path,
+    delays_s: dict[int, float],
+    latency_s: float = 0.05,
+    gap_s: tuple[float, float] = (0.0, 0.0),
+    lonely_tag: int | None = None,
 ) -> Path:
     """Write a drive of 40 s with corrected ranges, their truth, and true positions.
 
@@ -45,6 +50,7 @@ def write_drive(
         delays_s: {tag: what its clock shows more than the clock of the recorder}.
         latency_s: time from a range to its log time.
         gap_s: interval without ranges.
+        lonely_tag: receives only the first anchor.
     """
     ranges, truth = drive(seconds=40.0, rate_hz=25.0)
     with BagWriter(path, {}) as out:
@@ -52,7 +58,7 @@ def write_drive(
         for tag, delay_s in delays_s.items():
             for row in range(len(ranges)):
                 time_s = ranges.stamp_ns[row] / 1e9
-                if gap_s[0] < time_s < gap_s[1]:
+                if gap_s[0] < time_s < gap_s[1] or (tag == lonely_tag and ranges.anchor[row]):
                     continue
                 log_ns = START_NS + int(ranges.stamp_ns[row]) + int(latency_s * 1e9)
                 stamp_ns = START_NS + int(ranges.stamp_ns[row]) + int(delay_s * 1e9)
@@ -127,6 +133,21 @@ def test_clocks_of_two_tags_may_differ_by_an_hour(browser: Browser, tmp_path: Pa
         browser.open(server.url + "#t=30&anchor=1&tag=8")
         browser.wait("pairs of both tags", lambda: len(browser.column("pairs", "tag")) == 10)
         browser.wait("a full strip", lambda: len(browser.column("strip", "raw")) > 140)
+
+
+def test_tag_that_never_has_a_position_is_named_and_the_player_runs(browser: Browser, tmp_path: Path):
+    anchor, bag = HALL.anchors[0].id, write_drive(tmp_path / "two.mcap", {7: 0.0, 9: 0.0}, lonely_tag=9)
+    with serve(bag) as (_, server):
+        browser.open(f"{server.url}#t=30&anchor={anchor}&tag=9")
+        browser.wait("its verdict", lambda: "Position not determined" in browser.text())
+        browser.wait("its row", lambda: "no position" in [row["age"] for row in browser.table("Tags")])
+        send(browser, "seek", 10.0)
+        browser.wait("the other position", lambda: position_s(browser) == 10.0)
+        send(browser, "select", anchor, 7)
+        browser.wait("the other tag", lambda: "Position RMSE, whole recording" in browser.cards())
+        browser.wait("its errors", lambda: len(browser.column("positions", "error")) > 100)
+        browser.wait("its residuals", lambda: any(browser.column("history", "residual")))
+        assert browser.console_messages() == []
 
 
 def test_same_url_shows_the_same_figures(browser: Browser, tmp_path: Path):

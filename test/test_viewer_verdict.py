@@ -16,9 +16,10 @@ from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import AnchorPosition, NodeStatus, Pose, Sample, Scene
+from uwb_mitigation.viewer.scene import AnchorPosition, NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.state import View
 from uwb_mitigation.viewer.verdict import DEGRADED, GOOD, HeldVerdict, Verdict
 
@@ -141,15 +142,8 @@ def test_better_verdict_is_held_back_and_a_seek_is_not():
 def test_state_of_an_anchor_needs_evidence_and_has_hysteresis(
     changes: dict[str, float], before: str, expected: str
 ):
-    means = {
-        "rate": 10.0,
-        "nlos": 0.0,
-        "lost": 0.0,
-        "not_ok": 0.0,
-        "residual": 0.0,
-        "stopped": 0.0,
-        "evidence": 100.0,
-    }
+    means = dict.fromkeys(("nlos", "lost", "not_ok", "residual", "stopped"), 0.0)
+    means |= {"rate": 10.0, "evidence": 100.0}
     assert health.state(means | changes, before) == expected
 
 
@@ -208,13 +202,8 @@ def test_controls_without_effect_are_disabled():
 def test_labels_of_colour_bars_and_of_the_outermost_bins_are_distinct():
     document = shown(driven()[0])
     bars = [bar for bar in document.get_model_by_name("map").right if hasattr(bar, "color_mapper")]
-    assert list(bars[1].major_label_overrides.values()) == [
-        "\u2264 0.1",
-        "\u2264 0.2",
-        "\u2264 0.5",
-        "\u2264 1",
-        "\u2264 10",
-    ]
+    steps = [f"\u2264 {limit}" for limit in ("0.1", "0.2", "0.5", "1", "10")]
+    assert list(bars[1].major_label_overrides.values()) == steps
     assert document.get_model_by_name("errors").xaxis[0].major_label_overrides == {
         -1: "-1 or less",
         2: "2 or more",
@@ -250,3 +239,23 @@ def test_late_positions_give_no_residuals():
         scene.add_sample((1, 7), Sample(clock.now_s + 900.0, 9.0, 9.0, 0.1, Status.OK))
     assert np.isnan([sample.residual_m for sample in list(scene.pairs[1, 7].samples)[-18:]]).all()
     assert {row[0] for row in controls(scene).health} == {health.GOOD}
+
+
+def test_history_of_the_selected_anchor_and_errors_with_standard_deviations():
+    scene, _ = driven({1: 0.6})
+    scene.pairs[1, 7].samples[-1].gap_db = 9.0
+    for sample in scene.pairs[1, 7].samples:
+        sample.true_m = 5.0
+        scene.count_error(sample)
+    figures = shown(scene)
+
+    def column(figure: str, name: str) -> np.ndarray:
+        sources = [renderer.data_source.data for renderer in figures.get_model_by_name(figure).renderers]
+        return np.array(next(source[name] for source in sources if name in source))
+
+    assert column("history", "residual") == pytest.approx(0.6)
+    assert (column("history", "rate")[-1], column("history", "NLOS")[-1]) == pytest.approx((10.0, 100.0))
+    assert column("positions", "bound") == pytest.approx(0.2)
+    shares, edges = column("distribution", "raw_share"), column("distribution", "right")
+    assert shares[edges < 0.6 - 1e-9].tolist() == [0.0] * 31
+    assert shares[-1] == 100.0

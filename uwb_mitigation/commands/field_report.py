@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import json
+import math
 import platform
 import re
 import socket
@@ -14,8 +15,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from threading import Lock
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -27,6 +30,7 @@ from uwb_mitigation.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
     from uwb_mitigation.commands.field.checks import Check, Observation
+    from uwb_mitigation.types.measurement import Truth
 
 
 def field_report(
@@ -126,41 +130,77 @@ def _correct(observation: Observation) -> None:
 
 def _write(folder: Path, source: str, observation: Observation, checks: list[Check]) -> None:
     """Write the page, the values and the ranges."""
-    from uwb_mitigation.calibration.html import render_page
     from uwb_mitigation.commands.field.test import SOURCES
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.measurement import Record, Truth
 
-    system = {
-        "uwb_mitigation": uwb_mitigation.__version__,
-        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "Python": platform.python_version(),
-        **observation.identity,
-    }
-    counts = Counter(check.verdict.value for check in checks)
     values = {
         "date": f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
         "source": source,
         "distance_m": observation.distance_m,
         "seconds": observation.seconds,
         "ranges": len(observation.ranges),
-        "system": system,
+        "system": {
+            "uwb_mitigation": uwb_mitigation.__version__,
+            "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+            "Python": platform.python_version(),
+            **observation.identity,
+        },
         "counters": observation.counters,
+        "checks": [asdict(check) for check in checks],
     }
-    templates = Path(__file__).parent / "field" / "templates"
-    shown = {name: counts[name] for name in ("pass", "warning", "fail")}
-    severity = ("fail", "warning", "pass")
-    first_failed = sorted(checks, key=lambda check: severity.index(check.verdict.value))
-    page = render_page(
-        "field_report.html.j2", templates, title=SOURCES[source], checks=first_failed, counts=shown, **values
-    )
-    (folder / "report.html").write_text(page, encoding="utf-8")
-    values["checks"] = [asdict(check) for check in checks]
-    (folder / "report.json").write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     truth = Truth(observation.distance_m, "LOS", "field report")
+    (folder / "report.html").write_text(
+        _page(SOURCES[source], observation, truth, checks, values), encoding="utf-8"
+    )
+    (folder / "report.json").write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     with BagWriter(folder / "ranges.mcap", {"source": "field report", "simulated": "unknown"}) as bag:
         for measured in observation.ranges:
             bag.write(Record(measured, truth))
+
+
+def _page(
+    title: str, observation: Observation, truth: Truth, checks: list[Check], values: dict[str, Any]
+) -> str:
+    """Return the page: checks, figures of the viewer, properties of the system."""
+    from markupsafe import Markup
+
+    from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status
+    from uwb_mitigation.types.ros.codec import measurement_key
+    from uwb_mitigation.viewer.feed import SceneUpdater
+    from uwb_mitigation.viewer.models import FIGURES
+    from uwb_mitigation.viewer.report import draw_scene, render_report
+    from uwb_mitigation.viewer.scene import Scene
+    from uwb_mitigation.viewer.state import View
+
+    feed = SceneUpdater(Scene(), Lock())
+    for measured, corrected in zip_longest(observation.ranges, observation.corrected):
+        key, raw_m = measurement_key(measured), measured.range_m
+        shown = corrected or CorrectedRange(raw_m, raw_m, 0.0, math.nan, Status.NO_CIR, CorrectedBy.HOST, 0)
+        feed.measurement(measured)
+        feed.truth(key, truth)
+        feed.corrected(key, shown)
+    figures = draw_scene(View(feed.scene, feed.lock)).figures
+    counts = Counter(check.verdict.value for check in checks)
+    severity = ("fail", "warning", "pass")
+    lines = [
+        f"{counts['fail']} failed, {counts['warning']} warning{'s' * (counts['warning'] != 1)}, {counts['pass']} passed.",
+        f"{values['date']}; {values['ranges']} ranges at {observation.distance_m:.2f} m in {observation.seconds:.0f} s.",
+        Markup(
+            "Please attach the zip file with this page to an issue of type <em>Field report</em>, also if checks failed. The file "
+            "contains this page, the ranges with their CIRs, the release of the kernel, and of UCI boards the raw bytes and the "
+            "device information. It contains no host name, user name or path."
+        ),
+    ]
+    rows = [
+        (check.name, check.verdict.value, check.value, check.limit, check.remedy)
+        for check in sorted(checks, key=lambda check: severity.index(check.verdict.value))
+    ]
+    parts: dict[str, Any] = {"Checks": [("check", "result", "value", "limit", "what to do"), *rows]}
+    parts |= {FIGURES[name]: figures[name] for name in ("strip", "errors", "cir", "waterfall")}
+    for heading, name in (("System", "system"), ("Counters of the driver", "counters")):
+        parts[heading] = [("name", "value"), *values[name].items()]
+    return render_report(f"Field report: {title}", lines, parts)
 
 
 def _pack(folder: Path, output: Path) -> None:

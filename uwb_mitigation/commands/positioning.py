@@ -75,6 +75,9 @@ def track(
         Path | None,
         typer.Option(metavar="FILE", help="Also write an HTML page: verdict, map, errors over time."),
     ] = None,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also draw a map of the tracks (needs matplotlib).")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -111,7 +114,7 @@ def track(
     show_models(corrector.used)
     several = len(recorded.tags) > 1
     tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
-    check_replaceable((*tum_files.values(), *([report] if report else [])), force)
+    check_replaceable((*tum_files.values(), *filter(None, (report, png))), force)
     origin = {"source": f"track of {bag.name}", "simulated": "false"}
     with BagWriter(output, origin, force=force) as out, console.progress() as bar:
         task, number = bar.add_task("tracking", total=len(recorded.tags)), itertools.count()
@@ -133,10 +136,17 @@ def track(
     for tracked in tracks if tum is not None else []:
         write_atomically(tum_files[tracked.recording.tag_id], tum_text(tracked.smoothed))
     if report is not None:
-        from uwb_mitigation.viewer.report import write_report
+        from uwb_mitigation.viewer.recorded_report import write_report
 
         write_report(report, bag, config, lambda: mitigation(settings), stamp_offset)
         print_line(f"Wrote {report}.")
+    if png is not None:
+        from uwb_mitigation.commands.offline.tracks import Tracks
+
+        picture = Tracks(tracks, config.anchors, ()).plot().get_figure(root=True)
+        assert picture is not None
+        picture.savefig(png, dpi=150, format="png")
+        print_line(f"Wrote {png}.")
     console.write_json(json, _result(tracks, recorded), {"held_out": residuals})
 
 

@@ -96,10 +96,9 @@ def view(
     )
     lock = Lock()
     anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
-    players, scenes, threads = [], [], []
-    for path in (bag, second):
-        if path is None:
-            continue
+    paths = [bag] if second is None else [bag, second]
+    players, threads = [], []
+    for path in paths:
         feed = SceneUpdater(Scene(), lock)
         player = BagPlayer(path, feed, partial(mitigation, settings), namespace)
         if anchor_map is not None:
@@ -111,21 +110,11 @@ def view(
         config = None if anchor_map is None else read_config(path, anchor_map, settings, console.warn)
         threads.append(player.index(config, stamp_offset))
         players.append(player)
-        scenes.append(feed.scene)
     first = players[0]
-    names = bag.resolve().name
-    if second is not None:
-        first.companion = players[1]
-        names += f" and {second.resolve().name}"
-    shown = View(
-        scenes[0],
-        lock,
-        title=names,
-        player=first,
-        second=scenes[1] if second is not None else None,
-        plan=None if floor_plan is None else load_floor_plan(floor_plan),
-        missing=first.missing,
-    )
+    first.companion = None if second is None else players[1]
+    names = " and ".join(path.resolve().name for path in paths)
+    plan = None if floor_plan is None else load_floor_plan(floor_plan)
+    shown = View(first.scene, lock, title=names, player=first, plan=plan, missing=first.missing)
     secret = secrets.token_urlsafe(16) if token else ""
     with ViewerServer(shown, host, port, tuple(origins or ()), secret) as server:
         if server.warning:

@@ -17,7 +17,7 @@ from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 from visualization_msgs.msg import MarkerArray
@@ -38,12 +38,7 @@ from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
 # Best effort: a publisher must not wait for a display.
-_QOS = QoSProfile(
-    reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=5000,
-)
+_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 MAX_BATCH = 500
 """Maximum number of ranges of a topic that are read at once, so that pages are served while many wait."""

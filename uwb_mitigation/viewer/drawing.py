@@ -11,23 +11,26 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
-from uwb_mitigation.types.measurement import FAULTS, Status
+from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Status
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.headline import WHOLE
+from uwb_mitigation.viewer.headline import WHOLE, live_positions, recorded_positions
+from uwb_mitigation.viewer.histories import (
+    HISTORY_S,
+    MAX_RANGE_M,
+    NO_DATA_S,
+    RATE_RANGES,
+    WATERFALL,
+    History,
+    Sample,
+    Trace,
+)
 from uwb_mitigation.viewer.models import FADING, TRACE_AFTER, TRACE_BEFORE
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import (
     CELL_M,
     ERROR_EDGES_M,
-    HISTORY_S,
-    MAX_RANGE_M,
-    NO_DATA_S,
-    WATERFALL,
-    History,
     Pose,
-    Sample,
     Scene,
-    Trace,
     count_errors,
     finite_or_zero,
     plain_tag_id,
@@ -69,6 +72,9 @@ class Figures:
         self._draw_strip(scene, history)
         self._draw_trace(scene, () if history is None else tuple(history.traces))
         self._draw_errors(scene)
+        self._draw_history(scene, history)
+        self._draw_positions(scene)
+        self._draw_timeline()
 
     def draw_map(self, scene: Scene) -> None:
         models = self._models
@@ -117,8 +123,10 @@ class Figures:
     def _draw_tracks(self, scene: Scene) -> None:
         models, second = self._models, self._view.second
         for kind, sources in models.tracks.items():
-            origin, origin_kind = (second, TrackKind.CORRECTED) if kind is TrackKind.SECOND else (scene, kind)
-            tracks = [] if origin is None else [
+            origin, origin_kind = scene, kind
+            if kind is TrackKind.SECOND and second is not None:
+                origin, origin_kind = second.scene, TrackKind.CORRECTED
+            tracks = [
                 view for (_, track_kind), view in origin.tracks.items() if track_kind is origin_kind and len(view.points)
             ]  # fmt: skip
             state = [(len(view.points), view.points[-1][0], math.floor(scene.age_s(view))) for view in tracks]
@@ -256,7 +264,7 @@ class Figures:
             triples = [(sample.raw_m, sample.range_m, sample.true_m) for sample in samples]
             values = list(np.array(triples, np.float64).reshape(-1, 3).T)
             statuses = np.array([float(sample.status) for sample in samples])
-        other = None if second is None or pair is None else second.pairs.get(pair)
+        other = None if second is None or pair is None else second.scene.pairs.get(pair)
         ranges = {round(sample.time_s, 6): sample.range_m for sample in other.samples} if other else {}
         compared = np.array([ranges.get(round(stamp_s, 6), math.nan) for stamp_s in stamps.tolist()])
         table = np.column_stack([stamps - now_s, *values, compared])
@@ -291,9 +299,8 @@ class Figures:
         set_rows(models.marks, [marks])
 
     def _draw_errors(self, scene: Scene) -> None:
-        player = self._player
-        timeline = None if player is None else player.timeline
-        second = None if player is None or player.companion is None else player.companion.timeline
+        player, timeline = self._player, self._view.timeline
+        second = None if self._view.second is None else self._view.second.timeline
         end_s = math.inf if player is None or self._state.window == WHOLE else player.position_s
         live_errors = scene.errors if timeline is None else -1
         if not self._state.changed("errors", (live_errors, end_s, second is None)):
@@ -305,7 +312,55 @@ class Figures:
         compared = counts if second is None else count_errors(second.range_errors(begin_s, end_s))
         columns = zip(("raw", "corrected", "second"), (*counts.astype(float), compared[1]), strict=True)
         self._models.show_empty("errors", "" if counts.any() else "No true ranges.")
-        self._models.errors.data = dict(columns) | {"left": ERROR_EDGES_M[:-1], "right": ERROR_EDGES_M[1:]}
+        data = dict(columns) | {"left": ERROR_EDGES_M[:-1], "right": ERROR_EDGES_M[1:]}
+        for kind in ("raw", "corrected", "second"):
+            data[f"{kind}_share"] = 100.0 * np.cumsum(data[kind]) / max(data[kind].sum(), 1.0)
+        self._models.errors.data = data
+
+    def _draw_timeline(self) -> None:
+        """Draw the mean errors of the recordings."""
+        models = self._models
+        for player, source in ((self._player, models.timeline), (self._view.second, models.second_timeline)):
+            if player is not None and player.timeline is not None and self._state.changed(source.name, True):
+                columns = player.timeline.mean_errors(player.seconds)
+                columns["second"] = columns["corrected"]
+                source.data = {name: columns[name] for name in source.data}
+
+    def _draw_history(self, scene: Scene, history: History | None) -> None:
+        samples = () if history is None else tuple(history.samples)
+        # All of it moves every second.
+        now_s = scene.now_s(self._state.tag_id)
+        if not self._state.changed(
+            "history", (self._state.selected, len(samples), int(finite_or_zero(now_s)))
+        ):
+            return
+        rows = [(one.time_s - now_s, drawable(one.residual_m), one.interval_s, one.gap_db) for one in samples]
+        age_s, residual_m, interval_s, gap_db = np.array(rows, np.float64).reshape(-1, 4).T
+        is_nlos = np.where(np.isfinite(gap_db), gap_db >= LINE_OF_SIGHT_DB, np.nan)
+        rate_hz, nlos = 1.0 / _rolling_mean(interval_s), 100.0 * _rolling_mean(is_nlos)
+        table = _thin(np.column_stack([age_s, residual_m, rate_hz, nlos]), MAX_POINTS)
+        table = with_gaps(table, NO_DATA_S if history is None else history.max_gap_s)
+        none = "No residuals of this pair yet."
+        self._models.fill(
+            "history", self._models.history, table, "" if np.isfinite(table[:, 1]).any() else none
+        )
+
+    def _draw_positions(self, scene: Scene) -> None:
+        """Draw the errors of the positions of the selected tag, with two standard deviations."""
+        timeline, tag_id = self._view.timeline, self._state.tag_id
+        is_complete = timeline is not None and timeline.is_complete
+        second = math.floor(scene.clock()) if self._player is None else -1
+        if not self._state.changed("positions", (tag_id, is_complete, second)):
+            return
+        table = np.zeros((0, 3))
+        if timeline is not None and is_complete:
+            table = recorded_positions(timeline, tag_id).error_columns()
+        elif self._player is None:
+            table = live_positions(scene, tag_id).error_columns()
+            table[:, 0] -= table[-1:, 0]
+        message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
+        table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S)
+        self._models.fill("positions", self._models.positions, table, message)
 
 
 def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:
@@ -319,6 +374,18 @@ def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.u
             level = 1.0 + np.log10(np.maximum(magnitude / peak, 1e-2)) / 2.0
             image[row, low - begin : high - begin] = (255.0 * level).astype(np.uint8)
     return image
+
+
+def _rolling_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the means of the last `RATE_RANGES` known values, float64 (n,); NaN: there is none."""
+    known = np.isfinite(values)
+    window = np.ones(RATE_RANGES)
+    sums, counts = (
+        np.convolve(column, window)[: len(values)] if len(values) else values
+        for column in (np.where(known, values, 0.0), known.astype(np.float64))
+    )
+    mean: NDArray[np.float64] = np.divide(sums, counts, out=np.full(len(values), np.nan), where=counts > 0.0)
+    return mean
 
 
 def _thin(rows: NDArray[np.float64], limit: int = MAX_POINTS) -> NDArray[np.float64]:

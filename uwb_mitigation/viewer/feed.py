@@ -20,24 +20,23 @@ from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.types.ros import topics
-from uwb_mitigation.types.ros.codec import MeasurementKey, decode_corrected, decode_range, decode_truth
+from uwb_mitigation.types.ros.codec import (
+    MeasurementKey,
+    decode_corrected,
+    decode_range,
+    decode_truth,
+    measurement_key,
+)
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
+from uwb_mitigation.viewer.histories import BoundedDict, Sample, Trace
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import (
-    DEFAULT_TAG,
-    MAX_TRUTHS,
-    MAX_WITHOUT_TRUTH,
-    AnchorPosition,
-    BoundedDict,
-    NodeStatus,
-    Pose,
-    Sample,
-    Scene,
-    Trace,
-)
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, AnchorPosition, NodeStatus, Pose, Scene
 
 DIAGNOSTICS = "/diagnostics"
+
+MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
+"""Truths and CIRs without corrected ranges, and corrected ranges without truths, that are kept."""
 
 DECODERS: dict[str, Callable[[bytes], Any]] = {
     topics.RANGE_RAW: decode_range,
@@ -63,7 +62,7 @@ class SceneUpdater:
         self.lock = lock
         self._adders: dict[str, Callable[[str, Any], None]] = {
             topics.RANGE_RAW: lambda _, measurement: self.measurement(measurement),
-            topics.RANGE_TRUTH: lambda _, decoded: self._truth(*decoded),
+            topics.RANGE_TRUTH: lambda _, decoded: self.truth(*decoded),
             topics.RANGE_CORRECTED: lambda _, decoded: self.corrected(*decoded),
             topics.POSE: self._pose,
             topics.ODOMETRY: self._pose,
@@ -73,11 +72,13 @@ class SceneUpdater:
             DIAGNOSTICS: lambda _, message: self._diagnostics(message),
         }
         self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
+        self._gaps_db: BoundedDict[MeasurementKey, float] = BoundedDict(MAX_TRUTHS)
         self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
         self._truths.clear()
+        self._gaps_db.clear()
         self._without_truth.clear()
         with self.lock:
             self.scene.clear()
@@ -104,10 +105,11 @@ class SceneUpdater:
     def measurement(self, measurement: RangeMeasurement) -> None:
         trace = Trace.from_cir(measurement.cir)
         if trace is not None:
+            self._gaps_db.add(measurement_key(measurement), measurement.cir.power_gap_db)
             with self.lock:
                 self.scene.add_trace((measurement.anchor_id, measurement.tag_id), trace)
 
-    def _truth(self, key: MeasurementKey, truth: Truth) -> None:
+    def truth(self, key: MeasurementKey, truth: Truth) -> None:
         if (sample := self._without_truth.pop(key, None)) is None:
             self._truths.add(key, truth)
             return
@@ -117,6 +119,7 @@ class SceneUpdater:
     def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
         sample = Sample.from_corrected(key.stamp_ns / 1e9, corrected, truth)
+        sample.gap_db = self._gaps_db.pop(key, math.nan)
         with self.lock:
             pair = key.anchor_id, key.tag_id
             self.scene.add_sample(pair, sample)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Track, TruePath
+from uwb_mitigation.viewer.histories import HISTORY_S, Pair
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, HISTORY_S, Pair, Scene, tag_label, tag_name
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, Scene, tag_label, tag_name
 
 if TYPE_CHECKING:
     # A live page reads no recordings.
@@ -40,13 +41,6 @@ def _track(columns: NDArray[np.float64]) -> Track:
     return Track(stamp_ns, columns[:, 1:4], np.zeros((n, 3)), np.full((n, 6, 6), np.nan))
 
 
-def current_card(timeline: Timeline, tag_id: int | None, position_s: float) -> list[Card]:
-    """Return the figure of a recording at a position of the player; empty before its index is complete."""
-    if not timeline.is_complete:
-        return []
-    return _Positions(timeline.tracks, tag_id, timeline.losses, timeline.estimates).current_card(position_s)
-
-
 def interval_cards(
     timeline: Timeline, second: Timeline | None, tag_id: int | None, window: str, position_s: float
 ) -> list[Card]:
@@ -63,9 +57,9 @@ def interval_cards(
     cards = []
     if timeline.is_complete:
         raw_name = "raw + same filter" if timeline.estimates else "raw + locator with default settings"
-        positions = _Positions(timeline.tracks, tag_id, timeline.losses, timeline.estimates)
+        positions = recorded_positions(timeline, tag_id)
         if second is not None and second.is_complete:
-            positions.second = _Positions(second.tracks, tag_id, second.losses, second.estimates)
+            positions.second = recorded_positions(second, tag_id)
         cards = positions.interval_cards(interval, window, raw_name)
     errors_m = dict(zip(("raw", ""), timeline.range_errors(*interval), strict=True))
     if second is not None:
@@ -77,8 +71,7 @@ def interval_cards(
 
 def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
     """Return the figures of live topics."""
-    tracks = {key: view.columns() for key, view in scene.tracks.items() if len(view.points)}
-    positions = _Positions(tracks, tag_id, scene.pairs)
+    positions = live_positions(scene, tag_id)
     now_s = math.nan
     if view := scene.tracks.get((positions.name, TrackKind.CORRECTED)):
         now_s = view.points[-1][0] + scene.age_s(view)
@@ -88,6 +81,17 @@ def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
     return cards + _range_cards(
         {"raw": means_m[0], "": means_m[1]}, scene.corrected, scene.faults, scene.ranges, LIVE
     )
+
+
+def live_positions(scene: Scene, tag_id: int | None) -> Positions:
+    """Return the positions of a tag from topics."""
+    tracks = {key: view.columns() for key, view in scene.tracks.items() if len(view.points)}
+    return Positions(tracks, tag_id, scene.pairs)
+
+
+def recorded_positions(timeline: Timeline, tag_id: int | None) -> Positions:
+    """Return the positions of a tag in a recording whose index is complete."""
+    return Positions(timeline.tracks, tag_id, timeline.losses, timeline.estimates)
 
 
 def _range_cards(
@@ -109,7 +113,7 @@ def _range_cards(
     return [not_ok_card, [f"Mean absolute range error, {window}", mean_m, references]]
 
 
-class _Positions:
+class Positions:
     """The positions of one tag.
 
     Args:
@@ -135,7 +139,7 @@ class _Positions:
         self._names = [name for name, kind in tracks if kind is TrackKind.CORRECTED]
         self.name = next(iter(self._names), "") if tag_id is None else tag_name(tag_id, self._names, pairs)
         self.label = tag_label(self.name or DEFAULT_TAG, tag_id)
-        self.second: _Positions | None = None
+        self.second: Positions | None = None
         self._estimated = estimates.get(self.name)
 
     def track(self, kind: TrackKind) -> NDArray[np.float64] | None:
@@ -146,20 +150,34 @@ class _Positions:
         is_single = len(true) == len(self._names) == 1
         return next(iter(true.values())) if is_single else true.get(self.label.replace(" ", "_"))
 
-    def errors(self, kind: TrackKind, interval: tuple[float, float], latest: bool = False) -> TrackErrors:
-        """Return the errors of a track in an interval, or of its latest position there."""
+    def _compared(self, kind: TrackKind, rows: slice) -> tuple[Track, TruePath] | None:
+        """Return a part of a track and the true path; None: one of them is unknown."""
         columns, true = self.track(kind), self.track(TrackKind.TRUE)
         if columns is None or true is None:
-            return NO_ERRORS
-        begin, end = np.searchsorted(columns[:, 0], interval, side="right").tolist()
-        rows = slice(max(begin, end - 1) if latest else begin, end)
+            return None
         if self._estimated is not None and len(self._estimated.recording.truth):
             # Exact stamps: the same figures as those of `track`.
-            return track_errors(
-                getattr(self._estimated, _ATTRIBUTES[kind]).take(rows), self._estimated.recording.truth
-            )
+            return getattr(self._estimated, _ATTRIBUTES[kind]).take(rows), self._estimated.recording.truth
         path = _track(true)
-        return track_errors(_track(columns[rows]), TruePath(path.stamp_ns, path.position * (1.0, 1.0, 0.0)))
+        return _track(columns[rows]), TruePath(path.stamp_ns, path.position * (1.0, 1.0, 0.0))
+
+    def errors(self, kind: TrackKind, interval: tuple[float, float], latest: bool = False) -> TrackErrors:
+        """Return the errors of a track in an interval, or of its latest position there."""
+        if (columns := self.track(kind)) is None:
+            return NO_ERRORS
+        begin, end = np.searchsorted(columns[:, 0], interval, side="right").tolist()
+        compared = self._compared(kind, slice(max(begin, end - 1) if latest else begin, end))
+        return NO_ERRORS if compared is None else track_errors(*compared)
+
+    def error_columns(self) -> NDArray[np.float64]:
+        """Return time (s), horizontal error and two standard deviations (m) of each position, float64 (n, 3); NaN: unknown."""
+        if (columns := self.track(TrackKind.CORRECTED)) is None:
+            return np.zeros((0, 3))
+        error_m = np.full(len(columns), np.nan)
+        if (compared := self._compared(TrackKind.CORRECTED, slice(None))) is not None:
+            track, truth = compared
+            error_m = np.linalg.norm((track.position - truth.position_at(track.stamp_ns))[:, :2], axis=1)
+        return np.column_stack([columns[:, 0], error_m, 2.0 * columns[:, 4]])
 
     def current_card(self, position_s: float) -> list[Card]:
         """Return the figure of the latest position."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
-from uwb_mitigation.viewer.scene import Pair
+from uwb_mitigation.viewer.histories import Pair
 
 LONG_M, VERY_LONG_M = 0.15, 0.3
 """Mean residuals that need attention, and that spoil positions."""

@@ -9,6 +9,7 @@ import math
 from collections import defaultdict
 from typing import Any
 
+import numpy as np
 from bokeh.core.properties import Any as AnyValue
 from bokeh.model import DataModel
 from bokeh.models import (
@@ -17,18 +18,24 @@ from bokeh.models import (
     ColumnDataSource,
     DataRange1d,
     FixedTicker,
+    HoverTool,
     Legend,
     LegendItem,
+    Line,
+    LinearAxis,
     LinearColorMapper,
+    Quad,
     Range1d,
 )
 from bokeh.palettes import cividis
 from bokeh.plotting import figure
 from bokeh.transform import factor_mark
+from numpy.typing import NDArray
 
 from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.headline import WHOLE
 from uwb_mitigation.viewer.health import BAD, CHECK, GOOD, STATES, STEPS_M, UNKNOWN
+from uwb_mitigation.viewer.histories import HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
 from uwb_mitigation.viewer.palette import (
     BLUE,
     GREEN,
@@ -41,7 +48,7 @@ from uwb_mitigation.viewer.palette import (
     VERMILLION,
     TrackKind,
 )
-from uwb_mitigation.viewer.scene import CELL_M, ERROR_EDGES_M, HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
+from uwb_mitigation.viewer.scene import CELL_M, ERROR_EDGES_M
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180
 """Number of samples shown before and after the first path."""
@@ -75,10 +82,13 @@ COLUMNS = {
 FIGURES = {
     "map": "Map",
     "strip": f"Range, last {HISTORY_S:.0f} s",
-    "timeline": f"Error over time, {WHOLE}",
+    "history": f"Residual, rate and NLOS share, last {HISTORY_S:.0f} s",
+    "timeline": f"Range error over time, {WHOLE}",
+    "positions": "Position error over time",
     "cir": "Last CIR",
     "waterfall": f"Last {WATERFALL} CIRs",
     "errors": "Error histogram",
+    "distribution": "Cumulative distribution of the errors",
 }
 """Names and headings of the figures."""
 
@@ -185,21 +195,32 @@ class Models:
         self.trace = _source("CIR", "sample", "magnitude")
         self.marks = _source("marks", "noise", "first", "from", "to")
         self.waterfall = _source("", "image")
-        self.errors = _source("histogram", "left", "right", "raw", "corrected", "second")
+        kinds = [kind.name.lower() for kind in _LIVE]
+        self.errors = _source("histogram", "left", "right", *kinds, *(f"{kind}_share" for kind in kinds))
+        self.history = _source("residuals", "age", "residual", "rate", "NLOS")
+        self.positions = _source("position errors", "time", "error", "bound")
         self.timeline = _source("mean errors", "time", "raw", "corrected")
         self.second_timeline = _source("mean errors of the second recording", "time", "second")
         self.position = _source("", "time")
         # A figure without data has no axis ranges: invisible corners define them until data arrives.
-        self.corners = {name: _source("", "corner_x", "corner_y") for name in ("cir", "strip", "errors")}
+        self.corners = {
+            name: _source("", "corner_x", "corner_y")
+            for name in ("cir", "strip", "history", "positions", "errors")
+        }
         self.layers: dict[str, list[Any]] = {}
-        self.figures = {"map": self._map(plan), "strip": self._strip(), "cir": self._cir()}
-        self.figures |= {"waterfall": self._waterfall(), "errors": self._errors()}
+        self.figures = {
+            "map": self._map(plan), "strip": self._strip(), "history": self._history(), "cir": self._cir(),
+            "waterfall": self._waterfall(), "errors": self._errors(), "distribution": self._distribution(),
+            "positions": self._positions(seconds is not None),
+        }  # fmt: skip
         if seconds is not None:
             self.figures["timeline"] = self._timeline(seconds)
         for name, plot in self.figures.items():
             plot.name = name
         for name, corners in self.corners.items():
             self.figures[name].scatter("corner_x", "corner_y", source=corners, size=0, alpha=0)
+        history = self.figures["history"]
+        history.y_range.renderers = [part for part in history.renderers if part.y_range_name == "default"]
 
     @property
     def roots(self) -> list[Any]:
@@ -212,6 +233,13 @@ class Models:
             self.corners[name].data = {"corner_x": corners, "corner_y": corners}
         if self.controls.empty.get(name) != message:
             self.controls.empty = self.controls.empty | {name: message}
+
+    def fill(self, name: str, source: ColumnDataSource, table: NDArray[np.float64], message: str) -> None:
+        """Set the columns of a figure, which at no moment has neither data nor corners."""
+        if message:
+            self.show_empty(name, message)
+        source.data = dict(zip(source.data, table.T.astype(np.float32), strict=True))
+        self.show_empty(name, message)
 
     def update_legend(self) -> None:
         """Show the entries of the map's legend that the map contains."""
@@ -256,11 +284,14 @@ class Models:
         for name, glyph, source, style in self._map_layers(plan is not None):
             items[name].append(getattr(plot, glyph)("x", style.pop("y", "y"), source=source, **style))
         del items[""]
+        named = items["anchor"] + items["tag"]
+        plot.add_tools(HoverTool(tooltips=[("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")], renderers=named))
         self.layers["circles"] = items["raw range"] + items["corrected range"]
         self.layers["heat"] = [*items["mean correction"], bars[0]]
         legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
         self._legend = Legend(items=[LegendItem(label=legend[name], renderers=items[name]) for name in items])
-        return _with_legend(plot, self._legend, "below")
+        plot.add_layout(self._legend, "below")
+        return _finished(plot)
 
     def _map_layers(self, has_plan: bool) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
         """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
@@ -310,34 +341,56 @@ class Models:
         ]  # fmt: skip
 
     def _strip(self) -> figure:
-        plot = _figure(230, "time before now, s", "m", x_range=Range1d(-HISTORY_S, 0))
-        self._lines(plot, self.strip, "age", *self._kinds, TrackKind.TRUE)
+        plot = _figure(230, _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
+        names = self._lines(plot, self.strip, "age", *self._kinds, TrackKind.TRUE)
         plot.scatter("age", "corrected", source=self.bad, size=8, legend_field="status", **self._symbols)
-        return _with_legend(plot)
+        return _finished(plot, "age", *names)
+
+    def _history(self) -> figure:
+        plot = _figure(230, _AGE, "residual, m", x_range=Range1d(-HISTORY_S, 0))
+        plot.extra_y_ranges = {"share": Range1d(0, 100)}
+        plot.add_layout(LinearAxis(y_range_name="share", axis_label="rate, Hz; NLOS, %"), "right")
+        for name, colour, dash, axis in (
+            ("residual", BLUE, "solid", "default"), ("rate", GREY, "dashed", "share"), ("NLOS", VERMILLION, "dotted", "share"),
+        ):  # fmt: skip
+            style = {"line_color": colour, "line_dash": dash, "line_width": 2, "y_range_name": axis}
+            plot.line("age", name, source=self.history, legend_label=name, **style)
+        return _finished(plot, "age", "residual", "rate", "NLOS")
+
+    def _positions(self, is_recording: bool) -> figure:
+        plot = _figure(230, _TIME if is_recording else _AGE, "m")
+        style = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
+        plot.varea("time", 0, "bound", source=self.positions, **style)
+        style = {"line_color": NIGHT, "line_width": 1.5, "legend_label": "error"}
+        plot.line("time", "error", source=self.positions, **style)
+        return _finished(plot, "time", "error", "bound")
 
     def _timeline(self, seconds: float) -> figure:
-        plot = _figure(170, "time in the recording, s", "mean |error|, m")
-        plot.x_range, plot.y_range = Range1d(0.0, max(seconds, 0.1)), DataRange1d(start=0.0)
-        self._lines(plot, self.timeline, "time", *_LIVE[:2])
+        plot = _figure(230, _TIME, "mean |error|, m", x_range=Range1d(0.0, max(seconds, 0.1)))
+        plot.y_range = DataRange1d(start=0.0)
+        names = self._lines(plot, self.timeline, "time", *_LIVE[:2])
         self._lines(plot, self.second_timeline, "time", *self._kinds[2:])
         plot.vspan("time", source=self.position, line_color=NIGHT, line_width=2)
-        return _with_legend(plot)
+        return _finished(plot, "time", *names)
 
-    def _lines(self, plot: figure, source: ColumnDataSource, x: str, *kinds: TrackKind) -> None:
-        for kind in kinds:
-            plot.line(x, kind.name.lower(), source=source, legend_label=kind.value, **_stroke(kind))
+    def _lines(
+        self, plot: figure, source: ColumnDataSource, x: str, *kinds: TrackKind, suffix: str = ""
+    ) -> list[str]:
+        """Draw lines of a source; return their columns."""
+        names = [kind.name.lower() + suffix for kind in kinds]
+        for kind, name in zip(kinds, names, strict=True):
+            plot.line(x, name, source=source, legend_label=kind.value, **_stroke(kind))
+        return names
 
     def _cir(self) -> figure:
         plot = _figure(230, _SAMPLES, "magnitude", x_range=_trace_range())
-        plot.vstrip(
-            "from", "to", source=self.marks, fill_color=GREEN, fill_alpha=0.15, line_color=None, legend_label="network input"
-        )  # fmt: skip
-        plot.line(
-            "sample", "magnitude", source=self.trace, line_color=BLUE, line_width=1.2, legend_label="CIR"
-        )
+        style = {"fill_color": GREEN, "fill_alpha": 0.15, "line_color": None, "legend_label": "network input"}
+        plot.vstrip("from", "to", source=self.marks, **style)
+        style = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
+        plot.line("sample", "magnitude", source=self.trace, **style)
         plot.vspan("first", source=self.marks, line_color=VERMILLION, line_width=2, legend_label="first path")
         plot.hspan("noise", source=self.marks, line_color=GREY, line_dash="dashed", legend_label="noise")
-        return _with_legend(plot)
+        return _finished(plot, "sample", "magnitude")
 
     def _waterfall(self) -> figure:
         plot = _figure(230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0))
@@ -365,10 +418,17 @@ class Models:
                 left="left", right="right", bottom=0, top=kind.name.lower(), source=self.errors, color=colour, fill_alpha=0.35,
                 hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
             )  # fmt: skip
-        return _with_legend(plot)
+        return _finished(plot, "left", "right", *(kind.name.lower() for kind in self._kinds))
+
+    def _distribution(self) -> figure:
+        plot = _figure(230, "measured - true, m", "share of ranges, %", y_range=Range1d(0, 100))
+        plot.x_range = Range1d(float(ERROR_EDGES_M[0]), float(ERROR_EDGES_M[-1]))
+        names = self._lines(plot, self.errors, "right", *self._kinds, suffix="_share")
+        return _finished(plot, "right", *names)
 
 
-_SAMPLES = "samples (1 ns) from the first path"
+_SAMPLES, _AGE = "samples (1 ns) from the first path", "time before now, s"
+_TIME = "time in the recording, s"
 
 
 def _trace_range() -> Range1d:
@@ -399,12 +459,17 @@ def _colour_bar(mapper: LinearColorMapper, **options: Any) -> ColorBar:
     return ColorBar(color_mapper=mapper, width=10, padding=4, **colours, **options)
 
 
-def _with_legend(plot: figure, legend: Legend | None = None, side: str = "above") -> figure:
-    """Put the legend next to the plot, where it covers no data."""
-    legend = legend or plot.legend[0]
-    plot.add_layout(legend, side)
-    legend.update(
-        orientation="horizontal", label_text_font_size="11px", padding=0, margin=0, spacing=8, location="left",
-        border_line_color=None,
-    )  # fmt: skip
+def _finished(plot: figure, *columns: str) -> figure:
+    """Put the legend next to the plot, where it covers no data; show values of columns next to the pointer."""
+    if columns:
+        tips = [(name.replace("_", " "), f"@{name}{{0.000}}") for name in columns]
+        first = [part for part in plot.renderers if isinstance(part.glyph, (Line, Quad))][:1]
+        plot.add_tools(HoverTool(tooltips=tips, mode="vline", renderers=first))
+    for legend in plot.legend:
+        if legend in plot.center:
+            plot.add_layout(legend, "above")
+        legend.update(
+            orientation="horizontal", label_text_font_size="11px", padding=0, margin=0, spacing=8, location="left",
+            border_line_color=None,
+        )  # fmt: skip
     return plot

@@ -17,9 +17,10 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.drawing import Figures
 from uwb_mitigation.viewer.headline import LIVE, RECENT, WHOLE
+from uwb_mitigation.viewer.histories import Pair
 from uwb_mitigation.viewer.models import COLUMNS, FIGURES, Models
 from uwb_mitigation.viewer.palette import STATUS_LOOKS
-from uwb_mitigation.viewer.scene import SPEEDS, Pair, Scene
+from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import PageState, View
 from uwb_mitigation.viewer.texts import Texts
 
@@ -81,7 +82,7 @@ class Page:
             states=health.STATES,
             figures={name: FIGURES[name] for name in FIGURES if name in models.figures},
             looks=STATUS_LOOKS,
-            speeds=SPEEDS,
+            speeds=player and player.SPEEDS,
             trails={
                 f"{seconds:g}": "all" if math.isinf(seconds) else f"{seconds:g} s" for seconds in TRAILS_S
             },
@@ -117,7 +118,10 @@ class Page:
         """Update every model from the scene, and number the update if anything has changed."""
         self._draw_player()
         player, scene = self._player, self._view.scene
-        position = None if player is None else (player.shown_s, player.is_behind, player.timeline is None)
+        position = None
+        if player is not None:
+            is_indexed = self._view.second is not None and self._view.second.timeline is not None
+            position = player.shown_s, player.is_behind, player.timeline is None, is_indexed
         with self._view.lock:
             # Ages change without data; drawing them once a second is enough.
             state = scene.revision, self._state.selected, math.floor(scene.clock()), position
@@ -176,8 +180,7 @@ class Page:
         )  # fmt: skip
         if self._state.changed("position", position_s):
             models.position.data = {"time": [position_s]}
-        if (timeline := player.timeline) is not None and self._state.changed("timeline", True):
-            models.timeline.data = timeline.mean_errors(player.seconds)
+        if (timeline := player.timeline) is not None and self._state.changed("marks", True):
             relative = timeline.log_s / max(player.seconds, 1e-9)
             largest = timeline.largest_error()
             self._state.set(
@@ -188,14 +191,6 @@ class Page:
                     "truth": bool(np.isfinite(timeline.true_m).any()),
                 }
             )
-        second = player.companion
-        if (
-            second is not None
-            and second.timeline is not None
-            and self._state.changed("second_timeline", True)
-        ):
-            columns = second.timeline.mean_errors(second.seconds)
-            models.second_timeline.data = {"time": columns["time"], "second": columns["corrected"]}
 
     # Events ---------------------------------------------------------------------------------------------------
 

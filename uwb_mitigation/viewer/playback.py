@@ -25,9 +25,10 @@ from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.histories import HISTORY_S, Pair
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording
-from uwb_mitigation.viewer.scene import HISTORY_S, MAX_MESSAGES, SPEEDS, MissingData, NodeStatus, Pair
+from uwb_mitigation.viewer.scene import MissingData, NodeStatus
 from uwb_mitigation.viewer.timeline import BATCH, Timeline, index_recording
 
 READ_S = 0.15
@@ -35,6 +36,9 @@ READ_S = 0.15
 
 MAX_STEP_S = 1.0
 """If no page was open for longer than this, playing continues from the last position."""
+
+MAX_MESSAGES = 3000
+"""Read at a seek; older ones are skipped."""
 
 POSE_PERIOD_S = 0.1
 """Recorded time between two positions of a tag."""
@@ -59,14 +63,18 @@ class BagPlayer:
         timeline: index of the recording; None: not ready.
         is_behind: whether the messages up to the position have not been read yet.
         companion: player of another recording of the same drive, which follows this one.
+        scene: scene of `feed`.
         missing: messages for the page on data that the bag does not contain.
         models: number of ranges that `index` corrected, by choice of the model.
     """
 
+    SPEEDS = 0.5, 1.0, 2.0, 5.0, 10.0, 50.0
+    """Recorded seconds per second."""
+
     def __init__(
         self, path: Path, feed: SceneUpdater, backend: Callable[[], Corrector], namespace: str | None = None
     ) -> None:
-        self._feed, self._new_backend = feed, backend
+        self._feed, self._new_backend, self.scene = feed, backend, feed.scene
         self._recording = recording = Recording(path, namespace)
         self.seconds, self.corrects = recording.seconds, recording.corrects
         self.position_s, self.speed, self.playing = 0.0, 1.0, False
@@ -130,14 +138,12 @@ class BagPlayer:
             self.play(bool(arguments[0]))
         elif name == "seek" and math.isfinite(position_s := float(arguments[0])):
             self.seek(position_s)
-        elif name == "speed" and float(arguments[0]) in SPEEDS:
+        elif name == "speed" and float(arguments[0]) in self.SPEEDS:
             self.speed = float(arguments[0])
         elif name == "step":
             self.step()
-        elif name == "next_bad" and self.timeline is not None:
-            return self.jump(self.timeline.next_bad(self.position_s))
-        elif name == "previous_bad" and self.timeline is not None:
-            return self.jump(self.timeline.previous_bad(self.position_s))
+        elif name in ("next_bad", "previous_bad") and self.timeline is not None:
+            return self.jump(self.timeline.bad_row(self.position_s, is_next=name == "next_bad"))
         elif name == "largest" and self.timeline is not None:
             return self.jump(self.timeline.largest_error())
         return None

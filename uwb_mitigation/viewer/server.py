@@ -8,7 +8,6 @@ import logging
 import secrets
 import socket
 import threading
-from concurrent.futures import Future
 from typing import Any
 from urllib.parse import quote, unquote
 
@@ -64,19 +63,19 @@ class ViewerServer:
         origins: tuple[str, ...] = (),
         token: str = "",
     ) -> None:
-        self._loop: IOLoop | None = None
-        outcome: Future[int] = Future()
-        self._thread = threading.Thread(
-            target=self._run, args=(outcome, view, host, port, origins, token), name="viewer", daemon=True
-        )
-        self._thread.start()
         try:
-            self.port = outcome.result()
+            sockets, self.port = bind_sockets("" if host in ALL_ADDRESSES else host, port)
         except (OSError, ValueError) as error:
             raise ParameterError(
                 f"the page cannot be served at {host}:{port}: {error}",
                 valid="a free port, and a name or an address of this machine",
             ) from error
+        application = _Application(view, accepted_hosts(host, self.port, origins), token)
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(
+            target=self._run, args=(application, sockets), name="viewer", daemon=True
+        )
+        self._thread.start()
         name = _bracketed("localhost" if host in ALL_ADDRESSES else host)
         self.url = f"http://{name}:{self.port}/" + (f"?token={quote(token)}" if token else "")
         self.warning = ""
@@ -88,9 +87,8 @@ class ViewerServer:
 
     def close(self) -> None:
         """Stop serving; may be called twice."""
-        loop, self._loop = self._loop, None
-        if loop is not None:
-            loop.add_callback(loop.stop)
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
 
     def __enter__(self) -> ViewerServer:
@@ -99,35 +97,21 @@ class ViewerServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _run(
-        self, outcome: Future[int], view: View, host: str, port: int, origins: tuple[str, ...], token: str
-    ) -> None:
-        asyncio.set_event_loop(asyncio.new_event_loop())
+    def _run(self, application: _Application, sockets: list[socket.socket]) -> None:
+        asyncio.set_event_loop(self._loop)
         # Bokeh warns if a tab is closed while data is sent to it.
         logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
-        loop = IOLoop.current()
-        sockets = []
-        try:
-            sockets, port = bind_sockets("" if host in ALL_ADDRESSES else host, port)
-            application = _Application(view, accepted_hosts(host, port, origins), token)
-            http = HTTPServer(application)
-            http.add_sockets(sockets)
-            server = BaseServer(loop, application, http)
-        except Exception as error:
-            for listening in sockets:
-                listening.close()
-            outcome.set_exception(error)
-            return
-        self._loop = loop
+        http = HTTPServer(application)
+        http.add_sockets(sockets)
+        server = BaseServer(IOLoop.current(), application, http)
         server.start()
-        loop.add_callback(outcome.set_result, port)
         try:
-            loop.start()
+            self._loop.run_forever()
         finally:
             server.unlisten()
             server.stop()
             # Also close its connections, so that the pages detect it immediately.
-            loop.close(all_fds=True)
+            IOLoop.current().close(all_fds=True)
 
 
 class _Application(BokehTornado):  # type: ignore[misc]

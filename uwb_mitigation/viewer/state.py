@@ -11,8 +11,9 @@ from bokeh.models import ColumnDataSource
 
 from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.headline import RECENT, WHOLE
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, History, Pair
 from uwb_mitigation.viewer.models import Models
-from uwb_mitigation.viewer.scene import MAX_RANGE_M, History, MissingData, Pair, Scene
+from uwb_mitigation.viewer.scene import MissingData, Scene
 from uwb_mitigation.viewer.verdict import HeldVerdict
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ class View:
         lock: held while the scene is changed or drawn.
         window: number of samples that the network reads.
         player: player of a recording; None: live.
-        second: scene of the second recording; None: there is only one.
         plan: floor plan; None: unknown.
         missing: the reasons for an empty page.
         pages: number of open pages.
@@ -39,7 +39,6 @@ class View:
     title: str = "UWB ranges"
     window: int = 157
     player: BagPlayer | None = None
-    second: Scene | None = None
     plan: MapImage | None = None
     missing: MissingData = field(default_factory=MissingData)
     pages: int = 0
@@ -48,6 +47,11 @@ class View:
     def timeline(self) -> Timeline | None:
         """The index of the recording; None: live, or not ready."""
         return None if self.player is None else self.player.timeline
+
+    @property
+    def second(self) -> BagPlayer | None:
+        """The player of the second recording; None: there is only one."""
+        return None if self.player is None else self.player.companion
 
 
 class PageState:

@@ -11,8 +11,9 @@ import numpy as np
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.determination import UNKNOWN_POSITION
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.headline import RECENT, Card, current_card, interval_cards, live_cards
-from uwb_mitigation.viewer.scene import NO_DATA_S, Pair, Scene, plain_tag_id, tag_label, tag_name
+from uwb_mitigation.viewer.headline import RECENT, Card, interval_cards, live_cards, recorded_positions
+from uwb_mitigation.viewer.histories import NO_DATA_S, Pair
+from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
 from uwb_mitigation.viewer.state import PageState, no_data, set_rows
 from uwb_mitigation.viewer.verdict import UNDETERMINED, WAITING, Verdict, verdict
 
@@ -89,7 +90,8 @@ class Texts:
             if timeline is not None and pair in timeline.losses:
                 lost, received = timeline.losses[pair]
                 means["lost"] = 100.0 * lost / max(lost + received, 1)
-            compared = None if second is None or pair not in second.pairs else second.pairs[pair].latest
+            other = None if second is None else second.scene.pairs.get(pair)
+            compared = None if other is None else other.latest
             pairs[pair] = means
             rows.append(means | {
                 "anchor": format_id(pair[0]), "tag": format_id(pair[1]), "state": self._health(pair, means),
@@ -146,12 +148,15 @@ class Texts:
             return self._interval_cards
         if timeline is None:
             return [["Reading the recording ...", "", ""]]
-        second = None if player.companion is None else player.companion.timeline
+        second = None if self._view.second is None else self._view.second.timeline
         position_s = player.shown_s if state.window == RECENT else 0.0
         is_complete = timeline.is_complete, second is not None and second.is_complete
         if state.changed("cards", (state.window, state.tag_id, position_s, second is None, *is_complete)):
             self._interval_cards = interval_cards(timeline, second, state.tag_id, state.window, position_s)
-        return current_card(timeline, state.tag_id, player.shown_s) + self._interval_cards
+        if not timeline.is_complete:
+            return self._interval_cards
+        positions = recorded_positions(timeline, state.tag_id)
+        return positions.current_card(player.shown_s) + self._interval_cards
 
     def _summary(self, scene: Scene) -> str:
         """Return time and counts."""

@@ -35,18 +35,10 @@ from uwb_mitigation.types.ros.topics import (
 )
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Track, TruePath
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, BoundedDict, Pair
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
-from uwb_mitigation.viewer.scene import (
-    MAX_CELLS,
-    MAX_RANGE_M,
-    MAX_TAGS,
-    BoundedDict,
-    Pair,
-    add_heat,
-    tag_name,
-    with_gaps,
-)
+from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_TAGS, add_heat, tag_name, with_gaps
 
 MAX_STAMP_S = 1.0
 """If stamp and log time of a message differ by more, its time is the log time."""
@@ -122,15 +114,11 @@ class Timeline:
     def pair(self, row: int) -> Pair:
         return int(self.anchor[row]), int(self.tag[row])
 
-    def next_bad(self, position_s: float) -> int | None:
-        """Return the row of the first range after a position whose status is not OK."""
-        rows = np.flatnonzero(self.bad & (self.log_s > position_s + 1e-6))
-        return int(rows[0]) if len(rows) else None
-
-    def previous_bad(self, position_s: float) -> int | None:
-        """Return the row of the last range before a position whose status is not OK."""
-        rows = np.flatnonzero(self.bad & (self.log_s < position_s - 2e-6))
-        return int(rows[-1]) if len(rows) else None
+    def bad_row(self, position_s: float, is_next: bool) -> int | None:
+        """Return the row of the next or previous range whose status needs attention; None: there is none."""
+        is_there = self.log_s > position_s + 1e-6 if is_next else self.log_s < position_s - 2e-6
+        rows = np.flatnonzero(self.bad & is_there)
+        return int(rows[0 if is_next else -1]) if len(rows) else None
 
     def largest_error(self) -> int | None:
         """Return the row of the range with the largest `deviation_m`; None: nothing deviates."""

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.scene import NO_DATA_S, Scene
+from uwb_mitigation.viewer.histories import NO_DATA_S
+from uwb_mitigation.viewer.scene import Scene
 
 GOOD, DEGRADED, LOST, UNDETERMINED, WAITING = "good", "degraded", "lost", "not determined", "no data yet"
 MAX_SD_M = 0.5

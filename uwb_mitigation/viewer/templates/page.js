@@ -45,16 +45,17 @@ function start(doc) {
   setInterval(showAge, 200);
 
   // Texts.
-  const tableRows = (rows) => rows.map((texts) => {
-    const row = document.createElement("tr");
-    for (const text of texts) row.insertCell().textContent = text;
-    return row;
-  });
-  on("cards", () => $("cards").replaceChildren(...controls.cards.map((texts) => {
-    const card = document.createElement("div");
-    texts.forEach((text, i) => { card.append(document.createElement(["span", "strong", "span"][i])); card.children[i].textContent = text; });
-    return card;
-  })));
+  const element = (tag, children) => {
+    const made = document.createElement(tag);
+    made.append(...[children].flat());
+    return made;
+  };
+  const texts = (id, name, make) => on(name, () => $(id).replaceChildren(...controls[name].map(make)));
+  for (const [id, name] of [["tags", "tag_rows"], ["health", "health"], ["nodes", "nodes"]])
+    texts(id, name, (cells) => element("tr", cells.map((text) => element("td", text))));
+  texts("events", "incidents", (text) => element("li", text));
+  texts("notice", "notice", (text) => element("div", text));
+  texts("cards", "cards", (lines) => element("div", lines.map((text, i) => element(i === 1 ? "strong" : "span", text))));
   on("verdict", () => {
     const [state, reason, action, facts] = controls.verdict, box = $("verdict");
     if (!state) return;
@@ -62,33 +63,18 @@ function start(doc) {
     [`Position ${state}${reason ? `: ${reason}` : ""}`, action, facts].forEach((text, i) => setText(box.children[i], text));
   });
   on("available", () => { for (const [id, is] of Object.entries(controls.available)) if ($(id)) $(id).disabled = !is; });
-  on("tag_rows", () => $("tags").replaceChildren(...tableRows(controls.tag_rows)));
-  on("incidents", () => $("events").replaceChildren(...controls.incidents.map((text) => {
-    const item = document.createElement("li");
-    item.textContent = text;
-    return item;
-  })));
-  on("health", () => $("health").replaceChildren(...tableRows(controls.health)));
   on("summary", () => setText($("summary"), controls.summary));
-  on("notice", () => $("notice").replaceChildren(...controls.notice.map((line) => {
-    const div = document.createElement("div");
-    div.textContent = line;
-    return div;
-  })));
-  on("nodes", () => $("nodes").replaceChildren(...tableRows(controls.nodes)));
 
   // Pairs: rows are kept, so that a click or the focus survives an update.
   const body = $("pairs").tBodies[0], rows = new Map();
   const fields = [...$("pairs").querySelectorAll("[data-sort]")].map((button) => button.dataset.sort);
   let sort = "pair", descending = false;
-  const makeRow = (data, i) => {
-    const row = document.createElement("tr"), pick = document.createElement("button");
-    for (const field of fields) row.insertCell().className = {pair: "pair", state: "text state", status: "text"}[field] ?? "";
+  const makeRow = (pair) => {
+    const pick = element("button", pair.join(", ")), row = element("tr", fields.map(() => element("td", [])));
     pick.type = "button";
-    pick.textContent = `${data.anchor[i]}, ${data.tag[i]}`;
-    pick.setAttribute("aria-label", `Select anchor ${data.anchor[i]}, tag ${data.tag[i]}`);
-    const pair = [data.anchor[i], data.tag[i]];
+    pick.setAttribute("aria-label", `Select anchor ${pair[0]}, tag ${pair[1]}`);
     row.addEventListener("click", () => send("select", ...pair));
+    fields.forEach((field, cell) => { row.cells[cell].className = {pair: "pair", state: "text state", status: "text"}[field] ?? ""; });
     row.cells[0].append(pick);
     return row;
   };
@@ -102,7 +88,7 @@ function start(doc) {
     shown.sort((a, b) => (descending ? -1 : 1) * compare(value(a), value(b)) || a - b);
     const drawn = shown.map((i) => {
       const key = `${data.anchor[i]} ${data.tag[i]}`;
-      if (!rows.has(key)) rows.set(key, makeRow(data, i));
+      if (!rows.has(key)) rows.set(key, makeRow([data.anchor[i], data.tag[i]]));
       const row = rows.get(key);
       const selected = controls.selected?.join(" ") === key;
       row.className = `${data.no_data[i] ? "no-data" : ""} ${selected ? "selected" : ""}`;
@@ -128,7 +114,7 @@ function start(doc) {
   body.addEventListener("pointerdown", () => { pressed = true; });
   for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { pressed = false; setTimeout(drawPairs); });
   source.properties.data.change.connect(updatePairs);
-  const titles = ["strip", "cir", "waterfall"].map((name) => [$(`${name}-title`), $(`${name}-title`).textContent]);
+  const titles = ["strip", "history", "cir", "waterfall"].map((name) => [$(`${name}-title`), $(`${name}-title`).textContent]);
   on("selected", () => {
     drawPairs();
     const [anchor, tag] = controls.selected ?? [];
@@ -207,29 +193,10 @@ function start(doc) {
     legend(figure).ncols = Math.max(2, Math.floor(width / (figure === map ? 140 : 110)));
   }).observe($(figure.name));
 
-  // Values at a click or tap: the nearest point of the first line or bar, and the values of all others there.
-  for (const figure of figures) if (figure.name !== "waterfall") $(figure.name).addEventListener("click", (event) => {
-    const view = Bokeh.index.find_one(figure), box = view.el.getBoundingClientRect(), {x_scale, y_scale, bbox} = view.frame;
-    const at = [event.clientX - box.left, event.clientY - box.top];
-    if (!bbox.contains(...at)) return;
-    const [x, y] = [x_scale.invert(at[0]), y_scale.invert(at[1])], show = (text) => setText($(`${figure.name}-values`), text);
-    if (figure === map) {
-      const data = map.renderers.map((r) => r.data_source).find((s) => "id" in s.data).data;
-      const i = data.id.findIndex((_, i) => Math.hypot(x_scale.compute(data.x[i]) - at[0], y_scale.compute(data.y[i]) - at[1]) < 15);
-      if (i >= 0) send("select_anchor", data.id[i]);
-      return show(`x ${number(x, 2)} m, y ${number(y, 2)} m`);
-    }
-    const parts = [];
-    for (const {label: {value}, renderers: [{glyph, data_source: {data}}]} of legend(figure).items) {
-      if (glyph.type !== "Line" && glyph.type !== "Quad") continue;
-      const bar = glyph.type === "Quad", xs = data[(bar ? glyph.left : glyph.x).field], ys = data[(bar ? glyph.top : glyph.y).field];
-      if (!xs.length) continue;
-      let best = 0;
-      for (let i = 1; i < xs.length; i++) if (bar ? xs[i] <= x : Math.abs(xs[i] - x) < Math.abs(xs[best] - x)) best = i;
-      if (!parts.length) parts.push(`${number(xs[best], 2)}${bar ? ` to ${number(data.right[best], 2)}` : ""} (${figure.below.find((part) => part.axis_label).axis_label})`);
-      parts.push(`${value} ${number(ys[best], bar ? 0 : 3)}`);
-    }
-    show(parts.join("; ") || "No data.");
+  $("map").addEventListener("click", (event) => {
+    const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = anchors.data;
+    const i = id.findIndex((_, i) => Math.hypot(x_scale.compute(x[i]) - event.clientX + box.left, y_scale.compute(y[i]) - event.clientY + box.top) < 15);
+    if (i >= 0) send("select_anchor", id[i]);
   });
 
   const titleErrors = () => setText($("errors-title"), `Range errors, ${$("window")?.value ?? "since the start"}`);
