@@ -196,11 +196,11 @@ def _page(
         (check.name, check.verdict.value, check.value, check.limit, check.remedy)
         for check in sorted(checks, key=lambda check: severity.index(check.verdict.value))
     ]
-    parts: dict[str, Any] = {"Checks": [("check", "result", "value", "limit", "what to do"), *rows]}
-    parts |= {FIGURES[name]: figures[name] for name in ("strip", "errors", "cir", "waterfall")}
+    sections: dict[str, Any] = {"Checks": [("check", "result", "value", "limit", "what to do"), *rows]}
+    sections |= {FIGURES[name]: figures[name] for name in ("strip", "errors", "cir", "waterfall")}
     for heading, name in (("System", "system"), ("Counters of the driver", "counters")):
-        parts[heading] = [("name", "value"), *values[name].items()]
-    return render_report(f"Field report: {title}", lines, parts)
+        sections[heading] = [("name", "value"), *values[name].items()]
+    return render_report(f"Field report: {title}", lines, sections)
 
 
 def _pack(folder: Path, output: Path) -> None:

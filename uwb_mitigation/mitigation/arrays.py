@@ -94,11 +94,11 @@ def _checked_samples(cir: Any) -> NDArray[Any]:
         valid = "(n, m) samples: `cir[None]` for one range, `i + 1j * q` for pairs"
         raise ParameterError(f"cir of shape {samples.shape}", valid=valid)
     if np.isrealobj(samples) and samples.size:
-        parts = [samples[start : start + _ROWS] for start in range(0, len(samples), _ROWS)]
-        if all((part < 0).any(axis=1).all() for part in parts):
+        blocks = [samples[start : start + _ROWS] for start in range(0, len(samples), _ROWS)]
+        if all((block < 0).any(axis=1).all() for block in blocks):
             valid = f"complex samples: `i + 1j * q`, or {LINEAR_MAGNITUDES}"
             raise ParameterError("every row of the real cir has negative samples", valid=valid)
-        if 2 * sum(np.count_nonzero(is_logarithmic(part)) for part in parts) > len(samples):
+        if 2 * sum(np.count_nonzero(is_logarithmic(block)) for block in blocks) > len(samples):
             raise ParameterError("the cir is in dB", valid=LINEAR_MAGNITUDES)
     return samples
 

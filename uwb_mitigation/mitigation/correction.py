@@ -255,8 +255,8 @@ class Corrector:
             ParameterError: the shapes are inconsistent, all magnitudes are negative, most are in dB, most ranges are longer
                 than a radio reaches, all first paths are outside of the CIRs, or a field is unknown.
         """
-        parts = columns_of_arrays(range_m, cir, first_path_index, **fields)
-        return CorrectedColumns.joined([self.correct_columns(part) for part in parts])
+        chunks = columns_of_arrays(range_m, cir, first_path_index, **fields)
+        return CorrectedColumns.joined([self.correct_columns(chunk) for chunk in chunks])
 
 
 def pass_through(

@@ -213,7 +213,7 @@ class LineSession:
     def opened(self, now_ns: int) -> None:
         """Begin with a port that was opened."""
         self.received = 0
-        self._rest, self._rest_stamp_ns = b"", 0
+        self._incomplete, self._incomplete_stamp_ns = b"", 0
         # The port may be opened in the middle of a line.
         self._is_partial = not self._has_datagrams
         self._outgoing, self._answer = b"", b""
@@ -233,19 +233,19 @@ class LineSession:
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
         """Return the ranges of the lines that are complete; the stamp of a line is that of its first byte."""
         self.received += len(data)
-        *lines, rest = re.split(
-            rb"[\r\n]", self._rest + data + (b"\n" if data and self._has_datagrams else b"")
+        *lines, incomplete = re.split(
+            rb"[\r\n]", self._incomplete + data + (b"\n" if data and self._has_datagrams else b"")
         )
-        stamps_ns = [self._rest_stamp_ns or stamp_ns] + [stamp_ns] * len(lines)
-        self._rest, self._rest_stamp_ns = rest, stamps_ns[len(lines)] if rest else 0
+        stamps_ns = [self._incomplete_stamp_ns or stamp_ns] + [stamp_ns] * len(lines)
+        self._incomplete, self._incomplete_stamp_ns = incomplete, stamps_ns[len(lines)] if incomplete else 0
         measurements: list[RangeMeasurement] = []
         for line, line_stamp_ns in zip(lines, stamps_ns, strict=False):
             if not self._is_partial and line.strip():
                 measurements += self._read(line.decode("utf-8", "replace").strip(), line_stamp_ns)
             self._is_partial = False
-        if len(rest) > MAX_LINE:
+        if len(incomplete) > MAX_LINE:
             self.counts[_TOO_LONG] += not self._is_partial
-            self._rest, self._rest_stamp_ns, self._is_partial = b"", 0, True
+            self._incomplete, self._incomplete_stamp_ns, self._is_partial = b"", 0, True
         if self._start is not None:
             self._converse(data, now_ns, bool(measurements))
         return measurements

@@ -430,12 +430,12 @@ class CorrectedColumns:
         return np.array([reason(*row) for row in zip(*(c.tolist() for c in columns), strict=True)], np.str_)
 
     @classmethod
-    def joined(cls, parts: Sequence[CorrectedColumns]) -> CorrectedColumns:
+    def joined(cls, chunks: Sequence[CorrectedColumns]) -> CorrectedColumns:
         """Concatenate ranges of one origin."""
         columns: dict[str, Any] = {
-            column.name: parts[0].origin
+            column.name: chunks[0].origin
             if column.name == "origin"
-            else np.concatenate([getattr(part, column.name) for part in parts])
+            else np.concatenate([getattr(chunk, column.name) for chunk in chunks])
             for column in fields(cls)
         }
         return cls(**columns)

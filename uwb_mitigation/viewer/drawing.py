@@ -334,7 +334,10 @@ class Figures:
             "history", (self._state.selected, len(samples), int(finite_or_zero(now_s)))
         ):
             return
-        rows = [(one.time_s - now_s, drawable(one.residual_m), one.interval_s, one.gap_db) for one in samples]
+        rows = [
+            (sample.time_s - now_s, drawable(sample.residual_m), sample.interval_s, sample.gap_db)
+            for sample in samples
+        ]
         age_s, residual_m, interval_s, gap_db = np.array(rows, np.float64).reshape(-1, 4).T
         is_nlos = np.where(np.isfinite(gap_db), gap_db >= LINE_OF_SIGHT_DB, np.nan)
         rate_hz, nlos = 1.0 / _rolling_mean(interval_s), 100.0 * _rolling_mean(is_nlos)
@@ -378,11 +381,11 @@ def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.u
 
 def _rolling_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the means of the last `RATE_RANGES` known values, float64 (n,); NaN: there is none."""
-    known = np.isfinite(values)
+    is_finite = np.isfinite(values)
     window = np.ones(RATE_RANGES)
     sums, counts = (
         np.convolve(column, window)[: len(values)] if len(values) else values
-        for column in (np.where(known, values, 0.0), known.astype(np.float64))
+        for column in (np.where(is_finite, values, 0.0), is_finite.astype(np.float64))
     )
     mean: NDArray[np.float64] = np.divide(sums, counts, out=np.full(len(values), np.nan), where=counts > 0.0)
     return mean

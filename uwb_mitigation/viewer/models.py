@@ -220,7 +220,9 @@ class Models:
         for name, corners in self.corners.items():
             self.figures[name].scatter("corner_x", "corner_y", source=corners, size=0, alpha=0)
         history = self.figures["history"]
-        history.y_range.renderers = [part for part in history.renderers if part.y_range_name == "default"]
+        history.y_range.renderers = [
+            renderer for renderer in history.renderers if renderer.y_range_name == "default"
+        ]
 
     @property
     def roots(self) -> list[Any]:
@@ -463,7 +465,7 @@ def _finished(plot: figure, *columns: str) -> figure:
     """Put the legend next to the plot, where it covers no data; show values of columns next to the pointer."""
     if columns:
         tips = [(name.replace("_", " "), f"@{name}{{0.000}}") for name in columns]
-        first = [part for part in plot.renderers if isinstance(part.glyph, (Line, Quad))][:1]
+        first = [renderer for renderer in plot.renderers if isinstance(renderer.glyph, (Line, Quad))][:1]
         plot.add_tools(HoverTool(tooltips=tips, mode="vline", renderers=first))
     for legend in plot.legend:
         if legend in plot.center:

@@ -50,10 +50,13 @@ def write_report(
     controls = models.controls
     state, reason, action, facts = controls.verdict
     lines = [f"Position {state}" + (f": {reason}. {action}" if reason else ""), facts, *controls.notice]
-    parts: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
-    parts |= {FIGURES[name]: models.figures[name] for name in SHOWN}
-    parts["Anchors at the end"] = [
+    sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
+    sections |= {FIGURES[name]: models.figures[name] for name in SHOWN}
+    sections["Anchors at the end"] = [
         ("state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"), *controls.health,
     ]  # fmt: skip
-    parts["Tags at the end"] = [("tag", "x, y, z, m", "\u03c3, m", "age", "ranges, Hz"), *controls.tag_rows]
-    write_atomically(path, render_report(bag.name, lines, parts))
+    sections["Tags at the end"] = [
+        ("tag", "x, y, z, m", "\u03c3, m", "age", "ranges, Hz"),
+        *controls.tag_rows,
+    ]
+    write_atomically(path, render_report(bag.name, lines, sections))

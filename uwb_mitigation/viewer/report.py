@@ -19,16 +19,16 @@ Rows = Sequence[Sequence[object]]
 """Rows of a table; the first one has the titles."""
 
 
-def render_report(title: str, lines: Sequence[str], parts: Mapping[str, figure | Rows]) -> str:
+def render_report(title: str, lines: Sequence[str], sections: Mapping[str, figure | Rows]) -> str:
     """Return an HTML page that needs no other file.
 
     Args:
         title: its heading.
         lines: paragraphs below it; text, or HTML as `markupsafe.Markup`.
-        parts: {heading: figure or table}, with at least one figure.
+        sections: {heading: figure or table}, with at least one figure.
     """
-    figures = [part for part in parts.values() if isinstance(part, figure)]
-    values = {"heading": title, "lines": lines, "parts": parts}
+    figures = [section for section in sections.values() if isinstance(section, figure)]
+    values = {"heading": title, "lines": lines, "sections": sections}
     template = TEMPLATES.get_template("report.html.j2")
     return str(file_html(figures, INLINE, title, template=template, template_variables=values))
 

@@ -153,9 +153,9 @@ def take_queued(subscription: Subscription, limit: int) -> Iterator[tuple[bytes,
     """
     take, kind = subscription.handle.take_message, subscription.msg_type
     for _ in range(limit):
-        if (taken := take(kind, True)) is None:
+        if (message := take(kind, True)) is None:
             return
-        data, info = taken
+        data, info = message
         yield data, info["publication_sequence_number"]
 
 

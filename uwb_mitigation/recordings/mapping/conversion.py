@@ -83,8 +83,8 @@ def take(columns: ColumnDict, rows: NDArray[Any]) -> ColumnDict:
         return columns
     count = int(np.count_nonzero(rows)) if rows.dtype == bool else len(rows)
     constant = [name for name, column in columns.items() if column.strides == (0,)]
-    taken = {name: np.broadcast_to(columns.pop(name)[:1], count) for name in constant}
-    return taken | {name: columns.pop(name)[rows] for name in list(columns)}
+    constants = {name: np.broadcast_to(columns.pop(name)[:1], count) for name in constant}
+    return constants | {name: columns.pop(name)[rows] for name in list(columns)}
 
 
 def measurement(columns: ColumnDict, row: int, cir: Cir, sequence: int) -> RangeMeasurement:
@@ -433,9 +433,9 @@ def impossible_rows(values: ColumnDict) -> dict[str, Mask]:
 
 def count_kept(rules: Mapping[str, Mask], count: int, dropped: Counter[str]) -> Mask:
     """Return which of `count` rows no rule drops, and count each other one with the first rule that drops it."""
-    kept = np.ones(count, bool)
+    is_kept = np.ones(count, bool)
     for reason, bad in rules.items():
-        if found := int(np.count_nonzero(bad & kept)):
+        if found := int(np.count_nonzero(bad & is_kept)):
             dropped[reason] += found
-        kept &= ~bad
-    return kept
+        is_kept &= ~bad
+    return is_kept
