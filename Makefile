@@ -30,7 +30,7 @@ test-fast: setup-training  ## the quick tests without ROS and torch: a minute on
 # More workers than processors: during most of a test, nodes wait for each other. The tests of a file share its fixtures.
 # A failed test is repeated, at most three in a run, and listed as RERUN: it has a race, which is a defect.
 test: setup-training  ## run all tests (COVERAGE=yes: with the coverage of the code)
-	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $$(($$(nproc) + 3)) --dist loadfile --no-loadscope-reorder -raR --reruns 1 --max-suite-reruns 3 \
+	@$(IN_ROS) $(VENV)/bin/python -m pytest -n $$(($$(nproc) + 3)) --dist loadfile --no-loadscope-reorder -raR --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks \
 	  $(if $(COVERAGE),--cov --cov-report=term:skip-covered)
 
 # The commands of a user with ROS 2; without ROS, .venv is used in place of /opt/ros/jazzy.
