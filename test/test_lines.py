@@ -117,7 +117,7 @@ def test_hostile_bytes_are_counted_and_the_next_line_is_read():
     assert session.counts["range is not a number"] + session.counts["range is above 10000"] == len(values)
     assert (session.counts["lines that do not match"], session.counts["lines that are too long"]) == (9, 1)
     assert session.example.startswith('\'{"tag": 1, "ranges": [')
-    assert len(session._rest) <= lines.MAX_LINE
+    assert len(session._incomplete) <= lines.MAX_LINE
 
 
 @pytest.mark.parametrize("name", MAPPINGS.values())
