@@ -128,6 +128,10 @@ def test_number_of_constant_errors_is_bounded():
         own_filter.predict(0.1 * time_s)
         own_filter.update(row, float(np.linalg.norm(anchors.position[row])), 0.01)
     assert len(own_filter.x) == FIRST_ERROR + len(anchors) + MAX_CONSTANT
+    # The latest ones have a state each.
+    latest = own_filter.state._constant_rows
+    assert list(latest) == list(range(4, len(anchors)))
+    assert len(set(latest.values())) == MAX_CONSTANT
     assert np.linalg.eigvalsh(own_filter.P).min() > -1e-9
 
 
