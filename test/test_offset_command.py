@@ -20,7 +20,7 @@ from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
-from uwb_mitigation.types.measurement import RadioType, Record, Segment
+from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.types.offsets import Offsets, parse_offsets
 
 NO_SAMPLES = np.empty(0, np.int16)
@@ -105,21 +105,23 @@ def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
 def test_nlos_is_refused_with_the_evidence(universal: Mitigation, direct: list[Record]):
     with pytest.raises(DatasetError, match=r"not line of sight: the first path is \d+\.\d dB below"):
         estimate_offset(universal, weaker_first_path(direct, 9.0), 3.0)
-    without_cir = [
-        replace(
-            record,
-            measurement=replace(record.measurement, cir=replace(record.measurement.cir, samples=NO_SAMPLES)),
-        )
-        for record in weaker_first_path(direct, float("nan"))
-    ]
-    with pytest.raises(DatasetError, match="the first-path power is unknown"):
-        estimate_offset(universal, without_cir, 3.0)
     with pytest.raises(DatasetError, match="check the distance"):
         estimate_offset(universal, longer(direct, 20.0), 3.0)
     with pytest.raises(DatasetError, match="only 5 ranges are in line of sight"):
         estimate_offset(universal, [direct[0]] * 5, 3.0)
     with pytest.raises(DatasetError, match="none of 20 ranges has a true distance"):
         estimate_offset(universal, [replace(record, truth=None) for record in direct[:20]])
+
+
+def test_distance_counts_without_levels_and_cirs_with_a_warning(tmp_path: Path):
+    """Boards that print their ranges have neither: the user saw that the radios stood in line of sight."""
+    with BagWriter(tmp_path / "los.mcap", {}) as out:
+        for number in range(20):
+            range_m = 5.25 + 0.01 * (number % 2)
+            out.write(Record(RangeMeasurement(10**8 * number, 1, 7, number, 0, range_m, Cir(NO_SAMPLES))))
+    outcome = command_line.succeed("offset los.mcap --distance 5", folder=tmp_path)
+    assert "offset 0.255 m" in outcome.stdout
+    assert "line of sight was not checked" in outcome.stderr
 
 
 def test_single_distance_needs_a_single_pair(universal: Mitigation, direct: list[Record]):

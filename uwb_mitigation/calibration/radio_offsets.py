@@ -204,7 +204,8 @@ def estimate_offset(
             predicted_m = _predicted_m(mitigation, measured, result)
             model = mitigation.bundles[mitigation.choose(CirKind.of(measured.cir)).model]
             gap_db = _power_gap_db(measured, Preprocessing(model.preprocessing.samples, Scaling.MAX))
-            is_los = _is_los(gap_db, None if truth is None or len(measured.cir) else truth.label)
+            label = None if len(measured.cir) else "" if truth is None else truth.label
+            is_los = _is_los(gap_db, label)
             offset_m = measured.range_m - predicted_m - true_m
             has_cirs |= len(measured.cir) > 0
             level_dbm = measured.cir.first_path_power_dbm
@@ -248,10 +249,10 @@ def _is_los(gap_db: float, label: str | None) -> float:
 
     Args:
         gap_db: receive level minus first-path level; NaN: unknown.
-        label: label of a surveyed range without a CIR, empty: none; None: any other range.
+        label: label of a range without a CIR, empty: none; None: the range has a CIR.
     """
     if label or (label is not None and math.isnan(gap_db)):
-        # Without a CIR the label decides, then the levels; surveyed ranges with neither are used.
+        # Without a CIR the label decides, then the levels; ranges with neither are used.
         return float(label in ("", "LOS"))
     return float(gap_db < LINE_OF_SIGHT_DB) if math.isfinite(gap_db) else math.nan
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path, PurePath
@@ -152,6 +153,9 @@ def _show(estimate: OffsetEstimate) -> None:
     for reason, count in rejected.items():
         if reason:
             warn(f"skipped: {count} placements: {reason} (each one: --json)")
+    unchecked = sum(math.isnan(row["power_gap_db"]) for row in accepted)
+    if unchecked:
+        warn(f"{unchecked} placements: the radio reports no levels, so line of sight was not checked")
     print_line(
         f"offset {estimate.offset_m:.3f} m, standard deviation {estimate.sd_m:.3f} m, from {estimate.ranges} ranges, "
         f"for model {estimate.model_id:08x}"

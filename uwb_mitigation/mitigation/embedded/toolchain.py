@@ -91,7 +91,7 @@ def compile_image(
         raise MissingDependencyError(
             "the boards of the firmware are not installed",
             where=str(boards),
-            valid="run from a source checkout",
+            valid="in a checkout: python3 -m uwb_mitigation.commands.cli board build-image",
         )
     common = boards / "cortex_m4"
     elf = build / f"{program.stem if program else board.value}_{kernels.value}.elf"
