@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 
 from uwb_mitigation.mitigation import early_path
-from uwb_mitigation.mitigation.model.bundle import Session
-from uwb_mitigation.mitigation.model.shipped import load_model
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.simulation.buildings import RADIO, WIDE_SHARE
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.simulated import block_dataset
@@ -24,7 +24,7 @@ FALSE_SHARES = (0.0, 0.02, 0.05)
 
 if __name__ == "__main__":
     early_path.SEARCH_TAPS = LONGEST_TAPS
-    bundle = load_model()
+    bundle = load_bundle(default_model_path())
     for share in FALSE_SHARES:
         radio = replace(RADIO, false_peak_share=share)
         blocks = [block_dataset(SEED, bundle.preprocessing, radio, WIDE_SHARE, n) for n in range(BLOCKS)]
