@@ -52,6 +52,9 @@ MOVING = 0.1
 SITES = range(10, 20)
 """Seeds of the simulated sites; lower ones are for development."""
 
+KINDS, KIND_SEEDS = ("site_gains", "plasterboard", "open_hall", "drone_room"), range(10, 14)
+"""Drives with CIRs of other boards and in other rooms, and their seeds."""
+
 DRONES = range(10, 16)
 GEOMETRY_SEEDS = (10, 11)
 """Seeds of the drives in layouts of real deployments; lower ones are for development."""
@@ -143,6 +146,9 @@ def simulated_runs() -> list[RunSource]:
     sites = [
         RunSource("site", str(seed), "load_site", (seed, 1), RunSource("", "", "load_site", (seed, 0)))
         for seed in SITES
+    ]
+    sites += [
+        RunSource(kind, str(seed), "load_site", (seed, 1, kind)) for kind in KINDS for seed in KIND_SEEDS
     ]
     drones = [
         RunSource("drone" + "_height" * height, str(seed), "load_drone", (seed, height))
@@ -342,9 +348,9 @@ def load_flat(set_name: str, name: str, anchors: int, drive: int) -> Run:
     return simulated_run(set_name, name, source)
 
 
-def load_site(set_name: str, name: str, seed: int, drive: int) -> Run:
-    """Return a drive at a random site with 4 to 8 anchors, whose radios have offsets."""
-    return simulated_run(set_name, name, Drive(seed, drive, 4 + seed % 5, 120.0))
+def load_site(set_name: str, name: str, seed: int, drive: int, kind: str = "site") -> Run:
+    """Return a drive of a `kind` of `Drive` with 4 to 8 anchors, whose radios have offsets."""
+    return simulated_run(set_name, name, Drive(seed, drive, 4 + seed % 5, 120.0, kind))
 
 
 def simulated_run(set_name: str, name: str, source: SimulatedSource | Drive) -> Run:

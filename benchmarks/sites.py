@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from uwb_mitigation.simulation.buildings import KINDS, RADIO, RESIDENTIAL, draw_plan, mean_level_dbm
+from uwb_mitigation.simulation.buildings import (
+    INDUSTRIAL,
+    KINDS,
+    RADIO,
+    RESIDENTIAL,
+    draw_plan,
+    mean_level_dbm,
+    mean_powers_db,
+)
 from uwb_mitigation.simulation.odometry import SimulatedMotion
 from uwb_mitigation.simulation.scene import (
     ANCHORS,
@@ -61,6 +69,15 @@ FLATS = {"open": replace(FLAT, walls=(), screens=())} | {
     for material, thickness_m in ((PLASTERBOARD, 0.025), (BRICK, 0.12), (CONCRETE, 0.20))
 }
 """The flat of the simulator with inner walls of one material, and without walls and obstacles."""
+
+ROOMS = {"open_hall": Building((24.0, 16.0)), "drone_room": Building((7.0, 6.0))}
+"""Rooms without obstacles."""
+
+DRONE_RADIO, DRONE_SLOW_M, DRONE_LENGTH_M = replace(RADIO, timestamp_std_m=0.06), 0.05, 0.5
+"""White noise of ranges to drones; standard deviation and length of errors that change with their position. 80 % of the variance are white."""
+
+GAIN_DB, ANCHOR_GAIN_DB = 5.0, 3.0
+"""Other boards at `site_gains`: common gain, whose sign alternates with the seed, and bound of the additional gains of the anchors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,34 +189,42 @@ def _received_share(plan: Building, anchor: Point, cells: NDArray[np.float64]) -
     n = len(cells)
     boards = RADIO.boards(n)
     here = np.tile(anchor, (n, 1))
-    level = mean_level_dbm(RESIDENTIAL, here, cells, plan.direct_path(here, cells), boards)
-    return float((level >= RADIO.sensitivities_dbm(boards)).mean())
+    powers = mean_powers_db(RESIDENTIAL, here, cells, plan.direct_path(here, cells))
+    return float((mean_level_dbm(*powers, boards) >= RADIO.sensitivities_dbm(boards)).mean())
 
 
 class Drive:
     """A drive at a simulated site; a `Source` whose pairs have offsets.
 
     Args:
-        flat: the flat of the simulator, also with other walls, instead of a random building.
+        kind: "site", a random building; "site_gains", the same with other boards; or one of `FLATS` or `ROOMS`.
     """
 
     simulated = True
 
-    def __init__(
-        self, seed: int, drive: int, anchors: int, seconds: float, flat: Building | None = None
-    ) -> None:
+    def __init__(self, seed: int, drive: int, anchors: int, seconds: float, kind: str = "site") -> None:
         rng = np.random.default_rng(UNSEEN + seed)
         self.offset_m = 0.2 + rng.normal(0.0, 0.12, anchors)
-        if flat is not None:
-            plan, places = flat, (ANCHORS + MORE_ANCHORS)[:anchors]
+        if kind in FLATS:
+            plan, places = FLATS[kind], (ANCHORS + MORE_ANCHORS)[:anchors]
             route = ROUTE[drive * 5 :] + ROUTE[: drive * 5]
         else:
-            site = draw_site(anchors, rng)
+            if kind in ROOMS:
+                room = ROOMS[kind]
+                site = Site(room, _along_walls(room.size, anchors, rng), *_free(room))
+            else:
+                site = draw_site(anchors, rng)
             plan, places = site.plan, site.anchors
             route = site.route(np.random.default_rng([UNSEEN + seed, drive]))
+        self._slow_m = DRONE_SLOW_M * (kind == "drone_room")
+        self._waves = rng.normal(0.0, 1.0 / DRONE_LENGTH_M, (anchors, 2))
+        gains_db = np.zeros(anchors)
+        if kind == "site_gains":
+            gains_db = (-1) ** seed * GAIN_DB + rng.uniform(-ANCHOR_GAIN_DB, ANCHOR_GAIN_DB, anchors)
         self._inner = SimulatedSource(
             seed=seed * 1000 + drive, count=round(seconds * RATE_HZ), rate_hz=RATE_HZ,
-            anchors=places, plan=plan, radio=RADIO, route=route,
+            anchors=places, plan=plan, radio=DRONE_RADIO if kind == "drone_room" else RADIO, route=route,
+            environments=INDUSTRIAL if kind == "open_hall" else RESIDENTIAL, gains_db=gains_db.tolist(),
         )  # fmt: skip
         self.plan = plan
         self.anchors: AnchorMap = self._inner.anchors
@@ -213,4 +238,7 @@ class Drive:
         for record in self._inner:
             measured = record.measurement
             off = float(self.offset_m[measured.anchor_id - 1])
+            if self._slow_m:
+                angle = self._waves[measured.anchor_id - 1] @ record.tag_position[:2]
+                off += self._slow_m * math.sqrt(2.0) * math.sin(angle)
             yield replace(record, measurement=replace(measured, range_m=measured.range_m + off))

@@ -81,7 +81,7 @@ def plot_raw_and_corrected() -> None:
         for screen in plan.screens:
             axes.plot(*zip(screen.start, screen.end, strict=True), color=GREY, lw=3, ls=(0, (2, 1)))
         axes.add_patch(Rectangle((0, 0), *plan.size, fill=False, color=GREY, lw=3))
-        drive = Drive(SHOWN_SEED, 0, 6, SHOWN_S, plan)
+        drive = Drive(SHOWN_SEED, 0, 6, SHOWN_S, building)
         run = simulated_run(building, "", drive)
         offsets = Offsets(anchors={anchor: float(m) for anchor, m in enumerate(drive.offset_m, 1)})
         raw = replace(

@@ -25,7 +25,7 @@ SEEDS = range(900, 906)
 
 def evaluate(building: str, anchors: int, seed: int) -> list[float]:
     """Return the RMSE of raw and of corrected ranges of a drive: as measured, calibrated, and with odometry."""
-    drive = Drive(seed, seed % 4, anchors, 60.0, FLATS[building])
+    drive = Drive(seed, seed % 4, anchors, 60.0, building)
     run = simulated_run(building, str(seed), drive)
     begin_ns = int(run.ranges.stamp_ns[0]) + round(WARM_UP_S * NS_PER_S)
     truth = run.truth.take(run.truth.stamp_ns >= begin_ns)

@@ -285,36 +285,26 @@ def _conditions(
     radio: Receiver,
 ) -> NDArray[np.int64]:
     """Predict the condition of each candidate from mean levels."""
-    direct, diffuse = _mean_powers_db(environments, anchor, tag, path)
-    is_detected = radio.direct_margin_db(direct, diffuse, boards) > 0
+    powers = mean_powers_db(environments, anchor, tag, path)
+    is_detected = radio.direct_margin_db(*powers, boards) > 0
     condition = np.where(path.crossings == 0, LOS, np.where(is_detected, NLOS, NDP_NLOS))
-    level = mean_level_dbm(environments, anchor, tag, path, boards, radio)
-    condition[level < radio.sensitivities_dbm(boards)] = WEAK
+    condition[mean_level_dbm(*powers, boards, radio) < radio.sensitivities_dbm(boards)] = WEAK
     return condition
 
 
 def mean_level_dbm(
-    environments: Environments,
-    anchor: NDArray[np.float64],
-    tag: NDArray[np.float64],
-    path: DirectPath,
-    boards: Boards,
-    radio: Receiver = RADIO,
+    direct_db: NDArray[np.float64], diffuse_db: NDArray[np.float64], boards: Boards, radio: Receiver = RADIO
 ) -> NDArray[np.float64]:
-    """Return the mean receive level, dBm (n,), of pairs between antennas at float64 (n, 2) in m with obstacles `path`."""
-    powers = _mean_powers_db(environments, anchor, tag, path)
-    level: NDArray[np.float64] = (
-        radio.tx_power_dbm
-        + boards.gain_db
-        + 10.0 * np.log10(10.0 ** (powers[0] / 10.0) + 10.0 ** (powers[1] / 10.0))
-    )
+    """Return the mean receive level, dBm (n,), from `mean_powers_db`."""
+    power = 10.0 ** (direct_db / 10.0) + 10.0 ** (diffuse_db / 10.0)
+    level: NDArray[np.float64] = radio.tx_power_dbm + boards.gain_db + 10.0 * np.log10(power)
     return level
 
 
-def _mean_powers_db(
+def mean_powers_db(
     environments: Environments, anchor: NDArray[np.float64], tag: NDArray[np.float64], path: DirectPath
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of the direct path and of all others relative to the transmit power."""
+    """Return the mean power of the direct path and of all others relative to the transmit power, dB (n,), for antennas at (n, 2) in m."""
     distance = np.hypot(*(tag - anchor).T)
     direct = channel.direct_power_db(distance, path.loss_db + math.prod(channel.PATTERN_LOSS_DB))
     diffuse = -np.where(path.crossings > 0, *(e.path_loss_db(distance) for e in environments[::-1]))

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import count as counting
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, label, place
+from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, label, place
 from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
 from uwb_mitigation.simulation.channel import DiffuseField, check_range
@@ -131,6 +131,8 @@ class SimulatedSource(Simulated):
         tags: 1 to 64, spread evenly along the route.
         anchors: positions in m; their identities are 1, 2, ... in this order.
         plan, radio, route: the scene, the receiver, the closed route (m).
+        environments: diffuse fields.
+        gains_db: of the tag and each anchor together, relative to the receiver's power and antennas; one for all, or one for each anchor.
 
     Attributes:
         anchors: their positions; all antennas are at z = 0.
@@ -150,6 +152,8 @@ class SimulatedSource(Simulated):
         plan: Building = FLAT,
         radio: Receiver | None = None,
         route: tuple[Point, ...] = ROUTE,
+        environments: Environments = RESIDENTIAL,
+        gains_db: Sequence[float] | float = 0.0,
     ) -> None:
         check_seed(seed)
         check_range("simulated source", "count", count, 0, 2**40, whole=True)
@@ -163,6 +167,8 @@ class SimulatedSource(Simulated):
         self._anchors = np.asarray(anchors, np.float64)
         self.anchors = AnchorMap([Anchor(n, (x, y, 0.0)) for n, (x, y) in enumerate(anchors, 1)])
         self._route = route
+        self._environments = environments
+        self._gains_db = np.broadcast_to(np.asarray(gains_db, np.float64), len(anchors))
         closed = np.asarray([*route, route[0]])
         self._spacing_m = float(np.hypot(*np.diff(closed, axis=0).T).sum()) / tags
 
@@ -186,7 +192,7 @@ class SimulatedSource(Simulated):
             if self._count and first >= self._count:
                 return
             rng = np.random.default_rng([self._seed, segment, 0])
-            fields = draw_fields(RESIDENTIAL, pairs, rng)
+            fields = draw_fields(self._environments, pairs, rng)
             for batch, start in enumerate(range(first, stop, BATCH)):
                 sequence = np.arange(start, min(start + BATCH, stop))
                 rng = np.random.default_rng([self._seed, segment, 1 + batch])
@@ -211,7 +217,8 @@ class SimulatedSource(Simulated):
             anchor_id,
             tag_id,
             names,
-            AntennaPairs(anchors, positions, path, RESIDENTIAL, fields, pair, stationary=False),
+            AntennaPairs(anchors, positions, path, self._environments, fields, pair, stationary=False),
+            replace(self._radio.boards(len(pair)), gain_db=self._gains_db[anchor]),
             tag_yaw=yaw_along_route(self._route, travelled),
         )
 
