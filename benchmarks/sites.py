@@ -216,11 +216,11 @@ class Drive:
                 site = draw_site(anchors, rng)
             plan, places = site.plan, site.anchors
             route = site.route(np.random.default_rng([UNSEEN + seed, drive]))
-        self._slow_m = DRONE_SLOW_M * (kind == "drone_room")
-        self._waves = rng.normal(0.0, 1.0 / DRONE_LENGTH_M, (anchors, 2))
         gains_db = np.zeros(anchors)
         if kind == "site_gains":
             gains_db = (-1) ** seed * GAIN_DB + rng.uniform(-ANCHOR_GAIN_DB, ANCHOR_GAIN_DB, anchors)
+        self._slow_m = DRONE_SLOW_M * (kind == "drone_room")
+        self._waves = rng.normal(0.0, 1.0 / DRONE_LENGTH_M, (anchors, 2))
         self._inner = SimulatedSource(
             seed=seed * 1000 + drive, count=round(seconds * RATE_HZ), rate_hz=RATE_HZ,
             anchors=places, plan=plan, radio=DRONE_RADIO if kind == "drone_room" else RADIO, route=route,

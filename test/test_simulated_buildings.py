@@ -59,14 +59,12 @@ def test_error_contains_only_the_channel(dataset: Dataset) -> None:
 def test_plans_match_their_kind(kind: buildings.BuildingType) -> None:
     rng = np.random.default_rng(0)
     plans = [draw_plan(kind, rng) for _ in range(30)]
+    low, high = np.transpose([kind.length_m, kind.width_m])
     for plan in plans:
-        assert kind.length_m[0] <= plan.size[0] <= kind.length_m[1]
-        assert kind.width_m[0] <= plan.size[1] <= kind.width_m[1]
+        assert ((low <= plan.size) & (plan.size <= high)).all()
         assert all(0.006 <= wall.thickness_m <= 0.5 for wall in plan.walls)
-        for wall in plan.walls:
-            ends = np.array([wall.start, wall.end])
-            assert (ends >= -1e-9).all()
-            assert (ends <= np.add(plan.size, 1e-9)).all()
+        ends = np.array([(wall.start, wall.end) for wall in plan.walls]).reshape(-1, 2)
+        assert ((ends >= -1e-9) & (ends <= np.add(plan.size, 1e-9))).all()
     if kind.name not in ("hall", "open"):
         assert np.mean([len(plan.walls) for plan in plans]) > 3
     assert any(plan.screens for plan in plans)

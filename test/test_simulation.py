@@ -29,6 +29,7 @@ from uwb_mitigation.simulation.scene import (
     knife_edge_loss_db,
     through_slab,
 )
+from uwb_mitigation.simulation.simulated import SimulatedSource
 
 QUIET = Receiver(range_offset_m=0.0, timestamp_std_m=0.0)
 
@@ -121,20 +122,14 @@ def test_direct_path_below_the_threshold_makes_the_range_long(direct_db: float, 
 
 def test_levels_follow_the_manuals_formulas() -> None:
     reception = QUIET.receive(lone_paths(20, -70.0), rng())
-    taps = reception.samples.astype(float).reshape(20, TAPS, 2)
-    magnitude = np.hypot(taps[..., 0], taps[..., 1])
-    n2 = reception.preamble_count.astype(float) ** 2
-    for i in range(20):
-        first = math.floor(reception.first_path_index[i])
-        f2 = sum(round(magnitude[i, first + k]) ** 2 for k in (1, 2, 3))
-        assert reception.first_path_power_dbm[i] == pytest.approx(
-            10 * math.log10(f2 / n2[i]) - POWER_CONSTANT_DB, abs=0.01
-        )
-        noise = (magnitude[i, NOISE_TAPS] ** 2).mean() * TAPS
-        c = round(((magnitude[i] ** 2).sum() - noise) / 2**17)
-        assert reception.rx_power_dbm[i] == pytest.approx(
-            10 * math.log10(c * 2**17 / n2[i]) - POWER_CONSTANT_DB, abs=0.01
-        )
+    magnitude = np.hypot(*reception.samples.astype(float).reshape(20, TAPS, 2).transpose(2, 0, 1))
+    first = np.floor(reception.first_path_index).astype(int)[:, None] + (1, 2, 3)
+    f2 = (np.rint(np.take_along_axis(magnitude, first, axis=1)) ** 2).sum(axis=1)
+    noise = (magnitude[:, NOISE_TAPS] ** 2).mean(axis=1) * TAPS
+    c = np.rint(((magnitude**2).sum(axis=1) - noise) / 2**17)
+    for reported, energy in ((reception.first_path_power_dbm, f2), (reception.rx_power_dbm, c * 2**17)):
+        expected = 10 * np.log10(energy / reception.preamble_count**2.0) - POWER_CONSTANT_DB
+        np.testing.assert_allclose(reported, expected, atol=0.01)
 
 
 def test_weak_level_is_reported_as_sent_and_a_strong_one_is_compressed() -> None:
@@ -148,3 +143,15 @@ def test_frame_below_the_sensitivity_is_not_received() -> None:
     reception = QUIET.receive(lone_paths(5, -90.0), rng())
     assert np.isnan(reception.first_path_index).all()
     assert np.isnan(reception.rx_power_dbm).all()
+
+
+def test_gain_belongs_to_its_anchor() -> None:
+    usual, stronger = (
+        np.array(
+            [record.measurement.cir.rx_power_dbm for record in SimulatedSource(count=40, gains_db=gains)]
+        )
+        for gains in (0.0, (6.0, 0.0, 0.0, 0.0))
+    )
+    higher = stronger - usual
+    assert 1.0 < np.median(higher[::4]) < 6.1  # strong levels are compressed
+    assert (higher[1::4] == 0.0).all()
