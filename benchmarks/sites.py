@@ -238,7 +238,7 @@ class Drive:
         for record in self._inner:
             measured = record.measurement
             off = float(self.offset_m[measured.anchor_id - 1])
-            if self._slow_m:
+            if self._slow_m and record.tag_position:
                 angle = self._waves[measured.anchor_id - 1] @ record.tag_position[:2]
                 off += self._slow_m * math.sqrt(2.0) * math.sin(angle)
             yield replace(record, measurement=replace(measured, range_m=measured.range_m + off))
