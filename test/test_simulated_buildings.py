@@ -42,8 +42,7 @@ def test_records_equal_arrays(dataset: Dataset) -> None:
 def test_conditions_are_balanced_and_few_frames_are_lost(dataset: Dataset) -> None:
     share = {name: np.mean(dataset.labels == name) for name in ("LOS", "NLOS", "NDP NLOS")}
     assert sum(share.values()) == pytest.approx(1.0)
-    assert min(share.values()) > 0.15
-    assert max(share.values()) < 0.5
+    assert all(0.15 < value < 0.5 for value in share.values())
     assert len(dataset) > 0.85 * BLOCKS * PLACEMENTS
 
 
