@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.model.architecture import Architecture
@@ -63,7 +64,9 @@ def fit(
         optimizer = torch.optim.AdamW(
             network.parameters(), options.learning_rate, weight_decay=options.weight_decay, fused=True
         )
-        mean = RunningMean(network)
+        mean = AveragedModel(network, avg_fn=_running_mean)
+        # Start from the initial weights.
+        mean.update_parameters(network)
         network.train()
         steps, step = options.epochs * -(-len(source) // options.batch), 0
         for epoch in range(1, options.epochs + 1):
@@ -79,11 +82,9 @@ def fit(
                 _check_loss(loss.item(), epoch)
                 step += 1
                 if vary is not None:
-                    mean.update(step)
+                    mean.update_parameters(network)
             on_epoch()
-        if vary is not None:
-            mean.copy_to_network()
-        return networks.weights_of(network)
+        return networks.weights_of(network if vary is None else mean.module)
 
 
 def _check_loss(loss: float, epoch: int) -> None:
@@ -95,25 +96,9 @@ def _rate_factor(step: int, steps: int) -> float:
     return next(factor for until, factor in STAGES if step < until * steps)
 
 
-class RunningMean:
-    """Running mean of the weights of a network."""
-
-    def __init__(self, network: networks.Network) -> None:
-        self._network = network
-        self._means = [weight.detach().clone() for weight in network.parameters()]
-
-    def update(self, step: int) -> None:
-        """Add the weights after `step`, from 1."""
-        # The mean adapts faster during the first steps, so that the initial weights have no effect.
-        decay = min(MEAN_DECAY, (1 + step) / (10 + step))
-        for mean, weight in zip(self._means, self._network.parameters(), strict=True):
-            mean.lerp_(weight.detach(), 1.0 - decay)
-
-    def copy_to_network(self) -> None:
-        """Replace the weights by their means."""
-        with torch.no_grad():
-            for mean, weight in zip(self._means, self._network.parameters(), strict=True):
-                weight.copy_(mean)
+def _running_mean(mean: Tensor, weight: Tensor, step: Tensor | int) -> Tensor:
+    """Return the mean after `step`, from 1; it adapts faster at first, so that the initial weights have no effect."""
+    return mean.lerp(weight, 1.0 - min(MEAN_DECAY, (1 + int(step)) / (10 + int(step))))
 
 
 @contextmanager
