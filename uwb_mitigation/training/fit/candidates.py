@@ -142,7 +142,7 @@ def fit_new_model(
             )
     options = replace(recipe.fit, seed=seed)
     network = _fit_residuals(
-        data, linear_bias, recipe.per_configuration, options, recipe.architecture, on_epoch=on_epoch
+        data, linear_bias, recipe.per_configuration, options, recipe.architecture, on_epoch
     )
     return FittedModel(linear_bias, network)
 
@@ -152,16 +152,13 @@ def _fit_residuals(
     linear_bias: LinearBiasModel,
     per_configuration: int,
     options: FitOptions,
-    architecture: Architecture | None = None,
-    start: FloatWeights | None = None,
+    architecture: Architecture,
     on_epoch: Callable[[], None] = lambda: None,
+    start: FloatWeights | None = None,
 ) -> FloatWeights:
-    """Fit a network, either of `architecture` or from `start`, to the residuals of a linear bias model."""
+    """Fit a network to the residuals of a linear bias model."""
     from uwb_mitigation.training.fit import fitting
 
-    if start is not None:
-        architecture = start.architecture
-    assert architecture is not None
     subset = data.rows(splits.subsample(data.configurations, per_configuration, options.seed))
     residual = subset.error_m - linear_bias_m(linear_bias, subset)
     # If the linear bias model needs a power that is unknown, the range is passed through.
@@ -200,10 +197,6 @@ def fit_line(data: Dataset) -> LinearBiasModel:
     )
 
 
-def _fit_network(recipe: Recipe, data: Dataset, seed: int) -> FittedModel:
-    return fit_new_model(data, recipe, seed)
-
-
 def _with_new_offset(
     linear_bias: LinearBiasModel, network: FloatWeights, data: Dataset, seed: int
 ) -> FittedModel:
@@ -224,8 +217,10 @@ def _fine_tuned(
     """Return a network that is trained further on the residuals of a line or of an offset."""
     linear_bias = fit_line(data) if has_line else _offset(data, network)
     options = replace(options, seed=seed)
+    architecture = network.architecture
     return FittedModel(
-        linear_bias, _fit_residuals(data, linear_bias, PER_CONFIGURATION, options, start=network)
+        linear_bias,
+        _fit_residuals(data, linear_bias, PER_CONFIGURATION, options, architecture, start=network),
     )
 
 
@@ -245,11 +240,13 @@ _WITHOUT_NETWORK = (
 
 def new_models(recipe: Recipe) -> list[Candidate]:
     """Return a constant, a line, a network on the residuals of the line, and a network without a line."""
-    networks = (
-        Candidate(name, partial(_fit_network, recipe.for_candidate(name)), trains=True)
-        for name in (LINE_NETWORK, NETWORK)
-    )
-    return [*_WITHOUT_NETWORK, *networks]
+
+    def network(name: str) -> Candidate:
+        return Candidate(
+            name, lambda data, seed: fit_new_model(data, recipe.for_candidate(name), seed), trains=True
+        )
+
+    return [*_WITHOUT_NETWORK, network(LINE_NETWORK), network(NETWORK)]
 
 
 def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:

@@ -6,6 +6,8 @@ one mean per configuration because its measurements are not independent.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,17 +51,14 @@ def fit_linear_bias(
         powers.append(rx_power_dbm - first_path_power_dbm)
     has_powers = np.isfinite(np.sum(powers, axis=0))
     names = configurations[has_powers]
-    columns = (
-        [configuration_means(names, values[has_powers]) for values in powers] if has_powers.any() else []
-    )
-    if not columns or len(columns[0]) < MIN_CONFIGURATIONS:
+    if len(np.unique(names)) < MIN_CONFIGURATIONS:
         return fit_constant(configurations, error_m)
-    design = np.column_stack([np.ones(len(columns[0])), *columns])
+    *columns, target = (configuration_means(names, values[has_powers]) for values in (*powers, error_m))
+    design = np.column_stack([np.ones(len(target)), *columns])
     has_constant_power = len(powers) == 1 and float(np.ptp(columns[0])) < MIN_POWER_RANGE_DB
     if has_constant_power or np.linalg.matrix_rank(design, tol=1e-3) < design.shape[1]:
         return fit_constant(configurations, error_m)
-    coefficients = least_absolute_deviations(design, configuration_means(names, error_m[has_powers]))
-    return LinearBiasModel(*(float(np.float32(value)) for value in coefficients))
+    return _model(least_absolute_deviations(design, target))
 
 
 def fit_linear_bias_to_rows(
@@ -89,7 +88,7 @@ def fit_linear_bias_to_rows(
     limit_m = float(np.abs(of_los).mean()) + MAX_LOS_INCREASE_M if len(of_los) else np.inf
     if len(of_los) and np.abs(of_los - offset_m).mean() > limit_m:
         offset_m = float(np.median(of_los))
-    constant = LinearBiasModel(float(np.float32(offset_m)))
+    constant = _model([offset_m])
     columns = [rx_power_dbm.astype(np.float64)]
     gap = columns[0] - first_path_power_dbm
     if np.isfinite(gap).any():
@@ -109,7 +108,7 @@ def fit_linear_bias_to_rows(
         weight[los] *= LOS_WEIGHT_STEP
     else:
         return constant
-    return LinearBiasModel(*(float(np.float32(value)) for value in coefficients))
+    return _model(coefficients)
 
 
 def least_absolute_deviations(
@@ -140,7 +139,11 @@ def least_absolute_deviations(
 
 def fit_constant(configurations: NDArray[np.str_], error_m: NDArray[np.floating]) -> LinearBiasModel:
     """Return the median over configurations of their mean errors; arguments of shape (n,), n > 0."""
-    return LinearBiasModel(float(np.float32(np.median(configuration_means(configurations, error_m)))))
+    return _model([float(np.median(configuration_means(configurations, error_m)))])
+
+
+def _model(coefficients: Iterable[float]) -> LinearBiasModel:
+    return LinearBiasModel(*(float(np.float32(value)) for value in coefficients))
 
 
 def configuration_means(

@@ -23,8 +23,6 @@ COLD_START_MIN_GAIN = 0.10
 NESTED = "selection (nested)"
 """Name of the errors of the selection procedure, on configurations that neither a fit nor the selection used."""
 
-_NO_CALLBACK: Callable[[], None] = lambda: None  # noqa: E731
-
 
 def step_counter(total: int, on_share: Callable[[float], None]) -> Callable[[], None]:
     """Return a callback for each of `total` steps; it calls `on_share` with the finished share."""
@@ -77,21 +75,17 @@ def held_out_errors(
     candidates: Sequence[Candidate],
     folds: Iterable[Split],
     seed: int,
-    on_fit: Callable[[], None] = _NO_CALLBACK,
-    *,
-    prepare: Callable[[Split], Dataset] | None = None,
+    on_fit: Callable[[], None],
 ) -> dict[str, NDArray[np.float64]]:
     """Cross-validate each candidate; return its errors on the test rows of all folds, {name: shape (n,)}.
 
-    Rows that are in no test part keep their raw errors. `prepare` replaces the data for one fold.
+    Rows that are in no test part keep their raw errors.
     """
     errors = {candidate.name: data.error_m.copy() for candidate in candidates}
     for fold in folds:
-        fold_data = data if prepare is None else prepare(fold)
-        train, test = fold_data.rows(fold.train), fold_data.rows(fold.test)
+        train, test = data.rows(fold.train), data.rows(fold.test)
         for candidate in candidates:
-            residuals = test.error_m - candidate.fit(train, seed).correction_m(test)
-            errors[candidate.name][fold.test] = residuals
+            errors[candidate.name][fold.test] -= candidate.fit(train, seed).correction_m(test)
             on_fit()
     return errors
 
