@@ -333,6 +333,8 @@ class RangeColumns:
         for indices in groups.values():
             members = [measurements[index] for index in indices]
             cirs = [measurement.cir for measurement in members]
+            tag_id = np.array([m.tag_id for m in members], np.uint64)
+            anchor_id = np.array([m.anchor_id for m in members], np.uint64)
             numbers = [
                 (
                     m.range_m,
@@ -345,27 +347,11 @@ class RangeColumns:
                 )
                 for m in members
             ]
-            range_m, start, first_path, scale, preamble_count, rx_power, first_path_power = np.array(
-                numbers, np.float64
-            ).T
-            yield (
-                indices,
-                RangeColumns(
-                    np.array([measurement.tag_id for measurement in members], np.uint64),
-                    np.array([measurement.anchor_id for measurement in members], np.uint64),
-                    range_m,
-                    cirs[0].encoding,
-                    np.array([cir.samples for cir in cirs]) if len(cirs) > 1 else cirs[0].samples[None],
-                    start,
-                    first_path,
-                    scale,
-                    preamble_count,
-                    rx_power,
-                    first_path_power,
-                    cirs[0].radio,
-                    cirs[0].segment,
-                ),
-            )
+            range_m, *others = np.array(numbers, np.float64).T
+            samples = np.array([cir.samples for cir in cirs]) if len(cirs) > 1 else cirs[0].samples[None]
+            columns = RangeColumns(tag_id, anchor_id, range_m, cirs[0].encoding, samples, *others)
+            columns.radio, columns.segment = cirs[0].radio, cirs[0].segment
+            yield indices, columns
 
     def take(self, rows: list[int]) -> RangeColumns:
         """Return the selected exchanges."""
