@@ -309,29 +309,19 @@ class RangeBatch:
 
     def encode_corrected(self, corrected: CorrectedColumns) -> list[bytes]:
         """Encode `RangeCorrected` in CDR for each message."""
-        ranges, start = self.columns, self._header.shape[1]
-        # The fields of `_CORRECTED`, after the header.
-        fields: tuple[tuple[int, str, Any], ...] = (
-            (0, "<u8", ranges.tag_id),
-            (8, "<u8", ranges.anchor_id),
-            (16, "<u4", self._sequence),
-            (20, "<f4", corrected.range_m),
-            (24, "<f4", ranges.range_m),
-            (28, "<f4", corrected.correction_m),
-            (32, "<f4", corrected.variance_m2),
-            (36, "u1", corrected.status),
-            (37, "u1", int(corrected.origin)),
-            (40, "<u4", corrected.model_id),
+        ranges = self.columns
+        columns = (
+            *(self._header, ranges.tag_id, ranges.anchor_id, self._sequence),
+            *(corrected.range_m, ranges.range_m, corrected.correction_m, corrected.variance_m2),
+            *(corrected.status, corrected.origin, 0, corrected.model_id),
         )
-        table = np.zeros((len(ranges), start + _CORRECTED.size), np.uint8)
-        table[:, :start] = self._header
-        for offset, kind, values in fields:
-            column = np.broadcast_to(np.asarray(values, kind), len(ranges))
-            width = column.dtype.itemsize
-            table[:, start + offset : start + offset + width] = (
-                np.ascontiguousarray(column).view(np.uint8).reshape(-1, width)
-            )
-        return [row.tobytes() for row in table]
+        # The fields of `_CORRECTED`, after the header.
+        header = f"{self._header.shape[1]}u1"
+        table = np.empty(len(ranges), f"{header},<u8,<u8,<u4,<f4,<f4,<f4,<f4,u1,u1,<u2,<u4")
+        for number, column in enumerate(columns):
+            table[f"f{number}"] = column
+        data, size = table.tobytes(), table.itemsize
+        return [data[start : start + size] for start in range(0, len(data), size)]
 
 
 def decode_frame_id(data: bytes) -> str:
