@@ -78,6 +78,8 @@ def steps(count: int, step_ns: int) -> ListSource:
 class Player:
     """Plays a source; `on_record(player, sequence)` is called for each record, from the playing thread."""
 
+    subscription_count = 0
+
     def __init__(
         self,
         source: ListSource,
@@ -99,13 +101,11 @@ class Player:
             self.clock,
             (DEFAULTS | options).__getitem__,
             SILENT,
-            subscribers=lambda: 0,
-            publish=self.publish,
-            on_time=self.on_time,
-            on_end=self.end,
+            self,
+            self.end,
         )
 
-    def publish(self, records: Sequence[tuple[Record, int]]) -> None:
+    def publish_records(self, records: Sequence[tuple[Record, int]]) -> None:
         self.batches.append(len(records))
         self.early.append(self.clock.now().nanoseconds < records[-1][1])
         for record, stamp_ns in records:
@@ -117,7 +117,7 @@ class Player:
     def set(self, **values: object) -> None:
         self.feed.apply(values, values.__getitem__)
 
-    def on_time(self, time_ns: int) -> None:
+    def publish_clock(self, time_ns: int) -> None:
         self.clock_times.append(time_ns)
 
     def end(self, error: UwbMitigationError | None) -> None:

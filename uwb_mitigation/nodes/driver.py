@@ -117,17 +117,7 @@ class Driver(ManagedNode):
         # A node that publishes /clock must not wait for /clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         clock = steady if self.value("publish_clock") else self.get_clock()
-        return lambda: ReplayFeed(
-            source,
-            clock,
-            self.value,
-            self.get_logger(),
-            subscribers=lambda: output.subscription_count,
-            publish=output.publish_records,
-            on_time=output.publish_clock,
-            on_end=self._finish,
-            robot=robot,
-        )
+        return lambda: ReplayFeed(source, clock, self.value, self.get_logger(), output, self._finish, robot)
 
     def _check(self, values: Mapping[str, Any]) -> None:
         """Raise for settings of radios that contradict each other, and for offsets that cannot be read."""

@@ -7,13 +7,14 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
+from uwb_mitigation.nodes.feeds.publishing import RangePublisher
 from uwb_mitigation.nodes.feeds.radios import CAPTURED_SOURCES, radio_source
 from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
 from uwb_mitigation.nodes.support import diagnostics
@@ -22,6 +23,9 @@ from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.ros.topics import RANGE_RAW
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import NS_PER_S
+
+if TYPE_CHECKING:
+    from uwb_mitigation.nodes.feeds.robot_messages import RobotMessage, RobotMessages
 
 TICK_S = 0.02
 """Interval at which commands and a simulated clock are checked, and /clock is published."""
@@ -62,27 +66,6 @@ def open_source(value: Callable[[str], Any]) -> Source:
     return open_decaranging(path, cir=CirFrame(value("cir")))
 
 
-class RobotMessage(NamedTuple):
-    """A recorded message, and the time in the recording at which it is due."""
-
-    recorded_ns: int
-    topic: str
-    message: Any
-
-
-class RobotSource(Protocol):
-    """Recorded messages of a robot in the order of time; see `robot_messages.RobotMessages`."""
-
-    @property
-    def topics(self) -> list[str]: ...
-
-    def publish_static(self) -> None: ...
-
-    def __iter__(self) -> Iterator[RobotMessage]: ...
-
-    def publish(self, item: RobotMessage, shift_ns: int) -> None: ...
-
-
 class ReplayFeed:
     """Publishes the records of a source when they are due, from its own thread; implements `Feed`.
 
@@ -94,9 +77,7 @@ class ReplayFeed:
         clock: the node's clock; simulated time paces the replay, otherwise a steady clock does.
         value: returns the value of a parameter of the driver. With `publish_clock`, stamps are the recorded ones.
         logger: with `info` and `warning`, as rclpy's.
-        subscribers: returns the number of subscribers.
-        publish: publishes [(record, stamp_ns), ...].
-        on_time: with `publish_clock`, called with the recorded time (ns) at every tick, to drive `/clock`.
+        output: publishes the records and, with `publish_clock`, the recorded time at every tick.
         robot: messages of a recorded robot; None: none.
         on_end: called once from the playing thread with the error or None, unless `stop` came first.
 
@@ -111,12 +92,9 @@ class ReplayFeed:
         clock: Clock,
         value: Callable[[str], Any],
         logger: Any,
-        *,
-        subscribers: Callable[[], int],
-        publish: Callable[[Sequence[tuple[Record, int]]], None],
-        on_time: Callable[[int], None],
+        output: RangePublisher,
         on_end: Callable[[UwbMitigationError | None], None],
-        robot: RobotSource | None = None,
+        robot: RobotMessages | None = None,
     ) -> None:
         self.played = 0
         self.late_ns = 0
@@ -125,9 +103,7 @@ class ReplayFeed:
         self._clock = ReplayClock(clock)
         self._value = value
         self._logger = logger
-        self._subscribers = subscribers
-        self._publish = publish
-        self._on_time = on_time
+        self._output = output
         self._on_end = on_end
         self._uses_recorded_stamps = value("publish_clock")
         self._requested_rate = self._rate = float(value("rate"))
@@ -205,7 +181,7 @@ class ReplayFeed:
     def _wait_for_subscribers(self) -> None:
         """Wait until there are enough subscribers and the graph had time to connect, or until the timeout."""
         required, started_s = self._value("wait_for_subscribers"), time.monotonic()
-        while (count := self._subscribers()) < required:
+        while (count := self._output.subscription_count) < required:
             if time.monotonic() - started_s >= self._value("longest_wait"):
                 self._logger.warning(f"{count} of {required} subscribers connected; the replay starts")
                 return
@@ -256,7 +232,7 @@ class ReplayFeed:
                 stamp_ns = recorded_ns
                 if not self._uses_recorded_stamps:
                     stamp_ns = self._clock.stamp_ns(self._clock_ns(due_ns))
-                if isinstance(record, RobotMessage):
+                if not isinstance(record, Record):
                     self._flush()
                     assert self._robot is not None
                     self._robot.publish(record, stamp_ns - recorded_ns)
@@ -284,7 +260,7 @@ class ReplayFeed:
 
     def _flush(self) -> None:
         if self._late:
-            self._publish(self._late)
+            self._output.publish_records(self._late)
             self.played += len(self._late)
             self._late = []
 
@@ -301,7 +277,7 @@ class ReplayFeed:
             ahead_ns = self._clock_ns(due_ns) - now_ns
             if self._uses_recorded_stamps:
                 # Simulated recordings start at 0, and ROS time cannot be negative.
-                self._on_time(max(recorded_ns - int(max(ahead_ns, 0) * self._rate), 0))
+                self._output.publish_clock(max(recorded_ns - int(max(ahead_ns, 0) * self._rate), 0))
             if ahead_ns <= 0 and not self._paused:
                 return -ahead_ns
             self._flush()
@@ -319,4 +295,4 @@ class ReplayFeed:
 
 
 def _recorded_ns(item: Record | RobotMessage) -> int:
-    return item.recorded_ns if isinstance(item, RobotMessage) else item.measurement.stamp_ns
+    return item.measurement.stamp_ns if isinstance(item, Record) else item.recorded_ns

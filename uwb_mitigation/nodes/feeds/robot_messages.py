@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -12,7 +12,6 @@ from rclpy.serialization import deserialize_message
 from rclpy.time import Time
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.nodes.feeds.replay import RobotMessage
 from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.recordings.bag.reader import BagReader
@@ -24,6 +23,14 @@ _TYPES = (ODOMETRY_TYPE, IMU_TYPE, TF_TYPE)
 _QOS = QoSProfile(depth=100)
 _MAX_DELAY_NS = NS_PER_S
 """A message that was received later than this after its stamp is due when it was received."""
+
+
+class RobotMessage(NamedTuple):
+    """A recorded message, and the time in the recording at which it is due."""
+
+    recorded_ns: int
+    topic: str
+    message: Any
 
 
 class RobotMessages:

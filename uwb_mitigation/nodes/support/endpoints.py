@@ -18,7 +18,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
@@ -38,23 +38,10 @@ MAX_SENSOR_TOPICS = 256
 """Maximum number of sensor_msgs/Range topics; bounded because ids are received over the air."""
 
 
-def _range_qos(reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
-    return QoSProfile(
-        reliability=reliability,
-        durability=DurabilityPolicy.VOLATILE,
-        history=HistoryPolicy.KEEP_LAST,
-        depth=DEPTH,
-    )
+# The other policies are ROS's defaults: reliable, volatile, keep last.
+RANGES = QoSProfile(depth=DEPTH)
 
-
-RANGES = _range_qos()
-
-LATCHED = QoSProfile(
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """QoS of messages that late-joining subscribers need too."""
 
 
@@ -85,9 +72,8 @@ def create_publisher(node: LifecycleNode, kind: type, topic: str) -> Publisher:
     """
     with _translate_qos_errors(node, topic):
         # rclpy writes overrides into the given profile, so each publisher needs a copy.
-        return node.create_lifecycle_publisher(
-            kind, topic, _range_qos(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
-        )
+        qos, overriding = QoSProfile(depth=DEPTH), QoSOverridingOptions.with_default_policies()
+        return node.create_lifecycle_publisher(kind, topic, qos, qos_overriding_options=overriding)
 
 
 def create_subscription(
@@ -104,9 +90,10 @@ def create_subscription(
         ParameterError: an overridden quality of service is invalid.
     """
     overriding = QoSOverridingOptions.with_default_policies()
+    qos = QoSProfile(depth=DEPTH, reliability=reliability)
     with _translate_qos_errors(node, topic):
         return node.create_subscription(
-            kind, topic, callback, _range_qos(reliability), qos_overriding_options=overriding, **options
+            kind, topic, callback, qos, qos_overriding_options=overriding, **options
         )
 
 
