@@ -12,14 +12,8 @@ from typing import TYPE_CHECKING, Any
 from rclpy.clock import Clock, ClockType
 
 from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.nodes.feeds import radios
 from uwb_mitigation.nodes.feeds.publishing import RangePublisher
-from uwb_mitigation.nodes.feeds.radios import (
-    CAPTURED_SOURCES,
-    RADIO_SOURCES,
-    RadioFeed,
-    SourceHandle,
-    radio_source,
-)
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed, open_source
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
@@ -55,8 +49,8 @@ class Driver(ManagedNode):
         self._ended = ended
         self._consumer = consumer
         self.exit_code = 0
-        self._make_feed: Callable[[], SourceHandle] | None = None
-        self._feed: SourceHandle | None = None
+        self._make_feed: Callable[[], radios.SourceHandle] | None = None
+        self._feed: radios.SourceHandle | None = None
         self._output: RangePublisher
         refuse_errors(self, self._check)
         self.add_post_set_parameters_callback(self._apply)
@@ -85,17 +79,17 @@ class Driver(ManagedNode):
 
     @property
     def _has_radios(self) -> bool:
-        is_capture = self.value("source") in CAPTURED_SOURCES and self.value("path")
-        return self.value("source") in RADIO_SOURCES and not is_capture
+        is_capture = self.value("source") in radios.CAPTURED_SOURCES and self.value("path")
+        return self.value("source") in radios.RADIO_SOURCES and not is_capture
 
-    def _prepare_radios(self) -> Callable[[], SourceHandle]:
-        source = radio_source(self.value("source"))
+    def _prepare_radios(self) -> Callable[[], radios.SourceHandle]:
+        source = radios.radio_source(self.value("source"))
         source.read_settings(self.value)
         corrections = self.value("source") == "serial"
         self._output = output = RangePublisher(self, self._consumer, corrections=corrections, recording=False)
-        return lambda: RadioFeed(source, self.value, output, self.now_ns, self.get_logger())
+        return lambda: radios.RadioFeed(source, self.value, output, self.now_ns, self.get_logger())
 
-    def _prepare_topics(self) -> Callable[[], SourceHandle]:
+    def _prepare_topics(self) -> Callable[[], radios.SourceHandle]:
         # Mapping files need pandas and pydantic, which the other sources do not.
         from uwb_mitigation.nodes.feeds.topic import TopicFeed
         from uwb_mitigation.recordings.mapping.mapping import load_mapping
@@ -105,7 +99,7 @@ class Driver(ManagedNode):
         feed = TopicFeed(self, mapping, self.value("topic"), self._publish_topic_range, self.now_ns)
         return lambda: feed
 
-    def _prepare_replay(self) -> Callable[[], SourceHandle]:
+    def _prepare_replay(self) -> Callable[[], radios.SourceHandle]:
         source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
         self._output = output = RangePublisher(self, self._consumer, corrections=False, recording=True)
         robot = None
@@ -126,7 +120,7 @@ class Driver(ManagedNode):
             for row in DRIVER:
                 if row.name in values:
                     row.check(values[row.name])
-            source = radio_source(self.value("source"))
+            source = radios.radio_source(self.value("source"))
             source.read_settings(lambda name: values.get(name, self.value(name)))
 
     def _apply(self, changes: list[Any]) -> None:

@@ -14,16 +14,9 @@ from typing import NamedTuple
 from uwb_mitigation.errors import RecordingError, did_you_mean
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.types.measurement import RangeMeasurement, Record, Truth
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import MeasurementKey, decode_range, decode_truth, measurement_key
 from uwb_mitigation.types.ros.poses import decode_true_position
-from uwb_mitigation.types.ros.topics import (
-    ODOMETRY_TRUTH,
-    ODOMETRY_TYPE,
-    RANGE_CIR_TYPE,
-    RANGE_RAW,
-    RANGE_TRUTH,
-    RANGE_TRUTH_TYPE,
-)
 from uwb_mitigation.types.source import Source
 
 JOIN_WINDOW = 32
@@ -45,7 +38,7 @@ class McapRecording(Source):
             the topic, or if its type, schema or field layout is not supported.
     """
 
-    def __init__(self, path: Path, *, topic: str = RANGE_RAW) -> None:
+    def __init__(self, path: Path, *, topic: str = topics.RANGE_RAW) -> None:
         self._path = path
         self._topic = topic
         self._closed = False
@@ -83,7 +76,7 @@ class McapRecording(Source):
         by_key: dict[MeasurementKey, _PendingRange] = {}
         early_truths: dict[MeasurementKey, Truth] = {}
         poses: dict[StampedTag, TruePose] = {}
-        has_poses = bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE
+        has_poses = bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE
 
         def pop_oldest() -> Record:
             entry = pending.popleft()
@@ -127,21 +120,21 @@ class McapRecording(Source):
         self, bag: BagReader
     ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | tuple[StampedTag, TruePose]]:
         checked_channels: set[int] = set()
-        types = {self._topic: RANGE_CIR_TYPE, RANGE_TRUTH: RANGE_TRUTH_TYPE}
-        if bag.topics.get(ODOMETRY_TRUTH) == ODOMETRY_TYPE:
-            types[ODOMETRY_TRUTH] = ODOMETRY_TYPE
+        types = {self._topic: topics.RANGE_CIR_TYPE, topics.RANGE_TRUTH: topics.RANGE_TRUTH_TYPE}
+        if bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE:
+            types[topics.ODOMETRY_TRUTH] = topics.ODOMETRY_TYPE
         for message in bag.messages(types):
             if self._closed:
                 return
             topic = message.channel.topic
             # The bag keeps references to its channels, so that an id() identifies one channel of one file.
-            if id(message.channel) not in checked_channels and topic != ODOMETRY_TRUTH:
+            if id(message.channel) not in checked_channels and topic != topics.ODOMETRY_TRUTH:
                 check_channel(message.channel, types[topic], self._path)
                 checked_channels.add(id(message.channel))
             try:
                 if topic == self._topic:
                     yield decode_range(message.data)
-                elif topic == RANGE_TRUTH:
+                elif topic == topics.RANGE_TRUTH:
                     yield decode_truth(message.data)
                 elif (decoded := decode_true_position(message.data)) is not None:
                     stamp_ns, tag_id, position, yaw = decoded

@@ -7,19 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.simulation.channel import (
-    DiffuseField,
-    Environment,
-    Multipath,
-    draw_diffuse_field,
-    propagate,
-)
+from uwb_mitigation.simulation import channel
 from uwb_mitigation.simulation.scene import DirectPath, Point
 
 BORDER_M = 0.2
 MIN_DISTANCE_M = 0.5
 
-Environments = tuple[Environment, Environment]
+Environments = tuple[channel.Environment, channel.Environment]
 """Diffuse fields for LOS and NLOS."""
 
 
@@ -39,7 +33,7 @@ class AntennaPairs:
     tag: NDArray[np.float64]
     path: DirectPath
     environments: Environments
-    fields: tuple[DiffuseField, DiffuseField]
+    fields: tuple[channel.DiffuseField, channel.DiffuseField]
     field_of: NDArray[np.intp]
     stationary: bool
 
@@ -56,7 +50,7 @@ class AntennaPairs:
         path = self.path.take(pairs)
         return AntennaPairs(*ends, path, self.environments, drawn, field_of, self.stationary)
 
-    def multipath(self, rng: np.random.Generator) -> Multipath:
+    def multipath(self, rng: np.random.Generator) -> channel.Multipath:
         """Return the received paths of each link; a link without obstacles uses the LOS environment."""
         path, distance = self.path, self.distance_m
         rays = self.fields[0].delay_ns.shape[1]
@@ -66,7 +60,7 @@ class AntennaPairs:
             (rows,) = np.nonzero((path.crossings > 0) == nlos)
             field_rows = self.field_of[rows]
             fading = field.fade(rng)[field_rows] if self.stationary else field.take(field_rows).fade(rng)
-            received = propagate(
+            received = channel.propagate(
                 distance[rows],
                 path.loss_db[rows],
                 path.excess_m[rows],
@@ -76,7 +70,7 @@ class AntennaPairs:
                 rng,
             )
             delay[rows], gain[rows] = received.delay_ns, received.gain
-        return Multipath(delay, gain)
+        return channel.Multipath(delay, gain)
 
 
 def draw_fields(
@@ -84,10 +78,10 @@ def draw_fields(
     n: int,
     rng: np.random.Generator,
     delay_factor: NDArray[np.float64] | float = 1.0,
-) -> tuple[DiffuseField, DiffuseField]:
+) -> tuple[channel.DiffuseField, channel.DiffuseField]:
     """Draw the diffuse fields of n placements for LOS and NLOS; see `draw_diffuse_field` for `delay_factor`."""
-    los, nlos = environments
-    return draw_diffuse_field(los, n, rng, delay_factor), draw_diffuse_field(nlos, n, rng, delay_factor)
+    los, nlos = (channel.draw_diffuse_field(one, n, rng, delay_factor) for one in environments)
+    return los, nlos
 
 
 def place(size: Point, n: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

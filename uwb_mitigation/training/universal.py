@@ -24,13 +24,7 @@ from uwb_mitigation.mitigation.model.weights import FloatWeights, Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.simulation.buildings import PLACEMENTS, RADIO, WIDE_SHARE
 from uwb_mitigation.simulation.radio import Receiver
-from uwb_mitigation.training.data.augmentation import (
-    normalised,
-    scaled_calibration_inputs,
-    vary_channel,
-    vary_noise,
-    vary_receiver,
-)
+from uwb_mitigation.training.data import augmentation
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.simulated import building_dataset
 from uwb_mitigation.training.evaluation.intervals import fit_scale, sigmas95_of
@@ -134,18 +128,20 @@ def train_universal_model(
         vary=_vary_levels if plan.scaling is Scaling.PREAMBLE else _vary_amplitudes,
     )
     subset = network_data.inputs[:: max(1, len(network_data) // CALIBRATION_INPUTS)]
-    integers = quantise_network(network, scaled_calibration_inputs(subset, plan.scaling))
+    integers = quantise_network(network, augmentation.scaled_calibration_inputs(subset, plan.scaling))
     on_share(1.0, "evaluating")
     return _evaluate(plan, name, network, integers, train_data, held_out)
 
 
 def _vary_levels(inputs: Tensor, generator: torch.Generator) -> Tensor:
-    return vary_noise(vary_channel(inputs, generator), generator)
+    return augmentation.vary_noise(augmentation.vary_channel(inputs, generator), generator)
 
 
 def _vary_amplitudes(inputs: Tensor, generator: torch.Generator) -> Tensor:
     # The simulated boards of the wide blocks already differ in noise.
-    return normalised(vary_receiver(vary_channel(inputs, generator), generator))
+    return augmentation.normalised(
+        augmentation.vary_receiver(augmentation.vary_channel(inputs, generator), generator)
+    )
 
 
 def _evaluate(

@@ -15,20 +15,12 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ModelError
 from uwb_mitigation.mitigation.correction import Corrector, pass_through
-from uwb_mitigation.mitigation.embedded.compiling import (
-    WARNINGS,
-    Signatures,
-    c_compiler,
-    compile_objects,
-    declare,
-    firmware_folder,
-    run_tool,
-)
+from uwb_mitigation.mitigation.embedded import compiling
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.types.measurement import CORRECTED, Cir, CirFault, CorrectedColumns, RangeColumns, Status
 
-_OPTIONS = ("-std=c99", "-O3", "-fPIC", *WARNINGS)
+_OPTIONS = ("-std=c99", "-O3", "-fPIC", *compiling.WARNINGS)
 
 _SHIM = (
     '#include "uwb_model.h"\n'
@@ -64,7 +56,7 @@ class _Corrected(ctypes.Structure):
     )
 
 
-_SIGNATURES: Signatures = {
+_SIGNATURES: compiling.Signatures = {
     "exported_model": (c_void_p, ()),
     "arena_size": (c_size_t, (c_void_p,)),
     "network": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, POINTER(c_float))),
@@ -92,7 +84,7 @@ class CompiledFirmware:
         shim = build / "exported_model.c"
         shim.write_text(_SHIM, encoding="utf-8")
         path = link(shim, export, build / "libuwb_mitigation.so", flags, shared=True)
-        self._library = declare(ctypes.CDLL(str(path)), "uwb_", _SIGNATURES)
+        self._library = compiling.declare(ctypes.CDLL(str(path)), "uwb_", _SIGNATURES)
         self._model = self._library.uwb_exported_model()
         self._arena_bytes: int = self._library.uwb_arena_size(self._model)
         self._arena = ctypes.create_string_buffer(self._arena_bytes)
@@ -128,17 +120,19 @@ def link(
 ) -> Path:
     """Link a C file that includes the model in `export` with the library, for this computer."""
     objects = library_objects(flags)
-    options = (*_OPTIONS, *flags, f"-I{firmware_folder() / 'src'}", f"-I{export}")
+    options = (*_OPTIONS, *flags, f"-I{compiling.firmware_folder() / 'src'}", f"-I{export}")
     kind = ("-shared",) if shared else ()
-    run_tool([*c_compiler(), *options, *kind, str(program), *objects, "-o", str(output), "-lm"])
+    compiling.run_tool(
+        [*compiling.c_compiler(), *options, *kind, str(program), *objects, "-o", str(output), "-lm"]
+    )
     return output
 
 
 def library_objects(flags: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the object files of the portable library for this computer, compiled once per process."""
-    sources = firmware_folder() / "src"
+    sources = compiling.firmware_folder() / "src"
     options = (*_OPTIONS, *flags, f"-I{sources}")
-    return compile_objects(c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
+    return compiling.compile_objects(compiling.c_compiler(), options, tuple(sorted(sources.glob("*.c"))))
 
 
 class FirmwareBackend:

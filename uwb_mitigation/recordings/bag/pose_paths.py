@@ -15,20 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
 from uwb_mitigation.recordings.bag.reader import BagReader, Channel
+from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import decode_frame_id
 from uwb_mitigation.types.ros.poses import POSITION_TYPES, UNOBSERVED, tag_of_frame
-from uwb_mitigation.types.ros.topics import (
-    IMU_TYPE,
-    ODOMETRY_TRUTH,
-    ODOMETRY_TYPE,
-    POSE_TYPE,
-    RANGE_CORRECTED,
-    RANGE_RAW,
-    RANGE_SENSOR_TYPE,
-    TF,
-    TF_STATIC,
-    TF_TYPE,
-)
 from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import Heights, PosePath, TruePath
 
@@ -40,13 +29,13 @@ MAX_POSES = 2_000_000
 MOVES_M = 0.05
 """If an antenna's position in the robot's frame changes more, it has no constant lever arm."""
 
-HEIGHT_TYPES = (RANGE_SENSOR_TYPE, ODOMETRY_TYPE, POSE_TYPE)
-_READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, TF_TYPE, *HEIGHT_TYPES, IMU_TYPE)))
+HEIGHT_TYPES = (topics.RANGE_SENSOR_TYPE, topics.ODOMETRY_TYPE, topics.POSE_TYPE)
+_READABLE_TYPES = tuple(dict.fromkeys((*POSITION_TYPES, topics.TF_TYPE, *HEIGHT_TYPES, topics.IMU_TYPE)))
 _MAX_FRAMES = 64
 _Row = tuple[int, float, float, float, float, float, float, float]
 
 
-def read_truth(path: Path, topic: str = ODOMETRY_TRUTH) -> dict[int | None, TruePath]:
+def read_truth(path: Path, topic: str = topics.ODOMETRY_TRUTH) -> dict[int | None, TruePath]:
     """Return the positions of tags on a topic, {tag id: path}; None: another frame. Empty if the topic is missing.
 
     Raises:
@@ -93,13 +82,13 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
     """
     bag = BagReader(path)
     where = f"{path}, topic {topic}"
-    check_topic(path, bag.topics, topic, (*POSITION_TYPES, TF_TYPE))
-    if bag.topics[topic] == TF_TYPE:
+    check_topic(path, bag.topics, topic, (*POSITION_TYPES, topics.TF_TYPE))
+    if bag.topics[topic] == topics.TF_TYPE:
         if frames is None:
             raise RecordingError(
                 "transforms between many frames", where=where, valid="--frames MAP BASE_LINK"
             )
-        edges = _edges(bag, [topic, TF_STATIC], where)
+        edges = _edges(bag, [topic, topics.TF_STATIC], where)
         return {_frame(frames[1]): _composed(edges, _frame(frames[0]), _frame(frames[1]), where)}
     bodies = _bodies(bag, topic, where)
     if frames is None or not set(bodies) - {""}:
@@ -135,12 +124,12 @@ def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, flo
         RecordingError: the frame moves relative to the robot.
     """
     bag = BagReader(path)
-    topics = [name for name in (TF, TF_STATIC) if bag.topics.get(name) == TF_TYPE]
-    where = f"{path}, {' and '.join(topics)}"
-    if not topics or not frame or _frame(frame) == _frame(base):
+    names = [name for name in (topics.TF, topics.TF_STATIC) if bag.topics.get(name) == topics.TF_TYPE]
+    where = f"{path}, {' and '.join(names)}"
+    if not names or not frame or _frame(frame) == _frame(base):
         return None
     try:
-        position = _composed(_edges(bag, topics, where), _frame(base), _frame(frame), where).position
+        position = _composed(_edges(bag, names, where), _frame(base), _frame(frame), where).position
     except RecordingError:
         return None
     if float(np.ptp(position, axis=0).max()) > MOVES_M:
@@ -155,15 +144,15 @@ def read_range_frame(path: Path) -> str:
     Raises:
         RecordingError: the bag or the message cannot be read.
     """
-    for message in BagReader(path).messages((RANGE_RAW, RANGE_CORRECTED)):
+    for message in BagReader(path).messages((topics.RANGE_RAW, topics.RANGE_CORRECTED)):
         return decode_frame_id(message.data)
     return ""
 
 
-def _edges(bag: BagReader, topics: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:
+def _edges(bag: BagReader, names: list[str], where: str) -> dict[str, dict[str, list[_Row]]]:
     """Return {child frame: {parent frame: transforms}}."""
     edges: dict[str, dict[str, list[_Row]]] = {}
-    for decoded in decode_messages(bag, topics, where):
+    for decoded in decode_messages(bag, names, where):
         for transform in decoded.transforms:
             row = _row(transform.header.stamp, transform.transform.translation, transform.transform.rotation)
             child = _frame(transform.child_frame_id)
@@ -190,7 +179,7 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
     check_topic(path, bag.topics, topic, HEIGHT_TYPES)
     rows: dict[int, tuple[float, float]] = {}
     for decoded in decode_messages(bag, [topic], where):
-        if bag.topics[topic] == RANGE_SENSOR_TYPE:
+        if bag.topics[topic] == topics.RANGE_SENSOR_TYPE:
             height, variance = float(decoded.range), float(getattr(decoded, "variance", 0.0))
             valid = decoded.min_range <= height <= decoded.max_range
         else:
@@ -206,21 +195,21 @@ def read_heights(path: Path, topic: str, sd_m: float = 0.1) -> Heights:
     return Heights(np.array(stamps, np.int64), values[:, 0], values[:, 1])
 
 
-def check_topic(path: Path, topics: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
+def check_topic(path: Path, recorded: dict[str, str], topic: str, types: tuple[str, ...]) -> None:
     """Raise RecordingError unless the topic exists and has one of the types."""
-    if topics.get(topic) in types:
+    if recorded.get(topic) in types:
         return
-    usable = [f"{name} ({kind})" for name, kind in sorted(topics.items()) if kind in types]
-    what = f"topic {topic} has the type {topics[topic]}" if topic in topics else f"no topic {topic}"
+    usable = [f"{name} ({kind})" for name, kind in sorted(recorded.items()) if kind in types]
+    what = f"topic {topic} has the type {recorded[topic]}" if topic in recorded else f"no topic {topic}"
     valid = ", ".join(usable) or f"a topic of type {', '.join(types)}; the bag has none"
-    suggestion = did_you_mean(topic, [name for name, kind in topics.items() if kind in types])
+    suggestion = did_you_mean(topic, [name for name, kind in recorded.items() if kind in types])
     raise RecordingError(what, where=str(path), valid=valid, suggestion=suggestion)
 
 
-def decode_messages(bag: BagReader, topics: list[str], where: str) -> Iterator[Any]:
+def decode_messages(bag: BagReader, names: list[str], where: str) -> Iterator[Any]:
     """Decode the messages of topics by the schemas of their channels."""
     stores: dict[int, tuple[Typestore, str]] = {}
-    for count, message in enumerate(bag.messages(topics)):
+    for count, message in enumerate(bag.messages(names)):
         if count >= MAX_POSES:
             raise RecordingError(f"more than {MAX_POSES} messages", where=where, valid="a shorter recording")
         key = id(message.channel)

@@ -20,30 +20,13 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.files import VERSION, partial_path, write_atomically
+from uwb_mitigation.recordings.bag import rosbag2
 from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import Channel, Schema
-from uwb_mitigation.recordings.bag.rosbag2 import (
-    METADATA_NAME,
-    NO_QOS,
-    TopicCount,
-    describe,
-    dump,
-    recorded_qos,
-)
 from uwb_mitigation.types.measurement import RangeMeasurement, Record
-from uwb_mitigation.types.ros import schemas
+from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.types.ros.codec import encode_range, encode_truth
 from uwb_mitigation.types.ros.poses import encode_true_position
-from uwb_mitigation.types.ros.topics import (
-    ODOMETRY_TRUTH,
-    ODOMETRY_TYPE,
-    RANGE_CIR_TYPE,
-    RANGE_CORRECTED,
-    RANGE_CORRECTED_TYPE,
-    RANGE_RAW,
-    RANGE_TRUTH,
-    RANGE_TRUTH_TYPE,
-)
 
 METADATA_RECORD = "uwb_mitigation"
 """Name of the MCAP metadata record that holds the bag's origin."""
@@ -104,7 +87,7 @@ class BagWriter:
         self._own_channels: dict[str, int] = {}
         self._channel_ids: dict[tuple[object, ...], int] = {}
         self._topic_of_channel: dict[int, str] = {}
-        self._topics: dict[str, TopicCount] = {}
+        self._topics: dict[str, rosbag2.TopicCount] = {}
         self._schemas: dict[Schema, int] = {}
         self._stream: BinaryIO | None = None
 
@@ -139,15 +122,15 @@ class BagWriter:
             RecordingError: a value does not fit its field, or the bag cannot be written.
         """
         measurement = record.measurement
-        self._write_own(RANGE_RAW, RANGE_CIR_TYPE, measurement, encode_range(measurement))
+        self._write_own(topics.RANGE_RAW, topics.RANGE_CIR_TYPE, measurement, encode_range(measurement))
         if record.truth is not None:
             truth = encode_truth(measurement, record.truth)
-            self._write_own(RANGE_TRUTH, RANGE_TRUTH_TYPE, measurement, truth)
+            self._write_own(topics.RANGE_TRUTH, topics.RANGE_TRUTH_TYPE, measurement, truth)
         if record.tag_position is not None:
             odometry = encode_true_position(
                 record.tag_position, measurement.tag_id, measurement.stamp_ns, record.tag_yaw
             )
-            self.write_message(ODOMETRY_TRUTH, ODOMETRY_TYPE, odometry, measurement.stamp_ns)
+            self.write_message(topics.ODOMETRY_TRUTH, topics.ODOMETRY_TYPE, odometry, measurement.stamp_ns)
 
     def write_message(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:
         """Write a serialised message of a standard type.
@@ -163,12 +146,14 @@ class BagWriter:
         Channels that differ only in their id get the same number, so that the files of one bag share it.
         The recorded QoS is copied in the format of the current rosbag2.
         """
-        metadata = channel.metadata | {_QOS_KEY: dump(recorded_qos(channel.metadata.get(_QOS_KEY, "")))}
+        metadata = channel.metadata | {
+            _QOS_KEY: rosbag2.dump(rosbag2.recorded_qos(channel.metadata.get(_QOS_KEY, "")))
+        }
         return self._add_channel(replace(channel, metadata=metadata))
 
     def corrected_channel(self) -> int:
         """Register `/uwb/range_corrected`, for serialised messages; return its number."""
-        return self._own_channel(RANGE_CORRECTED, RANGE_CORRECTED_TYPE)
+        return self._own_channel(topics.RANGE_CORRECTED, topics.RANGE_CORRECTED_TYPE)
 
     def write_serialized(
         self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int = 0
@@ -214,7 +199,7 @@ class BagWriter:
         number = self._own_channels.get(topic)
         if number is None:
             schema = Schema(type_name, SchemaEncoding.ROS2, schemas.definition(type_name).encode())
-            metadata = {_QOS_KEY: NO_QOS, _HASH_KEY: schemas.type_hash(type_name)}
+            metadata = {_QOS_KEY: rosbag2.NO_QOS, _HASH_KEY: schemas.type_hash(type_name)}
             number = self._add_channel(Channel(0, topic, MessageEncoding.CDR, metadata, schema))
             self._own_channels[topic] = number
         return number
@@ -231,22 +216,22 @@ class BagWriter:
             number = self._mcap.add_channel(topic, channel.encoding, schema_id, metadata)
         self._channel_ids[key], self._topic_of_channel[number] = number, topic
         # A topic may have several channels, of several publishers; rosbag2 lists it once.
-        kind, qos = schema.name if schema else "", recorded_qos(metadata[_QOS_KEY])
-        self._topics.setdefault(topic, TopicCount(topic, kind, metadata.get(_HASH_KEY, ""), 0, qos))
+        kind, qos = schema.name if schema else "", rosbag2.recorded_qos(metadata[_QOS_KEY])
+        self._topics.setdefault(topic, rosbag2.TopicCount(topic, kind, metadata.get(_HASH_KEY, ""), 0, qos))
         return number
 
     def _finish(self) -> None:
         counts = self.counts
-        topics = [replace(topic, messages=counts[topic.topic]) for topic in self._topics.values()]
-        document = describe(self.file.name, topics, self._mcap.bounds_ns, self._metadata)
+        counted = [replace(topic, messages=counts[topic.topic]) for topic in self._topics.values()]
+        document = rosbag2.describe(self.file.name, counted, self._mcap.bounds_ns, self._metadata)
         with self._translate_os_errors():
-            self._mcap.add_metadata("rosbag2", {"serialized_metadata": dump(document)})
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": rosbag2.dump(document)})
             self._mcap.finish()
             self._close()
             self._partial.replace(self.file)
             if self._folder is not None:
-                text = dump({"rosbag2_bagfile_information": document})
-                write_atomically(self.file.with_name(METADATA_NAME), text, RecordingError)
+                text = rosbag2.dump({"rosbag2_bagfile_information": document})
+                write_atomically(self.file.with_name(rosbag2.METADATA_NAME), text, RecordingError)
 
     def _close(self) -> None:
         stream, self._stream = self._stream, None
