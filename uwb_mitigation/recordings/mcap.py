@@ -9,7 +9,6 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
@@ -75,7 +74,7 @@ class McapRecording(Source):
         pending: deque[_PendingRange] = deque()
         by_key: dict[MeasurementKey, _PendingRange] = {}
         early_truths: dict[MeasurementKey, Truth] = {}
-        poses: dict[StampedTag, TruePose] = {}
+        poses: dict[tuple[int, int], TruePose] = {}
         has_poses = bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE
 
         def pop_oldest() -> Record:
@@ -87,11 +86,11 @@ class McapRecording(Source):
             for item in self._decoded(bag):
                 if isinstance(item, RangeMeasurement):
                     key = measurement_key(item)
-                    pose = poses.get(StampedTag(item.stamp_ns, item.tag_id))
+                    pose = poses.get((item.stamp_ns, item.tag_id))
                     entry = _PendingRange(item, early_truths.pop(key, None), pose)
                     pending.append(entry)
                     by_key[key] = entry
-                elif isinstance(item[0], MeasurementKey):
+                elif len(item) == 2:
                     key, truth = item
                     if key in by_key:
                         by_key[key].truth = truth
@@ -101,7 +100,13 @@ class McapRecording(Source):
                             del early_truths[next(iter(early_truths))]
                             self.skipped["truth without its range"] += 1
                 else:
-                    _assign_pose(*item, pending, poses)
+                    stamped_tag, pose = item[:2], item[2:]
+                    for entry in pending:
+                        if (entry.measurement.stamp_ns, entry.measurement.tag_id) == stamped_tag:
+                            entry.pose = pose
+                    poses[stamped_tag] = pose
+                    if len(poses) > JOIN_WINDOW:
+                        del poses[next(iter(poses))]
                 while pending and (
                     (pending[0].truth is not None and (pending[0].pose is not None or not has_poses))
                     or len(pending) > JOIN_WINDOW
@@ -118,7 +123,7 @@ class McapRecording(Source):
 
     def _decoded(
         self, bag: BagReader
-    ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | tuple[StampedTag, TruePose]]:
+    ) -> Iterator[RangeMeasurement | tuple[MeasurementKey, Truth] | TruePosition]:
         checked_channels: set[int] = set()
         types = {self._topic: topics.RANGE_CIR_TYPE, topics.RANGE_TRUTH: topics.RANGE_TRUTH_TYPE}
         if bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE:
@@ -137,21 +142,16 @@ class McapRecording(Source):
                 elif topic == topics.RANGE_TRUTH:
                     yield decode_truth(message.data)
                 elif (decoded := decode_true_position(message.data)) is not None:
-                    stamp_ns, tag_id, position, yaw = decoded
-                    yield StampedTag(stamp_ns, tag_id), (position, yaw)
+                    yield decoded
             except RecordingError as error:
                 self.skipped[error.what] += 1
 
 
+TruePosition = tuple[int, int, tuple[float, float, float], float | None]
+"""Stamp and tag of a true position, the position, and its yaw."""
+
 TruePose = tuple[tuple[float, float, float], float | None]
 """A true position and yaw."""
-
-
-class StampedTag(NamedTuple):
-    """Tag and stamp of a true position."""
-
-    stamp_ns: int
-    tag_id: int
 
 
 @dataclass(slots=True)
@@ -161,18 +161,3 @@ class _PendingRange:
     measurement: RangeMeasurement
     truth: Truth | None
     pose: TruePose | None
-
-
-def _assign_pose(
-    stamped_tag: StampedTag,
-    pose: TruePose,
-    pending: deque[_PendingRange],
-    poses: dict[StampedTag, TruePose],
-) -> None:
-    """Assign a true pose to earlier and later ranges with the same tag and stamp."""
-    for entry in pending:
-        if (entry.measurement.stamp_ns, entry.measurement.tag_id) == stamped_tag:
-            entry.pose = pose
-    poses[stamped_tag] = pose
-    if len(poses) > JOIN_WINDOW:
-        del poses[next(iter(poses))]
