@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from itertools import islice
 
 import numpy as np
 
@@ -13,8 +12,6 @@ from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.training.evaluation.metrics import ErrorStatistics, GroupMae, coverage, mae_by_group
 from uwb_mitigation.types.measurement import Record
-
-_BATCH = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,24 +61,20 @@ def evaluate_accuracy(
     """
     raw, corrected, variance, labels, configurations, model_ids = [], [], [], [], [], []
     statuses: Counter[str] = Counter()
-    stream = iter(records)
     read = 0
-    while batch := list(islice(stream, _BATCH)):
-        results = mitigation.correct([record.measurement for record in batch])
-        for record, result in zip(batch, results, strict=True):
-            # An infinite variance marks an invalid range.
-            if record.truth is None or not np.isfinite(record.truth.range_m + result.variance_m2):
-                continue
-            raw.append(result.range_raw_m - record.truth.range_m)
-            corrected.append(result.range_m - record.truth.range_m)
-            variance.append(result.variance_m2)
-            labels.append(record.truth.label)
-            configurations.append(record.truth.configuration)
-            model_ids.append(result.model_id)
-            statuses[result.status.name] += 1
-        read += len(batch)
-        for _ in batch:
-            on_record()
+    for record, result in mitigation.correct_records(records):
+        read += 1
+        on_record()
+        # An infinite variance marks an invalid range.
+        if record.truth is None or not np.isfinite(record.truth.range_m + result.variance_m2):
+            continue
+        raw.append(result.range_raw_m - record.truth.range_m)
+        corrected.append(result.range_m - record.truth.range_m)
+        variance.append(result.variance_m2)
+        labels.append(record.truth.label)
+        configurations.append(record.truth.configuration)
+        model_ids.append(result.model_id)
+        statuses[result.status.name] += 1
     if not raw:
         raise DatasetError(f"none of {read} measurements has a valid range and a true one")
     raw_m, corrected_m, variances = np.array(raw), np.array(corrected), np.array(variance)
