@@ -179,11 +179,9 @@ class SimulatedSource(Simulated):
         Raises:
             ParameterError: an argument is out of its range.
         """
-        check_range(
-            "simulated source", "anchors", number, len(ANCHORS), len(ANCHORS + MORE_ANCHORS), whole=True
-        )
-        anchors = (ANCHORS + MORE_ANCHORS)[:number]
-        return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors)
+        anchors = ANCHORS + MORE_ANCHORS
+        check_range("simulated source", "anchors", number, len(ANCHORS), len(anchors), whole=True)
+        return cls(seed=seed, count=count, rate_hz=rate_hz, anchors=anchors[:number])
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         pairs = self._tags * len(self._anchors)
@@ -236,31 +234,22 @@ class SimulatedSurvey(Simulated):
     Args:
         seed: 0 to 2^32 - 1.
         configurations: 1 to 10^7 placements. exchanges: 1 to 1000 for each.
-        rate_hz: exchanges per second, 0.1 to 100000.
-        plan, radio: the scene, the receiver.
+        plan: the scene.
 
     Raises:
         ParameterError: an argument is out of its range, or the plan is too small.
     """
 
     def __init__(
-        self,
-        *,
-        seed: int = 1,
-        configurations: int = 100,
-        exchanges: int = 20,
-        rate_hz: float = 20.0,
-        plan: Building = FLAT,
-        radio: Receiver | None = None,
+        self, *, seed: int = 1, configurations: int = 100, exchanges: int = 20, plan: Building = FLAT
     ) -> None:
         check_seed(seed)
         check_range("simulated survey", "configurations", configurations, 1, 10**7, whole=True)
         check_range("simulated survey", "exchanges", exchanges, 1, 1000, whole=True)
         for axis, extent in zip("xy", plan.size, strict=True):
             check_range("simulated survey", f"plan size in {axis}", extent, 2.0, 1000.0)
-        super().__init__(
-            f"simulated survey, seed {seed}", rate_hz, radio or Receiver(), configurations * exchanges
-        )
+        count = configurations * exchanges
+        super().__init__(f"simulated survey, seed {seed}", SURVEY_RATE_HZ, Receiver(), count)
         self._plan = plan
         self._seed = seed
         self._exchanges = exchanges
@@ -296,9 +285,8 @@ class SimulatedBuildings(Simulated):
         check_seed(seed)
         check_range("simulated buildings", "placements", placements, 1, 10**7, whole=True)
         check_range("simulated buildings", "exchanges", exchanges, 1, 1000, whole=True)
-        super().__init__(
-            f"simulated buildings, seed {seed}", SURVEY_RATE_HZ, BUILDINGS_RADIO, placements * exchanges
-        )
+        count = placements * exchanges
+        super().__init__(f"simulated buildings, seed {seed}", SURVEY_RATE_HZ, BUILDINGS_RADIO, count)
         self._seed = seed
         self._exchanges = exchanges
 
