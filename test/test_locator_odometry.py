@@ -435,7 +435,7 @@ class Continuation:
         node, self.path = MagicMock(), DeadReckoning()
         node.value.side_effect = {"map_frame": "map", "base_frame": "base_link", "odometry": "odom"}.get
         self.motion = OdometryInput(node, self.path)
-        self._receive = node.create_subscription.call_args_list[0].args[2]
+        self._receive = node.subscription.call_args_list[0].args[2]
         yaw = 0.5
         saved = {
             "odom_frame": "odom",

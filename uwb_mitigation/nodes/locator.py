@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -176,16 +175,11 @@ class Locator(ManagedNode):
         if kind in markers.ANCHOR_TYPES:
             # Some publishers send the anchors once for late subscribers, others repeatedly.
             for qos in (endpoints.LATCHED, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)):
-                sent = self.create_subscription(markers.ANCHOR_TYPES[kind], topic, self._on_anchors, qos)
-                self.destroy_at_close(sent, self.destroy_subscription)
+                self.subscription(markers.ANCHOR_TYPES[kind], topic, self._on_anchors, qos)
         self._subscribe_to_ranges(self.value("ranges"))
         if topic := self.value("height_topic"):
-            heights = endpoints.create_subscription(
-                self, PoseWithCovarianceStamped, topic, self._on_height, ReliabilityPolicy.BEST_EFFORT
-            )
-            self.destroy_at_close(heights, self.destroy_subscription)
-        timer = self.create_timer(PERIOD_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self.destroy_at_close(timer, self.destroy_timer)
+            self.subscription(PoseWithCovarianceStamped, topic, self._on_height)
+        self.steady_timer(PERIOD_S, self._on_timer)
 
     def begin(self) -> None:
         self._show_anchors()

@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError, format_id
-from uwb_mitigation.nodes.support import diagnostics, endpoints
+from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import PX4
@@ -82,10 +81,8 @@ class Px4(ManagedNode):
             self._open_ranges()
         else:
             self._publisher = self.publisher(self._messages.VehicleOdometry, topics.PX4_ODOMETRY, _QOS)
-            poses = self.create_subscription(
-                PoseWithCovarianceStamped, topics.relative(topics.POSE), self._on_pose, 10
-            )
-            self.destroy_at_close(poses, self.destroy_subscription)
+            name = topics.relative(topics.POSE)
+            poses = self.subscription(PoseWithCovarianceStamped, name, self._on_pose, 10)
             self.get_logger().info(f"sends {poses.topic_name} to {self._publisher.topic_name}")
 
     def begin(self) -> None:
@@ -96,18 +93,14 @@ class Px4(ManagedNode):
 
     def describe(self) -> Description:
         values: dict[str, object] = {"sent": self._sent, "mode": self.value("mode")}
-        level, text = diagnostics.OK, "sending" if self._sent else "no positions or ranges yet"
+        text = "sending" if self._sent else "no positions or ranges yet"
+        warning = ""
         if self.value("mode") == "ranges" and self._positions is None:
-            level, text = (
-                diagnostics.WARN,
-                "the origin of PX4 is unknown: set parameter origin, or wait for GNSS",
-            )
+            warning = "the origin of PX4 is unknown: set parameter origin, or wait for GNSS"
         elif self._unknown:
-            level, text = (
-                diagnostics.WARN,
-                f"ranges of anchors that are not in the file: {', '.join(map(format_id, sorted(self._unknown)))}",
-            )
-        return "PX4", level, text, values
+            unknown = ", ".join(map(format_id, sorted(self._unknown)))
+            warning = f"ranges of anchors that are not in the file: {unknown}"
+        return "PX4", diagnostics.WARN if warning else diagnostics.OK, warning or text, values
 
     def _open_ranges(self) -> None:
         beacon = getattr(self._messages, "RangingBeacon", None)
@@ -127,17 +120,10 @@ class Px4(ManagedNode):
             kind = self._messages.VehicleLocalPosition
             version = getattr(kind, "MESSAGE_VERSION", 0)
             name = topics.relative(topics.PX4_LOCAL_POSITION) + (f"_v{version}" if version else "")
-            local = self.create_subscription(kind, name, self._on_local_position, qos_profile_sensor_data)
-            self.destroy_at_close(local, self.destroy_subscription)
+            self.subscription(kind, name, self._on_local_position, qos_profile_sensor_data)
         self._publisher = self.publisher(beacon, topics.PX4_BEACON, _QOS)
-        name = topics.relative(topics.RANGE_CORRECTED)
-        ranges = endpoints.create_subscription(
-            self, RangeCorrected, name, self._on_range, ReliabilityPolicy.BEST_EFFORT
-        )
-        self.destroy_at_close(ranges, self.destroy_subscription)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.create_timer(RANGE_PERIOD_NS / NS_PER_S, self._send_range, clock=steady)
-        self.destroy_at_close(timer, self.destroy_timer)
+        ranges = self.subscription(RangeCorrected, topics.relative(topics.RANGE_CORRECTED), self._on_range)
+        self.steady_timer(RANGE_PERIOD_NS / NS_PER_S, self._send_range)
         self.get_logger().info(f"sends {ranges.topic_name} to {self._publisher.topic_name}")
 
     def _place_anchors(self, origin: tuple[float, float, float]) -> None:

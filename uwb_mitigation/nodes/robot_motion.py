@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu
 
 from uwb_mitigation.errors import ParameterError
@@ -138,20 +138,13 @@ class OdometryInput:
         # {child frame: (parent frame, translation, quaternion)} of static transforms.
         self._static: dict[str, tuple[str, Vector, tuple[float, ...]]] = {}
 
-        def subscribe(kind: type, topic: str, callback: Any) -> None:
-            received = endpoints.create_subscription(
-                node, kind, topic, callback, ReliabilityPolicy.BEST_EFFORT
-            )
-            node.destroy_at_close(received, node.destroy_subscription)
-
-        subscribe(Odometry, node.value("odometry"), self._on_odometry)
+        node.subscription(Odometry, node.value("odometry"), self._on_odometry)
         if node.value("imu"):
-            subscribe(Imu, node.value("imu"), self._on_imu)
+            node.subscription(Imu, node.value("imu"), self._on_imu)
         message = transform_type()
         if not self.lever_arm_is_set and message is not None:
             qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            static = node.create_subscription(message, self._static_topic, self._on_static, qos)
-            node.destroy_at_close(static, node.destroy_subscription)
+            node.subscription(message, self._static_topic, self._on_static, qos)
 
     def lever_arm(self, frame: str) -> Vector | None:
         """Return the position of a range's frame in the frame of the base, from /tf_static; None: unknown."""

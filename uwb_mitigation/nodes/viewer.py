@@ -14,7 +14,6 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -93,13 +92,8 @@ class Viewer(ManagedNode):
         self._range_node = self.destroy_at_close(range_node, lambda node: node.destroy_node())
         self._subscribe_ranges(RangeTruth, topics.RANGE_TRUTH)
         self._subscribe_ranges(RangeCorrected, topics.RANGE_CORRECTED)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        for period_s, callback in (
-            (DISCOVERY_PERIOD_S, self._discover_topics),
-            (READ_PERIOD_S, self._read_queued_ranges),
-        ):
-            timer = self.create_timer(period_s, callback, clock=steady)
-            self.destroy_at_close(timer, self.destroy_timer)
+        self.steady_timer(DISCOVERY_PERIOD_S, self._discover_topics)
+        self.steady_timer(READ_PERIOD_S, self._read_queued_ranges)
 
     def begin(self) -> None:
         self._view = View(
@@ -145,8 +139,8 @@ class Viewer(ManagedNode):
     ) -> None:
         """Subscribe to a topic; `plain` is its name in a bag."""
         if topic not in self._subscribed:
-            subscription = self.create_subscription(kind, topic, partial(self._feed.add, plain, tag=tag), qos)
-            self._subscribed[topic] = self.destroy_at_close(subscription, self.destroy_subscription)
+            callback = partial(self._feed.add, plain, tag=tag)
+            self._subscribed[topic] = self.subscription(kind, topic, callback, qos)
 
     def _subscribe_ranges(self, kind: type, topic: str) -> None:
         """Subscribe to a topic of ranges; they are queued until `_read_queued_ranges`."""

@@ -19,7 +19,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
 from uwb_mitigation.errors import (
     ParameterError,
@@ -108,6 +109,22 @@ class ManagedNode(LifecycleNode):
         else:
             resource = self.create_lifecycle_publisher(kind, relative(topic), qos)
         return self.destroy_at_close(resource, self.destroy_lifecycle_publisher)
+
+    def subscription(
+        self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile | int | None = None
+    ) -> Subscription:
+        """Return a subscription until `close`; by default one of ranges that also receives best-effort messages."""
+        if qos is None:
+            best_effort = ReliabilityPolicy.BEST_EFFORT
+            resource = endpoints.create_subscription(self, kind, topic, callback, best_effort)
+        else:
+            resource = self.create_subscription(kind, topic, callback, qos)
+        return self.destroy_at_close(resource, self.destroy_subscription)
+
+    def steady_timer(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call `callback` periodically until `close`, also while a simulated clock is paused."""
+        timer = self.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.destroy_at_close(timer, self.destroy_timer)
 
     def respawn_file(self, suffix: str) -> Path | None:
         """Return a file with which this node continues after a crash; None: it is not respawned by a launch file."""
