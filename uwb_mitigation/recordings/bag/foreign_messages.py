@@ -33,12 +33,12 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[_Message]:
     elif path.suffix == ".bag":
         yield from _ros1_messages(path, topics)
     else:
-        bag, types = BagReader(path), _Types()
+        bag, types = BagReader(path), BagTypes()
         _check_topics(path, topics, bag.topics)
         for message in bag.messages(topics):
             schema = message.channel.schema
-            text, kind = (schema.data.decode(errors="replace"), schema.name) if schema else ("", "")
-            yield message.channel.topic, message.log_time_ns, types.decode(kind, text, message.data)
+            kind, definition = (schema.name, schema.data) if schema else ("", b"")
+            yield message.channel.topic, message.log_time_ns, types.decode(kind, definition, message.data)
 
 
 def _check_topics(path: Path, topics: Collection[str], types: dict[str, str]) -> None:
@@ -52,28 +52,29 @@ def _damage(path: Path, error: Exception) -> DamagedRecordingError:
     return DamagedRecordingError(f"truncated or corrupt: {error!s:.200}", where=str(path))
 
 
-class _Types:
+class BagTypes:
     """Decodes messages with the definitions of a bag."""
 
     def __init__(self, *, ros1: bool = False) -> None:
         self._ros1 = ros1
-        self._stores: dict[str, Typestore] = {}
+        self._stores: dict[tuple[str, str | bytes], Typestore] = {}
 
-    def decode(self, type_name: str, definition: str, data: bytes) -> Any:
+    def decode(self, type_name: str, definition: str | bytes, data: bytes) -> Any:
+        """Return a message; raises errors of various types if the definition or the message is invalid."""
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         name = type_name if "/msg/" in type_name else type_name.replace("/", "/msg/")
-        if name not in self._stores:
+        if (store := self._stores.get((name, definition))) is None:
             store = get_typestore(Stores.EMPTY if definition else Stores.ROS2_JAZZY)
             if definition:
-                store.register(get_types_from_msg(definition, name))
-            self._stores[name] = store
-        store = self._stores[name]
+                text = definition if isinstance(definition, str) else definition.decode(errors="replace")
+                store.register(get_types_from_msg(text, name))
+            self._stores[name, definition] = store
         return store.deserialize_ros1(data, name) if self._ros1 else store.deserialize_cdr(data, name)
 
 
 def _sqlite_messages(path: Path, topics: Collection[str]) -> Iterator[_Message]:
-    types = _Types()
+    types = BagTypes()
     try:
         with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
             # Otherwise SQLite refuses a file that is shorter than its header claims.
@@ -100,7 +101,7 @@ def _ros1_messages(path: Path, topics: Collection[str]) -> Iterator[_Message]:
     """Read the records of a ROS 1 bag (format 2.0, wiki.ros.org/Bags/Format/2.0)."""
     from rosbags.rosbag1.reader import Header, ReaderError, decompressors, read_uint32
 
-    types, connections = _Types(ros1=True), dict[int, tuple[str, str, str]]()
+    types, connections = BagTypes(ros1=True), dict[int, tuple[str, str, str]]()
     damage: Exception | None = None
     with path.open("rb") as file:
         if not file.readline(32).startswith(b"#ROSBAG V2.0"):

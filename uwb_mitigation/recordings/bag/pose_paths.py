@@ -8,22 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
-from uwb_mitigation.recordings.bag.reader import BagReader, Channel
+from uwb_mitigation.recordings.bag.foreign_messages import BagTypes
+from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import decode_frame_id
 from uwb_mitigation.types.ros.poses import POSITION_TYPES, UNOBSERVED, tag_of_frame
 from uwb_mitigation.types.stamps import to_ns
 from uwb_mitigation.types.tracks import Heights, PosePath, TruePath
-
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
 
 MAX_POSES = 2_000_000
 MOVES_M = 0.05
@@ -208,33 +205,19 @@ def check_topic(path: Path, recorded: dict[str, str], topic: str, types: tuple[s
 
 def decode_messages(bag: BagReader, names: list[str], where: str) -> Iterator[Any]:
     """Decode the messages of topics by the schemas of their channels."""
-    stores: dict[int, tuple[Typestore, str]] = {}
+    types = BagTypes()
     for count, message in enumerate(bag.messages(names)):
         if count >= MAX_POSES:
             raise RecordingError(f"more than {MAX_POSES} messages", where=where, valid="a shorter recording")
-        key = id(message.channel)
-        if key not in stores:
-            stores[key] = _store(message.channel, where)
-        store, name = stores[key]
+        schema = message.channel.schema
+        if schema is None or schema.name not in _READABLE_TYPES:
+            what = f"messages of type {schema.name if schema else ''!r}"
+            raise RecordingError(what, where=where, valid=", ".join(_READABLE_TYPES))
         try:
-            decoded = store.deserialize_cdr(message.data, name)
+            decoded = types.decode(schema.name, schema.data, message.data)
         except Exception as error:  # Of no common type.
-            raise RecordingError(f"a message is damaged: {error}", where=where) from error
+            raise RecordingError(f"a message or its type is damaged: {error}", where=where) from error
         yield decoded
-
-
-def _store(channel: Channel, where: str) -> tuple[Typestore, str]:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    name = channel.schema.name if channel.schema is not None else ""
-    if channel.schema is None or name not in _READABLE_TYPES:
-        raise RecordingError(f"messages of type {name!r}", where=where, valid=", ".join(_READABLE_TYPES))
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register(get_types_from_msg(channel.schema.data.decode(), name))
-    except Exception as error:  # Of no common type.
-        raise RecordingError(f"the type {name} cannot be read: {error}", where=where) from error
-    return store, name
 
 
 def _frame(name: str) -> str:
