@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -24,15 +24,17 @@ NO_QOS = "[]"
 """No recorded QoS: `ros2 bag play` offers its default (reliable, volatile)."""
 
 
-@dataclass(frozen=True, slots=True)
-class TopicCount:
-    """A topic of a bag and its number of messages."""
-
-    topic: str
-    type_name: str
-    type_hash: str
-    messages: int
-    qos: Sequence[Mapping[str, Any]] = ()
+def topic_metadata(
+    topic: str, type_name: str, type_hash: str, qos: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the description of a topic in `metadata.yaml`."""
+    return {
+        "name": topic,
+        "type": type_name,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": qos,
+        "type_description_hash": type_hash,
+    }
 
 
 def recorded_qos(text: str) -> list[dict[str, Any]]:
@@ -51,12 +53,16 @@ def recorded_qos(text: str) -> list[dict[str, Any]]:
 
 
 def describe(
-    file_name: str, topics: Sequence[TopicCount], bounds_ns: tuple[int, int], custom: Mapping[str, str]
+    file_name: str,
+    topics: Sequence[dict[str, Any]],
+    counts: Counter[str],
+    bounds_ns: tuple[int, int],
+    custom: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return the content of `metadata.yaml` below its only key, for a bag of one file."""
+    """Return the content of `metadata.yaml` below its only key, for a bag of one file; `topics`: of `topic_metadata`."""
     start = {"nanoseconds_since_epoch": bounds_ns[0]}
     duration = {"nanoseconds": bounds_ns[1] - bounds_ns[0]}
-    total = sum(topic.messages for topic in topics)
+    total = counts.total()
     return {
         "version": VERSION,
         "storage_identifier": "mcap",
@@ -64,17 +70,7 @@ def describe(
         "starting_time": start,
         "message_count": total,
         "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": topic.topic,
-                    "type": topic.type_name,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": list(topic.qos),
-                    "type_description_hash": topic.type_hash,
-                },
-                "message_count": topic.messages,
-            }
-            for topic in topics
+            {"topic_metadata": topic, "message_count": counts[topic["name"]]} for topic in topics
         ],
         "compression_format": "",
         "compression_mode": "",

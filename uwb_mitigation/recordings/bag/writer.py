@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
@@ -23,7 +23,7 @@ from uwb_mitigation.files import VERSION, partial_path, write_atomically
 from uwb_mitigation.recordings.bag import rosbag2
 from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import Channel, Schema
-from uwb_mitigation.types.measurement import RangeMeasurement, Record
+from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.types.ros.codec import encode_range, encode_truth
 from uwb_mitigation.types.ros.poses import encode_true_position
@@ -87,7 +87,7 @@ class BagWriter:
         self._own_channels: dict[str, int] = {}
         self._channel_ids: dict[tuple[object, ...], int] = {}
         self._topic_of_channel: dict[int, str] = {}
-        self._topics: dict[str, rosbag2.TopicCount] = {}
+        self._topics: dict[str, dict[str, Any]] = {}
         self._schemas: dict[Schema, int] = {}
         self._stream: BinaryIO | None = None
 
@@ -122,23 +122,24 @@ class BagWriter:
             RecordingError: a value does not fit its field, or the bag cannot be written.
         """
         measurement = record.measurement
-        self._write_own(topics.RANGE_RAW, topics.RANGE_CIR_TYPE, measurement, encode_range(measurement))
+        stamp_ns, sequence, data = measurement.stamp_ns, measurement.sequence, encode_range(measurement)
+        self.write_message(topics.RANGE_RAW, topics.RANGE_CIR_TYPE, data, stamp_ns, sequence)
         if record.truth is not None:
-            truth = encode_truth(measurement, record.truth)
-            self._write_own(topics.RANGE_TRUTH, topics.RANGE_TRUTH_TYPE, measurement, truth)
+            data = encode_truth(measurement, record.truth)
+            self.write_message(topics.RANGE_TRUTH, topics.RANGE_TRUTH_TYPE, data, stamp_ns, sequence)
         if record.tag_position is not None:
-            odometry = encode_true_position(
-                record.tag_position, measurement.tag_id, measurement.stamp_ns, record.tag_yaw
-            )
-            self.write_message(topics.ODOMETRY_TRUTH, topics.ODOMETRY_TYPE, odometry, measurement.stamp_ns)
+            data = encode_true_position(record.tag_position, measurement.tag_id, stamp_ns, record.tag_yaw)
+            self.write_message(topics.ODOMETRY_TRUTH, topics.ODOMETRY_TYPE, data, stamp_ns)
 
-    def write_message(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:
+    def write_message(
+        self, topic: str, type_name: str, data: bytes, stamp_ns: int, sequence: int = 0
+    ) -> None:
         """Write a serialised message of a standard type.
 
         Raises:
             RecordingError: the time is before the epoch, or the bag cannot be written.
         """
-        self.write_serialized(self._own_channel(topic, type_name), data, stamp_ns, stamp_ns)
+        self.write_serialized(self._own_channel(topic, type_name), data, stamp_ns, stamp_ns, sequence)
 
     def copy_channel(self, channel: Channel) -> int:
         """Register a channel of another bag; return its number.
@@ -189,12 +190,6 @@ class BagWriter:
             self._discard()
             raise
 
-    def _write_own(self, topic: str, type_name: str, measurement: RangeMeasurement, data: bytes) -> None:
-        stamp_ns = measurement.stamp_ns
-        self.write_serialized(
-            self._own_channel(topic, type_name), data, stamp_ns, stamp_ns, measurement.sequence
-        )
-
     def _own_channel(self, topic: str, type_name: str) -> int:
         number = self._own_channels.get(topic)
         if number is None:
@@ -217,13 +212,13 @@ class BagWriter:
         self._channel_ids[key], self._topic_of_channel[number] = number, topic
         # A topic may have several channels, of several publishers; rosbag2 lists it once.
         kind, qos = schema.name if schema else "", rosbag2.recorded_qos(metadata[_QOS_KEY])
-        self._topics.setdefault(topic, rosbag2.TopicCount(topic, kind, metadata.get(_HASH_KEY, ""), 0, qos))
+        description = rosbag2.topic_metadata(topic, kind, metadata.get(_HASH_KEY, ""), qos)
+        self._topics.setdefault(topic, description)
         return number
 
     def _finish(self) -> None:
-        counts = self.counts
-        counted = [replace(topic, messages=counts[topic.topic]) for topic in self._topics.values()]
-        document = rosbag2.describe(self.file.name, counted, self._mcap.bounds_ns, self._metadata)
+        bounds_ns, topics_written = self._mcap.bounds_ns, [*self._topics.values()]
+        document = rosbag2.describe(self.file.name, topics_written, self.counts, bounds_ns, self._metadata)
         with self._translate_os_errors():
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": rosbag2.dump(document)})
             self._mcap.finish()
