@@ -148,6 +148,12 @@ def compare_models(
         by_label = {label: float(np.abs(errors[:, dataset.labels == label]).mean()) for label in labels}
         interval = bootstrap_interval(errors[0], dataset.configurations)
         rows.append(ErrorRow(name, float(maes.mean()), float(maes.std()), by_label, interval))
+    universal_coverage = None
+    if zero_shot_result is not None:
+        universal_errors = zero_shot_result.errors["universal_los_offset"][None]
+        variance = zero_shot_result.variance_m2[None].astype(np.float64)
+        wide_variance = variance * zero_shot_result.sigmas95**2
+        universal_coverage = _coverage(dataset.labels, universal_errors, variance, wide_variance)
     final = np.array([seed_result.errors[names[-1]] for seed_result in held_out_by_seed])
     variance = np.array([seed_result.variance_m2 for seed_result in held_out_by_seed])
     wide_variance = variance * np.array([seed_result.sigmas95 for seed_result in held_out_by_seed]) ** 2
@@ -164,14 +170,7 @@ def compare_models(
         folds=len(splits.by_group(dataset, group, folds, 0)),
         seeds=seeds,
         configurations=len(dataset.names),
-        universal_coverage=None
-        if zero_shot_result is None
-        else _coverage(
-            dataset.labels,
-            zero_shot_result.errors["universal_los_offset"][None],
-            zero_shot_result.variance_m2[None].astype(np.float64),
-            zero_shot_result.variance_m2[None].astype(np.float64) * zero_shot_result.sigmas95**2,
-        ),
+        universal_coverage=universal_coverage,
     )
 
 
@@ -182,14 +181,13 @@ def _coverage(
     wide_m2: NDArray[np.float64],
 ) -> Coverage:
     """Return the coverage by label (n,) of errors (seeds, n) and their variances."""
-    coverages = {}
-    for label in ("", *dict.fromkeys(labels.tolist())):
-        label_rows = (labels == label) | (label == "")
-        coverages[label] = (
-            coverage(error_m[:, label_rows], variance_m2[:, label_rows], 1.0),
-            coverage(error_m[:, label_rows], wide_m2[:, label_rows], 1.0),
-        )
-    return coverages
+
+    def shares(rows: NDArray[np.bool_]) -> tuple[float, float]:
+        narrow, wide = (coverage(error_m[:, rows], each[:, rows], 1.0) for each in (variance_m2, wide_m2))
+        return narrow, wide
+
+    names = ("", *dict.fromkeys(labels.tolist()))
+    return {name: shares((labels == name) | (name == "")) for name in names}
 
 
 def _hold_out(

@@ -39,11 +39,7 @@ def overall_median(train: Dataset) -> Predict:
 
 def ridge(train: Dataset, *, header: bool) -> Predict:
     """Fit a ridge regression on standardised features of the CIR and, with `header`, of the header."""
-    pipeline, linear, preprocessing = (
-        scikit_learn("pipeline"),
-        scikit_learn("linear_model"),
-        scikit_learn("preprocessing"),
-    )
+    pipeline, linear, preprocessing = map(scikit_learn, ("pipeline", "linear_model", "preprocessing"))
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear.Ridge(RIDGE_PENALTY))
     model.fit(baseline_features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
     return lambda data: np.asarray(model.predict(baseline_features(data, header=header)), np.float64)

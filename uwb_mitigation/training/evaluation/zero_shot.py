@@ -85,12 +85,7 @@ def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     offset_of_others = np.array(
         [np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))]
     )
-    errors = dict(
-        zip(
-            NAMES,
-            (residual, residual - los_offset, residual - offset_of_others[configuration_index]),
-            strict=True,
-        )
-    )
+    residuals = residual, residual - los_offset, residual - offset_of_others[configuration_index]
+    errors = dict(zip(NAMES, residuals, strict=True))
     sigmas95 = bundle.card.interval95_sigmas
     return ZeroShot(errors, los_offset, corrections.variance_m2, sigmas95, corrections.passed_through)
