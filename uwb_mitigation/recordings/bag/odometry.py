@@ -23,8 +23,8 @@ from uwb_mitigation.types.tracks import Imu, Odometry
 ODOM, BASE_LINK = "odom", "base_link"
 """The odometry frame and the robot's frame (REP-105)."""
 
-_PLANE = np.array([0, 1, 5])
-"""Rows of x, y and yaw in a 6x6 covariance."""
+_PLANE = np.ix_([0, 1, 5], [0, 1, 5])
+"""Rows and columns of x, y and yaw in a 6x6 covariance."""
 
 _UNMEASURED = 1e6
 """Variance of values that wheels do not measure: z, roll and pitch."""
@@ -105,7 +105,8 @@ def read_odometry(path: Path, topic: str) -> Odometry:
         pose, twist = decoded.pose.pose, decoded.twist.twist
         values = [pose.position.x, pose.position.y, yaw_of(pose.orientation)]
         values += [twist.linear.x, twist.linear.y, twist.angular.z]
-        covariances = [_three(item.covariance).ravel() for item in (decoded.pose, decoded.twist)]
+        six_by_six = np.reshape([decoded.pose.covariance, decoded.twist.covariance], (2, 6, 6))
+        covariances = [covariance[_PLANE].ravel() for covariance in six_by_six]
         rows[to_ns(decoded.header.stamp)] = np.concatenate([values, *covariances])
     # Some robots publish twists only: their orientation is zero, and the yaw NaN.
     stamp_ns, columns = _columns(rows, path, topic, slice(3, None))
@@ -156,11 +157,5 @@ def _columns(
 def _six(plane: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a 6x6 covariance, flat, from that of x, y and yaw."""
     covariance = np.diag(np.full(6, _UNMEASURED))
-    covariance[np.ix_(_PLANE, _PLANE)] = plane
+    covariance[_PLANE] = plane
     return covariance.ravel()
-
-
-def _three(covariance: Any) -> NDArray[np.float64]:
-    six = np.asarray(covariance, np.float64).reshape(6, 6)
-    plane: NDArray[np.float64] = six[np.ix_(_PLANE, _PLANE)]
-    return plane

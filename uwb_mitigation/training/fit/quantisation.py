@@ -68,7 +68,10 @@ def quantise_network(
     integers, biases = {}, {}
     limits = np.iinfo(np.int32)
     for name, weight in weights.weight.items():
-        unit = weight_scale[name] if name == HEAD else _by_output(weight_scale[name], weight)
+        # The first axis of the weights is the outputs; the head has one.
+        unit = (
+            weight_scale[name] if name == HEAD else weight_scale[name].reshape(-1, *[1] * (weight.ndim - 1))
+        )
         rounded = np.clip(np.rint(weight / unit), -WEIGHT_LIMIT, WEIGHT_LIMIT)
         integers[name] = rounded.astype(np.int8)
         bias = np.rint(weights.bias[name].astype(float) / (scale[reads[name]] * weight_scale[name]))
@@ -117,11 +120,6 @@ def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]
     peak = np.where(peak > 0, peak, peak.max() if peak.any() else 1.0)
     scale: NDArray[np.float32] = (peak / WEIGHT_LIMIT).astype(np.float32)
     return scale
-
-
-def _by_output(scale: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Reshape `scale` (outputs,) to broadcast with `weight`, whose first axis is the outputs."""
-    return scale.reshape(-1, *[1] * (weight.ndim - 1))
 
 
 def _peaks(weights: FloatWeights, calibration: NDArray[np.float32]) -> dict[str, float]:

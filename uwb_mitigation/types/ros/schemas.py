@@ -36,10 +36,8 @@ def typestore() -> Typestore:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
-    types = {}
     for name in ("Cir", "RangeCir", "RangeTruth", "RangeCorrected"):
-        types.update(get_types_from_msg(_message_text(name), f"{PACKAGE}/msg/{name}"))
-    store.register(types)
+        store.register(get_types_from_msg(_message_text(name), f"{PACKAGE}/msg/{name}"))
     return store
 
 
