@@ -185,9 +185,6 @@ class Locator(ManagedNode):
         self._show_anchors()
         self.get_logger().info("locating")
 
-    def end(self) -> None:
-        """Do nothing: the callbacks check whether the node is active."""
-
     def close(self) -> None:
         super().close()
         self._outputs, self._anchors_out, self._tf, self._estimator, self._ranges = {}, None, None, None, None

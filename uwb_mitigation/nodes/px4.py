@@ -85,12 +85,6 @@ class Px4(ManagedNode):
             poses = self.subscription(PoseWithCovarianceStamped, name, self._on_pose, 10)
             self.get_logger().info(f"sends {poses.topic_name} to {self._publisher.topic_name}")
 
-    def begin(self) -> None:
-        """Nothing: the lifecycle publisher sends while the node is active."""
-
-    def end(self) -> None:
-        """Nothing."""
-
     def describe(self) -> Description:
         values: dict[str, object] = {"sent": self._sent, "mode": self.value("mode")}
         text = "sending" if self._sent else "no positions or ranges yet"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
@@ -66,12 +67,11 @@ class TopicFeed:
 
     def start(self) -> None:
         """Subscribe to the topics."""
+        best_effort = ReliabilityPolicy.BEST_EFFORT
         for name in self._names:
-            self._subscriptions.append(
-                endpoints.create_subscription(
-                    self._node, self._type, name, self._callback(name), ReliabilityPolicy.BEST_EFFORT
-                )
-            )
+            take = partial(self.take, name=name)
+            received = endpoints.create_subscription(self._node, self._type, name, take, best_effort)
+            self._subscriptions.append(received)
         self._node.get_logger().info(f"{self._mapping.name}: ranges from {', '.join(self._names)}")
 
     def stop(self) -> None:
@@ -95,9 +95,6 @@ class TopicFeed:
 
     def apply(self, changed: Collection[str], value: Callable[[str], Any]) -> None:
         """Change nothing: no parameter of this source is live."""
-
-    def _callback(self, name: str) -> Callable[[Any], None]:
-        return lambda message: self.take(message, name)
 
     def take(self, message: Any, name: str) -> None:
         """Convert one message of the topic `name`; a message that cannot be used is counted and logged."""

@@ -55,7 +55,7 @@ def clock_reader(clock: Clock) -> Callable[[], int]:
 class ManagedNode(LifecycleNode):
     """A lifecycle node with a parameter table and one diagnostic status per second.
 
-    A subclass implements the transitions: `open` (configure), `begin` (activate), `end` (deactivate) and
+    A subclass implements the transitions: `open` (configure), and if necessary `begin` (activate), `end` (deactivate) and
     `close` (cleanup, shutdown). `end` and `close` may be called without `begin` or `open`.
     rclpy hides exceptions of a transition. This class logs them, shows them in the diagnostics, and closes what
     the transition has opened, so that it can be requested again.
@@ -87,10 +87,10 @@ class ManagedNode(LifecycleNode):
         raise NotImplementedError
 
     def begin(self) -> None:
-        raise NotImplementedError
+        """Do nothing: lifecycle publishers send while the node is active."""
 
     def end(self) -> None:
-        raise NotImplementedError
+        """Do nothing, see `begin`."""
 
     def close(self) -> None:
         """Destroy what `open` has created; a subclass also resets its attributes."""
