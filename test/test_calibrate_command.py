@@ -185,7 +185,7 @@ def test_offsets_alone_need_no_check_and_keep_the_default_standard_deviation(sit
 @pytest.fixture(scope="module")
 def calibrate_with():
     """Return a function that calibrates the first anchors of a drive whose ranges have these offsets."""
-    ranges, _ = drive(seconds=100, rate_hz=20.0, offset_m=0.0)
+    ranges, _ = drive(seconds=100, rate_hz=10.0, offset_m=0.0)
     universal = load_bundle(default_model_path())
 
     def calibrate(own):
@@ -475,7 +475,7 @@ def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps
     from benchmarks.equipment.uci_board import taps_of
 
     def measure(seed):
-        ranges, _ = drive(seconds=80, rate_hz=20.0, offset_m=0.0)
+        ranges, _ = drive(seconds=80, rate_hz=10.0, offset_m=0.0)
         rng, n = np.random.default_rng(seed), len(ranges)
         nlos = (rng.random((41, 5)) < 0.3)[ranges.stamp_ns // 2_000_000_000, ranges.anchor]
         gap = np.where(nlos, rng.normal(12, 2, n), rng.normal(3.5, 1, n))

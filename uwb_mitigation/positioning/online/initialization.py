@@ -95,11 +95,14 @@ def candidate_positions(
             x = area.clip(x)
         keep &= cost <= cost[keep].min() + IMPLAUSIBLE
     result: list[CandidatePosition] = []
-    for i in np.flatnonzero(keep)[np.argsort(cost[keep])]:
-        if any(_same(x[i], candidate) for candidate in result):
-            continue
-        covariance = np.linalg.inv(hessian[i] + 1e-6 * np.eye(3))
-        result.append(CandidatePosition(x[i].copy(), covariance, float(cost[i])))
+    left = np.flatnonzero(keep)[np.argsort(cost[keep])]
+    while len(left):
+        best = left[0]
+        information = hessian[best] + 1e-6 * np.eye(3)
+        result.append(CandidatePosition(x[best].copy(), np.linalg.inv(information), float(cost[best])))
+        offset = x[left] - x[best]
+        same = (np.sum(offset * offset, axis=1) < 0.25) | (np.sum(offset @ information * offset, axis=1) < 4.0)
+        left = left[~same]
     return result
 
 
@@ -185,11 +188,6 @@ class _Trilateration:
         hessian = np.einsum("nki,nkj->nij", rows, slope)
         hessian[:, [0, 1, 2], [0, 1, 2]] += self.information
         return cost, gradient, hessian, rows
-
-
-def _same(position: NDArray[np.float64], candidate: CandidatePosition) -> bool:
-    offset = position - candidate.position
-    return bool(offset @ offset < 0.25 or offset @ np.linalg.solve(candidate.covariance, offset) < 4.0)
 
 
 def _starts(
