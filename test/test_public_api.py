@@ -14,7 +14,6 @@ from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -42,7 +41,7 @@ from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import save_anchors
 from uwb_mitigation.types.measurement import is_logarithmic
 
-matplotlib.use("agg")
+os.environ["MPLBACKEND"] = "agg"
 PAGE = REPOSITORY / "docs" / "guides" / "python.md"
 IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
