@@ -402,8 +402,11 @@ def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     rng = np.random.default_rng(4)
     blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
     tail = np.where(blocked, rng.exponential(1.0, len(ranges)), 0.0)
+    exact = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
+    one = HALL.position + np.outer(np.arange(5) == 1, (0.25, 0.0, 0.0))
     for anchors, value in (
         (HALL.moved(HALL.position + np.array([0.15, 0.0, 0.0]), HALL.sd), ranges.range_m),
+        (HALL.moved(one, HALL.sd), exact),
         (HALL, ranges.range_m + tail),
     ):
         moved = replace(ranges, range_m=value)
