@@ -398,7 +398,7 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
 
 
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
-    ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
+    ranges, path = drive(seconds=160, rate_hz=10.0, offset_m=0.2)
     rng = np.random.default_rng(4)
     blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
     tail = np.where(blocked, rng.exponential(1.0, len(ranges)), 0.0)
