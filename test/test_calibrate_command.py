@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from bag_material import write_records
 from command_line import run, succeed
 from drives import HALL, drive
 from rosbags.typesys import Stores, get_typestore
@@ -108,9 +109,7 @@ def site(tmp_path_factory):
                     one.write_message("/odom", "nav_msgs/msg/Odometry", data, late)
         rare.write_message("/tf_static", TF_TYPE, arm_to("antenna"), int(ranges.stamp_ns[0]))
     other, _ = drive(seconds=80, rate_hz=8.0, offset_m=0.0, seed=5)
-    with BagWriter(folder / "other.mcap", {}) as bag:
-        for record in records_of(other, *with_errors(other, seed=6)):
-            bag.write(record)
+    write_records(folder / "other.mcap", records_of(other, *with_errors(other, seed=6)))
     return folder
 
 
@@ -506,9 +505,7 @@ def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps
 
     save_anchors(tmp_path / "anchors.yaml", HALL)
     for name, seed in (("drive", 1), ("other", 3)):
-        with BagWriter(tmp_path / f"{name}.mcap", {"simulated": "true"}) as bag:
-            for measured in measure(seed)[0]:
-                bag.write(Record(measured))
+        write_records(tmp_path / f"{name}.mcap", (Record(measured) for measured in measure(seed)[0]))
     succeed(f"calibrate drive.mcap {LEVEL} -o site.onnx --json r.json --check other.mcap", folder=tmp_path)
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["chosen"] == chosen

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_material import write_records
 from conftest import REPOSITORY
 
 import uwb_mitigation
@@ -36,7 +37,6 @@ from uwb_mitigation import (
     track,
 )
 from uwb_mitigation.errors import DamagedRecordingError, ModelError, ParameterError
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import save_anchors
 from uwb_mitigation.types.measurement import is_logarithmic
@@ -52,9 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with `drive.mcap`, `site.mcap` and `anchors.yaml`."""
     path = tmp_path_factory.mktemp("drive")
     for name, count in (("drive", 400), ("site", 2000)):
-        with BagWriter(path / f"{name}.mcap", {"simulated": "true"}) as bag:
-            for record in SimulatedSource(seed=1, count=count):
-                bag.write(record)
+        write_records(path / f"{name}.mcap", SimulatedSource(seed=1, count=count))
     save_anchors(path / "anchors.yaml", SimulatedSource().anchors)
     return path
 

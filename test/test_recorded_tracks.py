@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import record
+from bag_material import record, write_records
 from browser import Browser
 from command_line import run, succeed
 from drives import HALL, drive
@@ -26,7 +26,6 @@ from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.tag_locator import TagLocator
 from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
@@ -207,9 +206,9 @@ def test_report_is_one_file_with_the_figures_of_track(imported, tmp_path: Path):
 
 def test_odometry_of_one_robot_is_not_used_for_several_tags(tmp_path: Path):
     bag = tmp_path / "two.mcap"
-    with BagWriter(bag, {}) as out:
-        for number in range(20):
-            out.write(Record(replace(record(number).measurement, tag_id=7 + number % 3)))
+    write_records(
+        bag, (Record(replace(record(number).measurement, tag_id=7 + number % 3)) for number in range(20))
+    )
     config = EstimatorConfig(HALL, robot=RobotData())
     player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(TrackSettings()))
     player.index(config).join()
