@@ -107,9 +107,8 @@ def local_optima(
     """
     x = np.concatenate([_starts(anchors, one, height) for one in range_m])
     sets = len(range_m), len(x) // len(range_m)
-    problem = _Trilateration.for_starts(
-        len(x), anchors, np.repeat(range_m, sets[1], axis=0), sd_m, model, height
-    )
+    of_starts = np.repeat(range_m, sets[1], axis=0)
+    problem = _Trilateration(anchors, of_starts, sd_m, model, *_height_prior(len(x), height))
     x, loss, gradient, hessian = problem.descend(x)
     cost = loss.reshape(sets)
     # Discard starts that have not converged, unless no start has converged.
@@ -148,26 +147,10 @@ class _Trilateration:
     mean: NDArray[np.float64]
     information: NDArray[np.float64]
 
-    @classmethod
-    def for_starts(
-        cls,
-        count: int,
-        anchors: NDArray[np.float64],
-        range_m: NDArray[np.float64],
-        sd_m: NDArray[np.float64],
-        model: NoiseModel,
-        height: Height | None,
-    ) -> _Trilateration:
-        """Return the problem for that number of positions."""
-        mean, information = np.zeros((2, count, 3))
-        if height is not None:
-            mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
-        return cls(anchors, range_m, sd_m, model, mean, information)
-
     def with_walls(
         self, rows: NDArray[np.intp], wall: NDArray[np.float64], is_held: NDArray[np.bool_]
     ) -> _Trilateration:
-        """Return `at`, with the coordinates `held` bool (n, 3) at the boundary."""
+        """Return the problem of those positions, with the coordinates `is_held` bool (n, 3) at the boundary."""
         information = np.where(is_held, 1.0 / _WALL_SD_M**2, self.information[rows])
         mean = np.where(is_held, wall, self.mean[rows])
         return replace(self, range_m=self.range_m[rows], mean=mean, information=information)
@@ -212,6 +195,14 @@ class _Trilateration:
         return cost, gradient, hessian, rows
 
 
+def _height_prior(count: int, height: Height | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `mean` and `information` of that number of positions."""
+    mean, information = np.zeros((2, count, 3))
+    if height is not None:
+        mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
+    return mean, information
+
+
 def _starts(
     anchors: NDArray[np.float64], range_m: NDArray[np.float64], height: Height | None
 ) -> NDArray[np.float64]:
@@ -249,7 +240,8 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
     range_m, sd_m = np.where(present, latest, 0.0), np.where(present, 1.0, np.inf)
     reach = np.nanmedian(latest, axis=1, keepdims=True) if len(latest) else np.zeros((0, 1))
     exact = None if height is None else Height(height.value, 1e-4)
-    problem = _Trilateration.for_starts(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
+    prior = _height_prior(len(latest), exact)
+    problem = _Trilateration(anchors.position, range_m, sd_m, _LEAST_SQUARES, *prior)
     best, least = np.zeros((len(latest), 3)), np.full(len(latest), np.inf)
     sides = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -0.5]]) + 0.01
     for side in sides:
