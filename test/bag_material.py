@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import astuple, replace
 from pathlib import Path
 
@@ -70,19 +71,23 @@ def same(one: RangeMeasurement, other: RangeMeasurement) -> bool:
     return flat(one) == flat(other) and np.array_equal(one.cir.samples, other.cir.samples)
 
 
-def write_bag(path: Path, count: int = 5, simulated: str = "false") -> Path:
-    with BagWriter(path, {"source": "a test", "simulated": simulated}) as bag:
-        for number in range(count):
-            bag.write(record(number))
+def write_records(
+    path: Path, records: Iterable[Record], simulated: str = "true", source: str = "a test"
+) -> Path:
+    """Write records to a bag; return its path."""
+    with BagWriter(path, {"source": source, "simulated": simulated}) as bag:
+        for item in records:
+            bag.write(item)
     return path
+
+
+def write_bag(path: Path, count: int = 5, simulated: str = "false") -> Path:
+    return write_records(path, map(record, range(count)), simulated)
 
 
 def imported(source: Source, path: Path) -> Path:
     """Write the records of a source to a bag."""
-    with BagWriter(path, {"source": source.name, "simulated": "false"}) as bag:
-        for item in source:
-            bag.write(item)
-    return path
+    return write_records(path, source, "false", source.name)
 
 
 class Foreign:

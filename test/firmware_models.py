@@ -143,7 +143,7 @@ class Exported:
     subject: Network
     folder: Path
 
-    def windows(self, count: int = 2000) -> NDArray[np.float32]:
+    def windows(self, count: int = 500) -> NDArray[np.float32]:
         """Return windows that test every rounding: zero, saturating and random ones."""
         samples = self.weights.architecture.samples
         return random_networks.rounding_windows(samples, self.weights.activation_scale["input"], count)

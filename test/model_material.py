@@ -124,6 +124,13 @@ def record(seed: int = 0, configuration: str = "1", **changes: object) -> Record
     return Record(measurement(3.25, seed, **changes), Truth(3.0, "LOS", configuration))
 
 
+def changed(of: Record, cir: Cir | dict[str, object] | None = None, **changes: object) -> Record:
+    """Return a record with another CIR, or changes of it, and changes of its measurement."""
+    if cir is not None:
+        changes["cir"] = cir if isinstance(cir, Cir) else replace(of.measurement.cir, **cir)  # type: ignore[arg-type]
+    return replace(of, measurement=replace(of.measurement, **changes))  # type: ignore[arg-type]
+
+
 class Recorded(list):  # type: ignore[type-arg]
     """A recording in memory."""
 

@@ -96,6 +96,12 @@ def test_float32_numbers_read_back_to_the_bit(tmp_path):
     assert loaded.card.variance_m2 == float(np.float32(0.3))
 
 
+def test_lines_of_the_scale_pass_through_its_points():
+    begin, intercept, slope = card(SHAPE, scale=((0.0, 0.25), (0.5, 0.5), (2.0, 0.75))).scale_lines.T
+    assert (intercept + slope * begin).tolist() == pytest.approx([0.25, 0.5, 0.75])
+    assert slope.tolist() == pytest.approx([0.5, 1 / 6, 0.0])
+
+
 def test_id_is_the_checksum_of_the_file_with_the_id_blank(saved):
     data = saved.model.replace(b"%08x" % saved.model_id, b"00000000")
     assert zlib.crc32(data) == saved.model_id
@@ -147,6 +153,9 @@ def test_graph_that_onnx_runtime_cannot_run_is_refused(saved):
         lambda m: m.update(variance_m2=-1),
         lambda m: m.update(correction_limits_m=[1, 0]),
         lambda m: m.update(correction_limits_m=[1]),
+        lambda m: m.update(scale=[[1.0, 0.25]]),
+        lambda m: m.update(scale=[[0.0, 0.25], [0.0, 0.5]]),
+        lambda m: m.update(scale=[[0.0, -0.25]]),
         lambda m: m.update(quantised=False),
         lambda m: m.update(training=3),
         lambda m: m["architecture"].update(samples=32) or m["preprocessing"].update(samples=32),

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from bag_material import write_records
 from command_line import run, succeed
 from drives import HALL, drive
 from rosbags.typesys import Stores, get_typestore
@@ -108,9 +109,7 @@ def site(tmp_path_factory):
                     one.write_message("/odom", "nav_msgs/msg/Odometry", data, late)
         rare.write_message("/tf_static", TF_TYPE, arm_to("antenna"), int(ranges.stamp_ns[0]))
     other, _ = drive(seconds=80, rate_hz=8.0, offset_m=0.0, seed=5)
-    with BagWriter(folder / "other.mcap", {}) as bag:
-        for record in records_of(other, *with_errors(other, seed=6)):
-            bag.write(record)
+    write_records(folder / "other.mcap", records_of(other, *with_errors(other, seed=6)))
     return folder
 
 
@@ -185,7 +184,7 @@ def test_offsets_alone_need_no_check_and_keep_the_default_standard_deviation(sit
 @pytest.fixture(scope="module")
 def calibrate_with():
     """Return a function that calibrates the first anchors of a drive whose ranges have these offsets."""
-    ranges, _ = drive(seconds=100, rate_hz=20.0, offset_m=0.0)
+    ranges, _ = drive(seconds=100, rate_hz=10.0, offset_m=0.0)
     universal = load_bundle(default_model_path())
 
     def calibrate(own):
@@ -398,12 +397,15 @@ def test_anchors_at_wrong_positions_are_named_with_truth_too(site, move, named, 
 
 
 def test_small_displacement_and_heavy_tail_accuse_no_anchor():
-    ranges, path = drive(seconds=80, rate_hz=20.0, offset_m=0.2)
+    ranges, path = drive(seconds=160, rate_hz=10.0, offset_m=0.2)
     rng = np.random.default_rng(4)
     blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
     tail = np.where(blocked, rng.exponential(1.0, len(ranges)), 0.0)
+    exact = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
+    one = HALL.position + np.outer(np.arange(5) == 1, (0.25, 0.0, 0.0))
     for anchors, value in (
         (HALL.moved(HALL.position + np.array([0.15, 0.0, 0.0]), HALL.sd), ranges.range_m),
+        (HALL.moved(one, HALL.sd), exact),
         (HALL, ranges.range_m + tail),
     ):
         moved = replace(ranges, range_m=value)
@@ -475,7 +477,7 @@ def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps
     from benchmarks.equipment.uci_board import taps_of
 
     def measure(seed):
-        ranges, _ = drive(seconds=80, rate_hz=20.0, offset_m=0.0)
+        ranges, _ = drive(seconds=80, rate_hz=10.0, offset_m=0.0)
         rng, n = np.random.default_rng(seed), len(ranges)
         nlos = (rng.random((41, 5)) < 0.3)[ranges.stamp_ns // 2_000_000_000, ranges.anchor]
         gap = np.where(nlos, rng.normal(12, 2, n), rng.normal(3.5, 1, n))
@@ -503,9 +505,7 @@ def test_sts_ranges_are_corrected_from_their_levels_if_that_helps(tmp_path, taps
 
     save_anchors(tmp_path / "anchors.yaml", HALL)
     for name, seed in (("drive", 1), ("other", 3)):
-        with BagWriter(tmp_path / f"{name}.mcap", {"simulated": "true"}) as bag:
-            for measured in measure(seed)[0]:
-                bag.write(Record(measured))
+        write_records(tmp_path / f"{name}.mcap", (Record(measured) for measured in measure(seed)[0]))
     succeed(f"calibrate drive.mcap {LEVEL} -o site.onnx --json r.json --check other.mcap", folder=tmp_path)
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["chosen"] == chosen

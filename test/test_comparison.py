@@ -14,7 +14,6 @@ from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.training.data.splits import GroupKey
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-pytest.importorskip("sklearn", reason="run `make setup-training`")
 from uwb_mitigation.training import comparison
 from uwb_mitigation.training.data import recordings
 from uwb_mitigation.training.fit import candidates

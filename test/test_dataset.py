@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from model_material import record, window_of
+from model_material import changed, record, window_of
 
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
@@ -35,7 +35,7 @@ def test_skipped_records_are_counted_by_reason():
         record(),
         replace(record(), truth=None),
         replace(record(), truth=Truth(math.nan)),
-        replace(record(), measurement=replace(record().measurement, range_m=math.nan)),
+        changed(record(), range_m=math.nan),
         record(preamble_count=0),
         record(samples=np.zeros(0, np.int16)),
     ]
@@ -88,12 +88,7 @@ def test_thinning_keeps_a_maximum_number_per_configuration():
 
 
 def test_radios_and_segments_of_a_dataset_are_those_of_its_cirs():
-    records = [
-        replace(each, measurement=replace(each.measurement, cir=replace(each.measurement.cir, **source)))
-        for each, source in zip(
-            [record(), record()], [{}, {"radio": RadioType.DW3000, "segment": Segment.STS}], strict=True
-        )
-    ]
+    records = [record(), record(radio=RadioType.DW3000, segment=Segment.STS)]
     dataset = build_dataset(records, Preprocessing(157))
     assert (dataset.radios, dataset.segments) == (
         (RadioType.DW1000, RadioType.DW3000),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_material import write_records
 from model_material import measurement
 from typer.testing import CliRunner
 
@@ -17,7 +18,6 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.buildings import block_of
 from uwb_mitigation.simulation.channel import Multipath
 from uwb_mitigation.simulation.radio import DW3000_STS, PULSE_SPACING_TAPS, TAPS
@@ -83,9 +83,7 @@ def test_short_windows_and_other_sources_pass_through(received) -> None:
 def test_it_is_chosen_for_a_recording_of_the_sts_and_marked_as_experimental(received, tmp_path: Path) -> None:
     ranges = windows(received[0][:5], 16)
     recording = tmp_path / "sts.mcap"
-    with BagWriter(recording, {"source": "a test", "simulated": "true"}) as bag:
-        for each in ranges:
-            bag.write(Record(each))
+    write_records(recording, (Record(each) for each in ranges))
     assert bundle_for(None, recording).model_id == MODEL.model_id
     assert MODEL.card.label == "dw3000_sts (experimental)"
     for scaling in Scaling:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import Recorded, bundle, record
+from model_material import Recorded, bundle, changed, record
 from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
@@ -80,7 +80,7 @@ def test_intervals_are_those_of_the_bundle(tmp_path, sigmas, covered):
 
 def test_records_without_truth_or_range_are_skipped(tmp_path):
     mitigation = Mitigation(bundle(tmp_path, Remnet(samples=157)))
-    without_range = replace(record(), measurement=replace(record().measurement, range_m=np.nan))
+    without_range = changed(record(), range_m=np.nan)
     assert evaluate_accuracy(mitigation, [record(), replace(record(), truth=None), without_range]).n == 1
     with pytest.raises(DatasetError, match="none of 1 measurements"):
         evaluate_accuracy(mitigation, [replace(record(), truth=None)])

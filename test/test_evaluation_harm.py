@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from model_material import amplitudes_only
+from model_material import amplitudes_only, changed
 
 from benchmarks.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -73,33 +73,30 @@ PERTURBED = {
 }
 
 
-def changed(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
+def accuracy(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
     """Return the accuracy on records with changed CIRs."""
     return evaluate_accuracy(
         mitigation,
-        [
-            replace(record, measurement=replace(record.measurement, cir=change(record.measurement.cir)))
-            for record in records
-        ],
+        [changed(record, change(record.measurement.cir)) for record in records],
     )
 
 
 @pytest.mark.parametrize("name", PERTURBED)
 def test_site_model_does_not_worsen_out_of_distribution_measurements(name, mitigation, records):
-    outcome = changed(mitigation, records, PERTURBED[name])
+    outcome = accuracy(mitigation, records, PERTURBED[name])
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
 @pytest.mark.parametrize("decibels", [-14, -13, -12, -11])
 def test_weaker_radio_is_made_worse_by_an_eighth_at_most(decibels, mitigation, records):
     # A single range cannot distinguish a weaker radio in LOS from walls with the same attenuation.
-    outcome = changed(mitigation, records, louder(decibels))
+    outcome = accuracy(mitigation, records, louder(decibels))
     # If a bundle is better, update the table in docs/background/results.md.
     assert 1.02 < outcome.corrected.mae / outcome.raw.mae <= 1.12
 
 
 def test_inputs_that_cannot_be_in_distribution_are_reported(mitigation, records):
-    assert set(changed(mitigation, records, noise).statuses) == {"OUT_OF_DISTRIBUTION"}
+    assert set(accuracy(mitigation, records, noise).statuses) == {"OUT_OF_DISTRIBUTION"}
 
 
 def test_training_logs_are_in_distribution(mitigation, records):
@@ -128,28 +125,25 @@ def calibrated(records) -> list[Record]:
             error = record.measurement.range_m - record.truth.range_m
             errors.setdefault(record.truth.configuration, []).append(error)
     offset = float(np.median([np.mean(values) for values in errors.values()]))
-    return [
-        replace(record, measurement=replace(record.measurement, range_m=record.measurement.range_m - offset))
-        for record in records
-    ]
+    return [changed(record, range_m=record.measurement.range_m - offset) for record in records]
 
 
 @pytest.mark.parametrize("name", DAMAGED | LATE)
 def test_out_of_distribution_measurements_do_not_get_worse(name, universal, calibrated):
-    outcome = changed(universal, calibrated, PERTURBED[name])
+    outcome = accuracy(universal, calibrated, PERTURBED[name])
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
 @pytest.mark.parametrize(("name", "most"), [("shifted by 5", 1.6), ("shifted by 10", 1.02)])
 def test_late_windows_without_levels_are_mostly_not_corrected(name, most, calibrated):
     # Without levels, a window that starts 5 taps late is similar to a lost direct path: see the model card.
-    outcome = changed(Mitigation(load_bundle(default_model_path(Scaling.MAX))), calibrated, LATE[name])
+    outcome = accuracy(Mitigation(load_bundle(default_model_path(Scaling.MAX))), calibrated, LATE[name])
     assert outcome.corrected.mae <= most * outcome.raw.mae
 
 
 @pytest.mark.parametrize("decibels", [-25, *range(-20, -8), -7, -5, 0, 3, 5, 8, 10, 15, 20])
 def test_universal_model_does_not_harm_at_any_level(decibels, universal, calibrated):
-    outcome = changed(universal, calibrated, louder(decibels))
+    outcome = accuracy(universal, calibrated, louder(decibels))
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import shutil
 import subprocess
@@ -18,7 +19,18 @@ pytestmark = pytest.mark.skipif(
     shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi"
 )
 SOURCES = firmware_folder() / "src"
-KERNELS = ("quantise", "conv_first", "conv_residual", "conv_reduce_odd", "conv_reduce_even", "dense", "dot")
+KERNELS = {
+    f"uwb_{name}"
+    for name in (
+        "quantise",
+        "conv_first",
+        "conv_residual",
+        "conv_reduce_odd",
+        "conv_reduce_even",
+        "dense",
+        "dot",
+    )
+}
 
 # ArduinoCore-mbed, variant ARDUINO_NANO33BLE: platform.txt and cflags.txt. The assembler gets no -mfloat-abi.
 FPU = "-mfpu=fpv4-sp-d16"
@@ -36,13 +48,20 @@ CATEGORIES = ("Display", "Communication", "Signal Input/Output", "Sensors", "Dev
               "Data Storage", "Data Processing", "Other")  # fmt: skip
 
 
-def compile_each(compiler: tuple[str, ...], sources: list[Path], folder: Path) -> list[str]:
-    """Compile every source to an object file; return their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    objects = [str(folder / f"{source.stem}{source.suffix[1:]}.o") for source in sources]
-    for source, target in zip(sources, objects, strict=True):
-        run_tool([*compiler, str(source), "-o", target])
-    return objects
+@functools.cache
+def compile_each(compiler: tuple[str, ...], folder: Path, pattern: str = "*.c") -> list[str]:
+    """Compile each source of the library, once for all tests with the same flags; return the object files."""
+    target = folder / str(abs(hash(compiler)))
+    target.mkdir()
+    sources = sorted(SOURCES.rglob(pattern))
+    run_tool([*compiler, *map(str, sources)], folder=target)
+    return [str(target / f"{source.stem}.o") for source in sources]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder for object files."""
+    return tmp_path_factory.mktemp("built")
 
 
 def undefined_symbols(objects: list[str], folder: Path) -> set[str]:
@@ -62,16 +81,15 @@ def defined_symbols(objects: list[str]) -> set[str]:
 
 
 @pytest.mark.parametrize("name", ["UwbMitigation", "UwbRanger"])
-def test_sketch_and_library_link_with_the_flags_of_the_core(tmp_path: Path, name: str):
+def test_sketch_and_library_link_with_the_flags_of_the_core(tmp_path: Path, built: Path, name: str):
     """The symbols of the core, which the stub only declares, stay undefined."""
     export_bundle(load_bundle(default_model_path()), tmp_path)
     sketch = tmp_path / f"{name}.cpp"
     sketch.write_text((firmware_folder() / "examples" / name / f"{name}.ino").read_text())
     includes = (f"-I{STUB}", f"-I{SOURCES}", "-include", str(STUB / "Arduino.h"))
-    objects = compile_each((*CXX, *includes), [sketch], tmp_path)
-    objects += compile_each((*C, *SOFTFP), sorted(SOURCES.rglob("*.c")), tmp_path)
-    objects += compile_each((*ASSEMBLER, FPU), sorted(SOURCES.rglob("*.S")), tmp_path)
-
+    run_tool([*CXX, *includes, str(sketch)], folder=tmp_path)
+    objects = [str(sketch.with_suffix(".o"))]
+    objects += compile_each((*C, *SOFTFP), built) + compile_each((*ASSEMBLER, FPU), built, "*.S")
     undefined = undefined_symbols(objects, tmp_path)
     assert not {symbol for symbol in undefined if symbol.startswith("uwb_")}
     assert any("send_nb" in symbol for symbol in undefined), "the compiler removed the sending"
@@ -111,21 +129,22 @@ ASSEMBLER_VARIANTS = [
 
 
 @pytest.mark.parametrize("c_flags", C_VARIANTS, ids=lambda flags: " ".join(flags))
-def test_c_and_assembler_agree_for_every_combination_of_flags(tmp_path: Path, c_flags: tuple[str, ...]):
-    c = compile_each((*C, *c_flags), sorted(SOURCES.rglob("*.c")), tmp_path / "c")
+def test_c_and_assembler_agree_for_every_combination_of_flags(
+    tmp_path: Path, built: Path, c_flags: tuple[str, ...]
+):
+    c = compile_each((*C, *c_flags), built)
     portable = "-DUWB_PORTABLE" in c_flags or "-mfloat-abi=soft" in c_flags
-    for number, assembler_flags in enumerate(ASSEMBLER_VARIANTS):
-        folder = tmp_path / str(number)
-        assembled = compile_each((*ASSEMBLER, *assembler_flags), sorted(SOURCES.rglob("*.S")), folder)
-        undefined = undefined_symbols(c + assembled, folder)
+    # The portable kernels are in the C objects exactly if the assembler kernels are not used.
+    assert KERNELS & defined_symbols(c) == (KERNELS if portable else set())
+    for assembler_flags in ASSEMBLER_VARIANTS:
+        undefined = undefined_symbols(
+            c + compile_each((*ASSEMBLER, *assembler_flags), built, "*.S"), tmp_path
+        )
         assert not {name for name in undefined if name.startswith("uwb_")}, assembler_flags
-        # The portable kernels are in the C objects exactly if the assembler kernels are not used.
-        assert {f"uwb_{kernel}" for kernel in KERNELS} <= defined_symbols(c) or not portable
-        assert not ({f"uwb_{kernel}" for kernel in KERNELS} & defined_symbols(c)) or portable
 
 
 @pytest.mark.parametrize("cpu", ["cortex-m3", "cortex-m0"])
-def test_other_processors_use_portable_c(tmp_path: Path, cpu: str):
-    objects = compile_each((*C, f"-mcpu={cpu}"), sorted(SOURCES.rglob("*.c")), tmp_path)
-    objects += compile_each((*ASSEMBLER, f"-mcpu={cpu}"), sorted(SOURCES.rglob("*.S")), tmp_path)
+def test_other_processors_use_portable_c(tmp_path: Path, built: Path, cpu: str):
+    objects = compile_each((*C, f"-mcpu={cpu}"), built)
+    objects += compile_each((*ASSEMBLER, f"-mcpu={cpu}"), built, "*.S")
     assert not {name for name in undefined_symbols(objects, tmp_path) if name.startswith("uwb_")}

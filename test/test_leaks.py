@@ -27,7 +27,6 @@ from uwb_mitigation.training.evaluation import baselines
 from uwb_mitigation.training.fit import linear_fit
 
 pytest.importorskip("torch", reason="run `make setup-training`")
-pytest.importorskip("sklearn", reason="run `make setup-training`")
 from benchmarks.paper import data as recordings
 from benchmarks.paper import experiment, training
 from benchmarks.paper.training import NetworkStack

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import START_NS, STEP_NS, Foreign, numbers, record, write_bag
+from bag_material import START_NS, STEP_NS, Foreign, numbers, record, write_bag, write_records
 from mcap.writer import CompressionType
 
 from uwb_mitigation.errors import RecordingError
@@ -88,9 +88,7 @@ def test_tag_position_is_read_from_the_bag(tmp_path: Path) -> None:
     assert [item.tag_position for item in source] == places
     assert source.skipped == {"a message that is not nav_msgs/msg/Odometry": 1}
     again = tmp_path / "again.mcap"
-    with BagWriter(again, {}) as out:
-        for item in source:
-            out.write(item)
+    write_records(again, source)
     assert [item.tag_position for item in McapRecording(again)] == places
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_material import write_records
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
@@ -41,14 +42,9 @@ CORRECTED = "/uwb/range_corrected"
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of 300 simulated ranges at 40 Hz."""
-    from uwb_mitigation.recordings.bag.writer import BagWriter
-
     path = tmp_path_factory.mktemp("bag") / "simulated.mcap"
     source = SimulatedSource(seed=3, count=300, rate_hz=40.0)
-    with BagWriter(path, {"source": source.name, "simulated": "true"}) as writer:
-        for record in source:
-            writer.write(record)
-    return path
+    return write_records(path, source, source=source.name)
 
 
 def replay_through_both(ros: Ros, count: int, *driver: str) -> tuple[list[RangeCir], list[RangeCorrected]]:

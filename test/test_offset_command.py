@@ -10,7 +10,8 @@ from pathlib import Path
 import command_line
 import numpy as np
 import pytest
-from model_material import amplitudes_only
+from bag_material import write_records
+from model_material import amplitudes_only, changed
 
 from uwb_mitigation.calibration.radio_offsets import OffsetEstimate, bundle_with_line, estimate_offset
 from uwb_mitigation.errors import DatasetError, ParameterError
@@ -39,30 +40,25 @@ def direct() -> list[Record]:
         for record in SimulatedSource(seed=11, count=1500)
         if record.truth is not None and record.truth.label == "LOS"
     ]
-    return [
-        replace(record, measurement=replace(record.measurement, tag_id=1, anchor_id=2)) for record in seen
-    ]
+    return [changed(record, tag_id=1, anchor_id=2) for record in seen]
 
 
 def longer(records: list[Record], by_m: float) -> Iterator[Record]:
     for record in records:
-        measurement = record.measurement
-        yield replace(record, measurement=replace(measurement, range_m=measurement.range_m + by_m))
+        yield changed(record, range_m=record.measurement.range_m + by_m)
 
 
 def weaker_first_path(records: list[Record], by_db: float) -> Iterator[Record]:
     for record in records:
-        cir = record.measurement.cir
-        cir = replace(cir, first_path_power_dbm=cir.first_path_power_dbm - by_db)
-        yield replace(record, measurement=replace(record.measurement, cir=cir))
+        level_dbm = record.measurement.cir.first_path_power_dbm - by_db
+        yield changed(record, {"first_path_power_dbm": level_dbm})
 
 
 def without_levels(records: list[Record]) -> Iterator[Record]:
     """Return the records without preamble counts and levels."""
     unknown = {"rx_power_dbm": float("nan"), "first_path_power_dbm": float("nan")}
     for record in records:
-        cir = amplitudes_only(record.measurement.cir, **unknown)
-        yield replace(record, measurement=replace(record.measurement, cir=cir))
+        yield changed(record, amplitudes_only(record.measurement.cir, **unknown))
 
 
 def at_one_place(found: OffsetEstimate) -> set[str]:
@@ -125,10 +121,7 @@ def test_distance_counts_without_levels_and_cirs_with_a_warning(tmp_path: Path):
 
 
 def test_single_distance_needs_a_single_pair(universal: Mitigation, direct: list[Record]):
-    two = [
-        replace(record, measurement=replace(record.measurement, anchor_id=2 + n % 2))
-        for n, record in enumerate(direct)
-    ]
+    two = [changed(record, anchor_id=2 + n % 2) for n, record in enumerate(direct)]
     with pytest.raises(ParameterError, match=r"2 pairs.*--anchor and --tag"):
         estimate_offset(universal, two, 3.0)
     found = estimate_offset(universal, two, anchor_id=3)
@@ -181,9 +174,7 @@ def test_line_in_the_first_path_level_is_fitted_and_written_only_if_it_helps(
     assert "at least 6 over 3 dB are needed" in few.refused
 
     bag = tmp_path / "los.mcap"
-    with BagWriter(bag, {"source": "test", "simulated": "true"}) as writer:
-        for record in with_level_bias(direct[:60], 0.03):
-            writer.write(record)
+    write_records(bag, with_level_bias(direct[:60], 0.03))
     asked = ("offset", bag, "--truth", "--common", "-o", "o.yaml", "--bundle", "line.onnx")
     outcome = command_line.run(*asked, "--model", default_model_path(), "--json", "o.json", folder=tmp_path)
     assert outcome.returncode == 0, outcome.stderr
@@ -205,13 +196,7 @@ def test_line_in_the_first_path_level_is_fitted_and_written_only_if_it_helps(
 
 
 def test_line_is_fitted_without_cirs(universal: Mitigation, direct: list[Record], tmp_path: Path):
-    records = [
-        replace(
-            record,
-            measurement=replace(record.measurement, cir=replace(record.measurement.cir, samples=NO_SAMPLES)),
-        )
-        for record in with_level_bias(direct[:60], 0.03)
-    ]
+    records = [changed(record, {"samples": NO_SAMPLES}) for record in with_level_bias(direct[:60], 0.03)]
     estimate = estimate_offset(universal, records)
     assert (estimate.line.refused, estimate.has_cirs) == ("", False)
     bundle, _ = bundle_with_line(universal.bundle, estimate.line, tmp_path / "l.onnx", has_cirs=False)
@@ -223,9 +208,7 @@ def test_line_is_fitted_without_cirs(universal: Mitigation, direct: list[Record]
 
 
 def test_bundle_is_refused_without_support(direct: list[Record], tmp_path: Path):
-    with BagWriter(tmp_path / "los.mcap", {"source": "test", "simulated": "true"}) as bag:
-        for record in [direct[0]] * 20:
-            bag.write(record)
+    write_records(tmp_path / "los.mcap", [direct[0]] * 20)
     asked = ("offset", "los.mcap", "--distance", "3", "--bundle", "line.onnx")
     outcome = command_line.run(*asked, "--model", default_model_path(), folder=tmp_path)
     assert outcome.returncode != 0
@@ -234,9 +217,7 @@ def test_bundle_is_refused_without_support(direct: list[Record], tmp_path: Path)
 
 
 def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tmp_path: Path):
-    with BagWriter(tmp_path / "los.mcap", {"source": "test", "simulated": "true"}) as bag:
-        for record in longer(direct[:300], 0.5):
-            bag.write(record)
+    write_records(tmp_path / "los.mcap", longer(direct[:300], 0.5))
     asked = ("offset", "los.mcap", "--truth", "-o", "o.yaml")
     assert command_line.run(*asked, folder=tmp_path).returncode == 0
     again = command_line.run(*asked, folder=tmp_path)
@@ -278,11 +259,8 @@ def test_contradictory_options_are_refused_early(options: tuple[str, ...], excer
 def test_ranges_of_another_radio_have_their_whole_error_as_offset(
     universal: Mitigation, direct: list[Record]
 ):
-    def of_dw3000(record: Record) -> Record:
-        cir = replace(record.measurement.cir, radio=RadioType.DW3000, segment=Segment.STS, preamble_count=0)
-        return replace(record, measurement=replace(record.measurement, cir=cir))
-
-    records = [of_dw3000(record) for record in longer(direct, 0.4)]
+    dw3000 = {"radio": RadioType.DW3000, "segment": Segment.STS, "preamble_count": 0}
+    records = [changed(record, dw3000) for record in longer(direct, 0.4)]
     errors = [record.measurement.range_m - record.truth.range_m for record in records]
     estimate = estimate_offset(universal, records)
     assert estimate.offset_m == pytest.approx(np.median(errors), abs=0.1)

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from bag_material import write_records
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
@@ -18,7 +19,6 @@ from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER, TABLES, Parameter
 from uwb_mitigation.nodes.support.respawn import StateFile
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
 
@@ -129,9 +129,9 @@ def test_invalid_qos_override_is_refused(ros: Ros, value: str):
 
 def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):
     bag = tmp_path / "no_frames.mcap"
-    with BagWriter(bag, {"source": "a test", "simulated": "true"}) as writer:
-        for record in SimulatedSource(seed=1, count=5):
-            writer.write(Record(replace(record.measurement, frame_id="")))
+    write_records(
+        bag, (Record(replace(record.measurement, frame_id="")) for record in SimulatedSource(seed=1, count=5))
+    )
     received = ros.collect(RangeCir, "/elsewhere")
     ros.start(
         "driver",

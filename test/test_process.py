@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import Foreign, chunk_offsets
+from bag_material import Foreign, chunk_offsets, write_records
 from command_line import ENVIRONMENT, command, run, start, succeed
 from firmware_models import random_measurement
 from model_material import cir
@@ -28,7 +28,6 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.recordings.bag.reader import BagReader
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import Encoding, RadioType, RangeMeasurement, Record, Segment, Truth
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.ros import codec
@@ -53,10 +52,9 @@ def exchange(number: int) -> RangeMeasurement:
 
 def write_bag(path: Path, measurements: list[RangeMeasurement]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with BagWriter(path, {"source": "a test", "simulated": "true"}) as bag:
-        for measurement in measurements:
-            bag.write(Record(measurement, Truth(2.5, "LOS", "here")))
-    return path
+    return write_records(
+        path, (Record(measurement, Truth(2.5, "LOS", "here")) for measurement in measurements)
+    )
 
 
 def exchanges(count: int) -> list[RangeMeasurement]:

@@ -14,9 +14,9 @@ from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pytest
+from bag_material import write_records
 from conftest import REPOSITORY
 
 import uwb_mitigation
@@ -37,12 +37,11 @@ from uwb_mitigation import (
     track,
 )
 from uwb_mitigation.errors import DamagedRecordingError, ModelError, ParameterError
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import save_anchors
 from uwb_mitigation.types.measurement import is_logarithmic
 
-matplotlib.use("agg")
+os.environ["MPLBACKEND"] = "agg"
 PAGE = REPOSITORY / "docs" / "guides" / "python.md"
 IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
@@ -53,9 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with `drive.mcap`, `site.mcap` and `anchors.yaml`."""
     path = tmp_path_factory.mktemp("drive")
     for name, count in (("drive", 400), ("site", 2000)):
-        with BagWriter(path / f"{name}.mcap", {"simulated": "true"}) as bag:
-            for record in SimulatedSource(seed=1, count=count):
-                bag.write(record)
+        write_records(path / f"{name}.mcap", SimulatedSource(seed=1, count=count))
     save_anchors(path / "anchors.yaml", SimulatedSource().anchors)
     return path
 

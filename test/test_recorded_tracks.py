@@ -6,12 +6,14 @@ import json
 import os
 import re
 import threading
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import record
+from bag_material import record, write_records
 from browser import Browser
 from command_line import run, succeed
 from drives import HALL, drive
@@ -24,7 +26,6 @@ from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.tag_locator import TagLocator
 from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
@@ -40,7 +41,6 @@ from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
-from uwb_mitigation.viewer.timeline import Timeline
 
 DATA = Path(os.environ.get("UWB_MITIGATION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 HANYANG, LABYRINTH = DATA / "hanyang_outdoor", DATA / "chemnitz_labyrinth"
@@ -56,19 +56,23 @@ def indexed(bag: Path, settings: TrackSettings) -> tuple[BagPlayer, SceneUpdater
     return player, feed
 
 
-def viewed(bag: Path, settings: TrackSettings) -> Timeline:
-    """Return what `view` estimates of a bag."""
-    timeline = indexed(bag, settings)[0].timeline
-    assert timeline is not None
-    return timeline
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path | None], Path]:
+    """Return a function that imports a recording once (None: a simulated drive), and returns the bag."""
 
+    @cache
+    def import_once(source: Path | None) -> Path:
+        folder = tmp_path_factory.mktemp("imported")
+        if source is None:
+            succeed("data simulate --like drive --ranges 500 -o raw.mcap", folder=folder)
+        elif source.exists():
+            name = ["--map", "labyrinth"] if source == LABYRINTH else []
+            succeed("data", "import", source, *name, "-o", "raw.mcap", folder=folder)
+        else:
+            pytest.skip(f"no {source}")
+        return folder / "raw.mcap"
 
-def imported(source: Path, folder: Path) -> Path:
-    if not source.exists():
-        pytest.skip(f"no {source}")
-    name = ["--map", "labyrinth"] if source == LABYRINTH else []
-    succeed("data", "import", source, *name, "-o", "raw.mcap", folder=folder)
-    return folder / "raw.mcap"
+    return import_once
 
 
 SIMULATED = (None, ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
@@ -87,19 +91,17 @@ SIMULATED = (None, ["--height", "0", "--odometry", "/odom", "--imu", "/imu"],
     ids=["hanyang", "labyrinth processed", "simulated", "simulated processed"],
 )  # fmt: skip
 def test_track_and_view_give_the_same_figures(
-    tmp_path: Path, source: Path | None, options: list[str], settings: TrackSettings, processed: bool
-):
-    bag = tmp_path / "raw.mcap"
-    if source is None:
-        succeed("data simulate --like drive --ranges 500 -o", bag, folder=tmp_path)
-    else:
-        imported(source, tmp_path)
+    request: pytest.FixtureRequest, imported, tmp_path: Path, source: Path | None, options: list[str],
+    settings: TrackSettings, processed: bool,
+):  # fmt: skip
+    bag = imported(source)
     if processed:
+        succeed("process", bag, "-o", "processed.mcap", folder=tmp_path)
         bag = tmp_path / "processed.mcap"
-        succeed("process", tmp_path / "raw.mcap", "-o", bag, folder=tmp_path)
     succeed("track", bag, "-o", "track.mcap", *options, "--json", "track.json", folder=tmp_path)
     result = json.loads((tmp_path / "track.json").read_text())
-    timeline = viewed(bag, settings)
+    player, feed = indexed(bag, settings)
+    timeline = player.timeline
     (tag,) = result["tags"]
     cards = {
         title: (value, text)
@@ -115,20 +117,12 @@ def test_track_and_view_give_the_same_figures(
             assert live == raw, "nothing was corrected"
     shown = [notice.split(": ", 1)[1] for notice in timeline.notices]
     assert [text for text in shown if text in tag["warnings"]] == tag["warnings"]
+    if source is not None:
+        show_in_a_browser(request.getfixturevalue("browser"), player, feed)
 
 
-@pytest.mark.parametrize(
-    ("source", "settings"),
-    [
-        (HANYANG / "NLOS_A1", TrackSettings(1.0, area=BOX, stamp_offset_s=-0.2)),
-        (LABYRINTH, TrackSettings(0.0, odometry="/odom")),
-    ],
-    ids=["hanyang", "labyrinth"],
-)
-def test_public_recording_is_shown_in_a_browser(
-    browser: Browser, tmp_path: Path, source: Path, settings: TrackSettings
-):
-    player, feed = indexed(imported(source, tmp_path), settings)
+def show_in_a_browser(browser: Browser, player: BagPlayer, feed: SceneUpdater) -> None:
+    """Show a public recording without CIRs."""
     with ViewerServer(View(feed.scene, feed.lock, player=player), port=0) as server:
         browser.open(f"{server.url}#t=20")
         browser.wait("the errors", lambda: "Position RMSE, whole recording" in browser.cards())
@@ -144,7 +138,7 @@ def test_public_recording_is_shown_in_a_browser(
 def test_placements_have_no_positions_in_track_and_view(apartment_imported: Path, tmp_path: Path):
     bag = apartment_imported / "apartment.mcap"
     refused = run("track", bag, "-o", "track.mcap", folder=tmp_path).stderr
-    timeline = viewed(bag, TrackSettings())
+    timeline = indexed(bag, TrackSettings())[0].timeline
     assert timeline.notices
     assert timeline.notices[0] in refused.replace("\n", " ")
 
@@ -197,9 +191,8 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
     )
 
 
-def test_report_is_one_file_with_the_figures_of_track(tmp_path: Path):
-    bag, page = tmp_path / "drive.mcap", tmp_path / "drive.html"
-    succeed("data simulate --like drive --ranges 300 -o", bag, folder=tmp_path)
+def test_report_is_one_file_with_the_figures_of_track(imported, tmp_path: Path):
+    bag, page = imported(None), tmp_path / "drive.html"
     options = ("--height", "0", "--json", "track.json", "--report", page, "--png", tmp_path / "map.png")
     succeed("track", bag, "-o", "track.mcap", *options, folder=tmp_path)
     rmse_m = json.loads((tmp_path / "track.json").read_text())["live"]["horizontal_rmse_m"]
@@ -213,9 +206,9 @@ def test_report_is_one_file_with_the_figures_of_track(tmp_path: Path):
 
 def test_odometry_of_one_robot_is_not_used_for_several_tags(tmp_path: Path):
     bag = tmp_path / "two.mcap"
-    with BagWriter(bag, {}) as out:
-        for number in range(20):
-            out.write(Record(replace(record(number).measurement, tag_id=7 + number % 3)))
+    write_records(
+        bag, (Record(replace(record(number).measurement, tag_id=7 + number % 3)) for number in range(20))
+    )
     config = EstimatorConfig(HALL, robot=RobotData())
     player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(TrackSettings()))
     player.index(config).join()

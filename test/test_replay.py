@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bag_material import write_records
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
@@ -318,10 +319,7 @@ def test_late_records_are_published_in_batches_and_in_order():
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("replay") / "simulated.mcap"
     source = SimulatedSource(seed=1, count=COUNT, rate_hz=100.0)
-    with BagWriter(path, {"source": source.name, "simulated": "true"}) as writer:
-        for record in source:
-            writer.write(record)
-    return path
+    return write_records(path, source, source=source.name)
 
 
 @pytest.mark.ros

@@ -172,6 +172,14 @@ def test_estimates_stay_inside_the_area():
     assert area.holds(track.position).all()
 
 
+def test_antenna_is_projected_onto_the_area():
+    one, area = _filter(), Area((0.0, 0.0, 0.0), (4.5, 3.5, 1.0))
+    assert np.linalg.norm(one.estimate(0, DeadReckoning()).position - (4.5, 3.5, 1.0)) > 0.4
+    one.confine(area)
+    # The projection also turns the robot a little.
+    assert one.estimate(0, DeadReckoning()).position == pytest.approx((4.5, 3.5, 1.0), abs=0.05)
+
+
 HUGE = (math.nan, math.inf, -math.inf, 1e300, -1e300, 1e38, 1e9, 1e5, 0.0, -1.0, 1e-300)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import HALL, NANOSECONDS, circuit, drive
+from drives import HALL, circuit, drive
 
 from uwb_mitigation.calibration.survey import displacements, survey_anchors
 from uwb_mitigation.errors import DatasetError
@@ -19,7 +19,7 @@ LEVEL = Height(1.0)
 
 @pytest.fixture(scope="module")
 def minute():
-    return drive(seconds=60, rate_hz=20.0)[0]
+    return drive(seconds=60, rate_hz=10.0)[0]
 
 
 def test_anchors_are_estimated_from_guesses_with_errors_of_1_5_m(minute):
@@ -63,7 +63,7 @@ def test_mirror_image_of_a_square_is_not_a_swapped_pair():
     square = AnchorMap(
         [Anchor(i, (x, y, 2.0)) for i, (x, y) in enumerate([(2, 0), (10, 0), (10, 8), (2, 8)], 1)]
     )
-    ranges, _ = drive(square, seconds=40, rate_hz=20.0, seed=2)
+    ranges, _ = drive(square, seconds=40, rate_hz=10.0, seed=2)
     guesses = square.position + np.random.default_rng(3).normal(0, (0.4, 0.4, 0), (4, 3))
     found = survey_anchors(EstimatorConfig(square.moved(guesses, square.sd), height=LEVEL), ranges, off_m=0.4)
     assert found.explained
@@ -81,9 +81,10 @@ def test_mirror_image_that_fits_the_guesses_as_well_is_reported(guess_sd_m: floa
     assert found.mirrored is mirrored
 
 
-def test_unobservable_directions_are_reported(minute):
+def test_unobservable_directions_are_reported():
     guesses = HALL.moved(HALL.position, np.full(5, 0.5))
-    level_drive = minute.take(minute.stamp_ns < 30 * NANOSECONDS)
+    level_drive = drive(seconds=60, rate_hz=20.0)[0]
+    level_drive = level_drive.take(slice(0, 600))
     found = survey_anchors(EstimatorConfig(guesses), level_drive, off_m=0.5)
     assert found.undetermined == [0, 1, 2, 3, 4]
     assert {0, 2} <= set(found.alternatives)

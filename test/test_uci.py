@@ -594,6 +594,15 @@ def test_a_capture_that_is_damaged_is_refused(tmp_path, text: str, error: type):
         list(open_capture(path))
 
 
+def test_a_capture_ends_at_its_limit_and_ignores_what_comes_after_its_end(tmp_path):
+    writer = CaptureWriter(tmp_path / "session.txt", limit_bytes=200)
+    for _ in range(2):
+        for _ in range(20):
+            writer.add(0, bytes(20), sent=False)
+        writer.close()
+    assert 100 < (tmp_path / "session.txt").stat().st_size <= 200
+
+
 def test_responses_have_no_effect_before_their_command():
     run = Bench()
     run.step(encode_packets(*codes.RANGE_START, b"\0", PacketType.RESPONSE) * 10)

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_material import write_records
 from command_line import run, succeed
+from model_material import changed
 
 from uwb_mitigation.calibration.radio_offsets import estimate_offset
 from uwb_mitigation.errors import DatasetError
@@ -89,17 +91,14 @@ def test_cirs_are_preferred_to_ranges_without():
     bare = ranges(1)
     strong = np.full(2 * 200, 100, np.int16)
     cir = replace(bare[0].measurement.cir, samples=strong, first_path_index=20.0, preamble_count=128)
-    with_cir = replace(bare[0], measurement=replace(bare[0].measurement, cir=cir))
-    mixed = dataset([*bare[1:5], with_cir, *bare[5:9]])
+    mixed = dataset([*bare[1:5], changed(bare[0], cir), *bare[5:9]])
     assert mixed.has_cirs
     assert len(mixed) == 1
     assert sum(mixed.skipped.values()) == 8
 
 
 def test_train_and_evaluate_without_cirs(tmp_path: Path):
-    with BagWriter(tmp_path / "bare.mcap", {"source": "test", "simulated": "true"}) as bag:
-        for record in ranges():
-            bag.write(record)
+    write_records(tmp_path / "bare.mcap", ranges())
     succeed("train", "--data", "bare.mcap", "-o", "line.onnx", "--json", "train.json", folder=tmp_path)
     trained = json.loads((tmp_path / "train.json").read_text())
     assert trained["choice"]["chosen"] == "line"
@@ -128,10 +127,7 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
 def test_ranges_without_first_path_level_are_passed_through(tmp_path: Path):
     with BagWriter(tmp_path / "some.mcap", {"source": "test", "simulated": "true"}) as bag:
         for number, record in enumerate(ranges()):
-            cir = record.measurement.cir
-            if number % 5 == 0:
-                cir = replace(cir, first_path_power_dbm=np.nan)
-            bag.write(replace(record, measurement=replace(record.measurement, cir=cir)))
+            bag.write(changed(record, {"first_path_power_dbm": np.nan}) if number % 5 == 0 else record)
     done = succeed("train", "--data", "some.mcap", "-o", "line.onnx", "--json", "t.json", folder=tmp_path)
     mae_m = {row["name"]: row["mae"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
     assert 0.2 * mae_m["raw"] < mae_m["l1_line"] < 0.8 * mae_m["raw"]
@@ -142,15 +138,8 @@ def test_ranges_without_first_path_level_are_passed_through(tmp_path: Path):
 
 def test_offset_without_cirs_prefers_labels_to_levels():
     universal = Mitigation(load_bundle(default_model_path()))
-    records = [
-        replace(
-            record,
-            measurement=replace(
-                record.measurement, cir=Cir(EMPTY, rx_power_dbm=-80.0, first_path_power_dbm=-82.0)
-            ),
-        )
-        for record in ranges(4)
-    ]
+    levels = Cir(EMPTY, rx_power_dbm=-80.0, first_path_power_dbm=-82.0)
+    records = [changed(record, levels) for record in ranges(4)]
     found = estimate_offset(universal, records)
     assert {one.refused for one in found.placements} == {"", "not line of sight: labelled as NLOS"}
     assert found.offset_m == pytest.approx(-0.05, abs=0.05)
@@ -163,9 +152,7 @@ def test_offset_from_true_ranges_needs_no_levels(tmp_path: Path):
     assert found.offset_m == pytest.approx(-0.05, abs=0.05)
     refused = {one.refused for one in found.placements if one.refused}
     assert refused == {"not line of sight: labelled as NLOS"}
-    with BagWriter(tmp_path / "bare.mcap", {"source": "test", "simulated": "true"}) as bag:
-        for record in records:
-            bag.write(record)
+    write_records(tmp_path / "bare.mcap", records)
     done = succeed("offset", "bare.mcap", "--truth", folder=tmp_path)
     assert "nan" not in done.stdout
     blocked = [record for record in records if record.truth is not None and record.truth.label == "NLOS"]

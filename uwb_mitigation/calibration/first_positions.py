@@ -11,7 +11,11 @@ from uwb_mitigation.calibration.joint_fit import KNOT_S
 from uwb_mitigation.calibration.motion_segments import Segments
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
-from uwb_mitigation.positioning.online.initialization import CandidatePosition, candidate_positions
+from uwb_mitigation.positioning.online.initialization import (
+    CandidatePosition,
+    candidate_positions,
+    local_optima,
+)
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
@@ -150,9 +154,11 @@ def suspects(
 
 def _moment_losses(config: EstimatorConfig, moments: _Moments) -> NDArray[np.float64]:
     """Return the loss of all moments with each of `OFFSETS_M`."""
-    loss = np.zeros(len(OFFSETS_M))
+    total = np.zeros(len(OFFSETS_M))
     for row, value in moments:
-        for k, offset in enumerate(OFFSETS_M.tolist()):
-            possible = _candidate_positions(config, row, value - offset)
-            loss[k] += possible[0].loss if possible else NO_POSITION_LOSS
-    return loss
+        where, sd = config.anchors.position[row], np.full(len(row), START_SD_M)
+        shifted = value - OFFSETS_M[:, None]
+        _, losses, _ = local_optima(where, shifted, sd, config.model, config.height, config.area)
+        loss = losses.min(axis=1)
+        total += np.where(np.isfinite(loss), loss, NO_POSITION_LOSS)
+    return total

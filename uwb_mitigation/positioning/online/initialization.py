@@ -66,41 +66,69 @@ def candidate_positions(
         height: known height of the tag.
         area: area of the tag.
     """
-    dims = 2 if height is not None else 3
-    if len(range_m) < dims:
+    if len(range_m) < (2 if height is not None else 3):
         return []
-    x = _starts(anchors, range_m, height)
-    problem = _Trilateration.for_starts(len(x), anchors, range_m, sd_m, model, height)
-    x, cost, gradient, hessian = problem.descend(x)
+    (x,), (cost,), (hessian,) = local_optima(anchors, range_m[None], sd_m, model, height, area)
+    result: list[CandidatePosition] = []
+    left = np.flatnonzero(np.isfinite(cost))
+    left = left[np.argsort(cost[left])]
+    while len(left):
+        best = left[0]
+        information = hessian[best] + 1e-6 * np.eye(3)
+        result.append(CandidatePosition(x[best].copy(), np.linalg.inv(information), float(cost[best])))
+        offset = x[left] - x[best]
+        same = (np.sum(offset * offset, axis=1) < 0.25) | (
+            np.sum(offset @ information * offset, axis=1) < 4.0
+        )
+        left = left[~same]
+    return result
+
+
+def local_optima(
+    anchors: NDArray[np.float64],
+    range_m: NDArray[np.float64],
+    sd_m: NDArray[np.float64],
+    model: NoiseModel,
+    height: Height | None,
+    area: Area | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return n local optima for each of m sets of ranges, of which some are equal; see `candidate_positions`.
+
+    Args:
+        anchors: float64 (k, 3), m, of each range.
+        range_m: measured ranges, float64 (m, k), m.
+        sd_m: standard deviations of the ranges, float64 (k,), m.
+        model: how robust.
+        height: known height of the tag.
+        area: area of the tag.
+
+    Returns:
+        positions float64 (m, n, 3), losses (m, n), infinite where implausible, and Hessians (m, n, 3, 3).
+    """
+    x = np.concatenate([_starts(anchors, one, height) for one in range_m])
+    sets = len(range_m), len(x) // len(range_m)
+    of_starts = np.repeat(range_m, sets[1], axis=0)
+    problem = _Trilateration(anchors, of_starts, sd_m, model, *_height_prior(len(x), height))
+    x, loss, gradient, hessian = problem.descend(x)
+    cost = loss.reshape(sets)
     # Discard starts that have not converged, unless no start has converged.
     step = np.linalg.solve(hessian + 1e-9 * np.eye(3), gradient[..., None])[..., 0]
-    arrived = np.einsum("ni,ni->n", step, gradient) < _STUCK
-    if arrived.any():
-        cost = np.where(arrived, cost, np.inf)
-    keep = cost <= cost.min() + IMPLAUSIBLE
+    arrived = (np.einsum("ni,ni->n", step, gradient) < _STUCK).reshape(sets)
+    cost[~arrived & arrived.any(axis=1, keepdims=True)] = np.inf
     if area is not None:
-        keep = np.isfinite(cost)
         excess = x - area.clip(x)
         squared = np.einsum("ni,ni->n", excess, np.einsum("nij,nj->ni", hessian, excess))
         is_near = (np.linalg.norm(excess, axis=1) < _NEAR_WALL_M) | (squared < IMPLAUSIBLE)
-        keep &= is_near
-        if not keep.any():
-            return []
-        outside = np.flatnonzero(keep & (excess != 0.0).any(axis=1))
+        cost[~is_near.reshape(sets)] = np.inf
+        outside = np.flatnonzero(np.isfinite(cost.ravel()) & (excess != 0.0).any(axis=1))
         if len(outside):
             # Optima just outside, because of range errors: find the best positions on the boundary.
             wall = area.clip(x[outside])
             walls = problem.with_walls(outside, wall, excess[outside] != 0.0)
-            x[outside], cost[outside], _, hessian[outside] = walls.descend(wall)
+            x[outside], cost.flat[outside], _, hessian[outside] = walls.descend(wall)
             x = area.clip(x)
-        keep &= cost <= cost[keep].min() + IMPLAUSIBLE
-    result: list[CandidatePosition] = []
-    for i in np.flatnonzero(keep)[np.argsort(cost[keep])]:
-        if any(_same(x[i], candidate) for candidate in result):
-            continue
-        covariance = np.linalg.inv(hessian[i] + 1e-6 * np.eye(3))
-        result.append(CandidatePosition(x[i].copy(), covariance, float(cost[i])))
-    return result
+    cost[cost > cost.min(axis=1, keepdims=True) + IMPLAUSIBLE] = np.inf
+    return x.reshape(*sets, 3), cost, hessian.reshape(*sets, 3, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,33 +147,13 @@ class _Trilateration:
     mean: NDArray[np.float64]
     information: NDArray[np.float64]
 
-    @classmethod
-    def for_starts(
-        cls,
-        count: int,
-        anchors: NDArray[np.float64],
-        range_m: NDArray[np.float64],
-        sd_m: NDArray[np.float64],
-        model: NoiseModel,
-        height: Height | None,
-    ) -> _Trilateration:
-        """Return the problem for that number of positions."""
-        mean, information = np.zeros((2, count, 3))
-        if height is not None:
-            mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
-        return cls(anchors, range_m, sd_m, model, mean, information)
-
-    def select_positions(self, rows: NDArray[np.intp]) -> _Trilateration:
-        """Return the same ranges with the priors of those positions."""
-        return replace(self, mean=self.mean[rows], information=self.information[rows])
-
     def with_walls(
         self, rows: NDArray[np.intp], wall: NDArray[np.float64], is_held: NDArray[np.bool_]
     ) -> _Trilateration:
-        """Return `at`, with the coordinates `held` bool (n, 3) at the boundary."""
-        selected = self.select_positions(rows)
-        information = np.where(is_held, 1.0 / _WALL_SD_M**2, selected.information)
-        return replace(selected, mean=np.where(is_held, wall, selected.mean), information=information)
+        """Return the problem of those positions, with the coordinates `is_held` bool (n, 3) at the boundary."""
+        information = np.where(is_held, 1.0 / _WALL_SD_M**2, self.information[rows])
+        mean = np.where(is_held, wall, self.mean[rows])
+        return replace(self, range_m=self.range_m[rows], mean=mean, information=information)
 
     def descend(
         self, x: NDArray[np.float64]
@@ -187,9 +195,12 @@ class _Trilateration:
         return cost, gradient, hessian, rows
 
 
-def _same(position: NDArray[np.float64], candidate: CandidatePosition) -> bool:
-    offset = position - candidate.position
-    return bool(offset @ offset < 0.25 or offset @ np.linalg.solve(candidate.covariance, offset) < 4.0)
+def _height_prior(count: int, height: Height | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `mean` and `information` of that number of positions."""
+    mean, information = np.zeros((2, count, 3))
+    if height is not None:
+        mean[:, 2], information[:, 2] = height.value, 1.0 / height.sd**2
+    return mean, information
 
 
 def _starts(
@@ -229,7 +240,8 @@ def snapshot(anchors: AnchorMap, ranges: Ranges, height: Height | None = None) -
     range_m, sd_m = np.where(present, latest, 0.0), np.where(present, 1.0, np.inf)
     reach = np.nanmedian(latest, axis=1, keepdims=True) if len(latest) else np.zeros((0, 1))
     exact = None if height is None else Height(height.value, 1e-4)
-    problem = _Trilateration.for_starts(len(latest), anchors.position, range_m, sd_m, _LEAST_SQUARES, exact)
+    prior = _height_prior(len(latest), exact)
+    problem = _Trilateration(anchors.position, range_m, sd_m, _LEAST_SQUARES, *prior)
     best, least = np.zeros((len(latest), 3)), np.full(len(latest), np.inf)
     sides = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -0.5]]) + 0.01
     for side in sides:
