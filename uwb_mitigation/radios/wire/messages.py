@@ -140,25 +140,10 @@ class OffsetsAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class GetInfo:
-    """Requests a HELLO."""
-
-
-@dataclass(frozen=True, slots=True)
 class SetMode:
     """Requests a mode; the board answers with a HELLO that contains the active mode."""
 
     mode: Mode
-
-
-@dataclass(frozen=True, slots=True)
-class TimeSync:
-    """Requests a TIME_SYNC_REPLY."""
-
-
-@dataclass(frozen=True, slots=True)
-class GetRadio:
-    """Requests a RADIO."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,23 +160,8 @@ class SetOffsets:
     offsets: Offsets
 
 
-Message = (
-    Hello
-    | RangeMeasurement
-    | Correction
-    | Log
-    | BoardStatus
-    | TimeSyncReply
-    | RadioConfigured
-    | RadioStatus
-    | OffsetsAnswer
-    | GetInfo
-    | SetMode
-    | TimeSync
-    | GetRadio
-    | SetRadio
-    | SetOffsets
-)
+Message = object
+"""An object of a type in `_ENCODERS`, or the `MessageType` of a request without content: GET_INFO, TIME_SYNC, GET_RADIO."""
 
 
 def encode(message: Message) -> tuple[MessageType, bytes]:
@@ -202,6 +172,8 @@ def encode(message: Message) -> tuple[MessageType, bytes]:
     Raises:
         ParameterError: a value does not fit its field.
     """
+    if isinstance(message, MessageType):
+        return message, b""
     kind, pack = _ENCODERS[type(message)]
     try:
         return kind, pack(message)
@@ -219,8 +191,10 @@ def decode(kind: int, payload: bytes, *, stamp_ns: int = 0) -> Message | None:
     Raises:
         LinkError: the payload is too short for its type, or a field has a value outside its range.
     """
-    if kind not in _DECODERS:
+    if kind not in layout.STRUCTS:
         return None
+    if kind not in _DECODERS:
+        return MessageType(kind)
     name, size = MessageType(kind).name, layout.STRUCTS[kind].size
     if len(payload) < size:
         raise LinkError(f"a payload of {len(payload)} bytes", where=name, valid=f"at least {size}")
@@ -338,16 +312,6 @@ def _unpack_corrected(values: tuple[Any, ...], payload: bytes, stamp_ns: int) ->
     return Correction(stamp_ns, tag, anchor, sequence, _device_time(ticks), corrected, us)
 
 
-def _pack_status(m: BoardStatus) -> bytes:
-    counts = m.frames_received, m.frames_dropped, m.measurements, m.measurements_lost
-    return _STATUS.pack(*counts, m.temperature_c, m.mode)
-
-
-def _unpack_status(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> BoardStatus:
-    received, dropped, measurements, lost, temperature_c, mode = values
-    return BoardStatus(received, dropped, measurements, lost, _member(Mode, mode), temperature_c)
-
-
 def _settings_values(s: RadioSettings) -> tuple[Any, ...]:
     """Return the common fields of RADIO and SET_RADIO."""
     chip = s.address, s.antenna_delay, s.tx_power
@@ -418,15 +382,12 @@ _ENCODERS: dict[type, tuple[MessageType, Callable[[Any], bytes]]] = {
     RangeMeasurement: (MessageType.RANGE_CIR, _pack_range),
     Correction: (MessageType.RANGE_CORRECTED, _pack_corrected),
     Log: (MessageType.LOG, lambda m: _LOG.pack(m.level) + m.text.encode("utf-8", "replace")),
-    BoardStatus: (MessageType.STATUS, _pack_status),
+    BoardStatus: (MessageType.STATUS, lambda m: _STATUS.pack(*astuple(m)[:4], m.temperature_c, m.mode)),
     TimeSyncReply: (MessageType.TIME_SYNC_REPLY, lambda m: _SYNC.pack(m.request_sequence, m.received_us)),
     RadioConfigured: (MessageType.RADIO, _pack_radio),
     RadioStatus: (MessageType.RADIO_STATUS, _pack_radio_status),
     OffsetsAnswer: (MessageType.OFFSETS, lambda m: _OFFSETS.pack(m.request_sequence, m.slots, m.accepted)),
-    GetInfo: (MessageType.GET_INFO, lambda m: b""),
     SetMode: (MessageType.SET_MODE, lambda m: _SET_MODE.pack(m.mode)),
-    TimeSync: (MessageType.TIME_SYNC, lambda m: b""),
-    GetRadio: (MessageType.GET_RADIO, lambda m: b""),
     SetRadio: (
         MessageType.SET_RADIO,
         lambda m: (
@@ -442,15 +403,12 @@ _DECODERS: dict[int, Callable[[tuple[Any, ...], bytes, int], Message]] = {
     MessageType.LOG: lambda v, payload, _: Log(
         _member(LogLevel, v[0]), payload[_LOG.size :].decode("utf-8", "replace")
     ),
-    MessageType.STATUS: _unpack_status,
+    MessageType.STATUS: lambda v, payload, _: BoardStatus(v[0], v[1], v[2], v[3], _member(Mode, v[5]), v[4]),
     MessageType.TIME_SYNC_REPLY: lambda v, payload, _: TimeSyncReply(*v),
     MessageType.RADIO: _unpack_radio,
     MessageType.RADIO_STATUS: _unpack_radio_status,
     MessageType.OFFSETS: lambda v, payload, _: OffsetsAnswer(v[0], v[1], bool(v[2])),
-    MessageType.GET_INFO: lambda v, payload, _: GetInfo(),
     MessageType.SET_MODE: lambda v, payload, _: SetMode(_member(Mode, v[0])),
-    MessageType.TIME_SYNC: lambda v, payload, _: TimeSync(),
-    MessageType.GET_RADIO: lambda v, payload, _: GetRadio(),
     MessageType.SET_RADIO: lambda v, payload, _: SetRadio(_settings(v, payload, _SET_RADIO.size)[0]),
     MessageType.SET_OFFSETS: _unpack_offsets,
 }
