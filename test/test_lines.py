@@ -230,23 +230,24 @@ def test_the_output_of_a_dwm1001_is_on_in_whatever_state_it_was(tmp_path: Path, 
             assert boards.shells[0].output == "lec"
 
 
-def test_the_start_of_the_output_needs_neither_a_banner_nor_a_known_state():
-    """In virtual time: a shell without banner whose output someone turns off, after more than a minute."""
+@pytest.mark.parametrize("output", ["", "lec"])
+def test_the_start_of_the_output_needs_neither_a_banner_nor_a_known_state(output: str):
+    """In virtual time: a shell without banner, silent at first, whose output someone turns off, after more than a minute."""
     session, shell, now_ns = LineSession(load_mapping("dwm1001_pans")), PansShell(banner=""), 0
     shell.receive(b"\r\r", 0.0)
+    shell.output = output
     session.opened(0)
 
-    def run(seconds: float) -> list[RangeMeasurement]:
+    def run(seconds: float, line: str = f"{LEC}\r\n") -> list[RangeMeasurement]:
         nonlocal now_ns
         ranges: list[RangeMeasurement] = []
         for _ in range(round(seconds * 10)):
             now_ns += S // 10
             answer = shell.receive(session.outgoing(), now_ns / S)
-            ranges += session.receive(
-                answer + (f"{LEC}\r\n".encode() if shell.output else b""), now_ns, now_ns
-            )
+            ranges += session.receive(answer + (line.encode() if shell.output else b""), now_ns, now_ns)
         return ranges
 
+    run(5.0, line="")
     assert len(run(10.0)) > 100
     shell.output = ""
     assert len(run(40.0)) == 0
