@@ -103,9 +103,9 @@ class Board:
         if now_us < self._status_due_us:
             return b""
         self._status_due_us = now_us + STATUS_INTERVAL_US
-        received = self._decoder.counts
+        received = self._decoder
         status = BoardStatus(
-            frames_received=received.frames,
+            frames_received=received.counts["frames"],
             frames_dropped=received.corrupt + self._dropped,
             measurements=self._measurements,
             measurements_lost=self.measurements_lost,
@@ -115,9 +115,9 @@ class Board:
 
     def receive(self, data: bytes, now_us: int) -> bytes:
         """Return the answers to the host's frames in the data."""
-        foreign = self._decoder.counts.foreign_versions.total()
+        foreign = self._decoder.counts["foreign_version"]
         sent = b"".join(self._answer(frame, now_us) for frame in self._decoder.feed(data))
-        if self._decoder.counts.foreign_versions.total() > foreign:
+        if self._decoder.counts["foreign_version"] > foreign:
             # This frame shows the board's version to a host of another version.
             sent += self.hello(now_us)
         return sent

@@ -142,14 +142,9 @@ class BoardSession:
 
     def totals(self) -> dict[str, int]:
         """Return the counts of frames for diagnostics, {name: count}."""
-        decoder = self._decoder.counts
-        foreign = decoder.foreign_versions.total()
-        return {
-            "frames": decoder.frames,
-            "corrupt": decoder.corrupt,
-            "foreign_version": foreign,
-            **self.counts,
-        }
+        decoder = self._decoder
+        intact = {name: decoder.counts[name] for name in ("frames", "foreign_version")}
+        return intact | {"corrupt": decoder.corrupt} | self.counts
 
     @property
     def model_matches(self) -> bool:
@@ -379,12 +374,10 @@ class BoardSession:
         return True
 
     def _check_foreign_versions(self, now_ns: int) -> list[Event]:
-        counts = self._decoder.counts
-        count = counts.foreign_versions.total()
+        count, version = self._decoder.counts["foreign_version"], self._decoder.last_foreign_version
         if count == self._foreign_frames:
             return []
         self._foreign_frames = count
-        version = counts.last_foreign_version
         # The buffers may still contain frames of firmware that ran before the connected board was restarted.
         if self.state is LinkState.READY or version is None:
             return []
