@@ -109,7 +109,7 @@ def loopback(
         lost=frames - delivered,
         intact_lost=intact_lost,
         corrupt_delivered=corrupt,
-        bytes_received=decoder.counts.bytes_received,
+        bytes_received=decoder.counts["bytes_received"],
         decoder_s=decoder_s,
     )
 

@@ -20,8 +20,7 @@ from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.radios import evb1000
-from uwb_mitigation.radios.evb1000 import Evb1000Settings
-from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.dw1000.port import ChipSettings
 from uwb_mitigation.radios.settings import RadioSettings, Role
 from uwb_mitigation.radios.wire.layout import Mode
 from uwb_mitigation.types.measurement import DEVICE_TIME_WRAP
@@ -120,7 +119,7 @@ def evb1000_rate_hz(seconds: float) -> float:
     """
     with tempfile.TemporaryDirectory() as folder, _emulated(Path(folder) / "board") as paths:
         settings = [
-            Evb1000Settings(PortAddress.parse(str(path)), RadioSettings(role=role))
+            ChipSettings(str(path), RadioSettings(role=role))
             for path, role in zip(paths, (Role.TAG, Role.ANCHOR), strict=True)
         ]
         ports = evb1000.open(settings, lambda event: None)

@@ -27,14 +27,20 @@ def states() -> dict[str, str]:
 
 
 def test_library_that_cannot_be_imported_is_broken_unless_it_is_optional_and_missing(monkeypatch):
-    for module in ("numpy", "mcap", "bokeh"):
+    for module in ("numpy", "mcap", "bokeh", "h5py"):
         monkeypatch.setitem(sys.modules, module, None)
     installed = doctor.metadata.distributions
+    missing = ("bokeh", "h5py")
     monkeypatch.setattr(
-        doctor.metadata, "distributions", lambda name: [] if name == "bokeh" else installed(name=name)
+        doctor.metadata, "distributions", lambda name: [] if name in missing else installed(name=name)
     )
     found = states()
-    assert (found["numpy"], found["mcap"], found["bokeh"]) == ("broken", "broken", "optional")
+    assert [found[name] for name in ("numpy", "mcap", *missing)] == [
+        "broken",
+        "broken",
+        "optional",
+        "optional",
+    ]
 
 
 @pytest.mark.parametrize("module", ["rclpy", "uwb_mitigation_msgs"])

@@ -104,7 +104,7 @@ def received_messages(stream: bytes) -> list[object]:
     assert stream[:1] == b"\0", "a session starts with a complete frame"
     decoder = FrameDecoder()
     received: list[object] = [messages.decode(frame.type, frame.payload) for frame in decoder.feed(stream)]
-    assert decoder.counts.corrupt == 0
+    assert decoder.corrupt == 0
     return received
 
 

@@ -16,11 +16,9 @@ from uwb_mitigation.radios.wire.layout import MessageType, Mode
 from uwb_mitigation.radios.wire.messages import (
     BoardStatus,
     Correction,
-    GetInfo,
     Hello,
     Log,
     SetMode,
-    TimeSync,
     TimeSyncReply,
 )
 from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
@@ -36,8 +34,8 @@ SMALL = [
     BoardStatus(1, 2, 3, 4, Mode.DEVICE, 41.5),
     TimeSyncReply(17, 2**60),
     SetMode(Mode.DEVICE),
-    GetInfo(),
-    TimeSync(),
+    MessageType.GET_INFO,
+    MessageType.TIME_SYNC,
 ]
 
 

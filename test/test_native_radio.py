@@ -28,7 +28,8 @@ from uwb_mitigation.errors import LinkError, MissingDependencyError, ParameterEr
 from uwb_mitigation.radios import evb1000
 from uwb_mitigation.radios import spi as spidev_bus
 from uwb_mitigation.radios.dw1000.native import NativeRadio
-from uwb_mitigation.radios.evb1000 import Evb1000Bus, Evb1000Settings
+from uwb_mitigation.radios.dw1000.port import ChipSettings
+from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, Role
 from uwb_mitigation.radios.spi import SpidevBus
@@ -50,8 +51,8 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[EmulatedE
         yield emulated, prefix
 
 
-def settings(path: object, **radio: object) -> Evb1000Settings:
-    return Evb1000Settings(PortAddress.parse(str(path)), RadioSettings(**radio))
+def settings(path: object, **radio: object) -> ChipSettings:
+    return ChipSettings(str(path), RadioSettings(**radio))
 
 
 def test_tag_and_anchor_on_usb_recover_from_unplugging(boards: tuple[EmulatedEvb1000s, Path]):

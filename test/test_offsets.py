@@ -14,7 +14,7 @@ from benchmarks.equipment.board import Board
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.radios.wire.events import OffsetsRefused
+from uwb_mitigation.radios.wire.events import Refused
 from uwb_mitigation.radios.wire.framing import WireFrame
 from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import Correction, Hello
@@ -186,7 +186,7 @@ class Pair:
 def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
     pair = Pair(Offsets(0.25))
     assert pair.range() == []
-    assert pair.session.counts.wrong_offsets == 1
+    assert pair.session.counts["wrong_offsets"] == 1
     pair.turn()
     assert pair.range() == [2.75]
     pair.start(boot=2)
@@ -196,14 +196,14 @@ def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
     pair.session.set_offsets(NO_OFFSETS)
     pair.turn()
     assert pair.range() == [3.0]
-    assert not [event for event in pair.events if isinstance(event, OffsetsRefused)]
+    assert not [event for event in pair.events if isinstance(event, Refused)]
 
 
 def test_older_board_is_reported_and_its_corrections_are_ignored():
     pair = Pair(Offsets(0.25), OlderBoard)
     for _ in range(MAX_TRIES + 3):
         pair.turn()
-    (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]
+    (refused,) = [event for event in pair.events if isinstance(event, Refused)]
     assert "flash a newer" in refused.text
     assert pair.range() == []
 
@@ -213,13 +213,13 @@ def test_older_board_is_accepted_without_offsets():
     assert pair.range() == [3.0]
     for _ in range(MAX_TRIES + 3):
         pair.turn()
-    assert not [event for event in pair.events if isinstance(event, OffsetsRefused)]
+    assert not [event for event in pair.events if isinstance(event, Refused)]
     assert pair.range() == [3.0]
 
 
 def test_too_many_offsets_for_a_board_are_refused_with_both_numbers():
     pair = Pair(Offsets(anchors=dict.fromkeys(range(MAX_OFFSETS + 1), 0.1)))
     pair.turn()
-    (refused,) = [event for event in pair.events if isinstance(event, OffsetsRefused)]
+    (refused,) = [event for event in pair.events if isinstance(event, Refused)]
     assert f"can store {MAX_OFFSETS} offsets, but {MAX_OFFSETS + 1}" in refused.text
     assert pair.range() == []

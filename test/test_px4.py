@@ -298,6 +298,14 @@ def test_ranges_are_sent_as_ekf2_accepts_them(
     # Ten correlated ranges a second from each anchor: each has ten times the variance.
     assert {round(message["range_accuracy"] ** 2, 4) for message in messages[8:]} <= {0.1, 0.05}
     ros.diagnosis("px4", lambda status: "anchors that are not in the file: 7" in status.message)
+    # Which of two tags is on the vehicle is not known.
+    publisher.publish(RangeCorrected(tag_id=9))
+    ros.diagnosis("px4", lambda status: "set parameter tag to that of the vehicle (1, 9)" in status.message)
+    before = len(received())
+    for _ in range(5):
+        publisher.publish(RangeCorrected(tag_id=1, anchor_id=0x022E, range=1.0, variance=0.1))
+        ros.spin_for(0.1)
+    assert len(received()) == before
     assert node.signal(signal.SIGINT) == 0, node.output
 
 

@@ -10,7 +10,7 @@ from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.events import Event, RadioRefused
+from uwb_mitigation.radios.wire.events import Event, Refused
 from uwb_mitigation.radios.wire.messages import SetRadio
 from uwb_mitigation.radios.wire.session import BoardSession
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -48,7 +48,7 @@ def test_ranges_reach_the_host_with_stamps_of_their_reception():
         ranges = host.received(RangeMeasurement)
         addresses = air.address(tag), air.address(anchor)
     assert len(ranges) > 100
-    assert host.session.counts.lost == 0
+    assert host.session.counts["lost"] == 0
     last = ranges[-1]
     assert (last.tag_id, last.anchor_id) == addresses
     assert abs(last.range_m - 6) < 0.02
@@ -95,7 +95,7 @@ def test_host_configures_the_radio_while_it_ranges():
         host.session.set_radio(requested)
         host.run(1)
         ranges = host.received(RangeMeasurement)
-    assert not host.received(RadioRefused)
+    assert not host.received(Refused)
     assert host.session.radio is not None
     assert host.session.radio.settings.channel == 2
     assert len(ranges) > 50
@@ -111,7 +111,7 @@ def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
         assert messages.decode(messages.MessageType.SET_RADIO, payload) == SetRadio(RadioSettings(channel=6))
         host.session._radio_request.begin(SetRadio(RadioSettings(channel=6)))
         host.run(1)
-        (refusal,) = host.received(RadioRefused)
+        (refusal,) = host.received(Refused)
         assert "channel" in refusal.text
         assert host.session.radio is not None
         assert host.session.radio.settings.channel == 5

@@ -358,7 +358,7 @@ def test_reasons_are_shown_in_words(reason: int, text: str):
 def test_calibration_is_written_only_if_it_differs_and_restored_at_the_end():
     run = Bench(window=157).start()
     assert run.session.counts["calibration_writes"] == 2
-    run.session.closed()
+    run.session.closed(0)
     run.session.opened(run.now_ns)
     run.start()
     assert run.session.counts["calibration_writes"] == 2
@@ -380,7 +380,7 @@ def test_calibration_is_written_only_if_it_differs_and_restored_at_the_end():
 def test_a_window_that_the_board_does_not_accept_is_not_written_again():
     run = Bench(UciBoardModel(max_taps=64), window=157).start()
     for _ in range(3):
-        run.session.closed()
+        run.session.closed(0)
         run.session.opened(run.now_ns)
         run.start()
     assert run.session.counts["calibration_writes"] == 2
@@ -969,7 +969,7 @@ def test_damaged_files_of_the_calibration_are_ignored(killed: UciBoardModel, tmp
 def test_ranges_without_cir_are_explained_by_damaged_notifications_first(keep, warning: str):
     run = Bench(window=157).start()
     (handle,) = run.board.sessions
-    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), 0, None, print, lambda: 0)
+    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), (0, None, print, lambda: 0))
     port.session = run.session
     for sequence in range(1, 60):
         port.monitor.add_range(time.monotonic())

@@ -13,16 +13,21 @@ from typing import Protocol
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
-from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, MAX_PAYLOAD_BYTES, PROTOCOL_VERSION, Flag, Mode
+from uwb_mitigation.radios.wire.layout import (
+    MAX_OFFSETS,
+    MAX_PAYLOAD_BYTES,
+    PROTOCOL_VERSION,
+    Flag,
+    MessageType,
+    Mode,
+)
 from uwb_mitigation.radios.wire.messages import (
     BoardStatus,
     Correction,
-    GetInfo,
     Hello,
     OffsetsAnswer,
     SetMode,
     SetOffsets,
-    TimeSync,
     TimeSyncReply,
 )
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement
@@ -98,9 +103,9 @@ class Board:
         if now_us < self._status_due_us:
             return b""
         self._status_due_us = now_us + STATUS_INTERVAL_US
-        received = self._decoder.counts
+        received = self._decoder
         status = BoardStatus(
-            frames_received=received.frames,
+            frames_received=received.counts["frames"],
             frames_dropped=received.corrupt + self._dropped,
             measurements=self._measurements,
             measurements_lost=self.measurements_lost,
@@ -110,9 +115,9 @@ class Board:
 
     def receive(self, data: bytes, now_us: int) -> bytes:
         """Return the answers to the host's frames in the data."""
-        foreign = self._decoder.counts.foreign_versions.total()
+        foreign = self._decoder.counts["foreign_version"]
         sent = b"".join(self._answer(frame, now_us) for frame in self._decoder.feed(data))
-        if self._decoder.counts.foreign_versions.total() > foreign:
+        if self._decoder.counts["foreign_version"] > foreign:
             # This frame shows the board's version to a host of another version.
             sent += self.hello(now_us)
         return sent
@@ -122,7 +127,7 @@ class Board:
             message = messages.decode(frame.type, frame.payload)
         except LinkError:
             message = None
-        if isinstance(message, GetInfo):
+        if message is MessageType.GET_INFO:
             return self._hello(now_us, frame.sequence)
         if isinstance(message, SetMode):
             if self._corrector is not None or message.mode is Mode.HOST:
@@ -133,7 +138,7 @@ class Board:
             if accepted and self._corrector is not None:
                 self._corrector.offsets = message.offsets
             return self._send(OffsetsAnswer(frame.sequence, MAX_OFFSETS, accepted), now_us, Flag.ANSWER)
-        if isinstance(message, TimeSync):
+        if message is MessageType.TIME_SYNC:
             return self._send(TimeSyncReply(frame.sequence, now_us), now_us, Flag.ANSWER)
         if isinstance(message, RangeMeasurement) and self._corrector is not None:
             return self._correct(message, now_us, Flag.ANSWER)

@@ -94,7 +94,6 @@ class TextBoards:
 
     Attributes:
         shells: of the boards, for kind pans.
-        silent: the boards print no ranges while this is true.
     """
 
     failure = None
@@ -118,7 +117,6 @@ class TextBoards:
         )
         self._random = np.random.default_rng(seed)
         self._lock, self._stop = threading.RLock(), threading.Event()
-        self.silent = False
         self.shells = [PansShell() for _ in range(boards)]
         names = [links.with_name(f"{links.name}{number}") if links else None for number in range(boards)]
         self._terminals = [PseudoTerminal(name) for name in names]
@@ -183,7 +181,7 @@ class TextBoards:
                     received, backlog = terminal.read(), self._backlogs[number]
                     if self._kind == "pans":
                         backlog += self.shells[number].receive(received, now_s)
-                    if is_due and not self.silent and len(backlog) < MAX_BACKLOG_BYTES:
+                    if is_due and len(backlog) < MAX_BACKLOG_BYTES:
                         backlog += self._text(number, sequence).encode()
                     if self._udp is None:
                         terminal.write(backlog)

@@ -78,7 +78,7 @@ def board(data: bytes) -> None:
         assert len(answer) <= 4 * len(data) + 100
         answers = FrameDecoder()
         answers.feed(answer)
-        assert answers.counts.corrupt == 0
+        assert answers.corrupt == 0
 
 
 def _made_up(kind: int, script: Script) -> bytes:

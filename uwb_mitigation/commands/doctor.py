@@ -65,6 +65,7 @@ def examine() -> Iterator[Finding]:
     yield _check("shipped model", _compare_model)
     yield _check("ROS 2", _load_ros, "rclpy", "the nodes: source ROS and the workspace, or run make setup")
     yield from _ports()
+    yield _check("h5py", partial(_version, "h5py"), "h5py", "recordings in HDF5: pip install h5py")
     yield _check("torch", partial(metadata.version, "torch"), "torch", "training: make setup-training")
     for tool, use in _TOOLS.items():
         path = shutil.which(tool)

@@ -39,6 +39,9 @@ RANGE_PERIOD_NS = 15_000_000
 MAX_SHIFT_NS = 60_000_000
 """A range whose stamp would have to be later by more than this is not sent: at 1 m/s, it is 0.06 m."""
 
+MAX_IDS = 10
+"""Number of tags, and of unknown anchors, that are named."""
+
 _NAN3 = (math.nan,) * 3
 _QOS = QoSProfile(depth=10)
 
@@ -68,6 +71,7 @@ class Px4(ManagedNode):
         self._resets = 0
         self._publisher: Publisher
         self._tag = 0
+        self._tags: set[int] = set()
         self._anchors: AnchorMap
         self._positions: NDArray[np.float64] | None = None
         self._waiting: dict[int, tuple[int, RangeCorrected]] = {}
@@ -87,14 +91,17 @@ class Px4(ManagedNode):
 
     def describe(self) -> Description:
         values: dict[str, object] = {"sent": self._sent, "mode": self.value("mode")}
-        text = "sending" if self._sent else "no positions or ranges yet"
         warning = ""
         if self.value("mode") == "ranges" and self._positions is None:
             warning = "the origin of PX4 is unknown: set parameter origin, or wait for GNSS"
+        elif len(self._tags) > 1:
+            ids = ", ".join(map(format_id, sorted(self._tags)))
+            warning = f"no ranges are sent, because they are of several tags: set parameter tag to that of the vehicle ({ids})"
         elif self._unknown:
-            unknown = ", ".join(map(format_id, sorted(self._unknown)))
-            warning = f"ranges of anchors that are not in the file: {unknown}"
-        return "PX4", diagnostics.WARN if warning else diagnostics.OK, warning or text, values
+            ids = ", ".join(map(format_id, sorted(self._unknown)))
+            warning = f"ranges of anchors that are not in the file: {ids}"
+        text = warning or ("sending" if self._sent else "no positions or ranges yet")
+        return "PX4", diagnostics.WARN if warning else diagnostics.OK, text, values
 
     def _open_ranges(self) -> None:
         beacon = getattr(self._messages, "RangingBeacon", None)
@@ -107,7 +114,7 @@ class Px4(ManagedNode):
             raise ParameterError("parameter anchors is empty", valid="anchors:=FILE for mode:=ranges")
         self._anchors = load_anchors(Path(self.value("anchors")).expanduser())
         self._tag, self._positions = self.value("tag"), None
-        self._waiting, self._last_ns, self._unknown = {}, {}, set()
+        self._waiting, self._last_ns, self._unknown, self._tags = {}, {}, set(), set()
         if self.value("origin"):
             self._place_anchors(parse_origin(self.value("origin")))
         else:
@@ -131,11 +138,16 @@ class Px4(ManagedNode):
     def _on_range(self, message: RangeCorrected) -> None:
         """Keep the latest range of each anchor until it is sent."""
         stamp_ns = to_ns(message.header.stamp)
-        self._tag = self._tag or message.tag_id
-        if message.tag_id != self._tag:
+        if message.tag_id != (self._tag or message.tag_id):
+            return
+        if len(self._tags) < MAX_IDS:
+            self._tags.add(message.tag_id)
+        if len(self._tags) > 1:
+            # One of them is on the vehicle. The ranges of another one would move it.
+            self._waiting.clear()
             return
         if message.anchor_id not in self._anchors.index:
-            if len(self._unknown) < 10:
+            if len(self._unknown) < MAX_IDS:
                 self._unknown.add(message.anchor_id)
             return
         is_valid = stamp_ns >= 0 and 0.0 < message.range < MAX_VALUE and 0.0 < message.variance < MAX_VALUE

@@ -11,16 +11,13 @@ import os
 import select
 import struct
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import serial
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.dw1000.port import ChipPort, open_chips, read_chips
-from uwb_mitigation.radios.port import OnEvent, PortAddress
-from uwb_mitigation.radios.settings import DEFAULT_RADIO, RadioSettings, ValueReader
+from uwb_mitigation.radios.dw1000.port import open_chips, read_chips
+from uwb_mitigation.radios.port import PortAddress
 
 ANSWER_TIMEOUT_S = 0.4
 REPEATED_TIMEOUT_S = 0.2
@@ -40,25 +37,8 @@ _HEADER = struct.Struct("<BBHH")
 _REMEDY = "DIP switch S1-3 off (TREK1000: S1-4 to S1-7 on), then power the board on again: the display shows USB to SPI"
 
 
-@dataclass(frozen=True, slots=True)
-class Evb1000Settings:
-    """Settings of an EVB1000: address of its port, and what its radio does."""
-
-    address: PortAddress
-    radio: RadioSettings = DEFAULT_RADIO
-
-
-def read_settings(value: ValueReader) -> list[Evb1000Settings]:
-    """Return the settings of each radio from the parameters; raise ParameterError if one is invalid."""
-    return [Evb1000Settings(PortAddress.parse(port), radio) for port, radio in read_chips(value)]
-
-
-def open(
-    settings: Sequence[Evb1000Settings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
-) -> list[ChipPort]:
-    """Open radios; see `ChipPort` for the events and errors."""
-    chips = [(str(board.address), partial(Evb1000Bus, board.address), board.radio) for board in settings]
-    return open_chips(chips, on_event, stamp_clock)
+read_settings = partial(read_chips, PortAddress.parse)
+open = partial(open_chips, lambda chip: Evb1000Bus(PortAddress.parse(chip.port)))
 
 
 class Evb1000Bus:
@@ -90,10 +70,7 @@ class Evb1000Bus:
         except LinkError:
             self.close()
             raise
-
-    @property
-    def name(self) -> str:
-        return f"{self.version} at {self._address}"
+        self.name = f"{self.version} at {address}"
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         flags = (_WRITE if out is not None else 0) | (_FAST if self._fast else 0)

@@ -10,23 +10,22 @@ import re
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, RecordingError
-from uwb_mitigation.radios.capture import Capture, CaptureWriter
+from uwb_mitigation.radios.capture import Capture
 from uwb_mitigation.radios.port import (
     ExchangeMonitor,
-    OnEvent,
     PortAddress,
-    PortMessage,
     PortReport,
+    StreamPlace,
     StreamPort,
-    started,
+    StreamSettings,
+    stream_opener,
 )
-from uwb_mitigation.radios.settings import ValueReader, read_baud, read_ports
+from uwb_mitigation.radios.settings import PortMessage, ValueReader, read_baud, read_capture, read_ports
 from uwb_mitigation.recordings.live_ranges import LiveConverter
 from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
 from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
@@ -89,35 +88,19 @@ class _UdpSocket(socket.socket):
         raise NotImplementedError
 
 
-@dataclass(frozen=True, slots=True)
-class LineSettings:
-    """Settings of a board.
+@dataclass(frozen=True)
+class LineSettings(StreamSettings):
+    """Settings of a board; `mapping`: where the values are in its lines, and the baud rate unless there is another one."""
 
-    Attributes:
-        address: address of its port.
-        mapping: where the values are in its lines.
-        number: number of the board; it is added to a constant id of the tag.
-        baud: baud rate; 0 = that of the mapping.
-        dtr: the level of DTR.
-        capture: file for the raw bytes; None = none.
-    """
-
-    address: PortAddress
     mapping: Mapping
-    number: int = 0
-    baud: int = 0
-    dtr: bool = True
-    capture: Path | None = None
+    baud: int = field(default=0, kw_only=True)
 
 
 def read_settings(value: ValueReader) -> list[LineSettings]:
     """Return the settings of the boards at `port`; raise ParameterError if a parameter is invalid."""
     addresses, mapping = [parse_address(port) for port in read_ports(value)], read_mapping(value)
-    capture = Path(value("capture")).expanduser() if value("capture") else None
-    baud, dtr = read_baud(value, mapping.baud), value("dtr")
-    return [
-        LineSettings(address, mapping, number, baud, dtr, capture) for number, address in enumerate(addresses)
-    ]
+    line: dict[str, Any] = {"baud": read_baud(value, mapping.baud), "dtr": value("dtr")}
+    return [LineSettings(address, mapping, capture=read_capture(value), **line) for address in addresses]
 
 
 def read_mapping(value: ValueReader) -> Mapping:
@@ -139,19 +122,6 @@ def parse_address(text: str) -> PortAddress:
     if not port.isdecimal() or not 0 < int(port) < 65536:
         raise ParameterError(f"the port {text!r:.60}", valid="udp:PORT or udp:ADDRESS:PORT, such as udp:8000")
     return UdpAddress(host=host, number=int(port))
-
-
-def open(
-    settings: Sequence[LineSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
-) -> list[LinePort]:
-    """Open boards; `RadioPort.close` ends them. Events are measurements and `PortMessage`.
-
-    Raises:
-        ParameterError: the file of the capture cannot be written.
-    """
-    path = settings[0].capture
-    capture = CaptureWriter(path, "lines", len(settings)) if path is not None else None
-    return started([LinePort(board, capture, on_event, stamp_clock) for board in settings])
 
 
 def open_capture(path: Path, value: ValueReader) -> Capture:
@@ -178,7 +148,7 @@ class LineSession:
 
     Args:
         mapping: where the values are in a line, and how the output is started.
-        number: see `LineSettings`.
+        number: number of the board; it is added to a constant id of the tag.
         has_datagrams: whether a line ends with each piece of data.
 
     Attributes:
@@ -209,6 +179,10 @@ class LineSession:
         self.counts = self._converter.counts
         self.example, self.stamp_offset_s = "", 0.0
         self.opened(0)
+
+    def closed(self, now_ns: int) -> list[RangeMeasurement]:
+        """Do nothing: `opened` begins again."""
+        return []
 
     def opened(self, now_ns: int) -> None:
         """Begin with a port that was opened."""
@@ -299,40 +273,16 @@ class LineSession:
 
 
 class LinePort(StreamPort):
-    """Operates one board until `close`. See `open`.
-
-    Args:
-        settings, on_event, stamp_clock: see `open`.
-        capture: stores the raw bytes; None = not stored.
-
-    Attributes:
-        session: the state of the board.
-    """
+    """Operates one board until `close`; see `StreamPort`. Events are measurements and `PortMessage`."""
 
     session: LineSession
 
-    def __init__(
-        self,
-        settings: LineSettings,
-        capture: CaptureWriter | None,
-        on_event: OnEvent,
-        stamp_clock: Callable[[], int],
-    ) -> None:
-        self._settings = settings
-        self._baud = settings.baud or settings.mapping.baud
+    def __init__(self, settings: LineSettings, place: StreamPlace) -> None:
         self._is_udp = isinstance(settings.address, UdpAddress)
-        self.session = LineSession(settings.mapping, settings.number, has_datagrams=self._is_udp)
-        super().__init__(
-            settings.address,
-            on_event,
-            ExchangeMonitor({}),
-            stamp_clock=stamp_clock,
-            baud=self._baud,
-            dtr=settings.dtr,
-            capture=capture,
-            number=settings.number,
-        )
-        self._received_ns, self._has_ranges = 0, False
+        session = LineSession(settings.mapping, place[0], has_datagrams=self._is_udp)
+        settings = replace(settings, baud=settings.baud or settings.mapping.baud)
+        super().__init__(settings, session, ExchangeMonitor({}), place)
+        self._mapping, self._received_ns, self._has_ranges = settings.mapping, 0, False
         self._empty_read_is_loss = not self._is_udp
 
     def apply(self, settings: LineSettings) -> None:
@@ -353,7 +303,9 @@ class LinePort(StreamPort):
         session, text = self.session, self.monitor.warning(time.monotonic())
         if text and not session.received:
             remedy = (
-                "is the sender's address right?" if self._is_udp else f"is the baud rate {self._baud} right?"
+                "is the sender's address right?"
+                if self._is_udp
+                else f"is the baud rate {self._settings.baud} right?"
             )
             return f"{text}: nothing was received; {remedy}"
         if text and session.example:
@@ -369,7 +321,7 @@ class LinePort(StreamPort):
 
     def _opened(self, now_ns: int) -> list[Any]:
         if self._capture is not None:
-            mapping = self._settings.mapping.model_dump(mode="json", exclude_unset=True)
+            mapping = self._mapping.model_dump(mode="json", exclude_unset=True)
             settings = {"number": self._number, "datagrams": self._is_udp, "mapping": mapping}
             self._capture.add_board(self._number, settings)
         self._received_ns, self._has_ranges = now_ns, False
@@ -388,3 +340,6 @@ class LinePort(StreamPort):
             text = f"{self.session.mapping.name} at {self.device}: ranges of tag {measurements[0].tag_id}"
             return [PortMessage(logging.INFO, text), *measurements]
         return measurements
+
+
+open = stream_opener(LinePort, "lines")

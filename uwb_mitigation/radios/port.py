@@ -9,13 +9,15 @@ import contextlib
 import errno
 import logging
 import os
+import re
 import select
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 import serial
@@ -23,6 +25,7 @@ from serial.tools import list_ports
 
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
 from uwb_mitigation.radios.capture import CaptureWriter
+from uwb_mitigation.radios.settings import PortMessage, RadioStatus
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 MIN_RETRY_S = 0.1
@@ -42,14 +45,6 @@ _READ_BYTES = 1 << 16
 
 OnEvent = Callable[[Any], None]
 """Called with each event, from the thread of the port."""
-
-
-@dataclass(frozen=True, slots=True)
-class PortMessage:
-    """A text for the log; `level` is one of `logging`."""
-
-    level: int
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +101,12 @@ class ExchangeMonitor:
             self._failures.append((now_s, cause, count))
             if len(self._failures) > 4096:
                 self._failures.popleft()
+
+    def add_status(self, before: RadioStatus | None, status: RadioStatus, now_s: float) -> None:
+        """Add the exchanges that failed between two statuses of a radio; the remedies have the names of its counts."""
+        for cause in self.remedies if before is not None else ():
+            name = cause.replace(" ", "_")
+            self.add_failures(cause, getattr(status, name) - getattr(before, name), now_s)
 
     def reset(self) -> None:
         """Forget all exchanges, for example after the radio was lost."""
@@ -263,41 +264,48 @@ def started(ports: list[_Port]) -> list[_Port]:
     return ports
 
 
-class StreamPort(RadioPort):
-    """A serial port whose bytes a session encodes and decodes.
-
-    Args:
-        address: address of the port.
-        name, on_event, monitor: see `RadioPort`.
-        stamp_clock: the clock of the stamps, ns.
-        baud, dtr: see `PortAddress.open`.
-        capture: stores the raw bytes, as those of board `number`; None = not stored.
-        tick_s: maximum time between two calls of the session.
+@dataclass(frozen=True)
+class StreamSettings:
+    """Settings of a board on a port with a stream of bytes.
 
     Attributes:
-        session: the state of the board, whose `outgoing` returns the bytes to send.
+        address: address of the port.
+        baud: baud rate of a serial line; native USB ignores it.
+        dtr: the level of DTR. Boards with native USB send only while it is set; on boards with a USB bridge, its change
+            resets the board.
+        capture: file for the raw bytes of all boards; None = none.
+    """
+
+    address: PortAddress
+    baud: int = field(default=115_200, kw_only=True)
+    dtr: bool = field(default=True, kw_only=True)
+    capture: Path | None = field(default=None, kw_only=True)
+
+
+class StreamPort(RadioPort):
+    """A serial port whose bytes a session encodes and decodes. See `stream_opener`.
+
+    Args:
+        settings: of the board.
+        session: the state of the board.
+        monitor: see `RadioPort`.
+        place: number of the board, capture of its bytes, receiver of its events, and the clock of the stamps, ns.
+
+    Attributes:
+        session: see above; `outgoing` returns the bytes to send.
     """
 
     session: Any
+    _tick_s = 0.05
+    """Maximum time between two calls of the session."""
 
     def __init__(
-        self,
-        address: PortAddress,
-        on_event: OnEvent,
-        monitor: ExchangeMonitor,
-        *,
-        stamp_clock: Callable[[], int],
-        baud: int,
-        dtr: bool = True,
-        capture: CaptureWriter | None = None,
-        number: int = 0,
-        tick_s: float = 0.05,
+        self, settings: StreamSettings, session: Any, monitor: ExchangeMonitor, place: StreamPlace
     ) -> None:
-        super().__init__(str(address), on_event, monitor)
-        self._address, self._baud, self._dtr = address, baud, dtr
-        self._stamp_clock = stamp_clock
-        self._tick_s = tick_s
-        self._capture, self._number = capture, number
+        self._number, self._capture, on_event, self._stamp_clock = place
+        super().__init__(str(settings.address), on_event, monitor)
+        self._settings, self._address = settings, settings.address
+        self.session = session
         self._empty_read_is_loss = True
 
     @abstractmethod
@@ -314,7 +322,8 @@ class StreamPort(RadioPort):
 
     def _closed(self, now_ns: int) -> list[Any]:
         """End the session after the port was lost; return events."""
-        return []
+        events: list[Any] = self.session.closed(now_ns)
+        return events
 
     def _is_stopped(self, now_ns: int) -> bool:
         """Return whether the port may be closed; called after `close`, until it returns true."""
@@ -332,7 +341,7 @@ class StreamPort(RadioPort):
             self._capture.add(self._number, data, sent=sent)
 
     def _connect(self) -> None:
-        port = self._address.open(self._baud, self._dtr)
+        port = self._address.open(self._settings.baud, self._settings.dtr)
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Without this flag USB bridges delay bytes by 16 ms. Other ports do not support it.
             port.set_low_latency_mode(True)
@@ -374,7 +383,28 @@ class StreamPort(RadioPort):
             self._log_problem()
 
 
-@dataclass(frozen=True, slots=True)
+StreamPlace = tuple[int, CaptureWriter | None, OnEvent, Callable[[], int]]
+
+
+def stream_opener(make_port: Callable[[Any, StreamPlace], Any], kind: str = "") -> Callable[..., list[Any]]:
+    """Return the function `open` of a source of boards on streams.
+
+    `open(settings, on_event, stamp_clock=time.time_ns)` opens boards; `RadioPort.close` ends them. It raises
+    ParameterError if the file of the capture, of this `kind`, cannot be written.
+    """
+
+    def open(
+        settings: Sequence[StreamSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
+    ) -> list[Any]:
+        path = settings[0].capture
+        capture = CaptureWriter(path, kind, len(settings)) if path is not None else None
+        places = [(number, capture, on_event, stamp_clock) for number in range(len(settings))]
+        return started(list(map(make_port, settings, places)))
+
+    return open
+
+
+@dataclass(frozen=True)
 class PortAddress:
     """Address of a board: a device file, or the ids of a USB device.
 
@@ -398,14 +428,8 @@ class PortAddress:
         """
         if text.startswith("/"):
             return cls(device=text)
-        kind, *ids = text.split(":", 3)
-        try:
-            if kind == "usb" and len(ids) in (2, 3):
-                vendor, product = int(ids[0], 16), int(ids[1], 16)
-                if 0 <= vendor <= 0xFFFF and 0 <= product <= 0xFFFF:
-                    return cls("", vendor, product, ids[2] if len(ids) == 3 else "")
-        except ValueError:
-            pass
+        if ids := re.fullmatch("usb:([0-9a-fA-F]{1,4}):([0-9a-fA-F]{1,4})(?::(.*))?", text):
+            return cls("", int(ids[1], 16), int(ids[2], 16), ids[3] or "")
         raise ParameterError(
             f"the port {text!r}" if text else "no port is given",
             valid="port:=/dev/ttyACM0, or port:=usb:VENDOR:PRODUCT[:SERIAL]",

@@ -6,7 +6,6 @@ import logging
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,23 +13,23 @@ from uwb_mitigation.errors import LinkError, ParameterError, format_id
 from uwb_mitigation.radios.port import (
     PERIOD_S,
     ExchangeMonitor,
-    OnEvent,
     PortAddress,
-    PortMessage,
     PortReport,
+    StreamPlace,
     StreamPort,
+    StreamSettings,
     processes_using,
-    started,
+    stream_opener,
 )
 from uwb_mitigation.radios.settings import (
     DEFAULT_RADIO,
     EXCHANGE_REMEDIES,
     STATE_PROBLEMS,
+    PortMessage,
     RadioSettings,
     RadioStatus,
     Role,
     ValueReader,
-    count_failures,
     radio_values,
     read_baud,
     read_radio,
@@ -39,7 +38,7 @@ from uwb_mitigation.radios.settings import (
 )
 from uwb_mitigation.radios.wire import events
 from uwb_mitigation.radios.wire.events import Event, LinkState
-from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, LogLevel, Mode
+from uwb_mitigation.radios.wire.layout import LogLevel, Mode
 from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Log, RadioConfigured
 from uwb_mitigation.radios.wire.session import BoardSession
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -50,27 +49,19 @@ BAUD = 921_600
 REOPEN_TIMEOUT_NS = 10 * 10**9
 """Timeout after which the port is opened again. After a suspend, an open port may never receive data again."""
 
-_OFFSETS_PROBLEM, _RADIO_PROBLEM = "the offsets are not set", "the radio's settings are not used"
 
-
-@dataclass(frozen=True, slots=True)
-class SerialSettings:
-    """Settings of a board on a serial port.
+@dataclass(frozen=True, kw_only=True)
+class SerialSettings(StreamSettings):
+    """Settings of a board with the wire protocol.
 
     Attributes:
-        address: address of the port.
-        baud: baud rate of a serial line; native USB ignores it.
-        dtr: the level of DTR. Boards with native USB send only while it is set; on boards with a USB bridge, its change
-            resets the board.
         mode: what the board sends; None = do not change it.
         model_id: expected model of the board, whose corrections are delivered; None = any.
         radio: settings of the board's radio; None = the board keeps its own.
         offsets: offsets that the board subtracts in mode DEVICE.
     """
 
-    address: PortAddress
     baud: int = BAUD
-    dtr: bool = True
     mode: Mode | None = None
     model_id: int | None = None
     radio: RadioSettings | None = None
@@ -87,52 +78,30 @@ def read_settings(value: ValueReader) -> list[SerialSettings]:
     radio = read_radio(value)
     settings = SerialSettings(
         PortAddress.parse(value("port")),
-        read_baud(value, BAUD),
-        value("dtr"),
-        Mode[value("mode").upper()],
-        int(digits, 16) if digits else None,
-        radio if radio != DEFAULT_RADIO else None,
-        read_offsets(str(value("offsets"))),
+        baud=read_baud(value, BAUD),
+        dtr=value("dtr"),
+        mode=Mode[value("mode").upper()],
+        model_id=int(digits, 16) if digits else None,
+        radio=radio if radio != DEFAULT_RADIO else None,
+        offsets=read_offsets(str(value("offsets"))),
     )
     return [settings]
 
 
-def open(
-    settings: Sequence[SerialSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
-) -> list[BoardPort]:
-    """Open boards; `RadioPort.close` ends them.
-
-    Args:
-        settings: of each board.
-        on_event: called with measurements, corrections, events of the session and `PortMessage`.
-        stamp_clock: the clock of the stamps, ns.
-    """
-    return started([BoardPort(board, on_event, stamp_clock) for board in settings])
-
-
 class BoardPort(StreamPort):
-    """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise; see `open`.
+    """Keeps a board connected until `close`; reconnects after unplugging, resets, timeouts and noise; see `StreamPort`.
 
-    Attributes:
-        session: the state of the board.
+    Events are measurements, corrections, events of the session and `PortMessage`.
     """
 
     session: BoardSession
 
     _range_types = (RangeMeasurement, Correction)
 
-    def __init__(self, settings: SerialSettings, on_event: OnEvent, stamp_clock: Callable[[], int]) -> None:
-        monitor = ExchangeMonitor(EXCHANGE_REMEDIES)
-        super().__init__(
-            settings.address,
-            on_event,
-            monitor,
-            stamp_clock=stamp_clock,
-            baud=settings.baud,
-            dtr=settings.dtr,
-        )
-        self.session = BoardSession(mode=settings.mode, expected_model_id=settings.model_id)
-        self._settings = settings
+    def __init__(self, settings: SerialSettings, place: StreamPlace) -> None:
+        session = BoardSession(mode=settings.mode, expected_model_id=settings.model_id)
+        super().__init__(settings, session, ExchangeMonitor(EXCHANGE_REMEDIES), place)
+        self._board = settings
         self._connections = 0
         self._other_users = ""
         self._refused: dict[str, str] = {}
@@ -148,15 +117,15 @@ class BoardPort(StreamPort):
     def apply(self, settings: SerialSettings) -> None:
         """Send the settings that differ to the board."""
         with self._lock:
-            before, self._settings = self._settings, settings
+            before, self._board = self._board, settings
             if settings.radio != before.radio:
-                self._refused.pop(_RADIO_PROBLEM, None)
+                self._refused.pop(events.RADIO_PROBLEM, None)
                 self.session.set_radio(settings.radio or DEFAULT_RADIO)
             if settings.mode is Mode.DEVICE and (settings.mode, settings.offsets) != (
                 before.mode,
                 before.offsets,
             ):
-                self._refused.pop(_OFFSETS_PROBLEM, None)
+                self._refused.pop(events.OFFSETS_PROBLEM, None)
                 self.session.set_offsets(settings.offsets)
             if settings.mode is not None and settings.mode != before.mode:
                 self.session.set_mode(settings.mode)
@@ -221,7 +190,7 @@ class BoardPort(StreamPort):
 
     def _opened(self, now_ns: int) -> list[Any]:
         self._other_users = ", ".join(processes_using(self.device))
-        self._connections = self.session.counts.connections
+        self._connections = self.session.counts["connections"]
         return self._observed(self.session.opened(now_ns))
 
     def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
@@ -231,8 +200,8 @@ class BoardPort(StreamPort):
         return observed
 
     def _closed(self, now_ns: int) -> list[Any]:
-        self._was_connected = self.session.counts.connections > self._connections
-        return self._observed(self.session.closed(now_ns))
+        self._was_connected = self.session.counts["connections"] > self._connections
+        return self._observed(super()._closed(now_ns))
 
     def _observed(self, received: list[Event]) -> list[Any]:
         """Update the state for the diagnostics; return the events and the messages for the log."""
@@ -251,16 +220,16 @@ class BoardPort(StreamPort):
             case BoardStatus():
                 self._status = event
             case RadioStatus():
-                count_failures(self.monitor, self._radio_status, event, time.monotonic())
+                self.monitor.add_status(self._radio_status, event, time.monotonic())
                 self._radio_status = event
             case RadioConfigured(settings=settings):
                 # A board may repeat its settings.
                 if settings != self._radio:
                     text = f"the board's radio {format_id(settings.address)}: {settings_text(settings)}"
                 self._radio = settings
-            case events.RadioRefused(text=reason):
-                self._refused[_RADIO_PROBLEM] = reason
-                level, text = logging.ERROR, f"{_RADIO_PROBLEM}: {reason}"
+            case events.Refused(problem=problem, text=reason):
+                self._refused[problem] = reason
+                level, text = logging.ERROR, f"{problem}: {reason}"
             case events.Connected(hello=hello):
                 self._refused.clear()
                 self._radio = self._radio_status = None
@@ -273,24 +242,10 @@ class BoardPort(StreamPort):
                         logging.WARNING,
                         f"disconnected from the board: {loss.value}; waiting for it",
                     )
-            case events.VersionMismatch(version=version):
-                level = logging.ERROR
-                text = (
-                    f"the board uses version {version} of the protocol, this driver version {PROTOCOL_VERSION}: "
-                    "update the older one"
-                )
-            case events.ModeChanged(mode=mode):
-                text = f"the board is in mode {mode.name}"
-            case events.ModeRefused(mode=mode, requested=requested):
-                level = logging.WARNING
-                text = (
-                    f"the board stays in mode {mode.name} instead of {requested.name}: does it have a model?"
-                )
-            case events.OffsetsRefused(text=reason):
-                self._refused[_OFFSETS_PROBLEM] = reason
-                level = logging.ERROR
-                text = f"the board's corrections are not published: {_OFFSETS_PROBLEM}: {reason}"
             case Log(level=severity, text=board_text):
                 level = logging.WARNING if severity >= LogLevel.WARNING else logging.INFO
                 text = f"board: {board_text}"
         return PortMessage(level, text) if text else None
+
+
+open = stream_opener(BoardPort)

@@ -7,15 +7,22 @@ import enum
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from uwb_mitigation.errors import ParameterError, format_id, parse_id
 
-if TYPE_CHECKING:
-    from uwb_mitigation.radios.port import ExchangeMonitor
-
 ValueReader = Callable[[str], Any]
 """Returns the value of a parameter of the driver."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortMessage:
+    """A text for the log; `level` is one of `logging`."""
+
+    level: int
+    text: str
+
 
 PREFIX = "radio."
 """Prefix of the parameters of radios."""
@@ -177,6 +184,11 @@ def read_ports(value: ValueReader) -> list[str]:
     return ports
 
 
+def read_capture(value: ValueReader) -> Path | None:
+    """Return the parameter `capture`; None = none."""
+    return Path(value("capture")).expanduser() if value("capture") else None
+
+
 def read_baud(value: ValueReader, default: int) -> int:
     """Return the parameter `baud`, or a default for 0; raise ParameterError if it is too small."""
     if 0 < (baud := int(value("baud"))) < 1200:
@@ -233,11 +245,16 @@ def read_radio(value: ValueReader) -> RadioSettings:
         interval_us=round(1e6 / rate_hz) if rate_hz else 0,
         **settings,
     )
+    check_parameters(radio)
+    return radio
+
+
+def check_parameters(settings: Any) -> None:
+    """Check settings that were read from the parameters `radio.*`; raise ParameterError, with their name."""
     try:
-        radio.check()
+        settings.check()
     except ParameterError as error:
         raise ParameterError(f"parameters {PREFIX}*: {error.what}", valid=error.valid) from error
-    return radio
 
 
 def settings_text(settings: RadioSettings) -> str:
@@ -253,16 +270,6 @@ def status_warning(status: RadioStatus) -> str:
     if status.state is RadioState.LOCK_UNCONFIRMED:
         return "the DW1000 has not reported that its clock PLL locked; if it does not range, check its supply"
     return ""
-
-
-def count_failures(
-    monitor: ExchangeMonitor, before: RadioStatus | None, status: RadioStatus, now_s: float
-) -> None:
-    """Add the exchanges that failed between two statuses of a radio to its monitor."""
-    for cause in EXCHANGE_REMEDIES:
-        name = cause.replace(" ", "_")
-        earlier = getattr(before, name) if before is not None else getattr(status, name)
-        monitor.add_failures(cause, getattr(status, name) - earlier, now_s)
 
 
 def radio_values(settings: RadioSettings | None, status: RadioStatus, prefix: str = "") -> dict[str, object]:

@@ -9,15 +9,11 @@ import os
 import re
 import struct
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, not_installed
-from uwb_mitigation.radios.dw1000.port import ChipPort, open_chips, read_chips
-from uwb_mitigation.radios.port import OnEvent
-from uwb_mitigation.radios.settings import DEFAULT_RADIO, PREFIX, RadioSettings, ValueReader
+from uwb_mitigation.radios.dw1000.port import open_chips, read_chips
 
 SLOW_HZ, FAST_HZ = 2_000_000, 16_000_000
 RESET_PULSE_S = 0.001
@@ -29,26 +25,8 @@ _GET_LINE = 3 << 30 | _REQUEST.size << 16 | 0xB4 << 8 | 0x03
 _INPUT, _OUTPUT, _OPEN_DRAIN = 1 << 0, 1 << 1, 1 << 3
 
 
-@dataclass(frozen=True, slots=True)
-class SpiSettings:
-    """Settings of a chip at `/dev/spidevBUS.SELECT`: device file, reset line (see `SpidevBus`), and what it does."""
-
-    device: str
-    reset: str = ""
-    radio: RadioSettings = DEFAULT_RADIO
-
-
-def read_settings(value: ValueReader) -> list[SpiSettings]:
-    """Return the settings of each radio from the parameters; raise ParameterError if one is invalid."""
-    return [SpiSettings(port, value(PREFIX + "reset"), radio) for port, radio in read_chips(value)]
-
-
-def open(
-    settings: Sequence[SpiSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
-) -> list[ChipPort]:
-    """Open radios; see `ChipPort` for the events and errors."""
-    chips = [(chip.device, partial(SpidevBus, chip.device, chip.reset), chip.radio) for chip in settings]
-    return open_chips(chips, on_event, stamp_clock)
+read_settings = partial(read_chips, str)
+open = partial(open_chips, lambda chip: SpidevBus(chip.port, chip.reset))
 
 
 class SpidevBus:
@@ -81,6 +59,7 @@ class SpidevBus:
             raise not_installed("spidev") from None
         self.name = device
         self._line = (f"/dev/{line[1]}", int(line[2])) if line is not None else None
+        self.has_reset = line is not None
         self._line_fd: int | None = None
         self._spi: Any = spidev.SpiDev()
         try:
@@ -93,10 +72,6 @@ class SpidevBus:
             raise LinkError(
                 f"cannot be opened: {error.strerror}", where=device, valid="enable SPI"
             ) from error
-
-    @property
-    def has_reset(self) -> bool:
-        return self._line is not None
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         try:

@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 import logging
-import math
-import statistics
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
-from uwb_mitigation.radios.capture import Capture, CaptureWriter
+from uwb_mitigation.radios.capture import Capture
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
 from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import (
     PERIOD_S,
     ExchangeMonitor,
-    OnEvent,
     PortAddress,
-    PortMessage,
     PortReport,
+    StreamPlace,
     StreamPort,
-    started,
+    StreamSettings,
+    stream_opener,
 )
-from uwb_mitigation.radios.settings import PREFIX, Role, ValueReader, read_addresses, read_ports
+from uwb_mitigation.radios.settings import (
+    PREFIX,
+    PortMessage,
+    Role,
+    ValueReader,
+    check_parameters,
+    read_addresses,
+    read_capture,
+    read_ports,
+)
 
-BAUD = 115_200
 DEFAULT_CHANNEL = 9
 """The channel of the configuration that is known from a real board."""
 
@@ -42,13 +47,11 @@ _MIN_RANGES, _CIR_SHARE = 20, 0.5
 _MIN_DAMAGES, _DAMAGE_SHARE = 20, 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class UciPortSettings:
-    """Settings of a UCI board: address of its port, what the board does, and a file for the raw bytes; None = none."""
+@dataclass(frozen=True)
+class UciPortSettings(StreamSettings):
+    """Settings of a UCI board; `board`: what it does."""
 
-    address: PortAddress
     board: UciSettings
-    capture: Path | None = None
 
 
 def read_settings(value: ValueReader) -> list[UciPortSettings]:
@@ -80,32 +83,10 @@ def read_settings(value: ValueReader) -> list[UciPortSettings]:
     )
     anchor = replace(first, role=Role.ANCHOR, peers=(address,))
     boards = [first, *(replace(anchor, address=local) for local in local_anchors)]
-    try:
-        for board in boards:
-            board.check()
-    except ParameterError as error:
-        raise ParameterError(f"parameters {PREFIX}*: {error.what}", valid=error.valid) from error
-    capture = Path(value("capture")).expanduser() if value("capture") else None
-    return [UciPortSettings(port, board, capture) for port, board in zip(ports, boards, strict=True)]
-
-
-def open(
-    settings: Sequence[UciPortSettings], on_event: OnEvent, stamp_clock: Callable[[], int] = time.time_ns
-) -> list[UciPort]:
-    """Open boards; `RadioPort.close` ends them.
-
-    Args:
-        settings: of each board; all have the same capture.
-        on_event: called with measurements and `PortMessage`. An anchor delivers its measurements only if its
-            settings request it.
-        stamp_clock: the clock of the stamps, ns.
-
-    Raises:
-        ParameterError: the file of the capture cannot be written.
-    """
-    path = settings[0].capture
-    capture = CaptureWriter(path, "UCI", len(settings)) if path is not None else None
-    return started([UciPort(board, n, capture, on_event, stamp_clock) for n, board in enumerate(settings)])
+    for board in boards:
+        check_parameters(board)
+    capture = read_capture(value)
+    return [UciPortSettings(port, board, capture=capture) for port, board in zip(ports, boards, strict=True)]
 
 
 def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
@@ -120,43 +101,20 @@ def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
 
 
 class UciPort(StreamPort):
-    """Operates one board until `close`; starts it again after a loss. See `open`.
+    """Operates one board until `close`; starts it again after a loss. See `StreamPort`.
 
-    Args:
-        settings: see `open`.
-        number: number of the board in the capture.
-        capture: stores the raw bytes; None = not stored.
-        on_event, stamp_clock: see `open`.
-
-    Attributes:
-        session: the state of the board.
+    Events are measurements and `PortMessage`; an anchor delivers its measurements only if its settings request it.
     """
 
     session: UciSession
+    _tick_s = 0.01
 
-    def __init__(
-        self,
-        settings: UciPortSettings,
-        number: int,
-        capture: CaptureWriter | None,
-        on_event: OnEvent,
-        stamp_clock: Callable[[], int],
-    ) -> None:
+    def __init__(self, settings: UciPortSettings, place: StreamPlace) -> None:
         remedies = {cause.name: cause.remedy for cause in EXCHANGE_CAUSES.values()}
         unexpected = [cause.name for cause in EXCHANGE_CAUSES.values() if cause.unexpected]
-        monitor = ExchangeMonitor(remedies, unexpected)
-        super().__init__(
-            settings.address,
-            on_event,
-            monitor,
-            stamp_clock=stamp_clock,
-            baud=BAUD,
-            capture=capture,
-            number=number,
-            tick_s=0.01,
-        )
         self._originals = OriginalsFile(str(settings.address))
-        self.session = UciSession(settings.board, self._originals)
+        session = UciSession(settings.board, self._originals)
+        super().__init__(settings, session, ExchangeMonitor(remedies, unexpected), place)
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
 
@@ -198,12 +156,6 @@ class UciPort(StreamPort):
             hardware = f"UCI board {format_id(s.address)}"
             activity = "ranging" if s.role is Role.TAG else "answering"
             return PortReport(self.device, hardware, self.problem, self._warning(), activity, values)
-
-    @property
-    def clock_offset_ppm(self) -> float:
-        """Median carrier frequency offset of the peers; NaN = unknown."""
-        with self._lock:
-            return statistics.median(self.session.assembly.clock_offsets_ppm or [math.nan])
 
     def _warning(self) -> str:
         """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
@@ -256,10 +208,6 @@ class UciPort(StreamPort):
             raise LinkError(session.state, where=str(self._address))
         return messages + measurements if session.settings.delivers else messages
 
-    def _closed(self, now_ns: int) -> list[Any]:
-        self.session.closed()
-        return []
-
     def _is_stopped(self, now_ns: int) -> bool:
         with self._lock:
             if not self._stop_ns:
@@ -274,3 +222,6 @@ class UciPort(StreamPort):
             f"UCI board {format_id(s.address)} at {self.device}: {s.role.name.lower()}, channel {s.channel}, "
             f"peers {', '.join(map(format_id, s.peers))}, {s.effective_interval_ms} ms, {taps}"
         )
+
+
+open = stream_opener(UciPort, "UCI")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import re
+import statistics
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -12,19 +14,19 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uwb_mitigation.commands.field.checks import Observation
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
 from uwb_mitigation.radios import evb1000, lines, serial, spi, uci
-from uwb_mitigation.radios.dw1000.port import ChipPort
-from uwb_mitigation.radios.evb1000 import Evb1000Bus, Evb1000Settings
+from uwb_mitigation.radios.dw1000.port import ChipPort, ChipSettings
+from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.fira.session import UciSettings
 from uwb_mitigation.radios.lines import LinePort, LineSettings
-from uwb_mitigation.radios.port import OnEvent, PortAddress, PortMessage, RadioPort
+from uwb_mitigation.radios.port import OnEvent, PortAddress, RadioPort
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
-from uwb_mitigation.radios.settings import RadioSettings, Role
-from uwb_mitigation.radios.spi import SpidevBus, SpiSettings
+from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
+from uwb_mitigation.radios.spi import SpidevBus
 from uwb_mitigation.radios.uci import UciPort, UciPortSettings
 from uwb_mitigation.radios.wire.layout import Mode
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -176,21 +178,16 @@ def _open(
         boards = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
         return uci.open(
             [
-                UciPortSettings(PortAddress.parse(port), board, capture)
+                UciPortSettings(PortAddress.parse(port), board, capture=capture)
                 for port, board in zip(ports, boards, strict=False)
             ],
             on_event,
         )
     tag = RadioSettings(window=_WINDOW)
     radios = (tag, replace(tag, role=Role.ANCHOR))
-    if source == "spi":
-        return spi.open(
-            [SpiSettings(port, radio=radio) for port, radio in zip(ports, radios, strict=False)], on_event
-        )
-    return evb1000.open(
-        [Evb1000Settings(PortAddress.parse(port), radio) for port, radio in zip(ports, radios, strict=False)],
-        on_event,
-    )
+    module: Any = spi if source == "spi" else evb1000
+    opened: Sequence[RadioPort] = module.open(list(map(ChipSettings, ports, radios)), on_event)
+    return opened
 
 
 def _values(settings: RadioSettings) -> dict[str, object]:
@@ -213,7 +210,7 @@ def _describe(radios: Sequence[RadioPort], o: Observation) -> None:
         o.written = {"CIR taps": settings.window, "CIR taps before the first path": 5}
         if session.window is not None:
             o.read = dict(zip(o.written, session.window, strict=True))
-        o.clock_offset_ppm = tag.clock_offset_ppm
+        o.clock_offset_ppm = statistics.median(session.assembly.clock_offsets_ppm or [math.nan])
         o.damaged, o.foreign = counts["damaged"], counts["unknown_session"]
     elif isinstance(tag, LinePort):
         # Such boards have no CIRs unless their mapping has them, and other lines are not damaged.

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 from uwb_mitigation.nodes.feeds.publishing import RangePublisher
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
-from uwb_mitigation.radios.port import OnEvent, PortMessage, RadioPort
-from uwb_mitigation.radios.settings import ValueReader
+from uwb_mitigation.radios.port import OnEvent, RadioPort
+from uwb_mitigation.radios.settings import PortMessage, ValueReader
 from uwb_mitigation.radios.wire.messages import Correction
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.source import Source

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 TICK_S = 0.02
 """Interval at which commands and a simulated clock are checked, and /clock is published."""
 
-LATE_NS, BATCH = 1_000_000, 16
+LATE_NS, BATCH = 1_000_000, 64
 """A record that is later than this is published in a batch with the next ones, of at most BATCH records."""
 
 ANNOUNCEMENT_S = 3.0

@@ -270,7 +270,7 @@ PX4 = (
     Parameter("anchors", "", "YAML file with the positions of the anchors (ranges)."),
     Parameter("origin", "", "Latitude, longitude (degrees) and altitude above mean sea level (m) of the origin of the anchors' frame, "
               "whose x is true east and y true north. Empty: the origin of PX4's local frame (ranges)."),
-    Parameter("tag", 0, "Number of the tag on the vehicle; 0: the first received tag (ranges).", low=0, high=2**63 - 1),
+    Parameter("tag", 0, "Number of the tag on the vehicle; 0: the only tag (ranges).", low=0, high=2**63 - 1),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 

@@ -6,29 +6,25 @@ from typing import Protocol
 
 
 class Bus(Protocol):
-    """SPI to one DW1000. If the chip is unreachable, methods raise LinkError within a second."""
+    """SPI to one DW1000. If the chip is unreachable, methods raise LinkError within a second.
 
-    @property
-    def name(self) -> str:
-        """Name for users."""
+    Attributes:
+        name: name for users.
+        reply_us: time that a tag on this bus needs from ANSWER to FINAL.
+        timeout_us: timeout of a tag for the frames of an anchor on such a bus.
+        has_reset: whether RSTn is wired.
+    """
+
+    name: str
+    reply_us: int
+    timeout_us: int
+    has_reset: bool
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         """Transfer in one chip-select period: write `header`, then write `out` or read and return `count` octets."""
 
     def speed(self, fast: bool) -> None:
         """Set the SPI clock: at most 3 MHz, or at most 20 MHz if `fast`."""
-
-    @property
-    def reply_us(self) -> int:
-        """Time that a tag on this bus needs from ANSWER to FINAL."""
-
-    @property
-    def timeout_us(self) -> int:
-        """Timeout of a tag for the frames of an anchor on such a bus."""
-
-    @property
-    def has_reset(self) -> bool:
-        """Whether RSTn is wired."""
 
     def reset(self) -> None:
         """Pull RSTn low for a short time, then let it float."""

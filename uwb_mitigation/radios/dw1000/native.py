@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from ctypes import POINTER, c_char_p, c_float, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from dataclasses import replace
+from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.mitigation.embedded.compiling import (
@@ -24,6 +25,7 @@ from uwb_mitigation.radios.dw1000 import structures
 from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.settings import (
     AGE_UNKNOWN_MS,
+    STATE_PROBLEMS,
     AnchorStatus,
     RadioSettings,
     RadioState,
@@ -37,11 +39,6 @@ _OPTIONS = ("-std=c99", "-O2", "-fPIC", *WARNINGS)
 _RANGED, _FAULT = 1, 2
 
 _loading = threading.Lock()
-_FAULTS = {
-    RadioState.BUS: "the bus failed",
-    RadioState.ABSENT: "no DW1000 answers: check wiring and supply",
-    RadioState.NO_CLOCK: "the DW1000's clock PLL does not lock: check its supply",
-}
 
 
 class NativeRadio:
@@ -89,13 +86,12 @@ class NativeRadio:
         Raises:
             LinkError: the bus is lost, or no chip answers; the next call tries to start the chip again.
         """
-        self._failure = None
         until_us = time.monotonic_ns() // 1000 + round(timeout_s * 1e6)
-        event = self._library.native_radio_exchange(self._radio, until_us)
-        if self._failure is not None:
-            raise self._failure
+        event = self._call(self._library.native_radio_exchange, until_us)
         if event == _FAULT:
-            text = _FAULTS.get(self._state(), "the DW1000 was reset, or did not finish a command in time")
+            text = STATE_PROBLEMS.get(
+                self._state(), "the DW1000 was reset, or did not finish a command in time"
+            )
             raise LinkError(text, where=self._bus.name)
         return self._measurement() if event == _RANGED else None
 
@@ -141,13 +137,8 @@ class NativeRadio:
             LinkError: the bus is lost.
         """
         temperature, voltage = c_float(), c_float()
-        self._failure = None
-        error = self._library.native_radio_sensors(
-            self._radio, ctypes.byref(temperature), ctypes.byref(voltage)
-        )
-        if self._failure is not None:
-            raise self._failure
-        if not error:
+        sensors = self._library.native_radio_sensors
+        if not self._call(sensors, ctypes.byref(temperature), ctypes.byref(voltage)):
             self._temperature_c, self._voltage = temperature.value, voltage.value
 
     def status(self) -> RadioStatus:
@@ -189,6 +180,14 @@ class NativeRadio:
         self._times_us = config.reply_us, config.timeout_us
         return config
 
+    def _call(self, function: Callable[..., int], *arguments: Any) -> int:
+        """Call a function that uses the bus; raise what a callback has raised."""
+        self._failure = None
+        result = function(self._radio, *arguments)
+        if self._failure is not None:
+            raise self._failure
+        return result
+
     def _state(self) -> RadioState:
         return RadioState(self._library.native_radio_state(self._radio))
 
@@ -206,21 +205,21 @@ class NativeRadio:
     def _transfer(
         self, _: int, header: int, header_bytes: int, out: int | None, into: int, count: int
     ) -> int:
-        try:
+        def transfer() -> None:
             sent = ctypes.string_at(out, count) if out else None
             answer = self._bus.transfer(ctypes.string_at(header, header_bytes), sent, count)
             if sent is None:
                 ctypes.memmove(into, answer, count)
-        except BaseException as error:  # nothing may pass through C
-            self._failure = error
-            return -1
-        return 0
 
-    def _catch_exception(self, act: Callable[[], None]) -> None:
+        return self._catch_exception(transfer)
+
+    def _catch_exception(self, act: Callable[[], None]) -> int:
         try:
             act()
         except BaseException as error:  # nothing may pass through C
             self._failure = error
+            return -1
+        return 0
 
 
 def load_native() -> ctypes.CDLL:

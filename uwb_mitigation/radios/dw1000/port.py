@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
 from uwb_mitigation.radios.port import PERIOD_S, ExchangeMonitor, OnEvent, PortReport, RadioPort, started
 from uwb_mitigation.radios.settings import (
+    DEFAULT_RADIO,
     EXCHANGE_REMEDIES,
     PREFIX,
     RadioSettings,
@@ -20,7 +21,6 @@ from uwb_mitigation.radios.settings import (
     RadioStatus,
     Role,
     ValueReader,
-    count_failures,
     radio_values,
     read_ports,
     read_radio,
@@ -35,11 +35,20 @@ SENSORS_INTERVAL_S = 10.0
 _EXCHANGE_TIMEOUT_S = 0.1
 
 
-def read_chips(value: ValueReader) -> list[tuple[str, RadioSettings]]:
-    """Return the port and the settings of each radio. The first has the role of the parameter, the others are anchors.
+@dataclass(frozen=True, slots=True)
+class ChipSettings:
+    """Settings of a radio: port of its bus, what it does, and its reset line (see `SpidevBus`)."""
+
+    port: str
+    radio: RadioSettings = DEFAULT_RADIO
+    reset: str = ""
+
+
+def read_chips(check_port: Callable[[str], object], value: ValueReader) -> list[ChipSettings]:
+    """Return the settings of each radio. The first has the role of the parameter, the others are anchors.
 
     Raises:
-        ParameterError: a parameter is invalid.
+        ParameterError: a parameter is invalid; also by `check_port`.
     """
     radio, ports = read_radio(value), read_ports(value)
     if radio.address and len(ports) > 1:
@@ -47,17 +56,20 @@ def read_chips(value: ValueReader) -> list[tuple[str, RadioSettings]]:
             f"parameter {PREFIX}address with {len(ports)} ports",
             valid="empty: each radio uses the address of its chip",
         )
-    anchor = replace(radio, role=Role.ANCHOR, anchors=())
-    return [(port, anchor if number else radio) for number, port in enumerate(ports)]
+    for port in ports:
+        check_port(port)
+    anchor, reset = replace(radio, role=Role.ANCHOR, anchors=()), value(f"{PREFIX}reset")
+    return [ChipSettings(port, anchor if number else radio, reset) for number, port in enumerate(ports)]
 
 
 def open_chips(
-    chips: Iterable[tuple[str, Callable[[], Bus], RadioSettings]],
+    open_bus: Callable[[ChipSettings], Bus],
+    settings: Sequence[ChipSettings],
     on_event: OnEvent,
-    stamp_clock: Callable[[], int],
+    stamp_clock: Callable[[], int] = time.time_ns,
 ) -> list[ChipPort]:
-    """Open radios, each with its name, the function that opens its bus, and its settings; see `ChipPort`."""
-    return started([ChipPort(*chip, on_event, stamp_clock) for chip in chips])
+    """Open radios; see `ChipPort` for the events and errors."""
+    return started([ChipPort(chip, partial(open_bus, chip), on_event, stamp_clock) for chip in settings])
 
 
 class ChipPort(RadioPort):
@@ -66,9 +78,8 @@ class ChipPort(RadioPort):
     Events are measurements, `RadioStatus` once a second, and `PortMessage`.
 
     Args:
-        name: of the bus.
+        settings: what the radio does, and where.
         open_bus: opens the bus; called again after it was lost.
-        settings: what the radio does.
         on_event: see `RadioPort`.
         stamp_clock: clock for stamps, ns.
 
@@ -83,34 +94,32 @@ class ChipPort(RadioPort):
 
     def __init__(
         self,
-        name: str,
+        settings: ChipSettings,
         open_bus: Callable[[], Bus],
-        settings: RadioSettings,
         on_event: OnEvent,
-        stamp_clock: Callable[[], int] = time.time_ns,
+        stamp_clock: Callable[[], int],
     ) -> None:
-        super().__init__(name, on_event, ExchangeMonitor(EXCHANGE_REMEDIES))
-        settings.check()
+        super().__init__(settings.port, on_event, ExchangeMonitor(EXCHANGE_REMEDIES))
+        settings.radio.check()
         load_native()
         self.settings: RadioSettings | None = None
         self.status = RadioStatus(state=RadioState.BUS)
         self._open_bus = open_bus
         self._stamp_clock = stamp_clock
-        self._requested_settings = settings
+        self._requested_settings = settings.radio
         self._settings_changed = False
         self._radio: NativeRadio | None = None
 
-    def apply(self, settings: Any) -> None:
-        """Use other settings of the radio (`settings.radio`), starting with the next exchange.
+    def apply(self, settings: ChipSettings) -> None:
+        """Use other settings of the radio, starting with the next exchange.
 
         Raises:
             ParameterError: the settings are invalid.
         """
-        radio: RadioSettings = settings.radio
-        radio.check()
+        settings.radio.check()
         with self._lock:
-            if radio != self._requested_settings:
-                self._requested_settings, self._settings_changed = radio, True
+            if settings.radio != self._requested_settings:
+                self._requested_settings, self._settings_changed = settings.radio, True
 
     def report(self) -> PortReport:
         """Return the present state."""
@@ -174,7 +183,7 @@ class ChipPort(RadioPort):
             with self._lock:
                 self._lost = ""
                 self.settings = radio.settings if started else None
-                count_failures(self.monitor, self.status, status, now_s)
+                self.monitor.add_status(self.status, status, now_s)
                 self.status = status
             if starts:
                 self._was_connected = True

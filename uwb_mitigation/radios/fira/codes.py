@@ -102,13 +102,7 @@ _STATUS_TEXTS = (
     "the session is active; too many sessions; the session is not configured: a parameter is missing; "
     "other sessions are active"
 )
-_STATUSES = dict(
-    zip(
-        (*range(0x01, 0x0B), *range(0x11, 0x17)),
-        _STATUS_TEXTS.split("; "),
-        strict=True,
-    )
-)
+_STATUSES = dict(zip((*range(0x01, 0x0B), *range(0x11, 0x17)), _STATUS_TEXTS.split("; "), strict=True))
 
 _REASONS = {
     0x01: "maximum number of unanswered rounds",
@@ -130,13 +124,8 @@ _REASON_TEXTS = (
     "reference session with an invalid offset; reference session lost; DT-anchor: rounds not configured; "
     "DT-tag: rounds not configured; initiation time has passed"
 )
-_REASONS |= dict(
-    zip(
-        (0x00, 0x03, 0x04, 0x05, *range(0x1D, 0x43)),
-        _REASON_TEXTS.split("; "),
-        strict=True,
-    )
-)
+_REASON_NUMBERS = (0x00, *range(0x03, 0x06), *range(0x1D, 0x43))
+_REASONS |= dict(zip(_REASON_NUMBERS, _REASON_TEXTS.split("; "), strict=True))
 
 _PARAMETER_NAMES = (
     "DEVICE_TYPE RANGING_ROUND_USAGE STS_CONFIG MULTI_NODE_MODE CHANNEL_NUMBER NUMBER_OF_CONTROLEES "
@@ -145,15 +134,10 @@ _PARAMETER_NAMES = (
     "STATIC_STS_IV UWB_INITIATION_TIME HOPPING_MODE BLOCK_STRIDE_LENGTH RESULT_REPORT_CONFIG "
     "MAX_NUMBER_OF_MEASUREMENTS STS_LENGTH ENABLE_DIAGNOSTICS DIAGS_FRAME_REPORTS_FIELDS"
 )
-PARAMETERS = dict(
-    zip(
-        bytes.fromhex(
-            "00 01 02 03 04 05 06 07 08 09 0d 11 12 13 14 15 1b 22 24 27 28 2b 2c 2d 2e 32 35 e8 e9"
-        ),
-        _PARAMETER_NAMES.split(),
-        strict=True,
-    )
+_TAGS = bytes.fromhex(
+    "00 01 02 03 04 05 06 07 08 09 0d 11 12 13 14 15 1b 22 24 27 28 2b 2c 2d 2e 32 35 e8 e9"
 )
+PARAMETERS = dict(zip(_TAGS, _PARAMETER_NAMES.split(), strict=True))
 """{tag: name} of the parameters of a session."""
 
 

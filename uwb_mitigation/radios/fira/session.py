@@ -101,12 +101,13 @@ class UciSession:
         self._commands.cancel()
         self._begin(now_ns)
 
-    def closed(self) -> None:
-        """Stop after the port was lost."""
+    def closed(self, now_ns: int) -> list[RangeMeasurement]:
+        """Stop after the port was lost; return no measurements."""
         self._restart_ns = None
         self._commands.cancel()
         self._forget_sessions()
         self.state = _NOT_CONNECTED
+        return []
 
     def stop(self, now_ns: int) -> None:
         """End all sessions and restore the calibration, before the port is closed; `stopped` follows."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import enum
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from uwb_mitigation.radios.settings import RadioStatus
-from uwb_mitigation.radios.wire.layout import Mode
-from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, RadioConfigured
-from uwb_mitigation.types.measurement import RangeMeasurement
+from uwb_mitigation.radios.wire.messages import Hello
+
+RADIO_PROBLEM = "the radio's settings are not used"
+OFFSETS_PROBLEM = "the offsets are not set, so the corrections of the board are not published"
 
 
 class LinkState(enum.Enum):
@@ -44,82 +44,41 @@ class Disconnected:
 
 
 @dataclass(frozen=True, slots=True)
-class VersionMismatch:
-    """The board uses another protocol version; its data is not delivered."""
-
-    version: int
-
-
-@dataclass(frozen=True, slots=True)
-class ModeChanged:
-    """The board has confirmed the requested mode."""
-
-    mode: Mode
-
-
-@dataclass(frozen=True, slots=True)
-class ModeRefused:
-    """The board was requested to use the mode `requested` but stays in `mode`."""
-
-    requested: Mode
-    mode: Mode
-
-
-@dataclass(frozen=True, slots=True)
-class RadioRefused:
-    """The board does not use the requested radio settings; `text` is the reason."""
-
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class OffsetsRefused:
-    """The board does not use the requested offsets; `text` is the reason. Its corrections are not delivered."""
-
-    text: str
-
-
-Event = (
-    Connected
-    | Disconnected
-    | VersionMismatch
-    | ModeChanged
-    | ModeRefused
-    | RangeMeasurement
-    | Correction
-    | Log
-    | BoardStatus
-    | RadioConfigured
-    | RadioStatus
-    | RadioRefused
-    | OffsetsRefused
-)
-
-
-@dataclass(slots=True)
-class SessionCounts:
-    """Counts of intact frames that were not delivered, and of lost frames.
+class Refused:
+    """The board does not use the requested settings or offsets; without the offsets, its corrections are not delivered.
 
     Attributes:
-        lost: missing sequence numbers.
-        stale: sequence number not above that of a frame already received.
-        withheld: received while not connected.
-        unknown_type: of types unknown to this version, {type: count}.
-        malformed: of a known type, but with invalid contents.
-        wrong_model: corrections by another model than the expected one.
-        wrong_offsets: corrections before the board confirmed the requested offsets.
-        unsolicited: unsolicited answers.
-        unsent: requests dropped because the output queue was full.
-        connections: HELLOs that started a connection.
+        problem: `RADIO_PROBLEM` or `OFFSETS_PROBLEM`.
+        text: the reason.
     """
 
-    lost: int = 0
-    stale: int = 0
-    withheld: int = 0
-    unknown_type: Counter[int] = field(default_factory=Counter)
-    malformed: int = 0
-    wrong_model: int = 0
-    wrong_offsets: int = 0
-    unsolicited: int = 0
-    unsent: int = 0
-    connections: int = 0
+    problem: str
+    text: str
+
+
+Event = object
+"""One of the classes above, a `RangeMeasurement`, a message of the board, or a `PortMessage`."""
+
+COUNTS = Counter(
+    # missing sequence numbers
+    lost=0,
+    # sequence number not above that of a frame already received
+    stale=0,
+    # received while not connected
+    withheld=0,
+    # of types unknown to this version
+    unknown_type=0,
+    # of a known type, but with invalid contents
+    malformed=0,
+    # corrections by another model than the expected one
+    wrong_model=0,
+    # corrections before the board confirmed the requested offsets
+    wrong_offsets=0,
+    # unsolicited answers
+    unsolicited=0,
+    # requests dropped because the output queue was full
+    unsent=0,
+    # HELLOs that started a connection
+    connections=0,
+)
+"""Counts of intact frames that were not delivered, and of lost frames, at the start."""

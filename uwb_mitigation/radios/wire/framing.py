@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from cobs import cobs
@@ -32,6 +31,7 @@ _CRC_RESIDUE = 0x2144DF1C
 # Limits the memory for splitting data that consists mainly of delimiters.
 _SLICE_BYTES = 1 << 16
 
+_CORRUPT = ("bad_cobs", "bad_length", "bad_crc", "oversize")
 _MIN_FRAME_BYTES = HEADER_BYTES + CRC_BYTES
 _header = HEADER.as_struct()
 
@@ -44,36 +44,6 @@ class WireFrame(NamedTuple):
     sequence: int
     time_us: int
     payload: bytes
-
-
-@dataclass(slots=True)
-class DecoderCounts:
-    """Counts of the data that a decoder received.
-
-    Attributes:
-        frames: intact frames delivered.
-        bad_cobs: segments between delimiters that are not valid COBS.
-        bad_length: valid COBS, but shorter than header and CRC.
-        bad_crc: valid length, but wrong CRC.
-        oversize: segments longer than the longest frame.
-        foreign_versions: intact frames of other protocol versions, {version: count}.
-        last_foreign_version: version of the last of these frames; None = not yet received.
-        bytes_received: number of all bytes.
-    """
-
-    frames: int = 0
-    bad_cobs: int = 0
-    bad_length: int = 0
-    bad_crc: int = 0
-    oversize: int = 0
-    foreign_versions: Counter[int] = field(default_factory=Counter)
-    last_foreign_version: int | None = None
-    bytes_received: int = 0
-
-    @property
-    def corrupt(self) -> int:
-        """Number of segments that are not an intact frame of any version."""
-        return self.bad_cobs + self.bad_length + self.bad_crc + self.oversize
 
 
 def encode_frame(frame: WireFrame, version: int = PROTOCOL_VERSION) -> bytes:
@@ -114,14 +84,24 @@ class FrameEncoder:
 class FrameDecoder:
     """Decodes the intact frames in a byte stream, which arrives in chunks of any size.
 
-    Never raises; `counts` contains the number of dropped frames. Between calls it buffers at most
-    `MAX_ENCODED_BYTES` bytes.
+    Never raises. Between calls it buffers at most `MAX_ENCODED_BYTES` bytes.
+
+    Attributes:
+        counts: number of intact `frames`, of those of a `foreign_version`, of `bytes_received`, and of segments between
+            delimiters that are no frame: `bad_cobs`, `bad_length` (shorter than header and CRC), `bad_crc`, `oversize`.
+        last_foreign_version: version of the last frame of another protocol version; None = not yet received.
     """
 
     def __init__(self) -> None:
-        self.counts = DecoderCounts()
+        self.counts = Counter(dict.fromkeys(("frames", "foreign_version", "bytes_received", *_CORRUPT), 0))
+        self.last_foreign_version: int | None = None
         self._tail = b""
         self._overrun = False
+
+    @property
+    def corrupt(self) -> int:
+        """Number of segments that are not an intact frame of any version."""
+        return sum(self.counts[name] for name in _CORRUPT)
 
     def feed(self, data: bytes) -> list[WireFrame]:
         """Return the frames that `data` completes, in order."""
@@ -137,7 +117,7 @@ class FrameDecoder:
 
     def _feed_slice(self, data: bytes, frames: list[WireFrame]) -> None:
         counts = self.counts
-        counts.bytes_received += len(data)
+        counts["bytes_received"] += len(data)
         segments = data.split(DELIMITER)
         if self._overrun:
             # The rest of a segment that is already counted as oversize.
@@ -153,7 +133,7 @@ class FrameDecoder:
             if frame is not None:
                 frames.append(frame)
         if len(tail) > MAX_ENCODED_BYTES:
-            counts.oversize += 1
+            counts["oversize"] += 1
             self._overrun = True
             tail = b""
         self._tail = tail
@@ -161,23 +141,23 @@ class FrameDecoder:
     def _decode(self, segment: bytes) -> WireFrame | None:
         counts = self.counts
         if len(segment) > MAX_ENCODED_BYTES:
-            counts.oversize += 1
+            counts["oversize"] += 1
             return None
         try:
             body = cobs.decode(segment)
         except cobs.DecodeError:
-            counts.bad_cobs += 1
+            counts["bad_cobs"] += 1
             return None
         if not _MIN_FRAME_BYTES <= len(body) <= MAX_FRAME_BYTES:
-            counts.bad_length += 1
+            counts["bad_length"] += 1
             return None
         if zlib.crc32(body) != _CRC_RESIDUE:
-            counts.bad_crc += 1
+            counts["bad_crc"] += 1
             return None
         version, kind, flags, sequence, time_us = _header.unpack_from(body)
         if version != PROTOCOL_VERSION:
-            counts.foreign_versions[version] += 1
-            counts.last_foreign_version = version
+            counts["foreign_version"] += 1
+            self.last_foreign_version = version
             return None
-        counts.frames += 1
+        counts["frames"] += 1
         return WireFrame(kind, flags, sequence, time_us, body[HEADER_BYTES:-CRC_BYTES])

@@ -140,25 +140,10 @@ class OffsetsAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class GetInfo:
-    """Requests a HELLO."""
-
-
-@dataclass(frozen=True, slots=True)
 class SetMode:
     """Requests a mode; the board answers with a HELLO that contains the active mode."""
 
     mode: Mode
-
-
-@dataclass(frozen=True, slots=True)
-class TimeSync:
-    """Requests a TIME_SYNC_REPLY."""
-
-
-@dataclass(frozen=True, slots=True)
-class GetRadio:
-    """Requests a RADIO."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,23 +160,8 @@ class SetOffsets:
     offsets: Offsets
 
 
-Message = (
-    Hello
-    | RangeMeasurement
-    | Correction
-    | Log
-    | BoardStatus
-    | TimeSyncReply
-    | RadioConfigured
-    | RadioStatus
-    | OffsetsAnswer
-    | GetInfo
-    | SetMode
-    | TimeSync
-    | GetRadio
-    | SetRadio
-    | SetOffsets
-)
+Message = object
+"""An object of a type in `_ENCODERS`, or the `MessageType` of a request without content: GET_INFO, TIME_SYNC, GET_RADIO."""
 
 
 def encode(message: Message) -> tuple[MessageType, bytes]:
@@ -202,9 +172,12 @@ def encode(message: Message) -> tuple[MessageType, bytes]:
     Raises:
         ParameterError: a value does not fit its field.
     """
-    kind, pack = _ENCODERS[type(message)]
+    if isinstance(message, MessageType):
+        return message, b""
+    kind, fields = _ENCODERS[type(message)]
     try:
-        return kind, pack(message)
+        *values, tail = fields(message)
+        return kind, layout.STRUCTS[kind].pack(*values) + tail
     except (struct.error, OverflowError) as error:
         name = type(message).__name__
         raise ParameterError(f"a value of {name} does not fit its field: {error}") from error
@@ -219,16 +192,17 @@ def decode(kind: int, payload: bytes, *, stamp_ns: int = 0) -> Message | None:
     Raises:
         LinkError: the payload is too short for its type, or a field has a value outside its range.
     """
-    if kind not in _DECODERS:
+    if kind not in layout.STRUCTS:
         return None
     name, size = MessageType(kind).name, layout.STRUCTS[kind].size
     if len(payload) < size:
         raise LinkError(f"a payload of {len(payload)} bytes", where=name, valid=f"at least {size}")
+    if kind not in _DECODERS:
+        return MessageType(kind)
     try:
-        message = _DECODERS[kind](layout.STRUCTS[kind].unpack_from(payload), payload, stamp_ns)
+        return _DECODERS[kind](layout.STRUCTS[kind].unpack_from(payload), payload, stamp_ns)
     except (LinkError, ParameterError) as error:
         raise LinkError(error.what, where=name, valid=error.valid) from error
-    return message
 
 
 _Member = TypeVar("_Member", bound=enum.IntEnum)
@@ -254,8 +228,13 @@ def _truncate_utf8(text: str, size: int) -> bytes:
     return text.encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()
 
 
-def _rows(row: struct.Struct, count: int, maximum: int, payload: bytes, start: int) -> list[tuple[Any, ...]]:
+def _text(payload: bytes, start: int) -> str:
+    return payload[start:].decode("utf-8", "replace")
+
+
+def _rows(row: struct.Struct, count: int, maximum: int, payload: bytes, kind: int) -> list[tuple[Any, ...]]:
     """Return the rows of a tail; raise LinkError if it does not contain them."""
+    start = layout.STRUCTS[kind].size
     end = start + count * row.size
     if count > maximum or end > len(payload):
         raise LinkError(
@@ -265,33 +244,27 @@ def _rows(row: struct.Struct, count: int, maximum: int, payload: bytes, start: i
     return list(row.iter_unpack(payload[start:end]))
 
 
-_HELLO, _RANGE_CIR, _CORRECTED, _LOG, _STATUS, _SYNC, _RADIO, _RADIO_STATUS, _OFFSETS = (
-    layout.STRUCTS[kind] for kind in list(MessageType)[:9]
-)
-_SET_MODE, _SET_RADIO, _SET_OFFSETS = (
-    layout.STRUCTS[kind] for kind in (MessageType.SET_MODE, MessageType.SET_RADIO, MessageType.SET_OFFSETS)
-)
-_ANCHOR_ROW, _OFFSET_ROW, _ADDRESS = (
-    layout.RADIO_ANCHOR.as_struct(),
-    layout.OFFSET.as_struct(),
-    struct.Struct("<Q"),
-)
+_RANGE_BYTES = layout.STRUCTS[MessageType.RANGE_CIR].size
+_ANCHOR_ROW, _OFFSET_ROW = layout.RADIO_ANCHOR.as_struct(), layout.OFFSET.as_struct()
+_ADDRESS = struct.Struct("<Q")
+
+# Functions that return the values of the fields of a message and its tail, and messages from values and the payload.
 
 
-def _pack_hello(m: Hello) -> bytes:
+def _hello_fields(m: Hello) -> tuple[Any, ...]:
     version = m.firmware_major, m.firmware_minor, m.firmware_patch
     identity = m.board_id, m.model_id, m.boot_id, m.request_sequence, m.window, m.max_payload
-    return _HELLO.pack(*identity, *version, m.mode, _truncate_utf8(m.firmware_name, 16))
+    return (*identity, *version, m.mode, _truncate_utf8(m.firmware_name, 16), b"")
 
 
-def _unpack_hello(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Hello:
+def _hello(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Hello:
     board, model, boot, request, window, max_payload, major, minor, patch, mode, name = values
     version = major, minor, patch
-    text = name.rstrip(b"\0").decode("utf-8", "replace")
+    text = _text(name.rstrip(b"\0"), 0)
     return Hello(board, model, window, _member(Mode, mode), boot, request, max_payload, *version, text)
 
 
-def _pack_range(m: RangeMeasurement) -> bytes:
+def _range_fields(m: RangeMeasurement) -> tuple[Any, ...]:
     cir, samples = m.cir, m.cir.samples
     if len(samples) > layout.MAX_SAMPLES:
         raise ParameterError(
@@ -300,23 +273,19 @@ def _pack_range(m: RangeMeasurement) -> bytes:
     exchange = m.tag_id, m.anchor_id, m.device_time, m.sequence, m.range_m
     shape = cir.sample_period_s, cir.first_path_index, cir.scale
     levels = cir.rx_power_dbm, cir.first_path_power_dbm, cir.start_index
-    counts = cir.preamble_count, cir.noise_threshold, _RANGE_CIR.size, len(samples)
-    fixed = _RANGE_CIR.pack(*exchange, *shape, *levels, *counts, cir.encoding, cir.channel, cir.prf_mhz)
-    return fixed + np.asarray(samples, dtype="<i2").tobytes()
+    counts = cir.preamble_count, cir.noise_threshold, _RANGE_BYTES, len(samples)
+    tail = np.asarray(samples, dtype="<i2").tobytes()
+    return (*exchange, *shape, *levels, *counts, cir.encoding, cir.channel, cir.prf_mhz, tail)
 
 
-def _unpack_range(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RangeMeasurement:
+def _range(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RangeMeasurement:
     tag, anchor, ticks, sequence, range_m, period_s, first_path, scale, rx_dbm, first_path_dbm = values[:10]
     first_index, preambles, threshold, offset, count, encoding, channel, prf_mhz = values[10:]
-    if (
-        count > layout.MAX_SAMPLES
-        or offset < _RANGE_CIR.size
-        or offset % 2
-        or offset + 2 * count > len(payload)
-    ):
+    is_inside = _RANGE_BYTES <= offset <= len(payload) - 2 * count
+    if count > layout.MAX_SAMPLES or offset % 2 or not is_inside:
         raise LinkError(
             f"{count} samples at byte {offset} of a payload of {len(payload)} bytes",
-            valid=f"at most {layout.MAX_SAMPLES}, inside the payload, at an even byte from {_RANGE_CIR.size}",
+            valid=f"at most {layout.MAX_SAMPLES}, inside the payload, at an even byte from {_RANGE_BYTES}",
         )
     samples = np.frombuffer(payload, "<i2", count, offset)
     shape = _member(Encoding, encoding), first_index, first_path, period_s, scale
@@ -324,86 +293,78 @@ def _unpack_range(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Ran
     return RangeMeasurement(stamp_ns, tag, anchor, sequence, _device_time(ticks), range_m, cir)
 
 
-def _pack_corrected(m: Correction) -> bytes:
+def _corrected_fields(m: Correction) -> tuple[Any, ...]:
     c = m.corrected
     exchange = m.tag_id, m.anchor_id, m.device_time, m.sequence, c.model_id
     ranges = c.range_m, c.range_raw_m, c.correction_m, c.variance_m2
-    return _CORRECTED.pack(*exchange, *ranges, m.compute_us, c.status)
+    return (*exchange, *ranges, m.compute_us, c.status, b"")
 
 
-def _unpack_corrected(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Correction:
+def _corrected(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> Correction:
     tag, anchor, ticks, sequence, model_id, range_m, raw_m, correction_m, variance_m2, us, status = values
     ranges = range_m, raw_m, correction_m, variance_m2
     corrected = CorrectedRange(*ranges, _member(Status, status), CorrectedBy.DEVICE, model_id)
     return Correction(stamp_ns, tag, anchor, sequence, _device_time(ticks), corrected, us)
 
 
-def _pack_status(m: BoardStatus) -> bytes:
-    counts = m.frames_received, m.frames_dropped, m.measurements, m.measurements_lost
-    return _STATUS.pack(*counts, m.temperature_c, m.mode)
-
-
-def _unpack_status(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> BoardStatus:
-    received, dropped, measurements, lost, temperature_c, mode = values
-    return BoardStatus(received, dropped, measurements, lost, _member(Mode, mode), temperature_c)
-
-
-def _settings_values(s: RadioSettings) -> tuple[Any, ...]:
-    """Return the common fields of RADIO and SET_RADIO."""
+def _settings_fields(s: RadioSettings) -> tuple[Any, ...]:
+    """Return the common fields of RADIO and SET_RADIO, and their tail."""
     chip = s.address, s.antenna_delay, s.tx_power
     times = s.reply_us, s.timeout_us, s.interval_us
     channel = s.pan, s.rate_kbps, s.preamble, s.window, s.channel, s.prf_mhz, s.preamble_code
-    return (*chip, *times, *channel, s.decawave_sfd, s.role, s.report, s.bias_correction, len(s.anchors))
+    flags = s.decawave_sfd, s.role, s.report, s.bias_correction, len(s.anchors)
+    return (*chip, *times, *channel, *flags, b"".join(map(_ADDRESS.pack, s.anchors)))
 
 
-def _settings(values: tuple[Any, ...], payload: bytes, start: int) -> tuple[RadioSettings, bytes]:
-    """Return the settings in the common fields and the tail, and the bytes after them."""
+def _settings(values: tuple[Any, ...], payload: bytes, kind: int) -> RadioSettings:
+    """Return the settings in the common fields and the tail."""
     address, delay, power, reply_us, timeout_us, interval_us, pan, rate, preamble, window = values[:10]
     channel, prf, code, decawave_sfd, role, report, bias_correction, count = values[10:]
-    anchors = tuple(anchor for (anchor,) in _rows(_ADDRESS, count, MAX_ANCHORS, payload, start))
-    settings = RadioSettings(
+    anchors = tuple(anchor for (anchor,) in _rows(_ADDRESS, count, MAX_ANCHORS, payload, kind))
+    return RadioSettings(
         _member(Role, role), address, pan, channel, prf, preamble, code, rate, bool(decawave_sfd), power, delay, window,
         anchors, reply_us, timeout_us, interval_us, bool(report), bool(bias_correction),
     )  # fmt: skip
-    return settings, payload[start + 8 * count :]
 
 
-def _pack_radio(m: RadioConfigured) -> bytes:
-    fixed = _RADIO.pack(m.request_sequence, m.accepted, *_settings_values(m.settings))
-    return fixed + b"".join(map(_ADDRESS.pack, m.settings.anchors)) + m.text.encode("utf-8", "replace")
+def _radio_fields(m: RadioConfigured) -> tuple[Any, ...]:
+    *settings, anchors = _settings_fields(m.settings)
+    return (m.request_sequence, m.accepted, *settings, anchors + m.text.encode("utf-8", "replace"))
 
 
-def _unpack_radio(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RadioConfigured:
-    settings, text = _settings(values[2:], payload, _RADIO.size)
-    return RadioConfigured(settings, values[0], bool(values[1]), text.decode("utf-8", "replace"))
+def _radio(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RadioConfigured:
+    settings = _settings(values[2:], payload, MessageType.RADIO)
+    start = layout.STRUCTS[MessageType.RADIO].size + _ADDRESS.size * len(settings.anchors)
+    return RadioConfigured(settings, values[0], bool(values[1]), _text(payload, start))
 
 
-def _pack_radio_status(m: RadioStatus) -> bytes:
-    *fixed, state, anchors = (getattr(m, name) for name in RadioStatus.__slots__)
-    rows = b"".join(_ANCHOR_ROW.pack(*astuple(anchor)) for anchor in anchors)
-    return _RADIO_STATUS.pack(*fixed, state, len(anchors)) + rows
+def _radio_status_fields(m: RadioStatus) -> tuple[Any, ...]:
+    *fixed, anchors = (getattr(m, name) for name in RadioStatus.__slots__)
+    return (*fixed, len(anchors), b"".join(_ANCHOR_ROW.pack(*astuple(anchor)) for anchor in anchors))
 
 
-def _unpack_radio_status(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RadioStatus:
-    rows = _rows(_ANCHOR_ROW, values[13], MAX_ANCHORS, payload, _RADIO_STATUS.size)
+def _radio_status(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RadioStatus:
+    rows = _rows(_ANCHOR_ROW, values[13], MAX_ANCHORS, payload, MessageType.RADIO_STATUS)
     anchors = tuple(AnchorStatus(*row) for row in rows)
     fields: tuple[Any, ...] = (*values[:12], _member(RadioState, values[12]), anchors)
     return RadioStatus(*fields)
 
 
-def _pack_offsets(m: SetOffsets) -> bytes:
+def _offsets_fields(m: SetOffsets) -> tuple[Any, ...]:
     o = m.offsets
     rows = [(tag, anchor, offset_m, OffsetScope.PAIR) for (tag, anchor), offset_m in o.pairs.items()]
     rows += [(0, anchor, offset_m, OffsetScope.ANCHOR) for anchor, offset_m in o.anchors.items()]
     rows += [(tag, 0, offset_m, OffsetScope.TAG) for tag, offset_m in o.tags.items()]
-    return _SET_OFFSETS.pack(o.default, len(rows)) + b"".join(_OFFSET_ROW.pack(*row) for row in rows)
+    return o.default, len(rows), b"".join(_OFFSET_ROW.pack(*row) for row in rows)
 
 
-def _unpack_offsets(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> SetOffsets:
+def _offsets(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> SetOffsets:
     anchors: dict[int, float] = {}
     tags: dict[int, float] = {}
     pairs: dict[tuple[int, int], float] = {}
-    for tag, anchor, offset_m, scope in _rows(_OFFSET_ROW, values[1], 0xFFFF, payload, _SET_OFFSETS.size):
+    for tag, anchor, offset_m, scope in _rows(
+        _OFFSET_ROW, values[1], 0xFFFF, payload, MessageType.SET_OFFSETS
+    ):
         if _member(OffsetScope, scope) is OffsetScope.ANCHOR:
             anchors.setdefault(anchor, offset_m)
         elif scope == OffsetScope.TAG:
@@ -413,44 +374,33 @@ def _unpack_offsets(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> S
     return SetOffsets(Offsets(default=values[0], anchors=anchors, tags=tags, pairs=pairs))
 
 
-_ENCODERS: dict[type, tuple[MessageType, Callable[[Any], bytes]]] = {
-    Hello: (MessageType.HELLO, _pack_hello),
-    RangeMeasurement: (MessageType.RANGE_CIR, _pack_range),
-    Correction: (MessageType.RANGE_CORRECTED, _pack_corrected),
-    Log: (MessageType.LOG, lambda m: _LOG.pack(m.level) + m.text.encode("utf-8", "replace")),
-    BoardStatus: (MessageType.STATUS, _pack_status),
-    TimeSyncReply: (MessageType.TIME_SYNC_REPLY, lambda m: _SYNC.pack(m.request_sequence, m.received_us)),
-    RadioConfigured: (MessageType.RADIO, _pack_radio),
-    RadioStatus: (MessageType.RADIO_STATUS, _pack_radio_status),
-    OffsetsAnswer: (MessageType.OFFSETS, lambda m: _OFFSETS.pack(m.request_sequence, m.slots, m.accepted)),
-    GetInfo: (MessageType.GET_INFO, lambda m: b""),
-    SetMode: (MessageType.SET_MODE, lambda m: _SET_MODE.pack(m.mode)),
-    TimeSync: (MessageType.TIME_SYNC, lambda m: b""),
-    GetRadio: (MessageType.GET_RADIO, lambda m: b""),
-    SetRadio: (
-        MessageType.SET_RADIO,
-        lambda m: (
-            _SET_RADIO.pack(*_settings_values(m.settings)) + b"".join(map(_ADDRESS.pack, m.settings.anchors))
-        ),
-    ),
-    SetOffsets: (MessageType.SET_OFFSETS, _pack_offsets),
+_ENCODERS: dict[type, tuple[MessageType, Callable[[Any], tuple[Any, ...]]]] = {
+    Hello: (MessageType.HELLO, _hello_fields),
+    RangeMeasurement: (MessageType.RANGE_CIR, _range_fields),
+    Correction: (MessageType.RANGE_CORRECTED, _corrected_fields),
+    Log: (MessageType.LOG, lambda m: (m.level, m.text.encode("utf-8", "replace"))),
+    BoardStatus: (MessageType.STATUS, lambda m: (*astuple(m)[:4], m.temperature_c, m.mode, b"")),
+    TimeSyncReply: (MessageType.TIME_SYNC_REPLY, lambda m: (m.request_sequence, m.received_us, b"")),
+    RadioConfigured: (MessageType.RADIO, _radio_fields),
+    RadioStatus: (MessageType.RADIO_STATUS, _radio_status_fields),
+    OffsetsAnswer: (MessageType.OFFSETS, lambda m: (*astuple(m), b"")),
+    SetMode: (MessageType.SET_MODE, lambda m: (m.mode, b"")),
+    SetRadio: (MessageType.SET_RADIO, lambda m: _settings_fields(m.settings)),
+    SetOffsets: (MessageType.SET_OFFSETS, _offsets_fields),
 }
 _DECODERS: dict[int, Callable[[tuple[Any, ...], bytes, int], Message]] = {
-    MessageType.HELLO: _unpack_hello,
-    MessageType.RANGE_CIR: _unpack_range,
-    MessageType.RANGE_CORRECTED: _unpack_corrected,
+    MessageType.HELLO: _hello,
+    MessageType.RANGE_CIR: _range,
+    MessageType.RANGE_CORRECTED: _corrected,
     MessageType.LOG: lambda v, payload, _: Log(
-        _member(LogLevel, v[0]), payload[_LOG.size :].decode("utf-8", "replace")
+        _member(LogLevel, v[0]), _text(payload, layout.STRUCTS[MessageType.LOG].size)
     ),
-    MessageType.STATUS: _unpack_status,
-    MessageType.TIME_SYNC_REPLY: lambda v, payload, _: TimeSyncReply(*v),
-    MessageType.RADIO: _unpack_radio,
-    MessageType.RADIO_STATUS: _unpack_radio_status,
-    MessageType.OFFSETS: lambda v, payload, _: OffsetsAnswer(v[0], v[1], bool(v[2])),
-    MessageType.GET_INFO: lambda v, payload, _: GetInfo(),
-    MessageType.SET_MODE: lambda v, payload, _: SetMode(_member(Mode, v[0])),
-    MessageType.TIME_SYNC: lambda v, payload, _: TimeSync(),
-    MessageType.GET_RADIO: lambda v, payload, _: GetRadio(),
-    MessageType.SET_RADIO: lambda v, payload, _: SetRadio(_settings(v, payload, _SET_RADIO.size)[0]),
-    MessageType.SET_OFFSETS: _unpack_offsets,
+    MessageType.STATUS: lambda v, *_: BoardStatus(v[0], v[1], v[2], v[3], _member(Mode, v[5]), v[4]),
+    MessageType.TIME_SYNC_REPLY: lambda v, *_: TimeSyncReply(*v),
+    MessageType.RADIO: _radio,
+    MessageType.RADIO_STATUS: _radio_status,
+    MessageType.OFFSETS: lambda v, *_: OffsetsAnswer(v[0], v[1], bool(v[2])),
+    MessageType.SET_MODE: lambda v, *_: SetMode(_member(Mode, v[0])),
+    MessageType.SET_RADIO: lambda v, payload, _: SetRadio(_settings(v, payload, MessageType.SET_RADIO)),
+    MessageType.SET_OFFSETS: _offsets,
 }

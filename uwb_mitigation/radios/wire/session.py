@@ -6,18 +6,26 @@ port calls `receive` after each read, `tick` at least ten times a second, and se
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import fields
+import logging
 from typing import TypeVar
 
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.settings import RadioSettings, RadioStatus
-from uwb_mitigation.radios.wire import events as link_events
+from uwb_mitigation.radios.settings import PortMessage, RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.clock import DeviceClock
-from uwb_mitigation.radios.wire.events import Event, LinkState, Loss, SessionCounts
+from uwb_mitigation.radios.wire.events import (
+    COUNTS,
+    OFFSETS_PROBLEM,
+    RADIO_PROBLEM,
+    Connected,
+    Disconnected,
+    Event,
+    LinkState,
+    Loss,
+    Refused,
+)
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
-from uwb_mitigation.radios.wire.layout import Flag, MessageType, Mode
+from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, Flag, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import Correction, Hello, RadioConfigured, SetOffsets, SetRadio
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
@@ -110,7 +118,7 @@ class BoardSession:
         self.hello: Hello | None = None
         self.radio: RadioConfigured | None = None
         self.foreign_version: int | None = None
-        self.counts = SessionCounts()
+        self.counts = COUNTS.copy()
         self.clock = DeviceClock()
         self._decoder = FrameDecoder()
         self._encoder = FrameEncoder()
@@ -118,12 +126,9 @@ class BoardSession:
         self._outgoing = bytearray()
         self._mode = mode
         self._mode_request = _Request()
-        self._radio_request = _Request(
-            "its firmware does not support radio settings: flash a newer version, or do not set any"
-        )
-        self._offsets_request = _Request(
-            "its firmware does not support offsets: flash a newer version, or correct on the host"
-        )
+        unsupported = "its firmware does not support {}: flash a newer version, or {}"
+        self._radio_request = _Request(unsupported.format("radio settings", "do not set any"))
+        self._offsets_request = _Request(unsupported.format("offsets", "correct on the host"))
         self._offsets_confirmed = False
         self._boot_key: tuple[int, int] | None = None
         self._next_request_ns = 0
@@ -137,13 +142,9 @@ class BoardSession:
 
     def totals(self) -> dict[str, int]:
         """Return the counts of frames for diagnostics, {name: count}."""
-        decoder, counts = self._decoder.counts, self.counts
-        totals = {"frames": decoder.frames, "corrupt": decoder.corrupt}
-        totals["foreign_version"] = decoder.foreign_versions.total()
-        for row in fields(counts):
-            value = getattr(counts, row.name)
-            totals[row.name] = value.total() if isinstance(value, Counter) else value
-        return totals
+        decoder = self._decoder
+        intact = {name: decoder.counts[name] for name in ("frames", "foreign_version")}
+        return intact | {"corrupt": decoder.corrupt} | self.counts
 
     @property
     def model_matches(self) -> bool:
@@ -154,29 +155,27 @@ class BoardSession:
             or self.hello.model_id == self._expected_model_id
         )
 
-    def opened(self, now_ns: int) -> list[Event]:
-        """Start the handshake after the port was opened."""
-        return self.closed(now_ns)
-
     def closed(self, now_ns: int) -> list[Event]:
-        """Discard partly received and unsent bytes after the port was lost or closed."""
+        """Begin again after the port was opened, lost or closed: discard partly received and unsent bytes."""
         self._decoder.reset()
         self._outgoing.clear()
         self._last_received_ns = now_ns
         return self._disconnect(Loss.CLOSED, now_ns)
+
+    opened = closed
 
     def idle_ns(self, now_ns: int) -> int:
         """Time since the last intact frame was received."""
         return now_ns - self._last_received_ns
 
     def set_mode(self, mode: Mode) -> None:
-        """Request `mode` until the board answers; a `ModeChanged` or `ModeRefused` follows."""
+        """Request `mode` until the board answers; a `PortMessage` follows."""
         self._mode = mode
         self._mode_request.begin(messages.SetMode(mode))
         self._next_request_ns = 0
 
     def set_radio(self, settings: RadioSettings) -> None:
-        """Request `settings` now and after each start of the board; a `RadioConfigured` or `RadioRefused` follows.
+        """Request `settings` now and after each start of the board; a `RadioConfigured` or `Refused` follows.
 
         Raises:
             ParameterError: no radio has such settings.
@@ -188,7 +187,7 @@ class BoardSession:
     def set_offsets(self, offsets: Offsets) -> None:
         """Request, now and after each start of the board, that it subtracts these offsets from its ranges.
 
-        Until the board confirms them, its corrections are counted and not delivered. `OffsetsRefused` follows if it
+        Until the board confirms them, its corrections are counted and not delivered. `Refused` follows if it
         cannot use them, except for offsets of 0, which a board without offsets has anyway.
         """
         self._offsets_confirmed = False
@@ -220,14 +219,14 @@ class BoardSession:
         if now_ns >= self._next_request_ns:
             self._next_request_ns = now_ns + REQUEST_INTERVAL_NS
             if self.state is not LinkState.READY:
-                self._send(*messages.encode(messages.GetInfo()))
+                self._send(MessageType.GET_INFO, b"")
                 return events
             if self._send_request(self._offsets_request) and self._offsets:
-                events.append(link_events.OffsetsRefused(self._offsets_request.unanswered))
+                events.append(Refused(OFFSETS_PROBLEM, self._offsets_request.unanswered))
             if self._mode_request.pending:
                 self._send_request(self._mode_request)
             elif self._send_request(self._radio_request):
-                events.append(link_events.RadioRefused(self._radio_request.unanswered))
+                events.append(Refused(RADIO_PROBLEM, self._radio_request.unanswered))
         if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
             self._send_sync(now_ns, stamp_ns)
         return events
@@ -236,14 +235,14 @@ class BoardSession:
         try:
             return self._parse(frame, now_ns, stamp_ns)
         except LinkError:
-            self.counts.malformed += 1
+            self.counts["malformed"] += 1
             return []
 
     def _parse(self, frame: WireFrame, now_ns: int, stamp_ns: int) -> list[Event]:
         if frame.type == MessageType.HELLO:
             return self._handle_hello(frame, now_ns, stamp_ns)
         if self.state is not LinkState.READY:
-            self.counts.withheld += 1
+            self.counts["withheld"] += 1
             return []
         if not self._in_sequence(frame):
             return (
@@ -265,11 +264,11 @@ class BoardSession:
         if isinstance(message, messages.OffsetsAnswer):
             return self._handle_offsets(message)
         if isinstance(message, RadioStatus) and self.radio is None:
-            self._send(*messages.encode(messages.GetRadio()))
+            self._send(MessageType.GET_RADIO, b"")
         if isinstance(message, RangeMeasurement | messages.Log | messages.BoardStatus | RadioStatus):
             return [message]
         # A board never sends the types of the host: count them as unknown.
-        self.counts.unknown_type[frame.type] += 1
+        self.counts["unknown_type"] += 1
         return []
 
     def _handle_hello(self, frame: WireFrame, now_ns: int, stamp_ns: int) -> list[Event]:
@@ -289,7 +288,7 @@ class BoardSession:
         self.hello = hello
         if self.state is not LinkState.READY:
             self.state = LinkState.READY
-            self.counts.connections += 1
+            self.counts["connections"] += 1
             self.foreign_version = None
             self._next_sequence = (frame.sequence + 1) % _SEQUENCES
             self._consecutive_stale = 0
@@ -302,15 +301,13 @@ class BoardSession:
             self._offsets_request.repeat(self._offsets_request.message)
             self._offsets_confirmed = False
             self._next_request_ns = now_ns
-            events.append(link_events.Connected(hello))
+            events.append(Connected(hello))
         elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
             requested = hello.mode if self._mode is None else self._mode
-            is_set = hello.mode == requested
-            events.append(
-                link_events.ModeChanged(requested)
-                if is_set
-                else link_events.ModeRefused(requested, hello.mode)
-            )
+            text = f"the board is in mode {requested.name}"
+            if hello.mode != requested:
+                text = f"the board stays in mode {hello.mode.name} instead of {requested.name}: does it have a model?"
+            events.append(PortMessage(logging.INFO if hello.mode == requested else logging.WARNING, text))
         return events
 
     @property
@@ -333,56 +330,54 @@ class BoardSession:
 
     def _handle_offsets(self, answer: messages.OffsetsAnswer) -> list[Event]:
         if not self._offsets_request.is_answered_by(answer.request_sequence):
-            self.counts.unsolicited += 1
+            self.counts["unsolicited"] += 1
             return []
         self._offsets_confirmed = answer.accepted
         text = f"it can store {answer.slots} offsets, but {len(self._offsets)} were requested"
-        return [] if answer.accepted else [link_events.OffsetsRefused(text)]
+        return [] if answer.accepted else [Refused(OFFSETS_PROBLEM, text)]
 
     def _handle_radio(self, radio: RadioConfigured, answer: bool) -> list[Event]:
         if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
-            return [link_events.RadioRefused(radio.text)]
+            return [Refused(RADIO_PROBLEM, radio.text)]
         self.radio = radio
         return [radio]
 
     def _handle_correction(self, correction: Correction, answer: bool) -> list[Event]:
         if not self.model_matches:
-            self.counts.wrong_model += 1
+            self.counts["wrong_model"] += 1
             return []
         if self._offsets and not self._offsets_confirmed:
-            self.counts.wrong_offsets += 1
+            self.counts["wrong_offsets"] += 1
             return []
         if answer:
             # This host never requests corrections from a board.
-            self.counts.unsolicited += 1
+            self.counts["unsolicited"] += 1
             return []
         return [correction]
 
     def _handle_sync(self, reply: messages.TimeSyncReply, replied_us: int, stamp_ns: int) -> None:
         sent_ns = self._sync_send_times_ns.pop(reply.request_sequence, None)
         if sent_ns is None:
-            self.counts.unsolicited += 1
+            self.counts["unsolicited"] += 1
         else:
             self.clock.exchange(sent_ns, reply.received_us, replied_us, stamp_ns)
 
     def _in_sequence(self, frame: WireFrame) -> bool:
         gap = (frame.sequence - self._next_sequence) % _SEQUENCES
         if gap > MAX_GAP:
-            self.counts.stale += 1
+            self.counts["stale"] += 1
             self._consecutive_stale += 1
             return False
-        self.counts.lost += gap
+        self.counts["lost"] += gap
         self._next_sequence = (frame.sequence + 1) % _SEQUENCES
         self._consecutive_stale = 0
         return True
 
     def _check_foreign_versions(self, now_ns: int) -> list[Event]:
-        counts = self._decoder.counts
-        count = counts.foreign_versions.total()
+        count, version = self._decoder.counts["foreign_version"], self._decoder.last_foreign_version
         if count == self._foreign_frames:
             return []
         self._foreign_frames = count
-        version = counts.last_foreign_version
         # The buffers may still contain frames of firmware that ran before the connected board was restarted.
         if self.state is LinkState.READY or version is None:
             return []
@@ -391,7 +386,8 @@ class BoardSession:
             return []
         self.state = LinkState.WRONG_VERSION
         self.foreign_version = version
-        return [link_events.VersionMismatch(version)]
+        text = f"the board uses version {version} of the protocol, this driver version {PROTOCOL_VERSION}"
+        return [PortMessage(logging.ERROR, f"{text}: update the older one")]
 
     def _disconnect(self, loss: Loss, now_ns: int) -> list[Event]:
         was_ready = self.state is LinkState.READY
@@ -403,10 +399,10 @@ class BoardSession:
             request.sent.clear()
         self._sync_send_times_ns.clear()
         self._next_request_ns = now_ns
-        return [link_events.Disconnected(loss)] if was_ready else []
+        return [Disconnected(loss)] if was_ready else []
 
     def _send_sync(self, now_ns: int, stamp_ns: int) -> None:
-        request = self._send(*messages.encode(messages.TimeSync()))
+        request = self._send(MessageType.TIME_SYNC, b"")
         if request is not None:
             _add_bounded(self._sync_send_times_ns, request, stamp_ns)
         self._num_syncs += 1
@@ -420,7 +416,7 @@ class BoardSession:
     def _send(self, kind: MessageType, payload: bytes) -> int | None:
         """Queue a frame; return its sequence number, or None if the queue is full."""
         if len(self._outgoing) + len(payload) > _MAX_OUTGOING_BYTES:
-            self.counts.unsent += 1
+            self.counts["unsent"] += 1
             return None
         sequence = self._encoder.sequence
         self._outgoing += self._encoder.encode(kind, payload)
