@@ -854,7 +854,7 @@ def test_predicted_accuracy_is_hdop_times_standard_deviation() -> None:
     image, low, size = health.predicted_accuracy(anchors, 1.0, 0.1)
     centre = np.array([*(low + size * (20 + 0.5) / 40), 1.0])
     assert image[20, 20] == pytest.approx(0.1 * dop(anchors, centre, level=True).hdop, rel=1e-5)
-    assert np.isnan(health.predicted_accuracy(anchors[:1], 1.0, 0.1)[0]).all()
+    assert np.isinf(health.predicted_accuracy(anchors[:1], 1.0, 0.1)[0]).all()
 
 
 def test_many_diagnostics_scroll_and_a_printed_page_is_complete(
@@ -938,7 +938,7 @@ def test_long_names_do_not_widen_the_page(browser: Browser, view: View, server: 
         view.scene.set_anchors({n: AnchorPosition(4.0 * n, 0, 2, name) for n in (1, 2)})
         view.scene.set_node_status(name, NodeStatus(1, name, determinations=(f"{name}: {name}",)))
         view.scene.add_pose(name, Pose(4.0, 3.0, 1.0, stamp_s=1000.0))
-        view.scene.report_event(name)
+        view.scene.incidents.report(0.0, name)
     view.title = name
     open_page(browser, server)
     browser.wait("the names", lambda: name in browser.text())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from uwb_mitigation.viewer.histories import (
     RATE_RANGES,
     WATERFALL,
     History,
+    RangeColumns,
     Sample,
     Trace,
 )
@@ -38,6 +39,9 @@ from uwb_mitigation.viewer.scene import (
     with_gaps,
 )
 from uwb_mitigation.viewer.state import PageState, drawable, no_data, set_rows
+
+if TYPE_CHECKING:
+    from uwb_mitigation.viewer.playback import BagPlayer
 
 MAX_LABEL = 20
 """Maximum number of characters of a name on the map."""
@@ -107,9 +111,6 @@ class Figures:
                     "protection": drawable(pose.protection_m),
                 })  # fmt: skip
         set_rows(models.tags, tags)
-        set_rows(models.ellipses, [row for row in tags if row["width"] > 0.0 and row["height"] > 0.0])
-        set_rows(models.protection, [row for row in tags if row["protection"] > 0.0])
-        set_rows(models.headings, [row for row in tags if math.isfinite(row["heading"])])
         self._draw_tracks(scene)
         self._draw_accuracy(scene, [sample for _, _, sample in scene.latest()])
         fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
@@ -224,52 +225,43 @@ class Figures:
         set_rows(self._models.rays, rows)
         set_rows(self._models.statuses, symbols)
 
+    def _ranges(
+        self, player: BagPlayer | None, scene: Scene, begin_s: float = -math.inf, end_s: float = math.inf
+    ) -> RangeColumns:
+        """Return the ranges of the selected pair: in an interval of an indexed recording, else those of the scene."""
+        pair = self._state.selected or (-1, -1)
+        if player is not None and player.timeline is not None:
+            return player.timeline.ranges(pair, begin_s, end_s)
+        return (scene.pairs.get(pair) or History()).columns()
+
     def _draw_strip(self, scene: Scene, history: History | None) -> None:
         # Also draw a pair without new data, because its ranges age.
         now_s = scene.now_s(self._state.tag_id)
-        if not self._state.changed(
-            "strip", (self._state.selected, now_s, scene.ranges, self._view.timeline is None)
-        ):
+        timeline, player, second = self._view.timeline, self._player, self._view.second
+        if not self._state.changed("strip", (self._state.selected, now_s, scene.ranges, timeline is None)):
             return
-        rows = self._strip_rows(scene, history, now_s)
-        count = 0 if history is None else len(history.samples)
-        none = (
-            f"No range of this pair in the last {HISTORY_S:.0f} s." if count else "No range of this pair yet."
-        )
-        self._models.show_empty("strip", "" if np.isfinite(rows[:, 1]).any() else none)
-        table = with_gaps(_thin(rows, 3 * MAX_POINTS), NO_DATA_S if history is None else history.max_gap_s)
-        names = ("age", "raw", "corrected", "true", "second")
-        self._models.strip.data = dict(zip(names, table[:, :5].T.astype(np.float32), strict=True))
-        faults = rows[np.isin(rows[:, 5], FAULTS)]
-        columns = {
-            "age": faults[:, 0],
-            "corrected": faults[:, 2],
-            "status": [Status(int(one)).name for one in faults[:, 5]],
-        }
-        if len(faults) or len(self._models.bad.data["age"]):
-            self._models.bad.data = columns
-
-    def _strip_rows(self, scene: Scene, history: History | None, now_s: float) -> NDArray[np.float64]:
-        """Return age, raw, corrected, true and second range, and status of the last minute, float64 (n, 6)."""
-        timeline, pair, second = self._view.timeline, self._state.selected, self._view.second
-        if timeline is not None and pair is not None and self._player is not None:
-            end_s = self._player.shown_s
-            rows = timeline.rows_of(pair, end_s - HISTORY_S, end_s)
-            columns = (timeline.raw_m, timeline.corrected_m, timeline.true_m)
-            stamps, values = timeline.stamp_s[rows], [column[rows] for column in columns]
-            statuses = timeline.status[rows].astype(float)
-        else:
-            samples = () if history is None else tuple(history.samples)
-            stamps = np.array([sample.time_s for sample in samples])
-            triples = [(sample.raw_m, sample.range_m, sample.true_m) for sample in samples]
-            values = list(np.array(triples, np.float64).reshape(-1, 3).T)
-            statuses = np.array([float(sample.status) for sample in samples])
-        other = None if second is None or pair is None else second.scene.pairs.get(pair)
-        ranges = {round(sample.time_s, 6): sample.range_m for sample in other.samples} if other else {}
-        compared = np.array([ranges.get(round(stamp_s, 6), math.nan) for stamp_s in stamps.tolist()])
-        table = np.column_stack([stamps - now_s, *values, compared])
+        if timeline is not None and player is not None:
+            now_s = player.shown_s
+        ranges = self._ranges(player, scene, now_s - HISTORY_S, now_s)
+        others = dict[float, float]()
+        if second is not None:
+            compared = self._ranges(second, second.scene)
+            others = dict(zip(compared.stamp_s.round(6).tolist(), compared.corrected_m.tolist(), strict=True))
+        second_m = [others.get(stamp_s, math.nan) for stamp_s in ranges.stamp_s.round(6).tolist()]
+        columns = ranges.time_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, second_m, ranges.status
+        table = np.column_stack(columns)[ranges.time_s >= now_s - HISTORY_S]
         table[:, 1:][~(np.abs(table[:, 1:]) < MAX_RANGE_M)] = np.nan
-        return np.column_stack([table, statuses])[stamps >= now_s - HISTORY_S]
+        none = "No range of this pair yet."
+        if history is not None and history.samples:
+            none = f"No range of this pair in the last {HISTORY_S:.0f} s."
+        self._models.show_empty("strip", "" if np.isfinite(table[:, 1]).any() else none)
+        bad = table[np.isin(table[:, 5], FAULTS)]
+        if len(bad) or len(self._models.bad.data["age"]):
+            statuses = [Status(int(status)).name for status in bad[:, 5]]
+            self._models.bad.data = {"age": bad[:, 0], "corrected": bad[:, 2], "status": statuses}
+        shown = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S if history is None else history.max_gap_s)
+        names = "age", "raw", "corrected", "true", "second"
+        self._models.strip.data = dict(zip(names, shown[:, :5].T.astype(np.float32), strict=True))
 
     def _draw_trace(self, scene: Scene, traces: tuple[Trace, ...]) -> None:
         models = self._models
@@ -327,26 +319,21 @@ class Figures:
                 source.data = {name: columns[name] for name in source.data}
 
     def _draw_history(self, scene: Scene, history: History | None) -> None:
-        samples = () if history is None else tuple(history.samples)
+        """Draw residual, rate and NLOS share of the selected pair: in the recording, or in the last minute."""
+        is_recorded = self._player is not None
+        is_complete = self._view.timeline is not None and self._view.timeline.is_complete
+        now_s = 0.0 if is_recorded else finite_or_zero(scene.now_s(self._state.tag_id))
         # All of it moves every second.
-        now_s = scene.now_s(self._state.tag_id)
-        if not self._state.changed(
-            "history", (self._state.selected, len(samples), int(finite_or_zero(now_s)))
-        ):
+        if not self._state.changed("history", (self._state.selected, math.floor(now_s), is_complete)):
             return
-        rows = [
-            (sample.time_s - now_s, drawable(sample.residual_m), sample.interval_s, sample.gap_db)
-            for sample in samples
-        ]
-        age_s, residual_m, interval_s, gap_db = np.array(rows, np.float64).reshape(-1, 4).T
-        is_nlos = np.where(np.isfinite(gap_db), gap_db >= LINE_OF_SIGHT_DB, np.nan)
-        rate_hz, nlos = 1.0 / _rolling_mean(interval_s), 100.0 * _rolling_mean(is_nlos)
-        table = _thin(np.column_stack([age_s, residual_m, rate_hz, nlos]), MAX_POINTS)
-        table = with_gaps(table, NO_DATA_S if history is None else history.max_gap_s)
-        none = "No residuals of this pair yet."
-        self._models.fill(
-            "history", self._models.history, table, "" if np.isfinite(table[:, 1]).any() else none
-        )
+        ranges = self._ranges(self._player, scene)
+        residual_m = np.where(np.abs(ranges.residual_m) < MAX_RANGE_M, ranges.residual_m, np.nan)
+        is_nlos = np.where(np.isfinite(ranges.gap_db), ranges.gap_db >= LINE_OF_SIGHT_DB, np.nan)
+        rate_hz, nlos = 1.0 / _rolling_mean(ranges.interval_s), 100.0 * _rolling_mean(is_nlos)
+        table = np.column_stack([ranges.time_s - now_s, residual_m, rate_hz, nlos])
+        message = "" if np.isfinite(residual_m).any() else "No residuals of this pair yet."
+        table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S if history is None else history.max_gap_s)
+        self._models.fill("history", self._models.history, table, message)
 
     def _draw_positions(self, scene: Scene) -> None:
         """Draw the errors of the positions of the selected tag, with two standard deviations."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.viewer.histories import Pair
 
 LONG_M, VERY_LONG_M = 0.15, 0.3
@@ -136,16 +137,10 @@ def predicted_accuracy(
         sd_m: standard deviation of a range, m.
 
     Returns:
-        The values, m, float32 (CELLS, CELLS), NaN where undetermined; lower left corner and size, float64 (2,), m.
+        The values, m, float32 (CELLS, CELLS), infinite where undetermined; lower left corner and size, float64 (2,), m.
     """
     margin_m = 1.0 + 0.1 * np.ptp(anchors[:, :2], axis=0)
     low, size = anchors[:, :2].min(axis=0) - margin_m, np.ptp(anchors[:, :2], axis=0) + 2.0 * margin_m
-    centres = (np.arange(CELLS) + 0.5) / CELLS
-    x, y = np.meshgrid(low[0] + centres * size[0], low[1] + centres * size[1])
-    delta = np.stack([x, y, np.full_like(x, height_m)], axis=-1)[:, :, None, :] - anchors
-    slope = (delta / np.maximum(np.linalg.norm(delta, axis=-1, keepdims=True), 0.05))[..., :2]
-    normal = np.einsum("xymi,xymj->xyij", slope, slope)
-    determinant = normal[..., 0, 0] * normal[..., 1, 1] - normal[..., 0, 1] ** 2
-    trace = normal[..., 0, 0] + normal[..., 1, 1]
-    predicted_m = sd_m * np.sqrt(trace / np.where(determinant > 1e-6, determinant, np.nan))
-    return predicted_m.astype(np.float32), low, size
+    x, y = low[:, None] + (np.arange(CELLS) + 0.5) / CELLS * size[:, None]
+    image = [[dop(anchors, np.array([at_x, at_y, height_m]), level=True).hdop for at_x in x] for at_y in y]
+    return (sd_m * np.array(image)).astype(np.float32), low, size

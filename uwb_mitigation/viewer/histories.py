@@ -7,7 +7,7 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,20 @@ class BoundedDict(OrderedDict[K, V]):
         if len(self) > self._limit:
             self.popitem(last=False)
         return value
+
+
+class RangeColumns(NamedTuple):
+    """Ranges of one pair, each float64 (n,); NaN: unknown. See `Sample`; `time_s` is on the clock of the figures."""
+
+    time_s: NDArray[np.float64]
+    stamp_s: NDArray[np.float64]
+    raw_m: NDArray[np.float64]
+    corrected_m: NDArray[np.float64]
+    true_m: NDArray[np.float64]
+    residual_m: NDArray[np.float64]
+    interval_s: NDArray[np.float64]
+    gap_db: NDArray[np.float64]
+    status: NDArray[np.float64]
 
 
 @dataclass(slots=True)
@@ -144,6 +158,17 @@ class History:
         self.received += 1
         while self.samples[0].time_s < now_s - HISTORY_S:
             self.samples.popleft()
+
+    def columns(self) -> RangeColumns:
+        """Return the ranges; their times are the stamps."""
+        rows = [
+            (
+                sample.time_s, sample.time_s, sample.raw_m, sample.range_m, sample.true_m, sample.residual_m, sample.interval_s,
+                sample.gap_db, sample.status,
+            )
+            for sample in self.samples
+        ]  # fmt: skip
+        return RangeColumns(*np.array(rows, np.float64).reshape(-1, len(RangeColumns._fields)).T)
 
     def count_lost(self, sequence: int) -> None:
         """Count missing ranges. Anchors are polled in turn, so the usual step is the median of the latest steps."""

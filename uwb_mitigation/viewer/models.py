@@ -74,15 +74,14 @@ COLUMNS = {
     "rx": ("RX, dBm", _CIRS, "mean receive level"),
     "fp": ("FP, dBm", _CIRS, "mean level of the first path"),
     "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
-    "lost": ("lost, %", WHOLE, "share of missing sequence numbers"),
+    "lost": ("lost, %", "all ranges", "share of missing sequence numbers"),
 }
-"""Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}; live, the interval `WHOLE` is
-`LIVE`."""
+"""Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
 FIGURES = {
     "map": "Map",
     "strip": f"Range, last {HISTORY_S:.0f} s",
-    "history": f"Residual, rate and NLOS share, last {HISTORY_S:.0f} s",
+    "history": "Residual, rate and NLOS share",
     "timeline": f"Range error over time, {WHOLE}",
     "positions": "Position error over time",
     "cir": "Last CIR",
@@ -100,6 +99,9 @@ _STROKES = {
     TrackKind.TRUE: (2.0, "dashed"),
 }
 """Width and dashes of the lines of each kind, in drawing order."""
+
+_SIZES = {"95 % ellipse": "width", "protection level": "protection", "heading": "heading"}
+"""Columns that are NaN if a tag has none."""
 
 _LIVE = TrackKind.RAW, TrackKind.CORRECTED, TrackKind.SECOND
 
@@ -177,12 +179,12 @@ class Models:
         self.pairs = _source("pairs", "anchor", "tag", "no_data", *COLUMNS)
         self.anchors = _source("anchors", "x", "y", "name", "id", "health", "label")
         self.selected = _source("", "x", "y")
-        self.tags = _source("tags", "x", "y", "name", "status", "label_y")
+        # Glyphs with NaN are not drawn: without a heading, for example.
+        self.tags = _source(
+            "tags", "x", "y", "name", "status", "label_y", "width", "height", "angle", "heading", "protection"
+        )
         # The script of the page fills it with the names that do not cover each other.
         self.labels = _source("", "x", "y", "text", "offset")
-        self.headings = _source("headings", "x", "y", "heading")
-        self.ellipses = _source("ellipses", "x", "y", "width", "height", "angle", "status")
-        self.protection = _source("protection levels", "x", "y", "protection")
         self.tracks = {kind: [_source(kind.value, "x", "y") for _ in FADING] for kind in _STROKES}
         self.accuracy = _source("predicted accuracy", "image", "x", "y", "dw", "dh")
         self.heat = _source("heat map", "x", "y", "mean")
@@ -209,12 +211,14 @@ class Models:
         }
         self.layers: dict[str, list[Any]] = {}
         self.figures = {
-            "map": self._map(plan), "strip": self._strip(), "history": self._history(), "cir": self._cir(),
+            "map": self._map(plan), "strip": self._strip(), "history": self._history(seconds), "cir": self._cir(),
             "waterfall": self._waterfall(), "errors": self._errors(), "distribution": self._distribution(),
-            "positions": self._positions(seconds is not None),
+            "positions": self._positions(seconds),
         }  # fmt: skip
         if seconds is not None:
             self.figures["timeline"] = self._timeline(seconds)
+            for name in ("history", "positions", "timeline"):
+                self.figures[name].vspan("time", source=self.position, line_color=NIGHT, line_width=2)
         for name, plot in self.figures.items():
             plot.name = name
         for name, corners in self.corners.items():
@@ -245,10 +249,9 @@ class Models:
 
     def update_legend(self) -> None:
         """Show the entries of the map's legend that the map contains."""
-        for item in self._legend.items:
-            shown = any(
-                renderer.visible and len(renderer.data_source.data["x"]) for renderer in item.renderers
-            )
+        for name, item in self._legend.items():
+            columns = [r.data_source.data[_SIZES.get(name, "x")] for r in item.renderers if r.visible]
+            shown = any(len(column) and not (name in _SIZES and np.isnan(column).all()) for column in columns)
             if item.visible != shown:
                 item.visible = shown
 
@@ -291,8 +294,8 @@ class Models:
         self.layers["circles"] = items["raw range"] + items["corrected range"]
         self.layers["heat"] = [*items["mean correction"], bars[0]]
         legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
-        self._legend = Legend(items=[LegendItem(label=legend[name], renderers=items[name]) for name in items])
-        plot.add_layout(self._legend, "below")
+        self._legend = {name: LegendItem(label=legend[name], renderers=items[name]) for name in items}
+        plot.add_layout(Legend(items=list(self._legend.values())), "below")
         return _finished(plot)
 
     def _map_layers(self, has_plan: bool) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
@@ -321,13 +324,13 @@ class Models:
                 (kind.value, "line", source, _stroke(kind) | {"line_alpha": alpha})
                 for kind, sources in self.tracks.items() for source, alpha in zip(sources, FADING, strict=True)
             ),
-            ("95 % ellipse", "ellipse", self.ellipses, {
+            ("95 % ellipse", "ellipse", self.tags, {
                 "width": "width", "height": "height", "angle": "angle", "color": BLUE, "fill_alpha": 0.25,
             }),
-            ("protection level", "circle", self.protection, {
+            ("protection level", "circle", self.tags, {
                 "radius": "protection", "fill_color": None, "line_color": NIGHT, "line_dash": "dotted",
             }),
-            ("heading", "ray", self.headings, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
+            ("heading", "ray", self.tags, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
             ("status", "scatter", self.statuses, self._symbols | {"size": 10, "line_width": 2}),
             ("tag", "scatter", self.tags, {
                 "marker": "star", "size": 13, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
@@ -348,8 +351,8 @@ class Models:
         plot.scatter("age", "corrected", source=self.bad, size=8, legend_field="status", **self._symbols)
         return _finished(plot, "age", *names)
 
-    def _history(self) -> figure:
-        plot = _figure(230, _AGE, "residual, m", x_range=Range1d(-HISTORY_S, 0))
+    def _history(self, seconds: float | None) -> figure:
+        plot = _time_figure(seconds, "residual, m")
         plot.extra_y_ranges = {"share": Range1d(0, 100)}
         plot.add_layout(LinearAxis(y_range_name="share", axis_label="rate, Hz; NLOS, %"), "right")
         for name, colour, dash, axis in (
@@ -359,8 +362,8 @@ class Models:
             plot.line("age", name, source=self.history, legend_label=name, **style)
         return _finished(plot, "age", "residual", "rate", "NLOS")
 
-    def _positions(self, is_recording: bool) -> figure:
-        plot = _figure(230, _TIME if is_recording else _AGE, "m")
+    def _positions(self, seconds: float | None) -> figure:
+        plot = _time_figure(seconds, "m")
         style = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
         plot.varea("time", 0, "bound", source=self.positions, **style)
         style = {"line_color": NIGHT, "line_width": 1.5, "legend_label": "error"}
@@ -368,11 +371,10 @@ class Models:
         return _finished(plot, "time", "error", "bound")
 
     def _timeline(self, seconds: float) -> figure:
-        plot = _figure(230, _TIME, "mean |error|, m", x_range=Range1d(0.0, max(seconds, 0.1)))
+        plot = _time_figure(seconds, "mean |error|, m")
         plot.y_range = DataRange1d(start=0.0)
         names = self._lines(plot, self.timeline, "time", *_LIVE[:2])
         self._lines(plot, self.second_timeline, "time", *self._kinds[2:])
-        plot.vspan("time", source=self.position, line_color=NIGHT, line_width=2)
         return _finished(plot, "time", *names)
 
     def _lines(
@@ -449,6 +451,13 @@ def _figure(
     )  # fmt: skip
     plot.toolbar.update(logo=None, autohide=True)
     return plot
+
+
+def _time_figure(seconds: float | None, y: str) -> figure:
+    """Return a figure of the whole recording, or of the last minute of live topics."""
+    if seconds is None:
+        return _figure(230, _AGE, y, x_range=Range1d(-HISTORY_S, 0))
+    return _figure(230, _TIME, y, x_range=Range1d(0.0, max(seconds, 0.1)))
 
 
 def _stroke(kind: TrackKind) -> dict[str, Any]:

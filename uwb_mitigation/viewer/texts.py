@@ -65,9 +65,7 @@ class Texts:
             verdict=[shown.state, shown.reason, shown.action, self._facts(scene, shown.accuracy)],
             health=_anchor_rows(anchors, states, names),
             tag_rows=self._tags(scene, pairs),
-            incidents=[
-                f"{self._time(time_s)}: {text}" for time_s, text in list(scene.events)[-MAX_SHOWN_EVENTS:]
-            ],
+            incidents=self._incidents(scene),
             cards=cards,
             nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports],
             notice=notices,
@@ -208,8 +206,13 @@ class Texts:
                 )
         return lines
 
-    def _time(self, time_s: float) -> str:
-        return f"{time_s:.1f} s" if self._player else f"{self._view.scene.clock() - time_s:.0f} s ago"
+    def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
+        """Return the incidents: time in the recording, None if they are live; text."""
+        if self._player is not None:
+            return [] if self._view.timeline is None else list(self._view.timeline.incidents)
+        scene.incidents.check(now_s := scene.clock())
+        latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
+        return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
 
 
 def _anchor_rows(

@@ -53,7 +53,12 @@ function start(doc) {
   const texts = (id, name, make) => on(name, () => $(id).replaceChildren(...controls[name].map(make)));
   for (const [id, name] of [["tags", "tag_rows"], ["health", "health"], ["nodes", "nodes"]])
     texts(id, name, (cells) => element("tr", cells.map((text) => element("td", text))));
-  texts("events", "incidents", (text) => element("li", text));
+  texts("events", "incidents", ([time, text]) => {
+    if (time === null) return element("li", text);
+    const button = element("button", `${time.toFixed(1)} s: ${text}`);
+    button.addEventListener("click", () => send("seek", time));
+    return element("li", button);
+  });
   texts("notice", "notice", (text) => element("div", text));
   texts("cards", "cards", (lines) => element("div", lines.map((text, i) => element(i === 1 ? "strong" : "span", text))));
   on("verdict", () => {
@@ -239,11 +244,12 @@ function start(doc) {
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
-      const {bad, count, largest, truth} = controls.marks;
+      const {bad, count, incidents, largest, truth} = controls.marks;
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
+        + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("")
         + (largest == null ? "" : mark(largest, "currentColor", "max"));
-      $("marks-legend").textContent = `| ranges that need attention: ${count || "none"}` + (largest == null ? "" : `; max: largest ${truth ? "error" : "correction"}`);
+      $("marks-legend").textContent = `| ranges that need attention: ${count || "none"}; \u25c6 events: ${incidents.length || "none"}` + (largest == null ? "" : `; max: largest ${truth ? "error" : "correction"}`);
     });
   }
   on("player", () => {
