@@ -256,7 +256,7 @@ class Models:
                 item.visible = shown
 
     def _map(self, plan: MapImage | None) -> figure:
-        plot = _figure(MAP_HEIGHT, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
+        plot = new_figure(MAP_HEIGHT, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
@@ -296,7 +296,7 @@ class Models:
         legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
         self._legend = {name: LegendItem(label=legend[name], renderers=items[name]) for name in items}
         plot.add_layout(Legend(items=list(self._legend.values())), "below")
-        return _finished(plot)
+        return finished(plot)
 
     def _map_layers(self, has_plan: bool) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
         """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
@@ -346,10 +346,10 @@ class Models:
         ]  # fmt: skip
 
     def _strip(self) -> figure:
-        plot = _figure(230, _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
+        plot = new_figure(230, _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
         names = self._lines(plot, self.strip, "age", *self._kinds, TrackKind.TRUE)
         plot.scatter("age", "corrected", source=self.bad, size=8, legend_field="status", **self._symbols)
-        return _finished(plot, "age", *names)
+        return finished(plot, "age", *names)
 
     def _history(self, seconds: float | None) -> figure:
         plot = _time_figure(seconds, "residual, m")
@@ -360,7 +360,7 @@ class Models:
         ):  # fmt: skip
             style = {"line_color": colour, "line_dash": dash, "line_width": 2, "y_range_name": axis}
             plot.line("age", name, source=self.history, legend_label=name, **style)
-        return _finished(plot, "age", "residual", "rate", "NLOS")
+        return finished(plot, "age", "residual", "rate", "NLOS")
 
     def _positions(self, seconds: float | None) -> figure:
         plot = _time_figure(seconds, "m")
@@ -368,14 +368,14 @@ class Models:
         plot.varea("time", 0, "bound", source=self.positions, **style)
         style = {"line_color": NIGHT, "line_width": 1.5, "legend_label": "error"}
         plot.line("time", "error", source=self.positions, **style)
-        return _finished(plot, "time", "error", "bound")
+        return finished(plot, "time", "error", "bound")
 
     def _timeline(self, seconds: float) -> figure:
         plot = _time_figure(seconds, "mean |error|, m")
         plot.y_range = DataRange1d(start=0.0)
         names = self._lines(plot, self.timeline, "time", *_LIVE[:2])
         self._lines(plot, self.second_timeline, "time", *self._kinds[2:])
-        return _finished(plot, "time", *names)
+        return finished(plot, "time", *names)
 
     def _lines(
         self, plot: figure, source: ColumnDataSource, x: str, *kinds: TrackKind, suffix: str = ""
@@ -387,17 +387,17 @@ class Models:
         return names
 
     def _cir(self) -> figure:
-        plot = _figure(230, _SAMPLES, "magnitude", x_range=_trace_range())
+        plot = new_figure(230, _SAMPLES, "magnitude", x_range=_trace_range())
         style = {"fill_color": GREEN, "fill_alpha": 0.15, "line_color": None, "legend_label": "network input"}
         plot.vstrip("from", "to", source=self.marks, **style)
         style = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
         plot.line("sample", "magnitude", source=self.trace, **style)
         plot.vspan("first", source=self.marks, line_color=VERMILLION, line_width=2, legend_label="first path")
         plot.hspan("noise", source=self.marks, line_color=GREY, line_dash="dashed", legend_label="noise")
-        return _finished(plot, "sample", "magnitude")
+        return finished(plot, "sample", "magnitude")
 
     def _waterfall(self) -> figure:
-        plot = _figure(230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0))
+        plot = new_figure(230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0))
         levels = LinearColorMapper("Cividis256", low=0, high=255)
         # Anchor the image at its first row, the newest, because the axis points down.
         plot.image(
@@ -412,7 +412,7 @@ class Models:
         return plot
 
     def _errors(self) -> figure:
-        plot = _figure(230, "measured - true, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
+        plot = new_figure(230, "measured - true, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
         low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
         plot.xaxis.ticker = FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
         plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
@@ -422,13 +422,13 @@ class Models:
                 left="left", right="right", bottom=0, top=kind.name.lower(), source=self.errors, color=colour, fill_alpha=0.35,
                 hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
             )  # fmt: skip
-        return _finished(plot, "left", "right", *(kind.name.lower() for kind in self._kinds))
+        return finished(plot, "left", "right", *(kind.name.lower() for kind in self._kinds))
 
     def _distribution(self) -> figure:
-        plot = _figure(230, "measured - true, m", "share of ranges, %", y_range=Range1d(0, 100))
+        plot = new_figure(230, "measured - true, m", "share of ranges, %", y_range=Range1d(0, 100))
         plot.x_range = Range1d(float(ERROR_EDGES_M[0]), float(ERROR_EDGES_M[-1]))
         names = self._lines(plot, self.errors, "right", *self._kinds, suffix="_share")
-        return _finished(plot, "right", *names)
+        return finished(plot, "right", *names)
 
 
 _SAMPLES, _AGE = "samples (1 ns) from the first path", "time before now, s"
@@ -443,7 +443,7 @@ def _source(title: str, *columns: str) -> ColumnDataSource:
     return ColumnDataSource({column: [] for column in columns}, name=title or None)
 
 
-def _figure(
+def new_figure(
     height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset", **options: Any
 ) -> figure:
     plot = figure(
@@ -456,8 +456,8 @@ def _figure(
 def _time_figure(seconds: float | None, y: str) -> figure:
     """Return a figure of the whole recording, or of the last minute of live topics."""
     if seconds is None:
-        return _figure(230, _AGE, y, x_range=Range1d(-HISTORY_S, 0))
-    return _figure(230, _TIME, y, x_range=Range1d(0.0, max(seconds, 0.1)))
+        return new_figure(230, _AGE, y, x_range=Range1d(-HISTORY_S, 0))
+    return new_figure(230, _TIME, y, x_range=Range1d(0.0, max(seconds, 0.1)))
 
 
 def _stroke(kind: TrackKind) -> dict[str, Any]:
@@ -470,7 +470,7 @@ def _colour_bar(mapper: LinearColorMapper, **options: Any) -> ColorBar:
     return ColorBar(color_mapper=mapper, width=10, padding=4, **colours, **options)
 
 
-def _finished(plot: figure, *columns: str) -> figure:
+def finished(plot: figure, *columns: str) -> figure:
     """Put the legend next to the plot, where it covers no data; show values of columns next to the pointer."""
     if columns:
         tips = [(name.replace("_", " "), f"@{name}{{0.000}}") for name in columns]

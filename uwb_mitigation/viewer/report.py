@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
 from bokeh.embed import file_html
+from bokeh.models import ColumnDataSource, FactorRange, Line
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 
 from uwb_mitigation.viewer.drawing import Figures
-from uwb_mitigation.viewer.models import Models
+from uwb_mitigation.viewer.models import Models, finished, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
+from uwb_mitigation.viewer.palette import TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.state import PageState, View
 from uwb_mitigation.viewer.texts import Texts
+
+_BOX = "low", "begin", "middle", "end", "high"
 
 Rows = Sequence[Sequence[object]]
 """Rows of a table; the first one has the titles."""
@@ -46,4 +51,27 @@ def draw_scene(view: View) -> Models:
     labels += [(*row, -4) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
     columns = zip(*labels, strict=True) if labels else ((),) * 4
     models.labels.data = dict(zip(models.labels.data, columns, strict=True))
+    for line in (r.glyph for r in models.figures["map"].renderers if isinstance(r.glyph, Line)):
+        line.line_alpha = 0.8
     return models
+
+
+def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Iterable[float]]]) -> figure:
+    """Return a figure with a box for each row and kind.
+
+    Args:
+        name: of the figure. axis: title of the horizontal axis.
+        rows: {kind: {row: ends of the lower line and of the box, middle, ends of the box and of the upper line}}.
+    """
+    names = list(next(iter(rows.values())))
+    plot = new_figure(90 + 20 * len(rows) * len(names), axis, "", y_range=FactorRange(*reversed(names)), name=name)
+    for number, (kind, boxes) in enumerate(rows.items()):
+        columns = np.array([list(box) for box in boxes.values()]).reshape(-1, len(_BOX))
+        # Of each row, the first kind is the upper one.
+        places = [(row, (0.5 * (len(rows) - 1) - number) / len(rows)) for row in boxes]
+        source = ColumnDataSource(dict(zip(_BOX, columns.T, strict=True)) | {"row": places})
+        style = {"source": source, "color": TRACK_COLOURS[kind], "legend_label": kind.value}
+        plot.segment("low", "row", "high", "row", **style)
+        plot.hbar("row", right="end", left="begin", height=0.35, fill_alpha=0.35, **style)
+        plot.scatter("middle", "row", marker="dash", angle=math.pi / 2, size=14, line_width=3, **style)
+    return finished(plot)
