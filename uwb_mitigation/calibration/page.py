@@ -15,7 +15,6 @@ from uwb_mitigation.calibration.site import SiteCalibration
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.models import FIGURES
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.report import draw_boxes, draw_scene, render_report
 from uwb_mitigation.viewer.scene import Pose, Scene, count_errors
@@ -68,8 +67,8 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         "Where the tag was": figures["map"],
         "Residuals of each anchor": draw_boxes("residuals", "residual, m", boxes),
         "Mean residuals of each anchor": table,
-        FIGURES["errors"]: figures["errors"],
-        FIGURES["distribution"]: figures["distribution"],
+        "Residuals before and after": figures["errors"],
+        "Residuals before and after, cumulative": figures["distribution"],
         "Offsets of the radios": draw_boxes("offsets", "offset, m", bars),
         "Values of the offsets": [
             ("radios", "offset, m", "standard deviation, m"),

@@ -84,7 +84,13 @@ def track(
 
         uwb-mitigation track drive.mcap -o track.mcap --odometry /odom --imu /imu
     """
-    from uwb_mitigation.commands.offline.track import held_out, mitigation, tum_file, write_tracks
+    from uwb_mitigation.commands.offline.track import (
+        displaced_anchor,
+        held_out,
+        mitigation,
+        tum_file,
+        write_tracks,
+    )
     from uwb_mitigation.commands.offline.track import tum as tum_text
     from uwb_mitigation.files import write_atomically
     from uwb_mitigation.positioning.recorded_tracks import track_tags
@@ -123,7 +129,7 @@ def track(
     if report is not None:
         from uwb_mitigation.viewer.recorded_report import write_report
 
-        write_report(report, bag, config, lambda: mitigation(settings), settings.stamp_offset_s)
+        write_report(report, bag, config, lambda: mitigation(settings), settings.stamp_offset_s, displaced_anchor)
         print_line(f"Wrote {report}.")
     if png is not None:
         from uwb_mitigation.commands.offline.tracks import Tracks

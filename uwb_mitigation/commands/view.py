@@ -70,7 +70,7 @@ def view(
     """
     from threading import Lock
 
-    from uwb_mitigation.commands.offline.track import mitigation, read_config
+    from uwb_mitigation.commands.offline.track import displaced_anchor, mitigation, read_config
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
     from uwb_mitigation.viewer.feed import SceneUpdater
@@ -94,7 +94,7 @@ def view(
                 f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
             )
         config = None if anchor_map is None else read_config(path, anchor_map, settings, console.warn)
-        threads.append(player.index(config, settings.stamp_offset_s))
+        threads.append(player.index(config, settings.stamp_offset_s, displaced_anchor))
         players.append(player)
     first = players[0]
     first.companion = None if second is None else players[1]

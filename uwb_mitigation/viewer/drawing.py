@@ -81,13 +81,15 @@ class Figures:
         self._draw_timeline()
 
     def draw_map(self, scene: Scene) -> None:
-        models = self._models
+        models, timeline = self._models, self._view.timeline
         anchors = []
         for identity, anchor in scene.anchors.items():
             state, residual_m = self._state.health.get(identity, (health.UNKNOWN, math.nan))
             name = anchor.name or format_id(identity)
             label = name[:MAX_LABEL] + (f" {state[0]}" if state != health.UNKNOWN else "")
-            if state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
+            if timeline is not None and identity in timeline.displaced:
+                label += " not here"
+            elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"
             values = anchor.x, anchor.y, name, str(identity), state, label
@@ -192,7 +194,7 @@ class Figures:
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # A margin for ellipses and labels; without anchors, one in which the tag can move.
-        margin = 0.05 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
+        margin = 0.1 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
         low, high = low - margin, high + margin
         self._models.extent.data = {name: [float(low[i]), float(high[i])] for i, name in enumerate("xy")}
 

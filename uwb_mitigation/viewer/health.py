@@ -35,7 +35,8 @@ STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
 
 Means = Mapping[str, float]
 """Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
-the estimated position (m); `evidence`, number of residuals; `stopped`, age of the last range if it is not recent, else 0 (s). NaN: unknown."""
+the estimated position (m); `evidence`, number of residuals; `stopped`, age of the last range if it is not recent, else 0 (s);
+`displaced`, held-out residual (m) of an anchor whose ranges fit another position, else 0. NaN: unknown."""
 
 
 def state(means: Means, before: str = "") -> str:
@@ -46,7 +47,8 @@ def state(means: Means, before: str = "") -> str:
         for limit_m, states in ((VERY_LONG_M, (BAD,)), (LONG_M, (BAD, CHECK)))
     )
     # Without line of sight, ranges may be long although anchor and offset are right.
-    if means["stopped"] > 0.0 or (residual_m > bad_m and not means["nlos"] > NLOS):
+    is_long = residual_m > bad_m and not means["nlos"] > NLOS
+    if means["stopped"] > 0.0 or means["displaced"] > 0.0 or is_long:
         return BAD
     is_suspicious = means["lost"] > LOST or means["not_ok"] > NOT_OK or means["nlos"] > NLOS
     if is_suspicious or residual_m > check_m:
@@ -78,7 +80,8 @@ def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple
 
     If all anchors are wrong in the same way, the cause is probably not in each of them.
     """
-    common = _common_advice(list(anchors.values())) if len(anchors) > 1 else ""
+    is_common = len(anchors) > 1 and not any(means["displaced"] for means in anchors.values())
+    common = _common_advice(list(anchors.values())) if is_common else ""
     return common, {
         anchor_id: ""
         if common
@@ -109,6 +112,11 @@ def _anchor_advice(name: str, means: Means) -> str:
     reads = f"{name} reads {abs(residual_m):.2f} m {'long' if residual_m > 0.0 else 'short'}"
     if means["stopped"] > 0.0:
         return f"{name} has not answered for {means['stopped']:.0f} s: check its power and PAN id."
+    if means["displaced"] > 0.0:
+        return (
+            f"{name} is not where the anchors file says: its ranges differ by {means['displaced']:.2f} m from the track of the "
+            "others, and fit another position. Measure it again."
+        )
     if abs(residual_m) > LONG_M and means["nlos"] > NLOS:
         return f"{reads}, with {means['nlos']:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."
     if abs(residual_m) > LONG_M:

@@ -184,7 +184,7 @@ class Models:
             "tags", "x", "y", "name", "status", "label_y", "width", "height", "angle", "heading", "protection"
         )
         # The script of the page fills it with the names that do not cover each other.
-        self.labels = _source("", "x", "y", "text", "offset")
+        self.labels = _source("", "x", "y", "text", "offset", "shift")
         self.tracks = {kind: [_source(kind.value, "x", "y") for _ in FADING] for kind in _STROKES}
         self.accuracy = _source("predicted accuracy", "image", "x", "y", "dw", "dh")
         self.heat = _source("heat map", "x", "y", "mean")
@@ -307,7 +307,7 @@ class Models:
         on_request: dict[str, Any] = {"fill_color": None, "visible": False}
         label = {
             "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
-            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset",
+            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset", "x_offset": "shift",
         }  # fmt: skip
         return [
             ("wall", "scatter", walls, {"marker": "square", "size": 12, "color": GREY}),
@@ -332,15 +332,15 @@ class Models:
             }),
             ("heading", "ray", self.tags, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
             ("status", "scatter", self.statuses, self._symbols | {"size": 10, "line_width": 2}),
-            ("tag", "scatter", self.tags, {
-                "marker": "star", "size": 13, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
-            }),
             ("anchor", "scatter", self.anchors, {
                 "marker": factor_mark("health", [marker for marker, _ in HEALTH_LOOKS.values()], list(HEALTH_LOOKS)),
                 "size": 15, "line_color": NIGHT, "fill_color": {"field": "health", "transform": anchor},
             }),
             ("selected anchor", "scatter", self.selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
+            }),
+            ("tag", "scatter", self.tags, {
+                "marker": "star", "size": 18, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
             }),
             ("", "text", self.labels, label),
         ]  # fmt: skip
@@ -412,7 +412,7 @@ class Models:
         return plot
 
     def _errors(self) -> figure:
-        plot = new_figure(230, "measured - true, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
+        plot = new_figure(230, "range error, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
         low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
         plot.xaxis.ticker = FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
         plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
@@ -425,7 +425,7 @@ class Models:
         return finished(plot, "left", "right", *(kind.name.lower() for kind in self._kinds))
 
     def _distribution(self) -> figure:
-        plot = new_figure(230, "measured - true, m", "share of ranges, %", y_range=Range1d(0, 100))
+        plot = new_figure(230, "range error, m", "share of ranges, %", y_range=Range1d(0, 100))
         plot.x_range = Range1d(float(ERROR_EDGES_M[0]), float(ERROR_EDGES_M[-1]))
         names = self._lines(plot, self.errors, "right", *self._kinds, suffix="_share")
         return finished(plot, "right", *names)
@@ -481,6 +481,6 @@ def finished(plot: figure, *columns: str) -> figure:
             plot.add_layout(legend, "above")
         legend.update(
             orientation="horizontal", label_text_font_size="11px", padding=0, margin=0, spacing=8, location="left",
-            border_line_color=None,
+            border_line_color=None, glyph_height=14, label_height=14,
         )  # fmt: skip
     return plot

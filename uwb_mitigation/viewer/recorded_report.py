@@ -12,7 +12,7 @@ from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.models import FIGURES
-from uwb_mitigation.viewer.playback import BagPlayer
+from uwb_mitigation.viewer.playback import BagPlayer, Check
 from uwb_mitigation.viewer.report import draw_scene, render_report
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import View
@@ -26,6 +26,7 @@ def write_report(
     config: EstimatorConfig,
     backend: Callable[[], Corrector],
     stamp_offset_s: float = 0.0,
+    check: Check | None = None,
 ) -> None:
     """Write the state of the page at the end of a recording.
 
@@ -34,7 +35,7 @@ def write_report(
         bag: the recording.
         config: of the estimators.
         backend: see `BagPlayer`.
-        stamp_offset_s: added to the stamps of the ranges.
+        stamp_offset_s, check: see `BagPlayer.index`.
 
     Raises:
         RecordingError: the bag cannot be read.
@@ -42,7 +43,7 @@ def write_report(
     feed = SceneUpdater(Scene(), Lock())
     player = BagPlayer(bag, feed, backend)
     feed.anchors(config.anchors)
-    player.index(config, stamp_offset_s).join()
+    player.index(config, stamp_offset_s, check).join()
     player.seek(player.seconds)
     while player.is_behind:
         player.advance()

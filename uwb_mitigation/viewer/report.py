@@ -47,9 +47,9 @@ def draw_scene(view: View) -> Models:
     Figures(state).draw(view.scene)
     # On the page, its script selects the labels.
     anchors, tags = models.anchors.data, models.tags.data
-    labels = [(*row, -13) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
-    labels += [(*row, -4) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
-    columns = zip(*labels, strict=True) if labels else ((),) * 4
+    labels = [(*row, -13, 0) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
+    labels += [(*row, -4, 0) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
+    columns = zip(*labels, strict=True) if labels else ((),) * 5
     models.labels.data = dict(zip(models.labels.data, columns, strict=True))
     for line in (r.glyph for r in models.figures["map"].renderers if isinstance(r.glyph, Line)):
         line.line_alpha = 0.8

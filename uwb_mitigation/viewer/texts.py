@@ -21,6 +21,7 @@ LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
 
 MAX_SHOWN_EVENTS = 8
+NOT_CORRECTED = "no range corrected: no CIRs"
 STAMP_DIFFERENCE_S = 1.0
 """If the age of the latest range by its stamp and by its reception differ by more, the page says so."""
 
@@ -41,7 +42,12 @@ class Texts:
         self._state.has_data = any(not row["no_data"] for row in rows)
         set_rows(self._models.pairs, rows)
         anchors = health.anchor_means(pairs)
-        states = {anchor_id: self._health(anchor_id, means) for anchor_id, means in anchors.items()}
+        # If no anchor answers, the cause is not in each of them.
+        is_lost = all(means["stopped"] > 0.0 for means in anchors.values())
+        states = {
+            anchor_id: health.UNKNOWN if is_lost else self._health(anchor_id, means)
+            for anchor_id, means in anchors.items()
+        }
         self._state.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
@@ -84,6 +90,7 @@ class Texts:
             means = history.statistics() | {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if missing else 0.0,
+                "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], 0.0),
             }
             if timeline is not None and pair in timeline.losses:
                 lost, received = timeline.losses[pair]
@@ -124,11 +131,9 @@ class Texts:
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
             corrected, count = self._counts(scene)
-            corrected_text = f"{100.0 * corrected / count:.0f} % of ranges" if corrected else "no range"
-            texts.append(f"{corrected_text} corrected")
-        texts += [
-            f"correction: {card[1]}" for card in self._interval_cards if card[0].startswith("Correction")
-        ]
+            texts.append(f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else NOT_CORRECTED)
+            cards = [card for card in self._interval_cards if corrected and card[0].startswith("Correction")]
+            texts += [f"correction: {card[1]} ({card[2]})" for card in cards]
         return " \u00b7 ".join(texts)
 
     def _counts(self, scene: Scene) -> tuple[int, int]:

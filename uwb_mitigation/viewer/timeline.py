@@ -68,6 +68,7 @@ class Timeline:
         estimates: {tag: its estimated tracks}, if the recording contains no positions.
         heat: see `Scene`.
         incidents: (log time, text).
+        displaced: {anchor whose ranges fit another position: its median held-out residual, m}.
         is_complete: whether tracks, residuals, heat map and incidents have been added.
     """
 
@@ -88,6 +89,7 @@ class Timeline:
     estimates: dict[str, TagTracks] = field(default_factory=dict)
     heat: BoundedDict[tuple[int, int], list[float]] = field(default_factory=lambda: BoundedDict(MAX_CELLS))
     incidents: list[tuple[float, str]] = field(default_factory=list)
+    displaced: dict[int, float] = field(default_factory=dict)
     is_complete: bool = False
 
     @cached_property
