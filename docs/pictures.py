@@ -192,7 +192,8 @@ def show_states(browser: Browser, folder: Path) -> None:
         with ViewerServer(view, port=0) as server:
             browser.open(f"{server.url}#t={state.seconds}", *FIRST_SCREEN)
             browser.wait("the page", browser.ready)
-            browser.wait("the time", lambda state=state: player.position_s == state.seconds and not player.is_behind)
+            while player.position_s != state.seconds or player.is_behind:
+                time.sleep(0.1)
             time.sleep(3.0)
             save(browser, f"state_{name}", 64)
 

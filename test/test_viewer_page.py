@@ -807,7 +807,7 @@ def test_anchors_have_a_traffic_light_and_advice(
     ],
 )
 def test_advice_names_the_probable_cause(residuals_m: list[float], nlos: list[float], expected: str) -> None:
-    others = dict.fromkeys(("rate", "lost", "not_ok", "stopped"), 0.0)
+    others = dict.fromkeys(("rate", "lost", "not_ok", "stopped", "displaced"), 0.0)
     anchors = {
         number: others | {"nlos": share, "residual": residual_m}
         for number, (residual_m, share) in enumerate(zip(residuals_m, nlos, strict=True), 1)

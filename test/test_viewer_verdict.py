@@ -137,12 +137,13 @@ def test_better_verdict_is_held_back_and_a_seek_is_not():
         ({"residual": 0.27}, health.BAD, health.BAD),
         ({"residual": 0.13}, health.CHECK, health.CHECK),
         ({"stopped": 5.0}, "", health.BAD),
+        ({"displaced": 0.4}, "", health.BAD),
     ],
 )
 def test_state_of_an_anchor_needs_evidence_and_has_hysteresis(
     changes: dict[str, float], before: str, expected: str
 ):
-    means = dict.fromkeys(("nlos", "lost", "not_ok", "residual", "stopped"), 0.0)
+    means = dict.fromkeys(("nlos", "lost", "not_ok", "residual", "stopped", "displaced"), 0.0)
     means |= {"rate": 10.0, "evidence": 100.0}
     assert health.state(means | changes, before) == expected
 

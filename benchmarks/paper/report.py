@@ -87,7 +87,9 @@ class Report:
         try:
             import jinja2
         except ModuleNotFoundError as error:
-            raise MissingDependencyError("a report's page needs jinja2", valid="run `make setup-training`") from error
+            raise MissingDependencyError(
+                "a report's page needs jinja2", valid="run `make setup-training`"
+            ) from error
         environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
             autoescape=True,

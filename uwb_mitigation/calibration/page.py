@@ -37,16 +37,21 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
     assert data.anchors is not None
     errors_m = np.stack([calibration.raw_error_m, calibration.held_out_error_m])
     is_known = np.isfinite(errors_m).all(axis=0)
-    table: list[tuple[object, ...]] = [("anchor", "ranges", "raw, mean |residual|, m", "calibrated, mean |residual|, m")]
+    table: list[tuple[object, ...]] = [
+        ("anchor", "ranges", "raw, mean |residual|, m", "calibrated, mean |residual|, m")
+    ]
     boxes = dict[TrackKind, dict[str, Iterable[float]]]({TrackKind.RAW: {}, TrackKind.CORRECTED: {}})
     for anchor in calibration.site.anchors.anchors:
         of_anchor = errors_m[:, (data.anchors == anchor.id) & is_known]
         if of_anchor.size:
-            table.append((anchor, of_anchor.shape[1], *(f"{mean:.3f}" for mean in np.abs(of_anchor).mean(axis=1))))
+            table.append(
+                (anchor, of_anchor.shape[1], *(f"{mean:.3f}" for mean in np.abs(of_anchor).mean(axis=1)))
+            )
             for row, residuals_m in zip(boxes.values(), of_anchor, strict=True):
                 row[str(anchor)] = np.percentile(residuals_m, PERCENTILES)
     offsets = {
-        f"tag {format_id(tag)}, anchor {format_id(anchor)}": values for (tag, anchor), values in calibration.pairs.items()
+        f"tag {format_id(tag)}, anchor {format_id(anchor)}": values
+        for (tag, anchor), values in calibration.pairs.items()
     }
     bars = {TrackKind.CORRECTED: {pair: offset_m + SDS * sd_m for pair, (offset_m, sd_m) in offsets.items()}}
     figures = draw_scene(_view(calibration, errors_m[:, is_known])).figures
@@ -58,7 +63,9 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         *_details(calibration),
         f"Recordings: {name}. Model: {bundle.model_id:08x}, {files[0]}. Offsets: {files[1]}. "
         f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC.",
-        Markup("Next: <code>ros2 run uwb_mitigation mitigator --ros-args -p model:={} -p offsets:={}</code>").format(*files),
+        Markup(
+            "Next: <code>ros2 run uwb_mitigation mitigator --ros-args -p model:={} -p offsets:={}</code>"
+        ).format(*files),
         f"Residuals: measured range minus {reference}. The model was fitted without the segment that it is tested on. Boxes: "
         "middle half of the ranges and median; lines: 5 to 95 %. Offsets: one and two standard deviations.",
         *calibration.notes,

@@ -129,7 +129,9 @@ def track(
     if report is not None:
         from uwb_mitigation.viewer.recorded_report import write_report
 
-        write_report(report, bag, config, lambda: mitigation(settings), settings.stamp_offset_s, displaced_anchor)
+        write_report(
+            report, bag, config, lambda: mitigation(settings), settings.stamp_offset_s, displaced_anchor
+        )
         print_line(f"Wrote {report}.")
     if png is not None:
         from uwb_mitigation.commands.offline.tracks import Tracks

@@ -250,7 +250,14 @@ class Figures:
             compared = self._ranges(second, second.scene)
             others = dict(zip(compared.stamp_s.round(6).tolist(), compared.corrected_m.tolist(), strict=True))
         second_m = [others.get(stamp_s, math.nan) for stamp_s in ranges.stamp_s.round(6).tolist()]
-        columns = ranges.time_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, second_m, ranges.status
+        columns = (
+            ranges.time_s - now_s,
+            ranges.raw_m,
+            ranges.corrected_m,
+            ranges.true_m,
+            second_m,
+            ranges.status,
+        )
         table = np.column_stack(columns)[ranges.time_s >= now_s - HISTORY_S]
         table[:, 1:][~(np.abs(table[:, 1:]) < MAX_RANGE_M)] = np.nan
         none = "No range of this pair yet."

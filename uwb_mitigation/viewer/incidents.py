@@ -80,7 +80,9 @@ class Incidents:
             if key[0] is None:
                 # The tag was away, not its anchors.
                 for (_, tag), other in self._sources.items():
-                    other.time_s = time_s if tag == key[1] else other.time_s
+                    if tag == key[1]:
+                        other.stamp_s += time_s - other.time_s
+                        other.time_s = time_s
         else:
             source.interval_s += SMOOTHING * (passed_s - source.interval_s)
         return source, passed_s

@@ -397,7 +397,9 @@ class Models:
         return finished(plot, "sample", "magnitude")
 
     def _waterfall(self) -> figure:
-        plot = new_figure(230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0))
+        plot = new_figure(
+            230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0)
+        )
         levels = LinearColorMapper("Cividis256", low=0, high=255)
         # Anchor the image at its first row, the newest, because the axis points down.
         plot.image(
@@ -446,6 +448,7 @@ def _source(title: str, *columns: str) -> ColumnDataSource:
 def new_figure(
     height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset", **options: Any
 ) -> figure:
+    """Return an empty figure with the style of the page."""
     plot = figure(
         height=height, min_width=200, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, tools=tools, **options
     )  # fmt: skip

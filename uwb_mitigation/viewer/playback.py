@@ -122,7 +122,8 @@ class BagPlayer:
         """Index the recording in a thread, which is returned.
 
         Args:
-            config, stamp_offset_s: see `index_recording`.
+            config: see `index_recording`.
+            stamp_offset_s: see `index_recording`.
             check: returns `Timeline.displaced` for estimated tracks.
         """
 

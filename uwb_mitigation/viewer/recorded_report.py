@@ -35,7 +35,8 @@ def write_report(
         bag: the recording.
         config: of the estimators.
         backend: see `BagPlayer`.
-        stamp_offset_s, check: see `BagPlayer.index`.
+        stamp_offset_s: see `BagPlayer.index`.
+        check: see `BagPlayer.index`.
 
     Raises:
         RecordingError: the bag cannot be read.

@@ -60,11 +60,14 @@ def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Itera
     """Return a figure with a box for each row and kind.
 
     Args:
-        name: of the figure. axis: title of the horizontal axis.
+        name: of the figure.
+        axis: title of the horizontal axis.
         rows: {kind: {row: ends of the lower line and of the box, middle, ends of the box and of the upper line}}.
     """
     names = list(next(iter(rows.values())))
-    plot = new_figure(90 + 20 * len(rows) * len(names), axis, "", y_range=FactorRange(*reversed(names)), name=name)
+    plot = new_figure(
+        90 + 20 * len(rows) * len(names), axis, "", y_range=FactorRange(*reversed(names)), name=name
+    )
     for number, (kind, boxes) in enumerate(rows.items()):
         columns = np.array([list(box) for box in boxes.values()]).reshape(-1, len(_BOX))
         # Of each row, the first kind is the upper one.

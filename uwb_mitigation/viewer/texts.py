@@ -131,7 +131,9 @@ class Texts:
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
             corrected, count = self._counts(scene)
-            texts.append(f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else NOT_CORRECTED)
+            texts.append(
+                f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else NOT_CORRECTED
+            )
             cards = [card for card in self._interval_cards if corrected and card[0].startswith("Correction")]
             texts += [f"correction: {card[1]} ({card[2]})" for card in cards]
         return " \u00b7 ".join(texts)
