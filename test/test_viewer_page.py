@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bokeh.document import Document
-from browser import Browser
+from browser import Browser, drawn_column
 from PIL import Image
 
 from benchmarks.equipment.page_clients import PageClients
@@ -310,12 +310,6 @@ def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, 
     )
     assert max(map(abs, ends)) < 100
     assert browser.cards()["Mean absolute range error, since the start"][0] == "0.250 m"
-
-
-def drawn_column(document: Document, figure: str, column: str) -> np.ndarray:
-    """Return a column of the source of a named figure, without a browser."""
-    sources = [renderer.data_source for renderer in document.get_model_by_name(figure).renderers]
-    return next(source.data[column] for source in sources if column in source.data)
 
 
 def test_ranges_of_a_stopped_pair_age_and_disappear(view: View, clock: Clock) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from bag_material import START_NS, STEP_NS, corrected, record, write_bag, write_corrected
 from bokeh.document import Document
-from browser import Browser
+from browser import Browser, drawn_column
 from command_line import run
 from drives import HALL, drive
 
@@ -321,8 +321,15 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     assert player.jump(largest) == timeline.pair(largest)
     assert timeline.deviation_m[largest] == np.nanmax(timeline.deviation_m)
     assert player.position_s == pytest.approx(timeline.time_s[largest], abs=1e-4)
-    mean = timeline.mean_errors(player.seconds)
-    assert np.nanmean(mean["corrected"]) < np.nanmean(mean["raw"])
+    raw_m, corrected_m = np.abs(timeline.range_errors(-np.inf, np.inf)).mean(axis=1)
+    assert corrected_m < raw_m
+    ranges = timeline.ranges((1, 101))
+    assert np.isfinite(ranges.residual_m).mean() > 0.9, "of the whole recording"
+    assert np.isfinite(ranges.gap_db).all()
+    assert np.ptp(drawn_column(document, "history", "age")) > 0.9 * player.seconds
+    assert np.nanmean(drawn_column(document, "positions", "error")) < np.nanmean(
+        drawn_column(document, "positions", "raw")
+    )
     seek(player, player.seconds)
     assert set(scene.tracks) == set(timeline.tracks)
     track = timeline.tracks["tag_101", TrackKind.CORRECTED]

@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_material import STEP_NS, corrected, record, write_corrected
 from bokeh.document import Document
+from browser import drawn_column
 
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import Sample
+from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import AnchorPosition, NodeStatus, Pose, Scene
@@ -184,6 +187,31 @@ def test_clock_jump_dead_tag_and_old_stamps_are_reported():
     assert [row[0] for row in page.tag_rows] == ["tag 7", "tag 9"]
 
 
+@pytest.mark.parametrize(
+    ("silent", "expected"),
+    [
+        ((1, 7), [(20.0, "anchor 1 of tag 7: lost"), (30.0, "anchor 1 of tag 7: back after 10 s")]),
+        ((None, 7), [(20.0, "tag 7: lost"), (30.0, "tag 7: back after 10 s")]),
+    ],
+)
+def test_lost_anchor_and_lost_tag_are_events(silent, expected: list[tuple[float, str]]):
+    incidents = Incidents()
+    for tenth in range(400):
+        # Anchor 4 is slow: it has data between its ranges.
+        for anchor in (1, 2, 3, 4)[: 4 if tenth % 50 == 0 else 3]:
+            for tag in (7, 8):
+                if not (200 < tenth < 300 and tag == silent[1] and silent[0] in (None, anchor)):
+                    incidents.add_range((anchor, tag), tenth / 10, tenth / 10 + 50.0)
+    assert list(incidents.found) == expected
+
+
+def test_jump_of_a_position_is_an_event_and_motion_is_not():
+    incidents = Incidents()
+    for tenth in range(100):
+        incidents.add_position("tag 7", tenth / 10, 0.5 * tenth + (3.0 if tenth >= 60 else 0.0), 0.0)
+    assert list(incidents.found) == [(6.0, "position of tag 7: jump by 3.5 m")]
+
+
 def test_badge_has_the_age_by_reception_and_by_stamp():
     scene, clock = driven()
     scene.stamp_clock = lambda: clock.now_s + 909.6
@@ -224,11 +252,9 @@ def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     while player.is_behind:
         player.advance()
     assert scene.ranges <= 3001
-    document = shown(scene, player)
-    strip = next(
-        r.data_source for r in document.get_model_by_name("strip").renderers if "raw" in r.data_source.data
+    assert np.nanmin(drawn_column(shown(scene, player), "strip", "age")) == pytest.approx(
+        -60.0, abs=60.0 * STEP_NS / 1e7
     )
-    assert np.nanmin(strip.data["age"]) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
 
 
 def test_late_positions_give_no_residuals():
@@ -247,12 +273,7 @@ def test_history_of_the_selected_anchor_and_errors_with_standard_deviations():
     for sample in scene.pairs[1, 7].samples:
         sample.true_m = 5.0
         scene.count_error(sample)
-    figures = shown(scene)
-
-    def column(figure: str, name: str) -> np.ndarray:
-        sources = [renderer.data_source.data for renderer in figures.get_model_by_name(figure).renderers]
-        return np.array(next(source[name] for source in sources if name in source))
-
+    column = partial(drawn_column, shown(scene))
     assert column("history", "residual") == pytest.approx(0.6)
     assert (column("history", "rate")[-1], column("history", "NLOS")[-1]) == pytest.approx((10.0, 100.0))
     assert column("positions", "bound") == pytest.approx(0.2)

@@ -13,7 +13,7 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Status
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.headline import WHOLE, live_positions, recorded_positions
+from uwb_mitigation.viewer.headline import WHOLE, Positions, live_positions, recorded_positions
 from uwb_mitigation.viewer.histories import (
     HISTORY_S,
     MAX_RANGE_M,
@@ -78,7 +78,6 @@ class Figures:
         self._draw_errors(scene)
         self._draw_history(scene, history)
         self._draw_positions(scene)
-        self._draw_timeline()
 
     def draw_map(self, scene: Scene) -> None:
         models, timeline = self._models, self._view.timeline
@@ -318,15 +317,6 @@ class Figures:
             data[f"{kind}_share"] = 100.0 * np.cumsum(data[kind]) / max(data[kind].sum(), 1.0)
         self._models.errors.data = data
 
-    def _draw_timeline(self) -> None:
-        """Draw the mean errors of the recordings."""
-        models = self._models
-        for player, source in ((self._player, models.timeline), (self._view.second, models.second_timeline)):
-            if player is not None and player.timeline is not None and self._state.changed(source.name, True):
-                columns = player.timeline.mean_errors(player.seconds)
-                columns["second"] = columns["corrected"]
-                source.data = {name: columns[name] for name in source.data}
-
     def _draw_history(self, scene: Scene, history: History | None) -> None:
         """Draw residual, rate and NLOS share of the selected pair: in the recording, or in the last minute."""
         is_recorded = self._player is not None
@@ -344,22 +334,40 @@ class Figures:
         table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S if history is None else history.max_gap_s)
         self._models.fill("history", self._models.history, table, message)
 
-    def _draw_positions(self, scene: Scene) -> None:
-        """Draw the errors of the positions of the selected tag, with two standard deviations."""
-        timeline, tag_id = self._view.timeline, self._state.tag_id
+    def _positions(self, player: BagPlayer | None, scene: Scene) -> Positions | None:
+        """Return the positions of the selected tag; None: the tracks of the recording are not known yet."""
+        if player is None:
+            return live_positions(scene, self._state.tag_id)
+        timeline = player.timeline
         is_complete = timeline is not None and timeline.is_complete
-        second = math.floor(scene.clock()) if self._player is None else -1
-        if not self._state.changed("positions", (tag_id, is_complete, second)):
+        return recorded_positions(timeline, self._state.tag_id) if timeline and is_complete else None
+
+    def _draw_positions(self, scene: Scene) -> None:
+        """Draw the errors of the positions of the selected tag with and without correction, with two standard deviations."""
+        second_player, models = self._view.second, self._models
+        own = self._positions(self._player, scene)
+        second = second_player and self._positions(second_player, second_player.scene)
+        second_s = math.floor(scene.clock()) if self._player is None else -1
+        state = self._state.tag_id, own is None, second is None, second_s
+        if not self._state.changed("positions", state):
             return
-        table = np.zeros((0, 3))
-        if timeline is not None and is_complete:
-            table = recorded_positions(timeline, tag_id).error_columns()
-        elif self._player is None:
-            table = live_positions(scene, tag_id).error_columns()
-            table[:, 0] -= table[-1:, 0]
+        table = _error_columns(own, TrackKind.CORRECTED)
+        now_s = table[-1, 0] if self._player is None and len(table) else 0.0
         message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
-        table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S)
-        self._models.fill("positions", self._models.positions, table, message)
+        models.fill("positions", models.positions, _shown_errors(table, now_s), message)
+        for kind, positions in ((TrackKind.RAW, own), (TrackKind.SECOND, second)):
+            source = models.compared_positions[kind]
+            columns = _error_columns(positions, TrackKind.CORRECTED if positions is second else kind)
+            time_s, error_m, _ = _shown_errors(columns, now_s).T.astype(np.float32)
+            source.data = {"time": time_s, kind.name.lower(): error_m}
+
+
+def _error_columns(positions: Positions | None, kind: TrackKind) -> NDArray[np.float64]:
+    return np.zeros((0, 3)) if positions is None else positions.error_columns(kind)
+
+
+def _shown_errors(table: NDArray[np.float64], now_s: float) -> NDArray[np.float64]:
+    return with_gaps(_thin(table - (now_s, 0.0, 0.0), 3 * MAX_POINTS), NO_DATA_S)
 
 
 def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:

@@ -169,12 +169,12 @@ class Positions:
         compared = self._compared(kind, slice(max(begin, end - 1) if latest else begin, end))
         return NO_ERRORS if compared is None else track_errors(*compared)
 
-    def error_columns(self) -> NDArray[np.float64]:
+    def error_columns(self, kind: TrackKind) -> NDArray[np.float64]:
         """Return time (s), horizontal error and two standard deviations (m) of each position, float64 (n, 3); NaN: unknown."""
-        if (columns := self.track(TrackKind.CORRECTED)) is None:
+        if (columns := self.track(kind)) is None:
             return np.zeros((0, 3))
         error_m = np.full(len(columns), np.nan)
-        if (compared := self._compared(TrackKind.CORRECTED, slice(None))) is not None:
+        if (compared := self._compared(kind, slice(None))) is not None:
             track, truth = compared
             error_m = np.linalg.norm((track.position - truth.position_at(track.stamp_ns))[:, :2], axis=1)
         return np.column_stack([columns[:, 0], error_m, 2.0 * columns[:, 4]])

@@ -25,7 +25,7 @@ class _Source:
     """Times of data: the latest one, the mean interval, its latest stamp or place, and whether it was reported as lost."""
 
     time_s: float
-    interval_s: float = 0.0
+    interval_s: float = math.inf
     stamp_s: float = math.nan
     place: tuple[float, float] = (math.nan, math.nan)
     is_lost: bool = False
@@ -73,6 +73,7 @@ class Incidents:
             self.check(time_s)
         if (source := self._sources.get(key)) is None:
             source = self._sources.add(key, _Source(time_s))
+            return source, math.nan
         passed_s, source.time_s = time_s - source.time_s, time_s
         if source.is_lost:
             source.is_lost = False
@@ -84,7 +85,8 @@ class Incidents:
                         other.stamp_s += time_s - other.time_s
                         other.time_s = time_s
         else:
-            source.interval_s += SMOOTHING * (passed_s - source.interval_s)
+            mean_s = source.interval_s if math.isfinite(source.interval_s) else passed_s
+            source.interval_s = mean_s + SMOOTHING * (passed_s - mean_s)
         return source, passed_s
 
     def check(self, now_s: float) -> None:

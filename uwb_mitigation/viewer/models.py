@@ -33,7 +33,6 @@ from bokeh.transform import factor_mark
 from numpy.typing import NDArray
 
 from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.headline import WHOLE
 from uwb_mitigation.viewer.health import BAD, CHECK, GOOD, STATES, STEPS_M, UNKNOWN
 from uwb_mitigation.viewer.histories import HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
 from uwb_mitigation.viewer.palette import (
@@ -82,7 +81,6 @@ FIGURES = {
     "map": "Map",
     "strip": f"Range, last {HISTORY_S:.0f} s",
     "history": "Residual, rate and NLOS share",
-    "timeline": f"Range error over time, {WHOLE}",
     "positions": "Position error over time",
     "cir": "Last CIR",
     "waterfall": f"Last {WATERFALL} CIRs",
@@ -201,8 +199,10 @@ class Models:
         self.errors = _source("histogram", "left", "right", *kinds, *(f"{kind}_share" for kind in kinds))
         self.history = _source("residuals", "age", "residual", "rate", "NLOS")
         self.positions = _source("position errors", "time", "error", "bound")
-        self.timeline = _source("mean errors", "time", "raw", "corrected")
-        self.second_timeline = _source("mean errors of the second recording", "time", "second")
+        self.compared_positions = {
+            kind: _source(f"position errors, {kind.value}", "time", kind.name.lower())
+            for kind in (TrackKind.RAW, TrackKind.SECOND)
+        }
         self.position = _source("", "time")
         # A figure without data has no axis ranges: invisible corners define them until data arrives.
         self.corners = {
@@ -216,8 +216,7 @@ class Models:
             "positions": self._positions(seconds),
         }  # fmt: skip
         if seconds is not None:
-            self.figures["timeline"] = self._timeline(seconds)
-            for name in ("history", "positions", "timeline"):
+            for name in ("history", "positions"):
                 self.figures[name].vspan("time", source=self.position, line_color=NIGHT, line_width=2)
         for name, plot in self.figures.items():
             plot.name = name
@@ -366,16 +365,13 @@ class Models:
         plot = _time_figure(seconds, "m")
         style = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
         plot.varea("time", 0, "bound", source=self.positions, **style)
-        style = {"line_color": NIGHT, "line_width": 1.5, "legend_label": "error"}
-        plot.line("time", "error", source=self.positions, **style)
+        plot.line(
+            "time", "error", source=self.positions, legend_label="corrected", **_stroke(TrackKind.CORRECTED)
+        )
+        for kind in self._kinds:
+            if kind in self.compared_positions:
+                self._lines(plot, self.compared_positions[kind], "time", kind)
         return finished(plot, "time", "error", "bound")
-
-    def _timeline(self, seconds: float) -> figure:
-        plot = _time_figure(seconds, "mean |error|, m")
-        plot.y_range = DataRange1d(start=0.0)
-        names = self._lines(plot, self.timeline, "time", *_LIVE[:2])
-        self._lines(plot, self.second_timeline, "time", *self._kinds[2:])
-        return finished(plot, "time", *names)
 
     def _lines(
         self, plot: figure, source: ColumnDataSource, x: str, *kinds: TrackKind, suffix: str = ""

@@ -76,7 +76,7 @@ class Page:
                 for interval, names in groupby(columns, key=lambda name: columns[name][1])
             ],
             states=health.STATES,
-            figures={name: FIGURES[name] for name in FIGURES if name in models.figures},
+            figures=FIGURES,
             looks=STATUS_LOOKS,
             speeds=player and player.SPEEDS,
             trails={

@@ -17,7 +17,7 @@ from uwb_mitigation.viewer.report import draw_scene, render_report
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import View
 
-SHOWN = "map", "timeline", "positions", "errors", "distribution"
+SHOWN = "map", "positions", "errors", "distribution"
 
 
 def write_report(

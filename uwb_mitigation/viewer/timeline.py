@@ -40,12 +40,10 @@ from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, BoundedDict,
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
-from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_TAGS, add_heat, tag_label, tag_name, with_gaps
+from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_TAGS, add_heat, tag_label, tag_name
 
 MAX_STAMP_S = 1.0
 """If stamp and log time of a message differ by more, its time is the log time."""
-BINS = 300
-"""Maximum number of points of the error over time."""
 BATCH = 256
 """Number of raw ranges that are corrected in one call."""
 _KINDS = {ODOMETRY_TRUTH: TrackKind.TRUE, POSE_SMOOTHED: TrackKind.SMOOTHED}
@@ -140,24 +138,6 @@ class Timeline:
         rows = slice(*np.searchsorted(self.log_s, (begin_s, end_s), side="right"))
         errors = np.stack([self.raw_m[rows], self.corrected_m[rows]]) - self.true_m[rows]
         return errors[:, (np.abs(errors) <= MAX_RANGE_M).all(axis=0)]
-
-    def mean_errors(self, seconds: float) -> dict[str, NDArray[np.float32]]:
-        """Return the mean absolute errors over time: `time`, `raw` and `corrected`, float32 (k,); NaN: a gap."""
-        errors = np.abs(np.stack([self.raw_m - self.true_m, self.corrected_m - self.true_m]))
-        is_valid = (errors < MAX_RANGE_M).all(axis=0)
-        if not is_valid.any():
-            # Without truth, only the size of the corrections is known.
-            errors = np.stack([np.full(len(self.time_s), np.nan), self.deviation_m])
-            is_valid = np.isfinite(errors[1])
-        width_s = max(seconds / BINS, 1.0)
-        row = (np.maximum(self.time_s[is_valid], 0.0) // width_s).astype(np.intp)
-        count = np.bincount(row)
-        filled = count > 0
-        means = [np.bincount(row, values)[filled] / count[filled] for values in errors[:, is_valid]]
-        columns = with_gaps(
-            np.stack([(np.flatnonzero(filled) + 0.5) * width_s, *means], axis=1), 1.5 * width_s
-        )
-        return dict(zip(("time", "raw", "corrected"), columns.T.astype(np.float32), strict=True))
 
 
 def index_recording(
