@@ -932,7 +932,7 @@ def test_long_names_do_not_widen_the_page(browser: Browser, view: View, server: 
         view.scene.set_anchors({n: AnchorPosition(4.0 * n, 0, 2, name) for n in (1, 2)})
         view.scene.set_node_status(name, NodeStatus(1, name, determinations=(f"{name}: {name}",)))
         view.scene.add_pose(name, Pose(4.0, 3.0, 1.0, stamp_s=1000.0))
-        view.scene.incidents.report(0.0, name)
+        view.scene.incidents.found.append((0.0, name))
     view.title = name
     open_page(browser, server)
     browser.wait("the names", lambda: name in browser.text())

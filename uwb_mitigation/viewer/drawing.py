@@ -346,7 +346,7 @@ class Figures:
         """Draw the errors of the positions of the selected tag with and without correction, with two standard deviations."""
         second_player, models = self._view.second, self._models
         own = self._positions(self._player, scene)
-        second = second_player and self._positions(second_player, second_player.scene)
+        second = None if second_player is None else self._positions(second_player, second_player.scene)
         second_s = math.floor(scene.clock()) if self._player is None else -1
         state = self._state.tag_id, own is None, second is None, second_s
         if not self._state.changed("positions", state):

@@ -33,8 +33,6 @@ from uwb_mitigation.viewer.histories import BoundedDict, Sample, Trace
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, AnchorPosition, NodeStatus, Pose, Scene
 
-DIAGNOSTICS = "/diagnostics"
-
 MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Truths and CIRs without corrected ranges, and corrected ranges without truths, that are kept."""
 
@@ -69,7 +67,7 @@ class SceneUpdater:
             topics.POSE_SMOOTHED: partial(self._position, TrackKind.SMOOTHED),
             topics.ODOMETRY_TRUTH: lambda _, m: self._position(TrackKind.TRUE, str(m.child_frame_id), m),
             topics.ANCHORS: lambda _, message: self.markers(message),
-            DIAGNOSTICS: lambda _, message: self._diagnostics(message),
+            topics.DIAGNOSTICS: lambda _, message: self._diagnostics(message),
         }
         self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
         self._gaps_db: BoundedDict[MeasurementKey, float] = BoundedDict(MAX_TRUTHS)

@@ -7,6 +7,7 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -95,6 +96,11 @@ class Sample:
         return sample
 
 
+_VALUES = attrgetter(
+    "time_s", "time_s", "raw_m", "range_m", "true_m", "residual_m", "interval_s", "gap_db", "status"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """One CIR; its magnitudes are computed only if it is shown."""
@@ -161,14 +167,8 @@ class History:
 
     def columns(self) -> RangeColumns:
         """Return the ranges; their times are the stamps."""
-        rows = [
-            (
-                sample.time_s, sample.time_s, sample.raw_m, sample.range_m, sample.true_m, sample.residual_m, sample.interval_s,
-                sample.gap_db, sample.status,
-            )
-            for sample in self.samples
-        ]  # fmt: skip
-        return RangeColumns(*np.array(rows, np.float64).reshape(-1, len(RangeColumns._fields)).T)
+        rows = np.array(list(map(_VALUES, self.samples)), np.float64).reshape(-1, len(RangeColumns._fields))
+        return RangeColumns(*rows.T)
 
     def count_lost(self, sequence: int) -> None:
         """Count missing ranges. Anchors are polled in turn, so the usual step is the median of the latest steps."""

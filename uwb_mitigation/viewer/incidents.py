@@ -44,28 +44,21 @@ class Incidents:
         self._sources: BoundedDict[tuple[int | None, int | str], _Source] = BoundedDict(MAX_SOURCES)
         self._check_s = -math.inf
 
-    def report(self, time_s: float, text: str) -> None:
-        """Add an incident, unless the latest one is the same."""
-        if not self.found or self.found[-1][1] != text:
-            self.found.append((time_s, text))
-
     def add_range(self, pair: Pair, time_s: float, stamp_s: float) -> None:
         """Add a range at a time; `stamp_s` is on the clock of its tag."""
-        anchor_id, tag_id = pair
-        self._add((None, tag_id), time_s)
-        source, passed_s = self._add((anchor_id, tag_id), time_s)
-        jump_s = stamp_s - source.stamp_s - passed_s
-        source.stamp_s = stamp_s
+        source, passed_s = self._add((None, pair[1]), time_s)
+        jump_s, source.stamp_s = stamp_s - source.stamp_s - passed_s, stamp_s
         # Ranges that are read late arrive at once.
         if abs(jump_s) > CLOCK_JUMP_S:
-            self.report(time_s, f"clock of tag {format_id(tag_id)}: jump by {jump_s:+.0f} s")
+            self.found.append((time_s, f"clock of tag {format_id(pair[1])}: jump by {jump_s:+.0f} s"))
+        self._add(pair, time_s)
 
     def add_position(self, label: str, time_s: float, x: float, y: float) -> None:
         """Add a position of a tag."""
         source, passed_s = self._add((None, label), time_s)
         moved_m, source.place = math.dist(source.place, (x, y)), (x, y)
         if moved_m > JUMP_M + MAX_SPEED * passed_s:
-            self.report(time_s, f"position of {label}: jump by {moved_m:.1f} m")
+            self.found.append((time_s, f"position of {label}: jump by {moved_m:.1f} m"))
 
     def _add(self, key: tuple[int | None, int | str], time_s: float) -> tuple[_Source, float]:
         """Return a source and the time since its last data."""
@@ -77,13 +70,11 @@ class Incidents:
         passed_s, source.time_s = time_s - source.time_s, time_s
         if source.is_lost:
             source.is_lost = False
-            self.report(time_s, f"{_name(key)}: back after {passed_s:.0f} s")
+            self.found.append((time_s, f"{_name(key)}: back after {passed_s:.0f} s"))
             if key[0] is None:
                 # The tag was away, not its anchors.
                 for (_, tag), other in self._sources.items():
-                    if tag == key[1]:
-                        other.stamp_s += time_s - other.time_s
-                        other.time_s = time_s
+                    other.time_s = time_s if tag == key[1] else other.time_s
         else:
             mean_s = source.interval_s if math.isfinite(source.interval_s) else passed_s
             source.interval_s = mean_s + SMOOTHING * (passed_s - mean_s)
@@ -97,7 +88,7 @@ class Incidents:
             is_late = now_s - source.time_s > max(NO_DATA_S, NO_DATA_INTERVALS * source.interval_s)
             if is_late and not tag.is_lost and not source.is_lost:
                 source.is_lost = True
-                self.report(source.time_s, f"{_name(key)}: lost")
+                self.found.append((source.time_s, f"{_name(key)}: lost"))
 
 
 def _name(key: tuple[int | None, int | str]) -> str:
