@@ -106,7 +106,7 @@ def position_s(browser: Browser) -> float:
     return float(browser.run("return document.getElementById('position').value"))
 
 
-@pytest.mark.parametrize("delay_s", [0.0, -2.0, 3600.0])
+@pytest.mark.parametrize("delay_s", [0.0, -2.0])
 def test_marks_and_map_agree_with_the_log_time(browser: Browser, tmp_path: Path, delay_s: float):
     with serve(write_drive(tmp_path / "drive.mcap", {7: delay_s})) as (player, server):
         browser.open(server.url)

@@ -15,6 +15,7 @@ from bokeh.document import Document
 from browser import drawn_column
 
 from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
@@ -22,7 +23,7 @@ from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import AnchorPosition, NodeStatus, Pose, Scene
+from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.state import View
 from uwb_mitigation.viewer.verdict import DEGRADED, GOOD, HeldVerdict, Verdict
 
@@ -43,8 +44,9 @@ def driven(
     clock = Clock()
     scene = Scene(clock)
     scene.stamp_clock = lambda: clock.now_s + 900.0
-    scene.set_anchors({1: AnchorPosition(0, 0, 0), 2: AnchorPosition(8, 0, 0, "door"), 3: AnchorPosition(0, 6, 0),
-                       4: AnchorPosition(8, 6, 0)})  # fmt: skip
+    scene.set_anchors(
+        [Anchor(id_, (x, y, 0.0), name="door" if id_ == 2 else "") for id_, (x, y) in ANCHORS.items()]
+    )
     for _ in range(count):
         clock.now_s += 0.1
         scene.add_pose("tag_7", Pose(4.0, 3.0, 0.0, stamp_s=clock.now_s + 900.0, sd_m=sd_m))

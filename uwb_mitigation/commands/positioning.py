@@ -127,7 +127,7 @@ def track(
     for tracked in tracks if tum is not None else []:
         write_atomically(tum_files[tracked.recording.tag_id], tum_text(tracked.smoothed))
     if report is not None:
-        from uwb_mitigation.viewer.recorded_report import write_report
+        from uwb_mitigation.viewer.report import write_report
 
         write_report(
             report, bag, config, lambda: mitigation(settings), settings.stamp_offset_s, displaced_anchor

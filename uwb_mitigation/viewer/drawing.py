@@ -91,13 +91,13 @@ class Figures:
             elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"
-            values = anchor.x, anchor.y, name, str(identity), state, label
+            values = *anchor.position[:2], name, str(identity), state, label
             anchors.append(dict(zip(models.anchors.data, values, strict=True)))
         if self._state.changed("anchors", anchors):
             set_rows(models.anchors, anchors)
         place = scene.anchors.get(self._state.selected[0]) if self._state.selected else None
         if self._state.changed("selected", place):
-            set_rows(models.selected, [{"x": place.x, "y": place.y}] if place else [])
+            set_rows(models.selected, [dict(zip("xy", place.position, strict=False))] if place else [])
         tags: list[dict[str, Any]] = []
         plain_id = plain_tag_id(scene.tags, scene.pairs)
         for name, tag in scene.tags.items():
@@ -168,7 +168,7 @@ class Figures:
         models, tag = self._models, next(iter(scene.tags.values()), None)
         if not models.layers["accuracy"][0].visible or len(scene.anchors) < 2:
             return
-        anchors = np.array([(place.x, place.y, finite_or_zero(place.z)) for place in scene.anchors.values()])
+        anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
         height_m = finite_or_zero(tag.pose.z if tag and tag.pose else math.nan)
         sds_m = [sample.sigma_m for sample in shown if sample.sigma_m > 0.0]
         sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
@@ -182,7 +182,7 @@ class Figures:
 
     def fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
-        places = [(place.x, place.y) for place in scene.anchors.values()]
+        places = [anchor.position[:2] for anchor in scene.anchors.values()]
         places += [(tag.pose.x, tag.pose.y) for tag in scene.tags.values() if tag.pose is not None]
         timeline = None if self._player is None else self._player.timeline
         tracks = [view.columns() for view in scene.tracks.values()]
@@ -212,16 +212,17 @@ class Figures:
                 or not is_drawable
             ):
                 continue
-            height_m = 0.0 if pose is None else finite_or_zero(pose.z - place.z)
+            x, y, z = place.position
+            height_m = 0.0 if pose is None else finite_or_zero(pose.z - z)
             raw_m, corrected_m = (
                 math.sqrt(max(finite_or_zero(drawable(value)) ** 2 - height_m * height_m, 0.0))
                 for value in (sample.raw_m, sample.range_m)
             )
-            x1, y1 = (place.x, place.y) if pose is None else (pose.x, pose.y)
-            ends = {"x": place.x, "y": place.y, "x1": x1, "y1": y1}
+            x1, y1 = (x, y) if pose is None else (pose.x, pose.y)
+            ends = {"x": x, "y": y, "x1": x1, "y1": y1}
             rows.append(ends | {"raw": raw_m, "corrected": corrected_m, "status": sample.status.name})
             if pose is not None:
-                middle = {"x": (place.x + x1) / 2, "y": (place.y + y1) / 2}
+                middle = {"x": (x + x1) / 2, "y": (y + y1) / 2}
                 symbols.append(middle | {"status": sample.status.name})
         set_rows(self._models.rays, rows)
         set_rows(self._models.statuses, symbols)

@@ -105,16 +105,6 @@ class TrackView:
 
 
 @dataclass(frozen=True, slots=True)
-class AnchorPosition:
-    """An anchor on the map, m."""
-
-    x: float
-    y: float
-    z: float = math.nan
-    name: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class NodeStatus:
     """The latest diagnostics of one node: level 0 OK, 1 WARN, 2 ERROR, 3 STALE.
 
@@ -183,7 +173,7 @@ class Scene:
         self.tracks: BoundedDict[tuple[str, TrackKind], TrackView] = BoundedDict(4 * MAX_TAGS)
         self.is_indexed = False
         self.heat: BoundedDict[tuple[int, int], list[float]] = BoundedDict(MAX_CELLS)
-        self.anchors: dict[int, AnchorPosition] = {}
+        self.anchors: dict[int, Anchor] = {}
         self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
         self.error_sums_m = np.zeros(2)
@@ -304,8 +294,9 @@ class Scene:
             return
         # On a busy computer, positions arrive late.
         if not abs(pose.stamp_s - sample.time_s) * tag.speed > MAX_MOVED_M:
-            height_m = finite_or_zero(pose.z - anchor.z)
-            sample.residual_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
+            x, y, z = anchor.position
+            distance_m = math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
+            sample.residual_m = sample.range_m - distance_m
         if not self.is_indexed:
             self._locate_raw(pair, pose, sample)
 
@@ -326,14 +317,16 @@ class Scene:
             point = (sample.time_s, *estimate.position.tolist(), math.nan)
             self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
 
-    def set_anchors(self, anchors: dict[int, AnchorPosition]) -> None:
-        plausible = (
-            (id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y, place.z)
-        )
-        anchors_before, self.anchors = self.anchors, dict(islice(plausible, MAX_ANCHORS))
+    def set_anchors(self, anchors: Iterable[Anchor]) -> None:
+        """Set the anchors on Earth; the height of an anchor may be NaN."""
+        plausible = (anchor for anchor in anchors if _is_plausible(*anchor.position))
+        anchors_before, self.anchors = self.anchors, {one.id: one for one in islice(plausible, MAX_ANCHORS)}
         self.revision += 1
         if self.anchors and self.anchors != anchors_before:
-            places = [Anchor(id_, (p.x, p.y, finite_or_zero(p.z))) for id_, p in self.anchors.items()]
+            places = [
+                replace(one, position=(*one.position[:2], finite_or_zero(one.position[2])))
+                for one in self.anchors.values()
+            ]
             self._anchor_map = AnchorMap(places)
             self._raw_locators.clear()
 
