@@ -157,6 +157,8 @@ def test_radio_without_cirs_is_a_normal_state(tmp_path: Path):
     scene, _ = driven(status=Status.NO_CIR)
     page = controls(scene)
     assert page.verdict[0] == "good"
+    assert page.verdict[3].endswith("no range corrected: no CIRs")
+    assert controls(driven(status=Status.BAD_CIR)[0]).verdict[3].endswith("no range corrected")
     assert {row[0] for row in page.health} == {health.GOOD}
     cards = {title: (value, text) for title, value, text in page.cards}
     assert cards["Ranges corrected, since the start"] == ("none", "0 of 120 ranges corrected: no CIRs")

@@ -236,8 +236,8 @@ def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str] 
     if not corrected_m + raw_m > 0.0:
         return None
     change_percent = 100.0 * (corrected_m / raw_m - 1.0)
-    text = "no change" if abs(change_percent) < 0.5 else f"position error {change_percent:+.0f} %"
-    return text, f"RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
+    text = "no change" if abs(change_percent) < 0.5 else f"{change_percent:+.0f} %"
+    return text, f"position RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
 
 
 def _metres(values_m: Any, statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:

@@ -21,7 +21,6 @@ LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
 
 MAX_SHOWN_EVENTS = 8
-NOT_CORRECTED = "no range corrected: no CIRs"
 STAMP_DIFFERENCE_S = 1.0
 """If the age of the latest range by its stamp and by its reception differ by more, the page says so."""
 
@@ -130,20 +129,20 @@ class Texts:
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
-            corrected, count = self._counts(scene)
-            texts.append(
-                f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else NOT_CORRECTED
-            )
+            corrected, count, faults = self._counts(scene)
+            not_corrected = "no range corrected" + ("" if faults else ": no CIRs")
+            share = f"{100.0 * corrected / count:.0f} % of ranges corrected"
+            texts.append(share if corrected else not_corrected)
             cards = [card for card in self._interval_cards if corrected and card[0].startswith("Correction")]
             texts += [f"correction: {card[1]} ({card[2]})" for card in cards]
         return " \u00b7 ".join(texts)
 
-    def _counts(self, scene: Scene) -> tuple[int, int]:
-        """Return the numbers of corrected and of all ranges."""
+    def _counts(self, scene: Scene) -> tuple[int, int, int]:
+        """Return the numbers of corrected ranges, of all ranges, and of those with a status that needs attention."""
         timeline = self._view.timeline
         if timeline is None:
-            return scene.corrected, scene.ranges
-        return int(np.count_nonzero(timeline.is_corrected)), len(timeline.status)
+            return scene.corrected, scene.ranges, scene.faults
+        return int(timeline.is_corrected.sum()), len(timeline.status), int(timeline.bad.sum())
 
     def _cards(self, scene: Scene) -> list[Card]:
         """Return the large figures."""
@@ -166,7 +165,7 @@ class Texts:
     def _summary(self, scene: Scene) -> str:
         """Return time and counts."""
         count = sum(1 for _ in scene.latest())
-        corrected, ranges = self._counts(scene)
+        corrected, ranges, _ = self._counts(scene)
         texts = [f"{count} pair{'' if count == 1 else 's'}", f"{corrected} corrected ranges of {ranges}"]
         if scene.dropped:
             texts.append(f"{scene.dropped} dropped by the viewer")
