@@ -224,7 +224,7 @@ def _write(
         from uwb_mitigation.files import write_atomically
 
         # As a reader of a format: only this option needs the drawing code.
-        page = importlib.import_module("uwb_mitigation.calibration.page")
+        page = importlib.import_module("uwb_mitigation.commands.offline.site_page")
         write_atomically(report, page.site_page(calibration, name, bundle, (str(output), str(offsets_path))))
         print_line(f"Wrote {report}.")
     return {"model_id": bundle.model_id, "offsets_file": offsets_path}
