@@ -220,6 +220,9 @@ def test_map_view_is_fixed_until_changed(browser: Browser, view: View, server: V
         view.scene.set_anchors([Anchor(5, (-70, 0, 2))])
     browser.wait("the new anchor", lambda: "5" in browser.column("map", "id"))
     assert view_of_map() == zoomed
+    with view.lock:
+        view.scene.add_pose("tag", Pose(1.5, 3.98, 0))
+    browser.wait("its name below the tag, in the frame", lambda: max(browser.column("map", "offset")) > 0)
 
 
 def test_page_can_be_paused_and_resumed(browser: Browser, view: View, server: ViewerServer) -> None:

@@ -183,7 +183,7 @@ def test_same_url_shows_the_same_figures(browser: Browser, tmp_path: Path):
 
 
 def test_gaps_are_shown_as_gaps(browser: Browser, tmp_path: Path):
-    with serve(write_drive(tmp_path / "gap.mcap", {7: -2.0}, gap_s=(10.0, 30.0))) as (player, server):
+    with serve(write_drive(tmp_path / "gap.mcap", {7: -2.0}, gap_s=(10.0, 30.0))) as (_, server):
         browser.open(server.url + "#t=25")
         browser.wait(
             "an old tag", lambda: any("no data for 15 s" in name for name in browser.column("map", "name"))

@@ -256,9 +256,9 @@ def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     while player.is_behind:
         player.advance()
     assert scene.ranges <= 3001
-    assert np.nanmin(drawn_column(shown(scene, player), "strip", "age")) == pytest.approx(
-        -60.0, abs=60.0 * STEP_NS / 1e7
-    )
+    page = shown(scene, player)
+    assert np.nanmin(drawn_column(page, "strip", "age")) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
+    assert np.ptp(drawn_column(page, "history", "age")) == pytest.approx(player.seconds, abs=1.0)
 
 
 def test_late_positions_give_no_residuals():
