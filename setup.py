@@ -70,7 +70,6 @@ setup(
             "models/*",
             "types/ros/interfaces/*.msg",
             "recordings/mappings/*.yaml",
-            "calibration/templates/*.j2",
             "viewer/templates/*",
         ]
     },

@@ -1,9 +1,10 @@
 """Make the pictures of the README and of the documentation. Both use simulated ranges.
 
 `raw_and_corrected.png` contains maps of two simulated drives with calibrated offsets: positions by least squares on raw ranges,
-by the locator on raw ranges, and by the locator on corrected ranges. `viewer.png` and `viewer_narrow.png` are screenshots in Chromium.
+by the locator on raw ranges, and by the locator on corrected ranges. The others are screenshots in Chromium: `viewer.png` and
+`viewer_narrow.png` of live topics, `state_*.png` of the first screen for each state of the position.
 
-    python docs/pictures.py [map]
+    python docs/pictures.py [map] [live] [states]
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ import socket
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -30,14 +33,24 @@ from benchmarks.equipment import processes  # noqa: E402
 from benchmarks.position_data import simulated_run  # noqa: E402
 from benchmarks.positions import WARM_UP_S, locate  # noqa: E402
 from benchmarks.sites import FLATS, Drive  # noqa: E402
+from uwb_mitigation.commands.data import write_simulated  # noqa: E402
+from uwb_mitigation.commands.offline.track import displaced_anchor, mitigation  # noqa: E402
 from uwb_mitigation.positioning.online.initialization import snapshot  # noqa: E402
 from uwb_mitigation.positioning.track_errors import track_errors  # noqa: E402
+from uwb_mitigation.positioning.track_settings import TrackSettings  # noqa: E402
+from uwb_mitigation.simulation.scene import ANCHORS, MORE_ANCHORS  # noqa: E402
 from uwb_mitigation.simulation.simulated import SimulatedSource  # noqa: E402
-from uwb_mitigation.types.anchors import dump_anchors  # noqa: E402
+from uwb_mitigation.types.anchors import AnchorMap, dump_anchors  # noqa: E402
+from uwb_mitigation.types.measurement import Cir, Record  # noqa: E402
 from uwb_mitigation.types.offsets import Offsets  # noqa: E402
 from uwb_mitigation.types.stamps import NS_PER_S  # noqa: E402
 from uwb_mitigation.types.tracks import Track  # noqa: E402
+from uwb_mitigation.viewer.feed import SceneUpdater  # noqa: E402
 from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, VERMILLION  # noqa: E402
+from uwb_mitigation.viewer.playback import BagPlayer  # noqa: E402
+from uwb_mitigation.viewer.scene import Scene  # noqa: E402
+from uwb_mitigation.viewer.server import ViewerServer  # noqa: E402
+from uwb_mitigation.viewer.state import View  # noqa: E402
 
 PICTURES = REPOSITORY / "docs" / "pictures"
 SIMULATED_HZ = 40.0
@@ -46,6 +59,11 @@ WATCHED_S = 40.0
 FILLED_S = 7.0
 """Duration before the screenshots are taken, for a waterfall plot."""
 
+DRIVE_RANGES = 1400
+"""Number of ranges of the drives of the states, at 20 Hz: 70 s."""
+OFFSET_M = 0.2
+"""Antenna delays of the simulated radios."""
+FIRST_SCREEN = 1280, 720
 
 SHOWN_S = 60.0
 """Duration of the drives that the maps show: one round through the flat."""
@@ -53,19 +71,19 @@ SHOWN_SEED = 906
 SHOWN_BUILDINGS = {"brick": "Brick walls", "open": "Open space"}
 
 
-def reduce_colours(path: Path) -> None:
-    """Reduce a PNG file to 256 colours; MAXCOVERAGE keeps colours of small areas."""
+def reduce_colours(path: Path, count: int = 256) -> None:
+    """Reduce a PNG file to a number of colours; MAXCOVERAGE keeps colours of small areas."""
     shown = Image.open(path).convert("RGB")
-    few = shown.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few = shown.quantize(count, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     few.save(path, optimize=True)
     print(f"{path.relative_to(REPOSITORY)}: {path.stat().st_size / 1000:.0f} kB")
 
 
-def save(browser: Browser, name: str) -> None:
+def save(browser: Browser, name: str, colours: int = 256) -> None:
     """Save a screenshot."""
     path = PICTURES / f"{name}.png"
     browser.driver.save_screenshot(str(path))
-    reduce_colours(path)
+    reduce_colours(path, colours)
 
 
 def plot_raw_and_corrected() -> None:
@@ -112,11 +130,88 @@ def plot_raw_and_corrected() -> None:
     reduce_colours(path)
 
 
+def displaced(anchors: AnchorMap) -> AnchorMap:
+    """Return the map with anchor 2 where it is not: 0.8 m from its place."""
+    changed = list(anchors.anchors)
+    x, y, z = changed[1].position
+    changed[1] = replace(changed[1], position=(x + 0.8, y, z))
+    return AnchorMap(changed)
+
+
+def without_cir(record: Record) -> Record:
+    return replace(record, measurement=replace(record.measurement, cir=Cir(np.zeros(0, np.int16))))
+
+
+class State(NamedTuple):
+    """A drive whose first screen is a picture.
+
+    Attributes:
+        building: see `FLATS`. anchors: changes the map. change: changes each record; None: it is not received.
+        seconds: time in the recording.
+    """
+
+    building: str = "open"
+    anchors: Callable[[AnchorMap], AnchorMap] = lambda anchors: anchors
+    change: Callable[[Record], Record | None] = lambda record: record
+    seconds: float = 40.0
+
+
+STATES = {
+    "good": State(),
+    "anchor_off": State(anchors=displaced),
+    "lost": State(change=lambda record: record if record.measurement.sequence < 700 or record.measurement.sequence > 1100 else None),
+    "not_determined": State(change=lambda record: record if record.measurement.anchor_id < 3 else None),
+    "without_cirs": State(change=without_cir),
+    "recording": State("brick"),
+}  # fmt: skip
+
+
+class ChangedDrive(SimulatedSource):
+    """A drive whose records are changed."""
+
+    def __init__(self, state: State) -> None:
+        super().__init__(count=DRIVE_RANGES, plan=FLATS[state.building], anchors=ANCHORS + MORE_ANCHORS[:2])
+        self._change = state.change
+
+    def __iter__(self) -> Iterator[Record]:
+        return filter(None, map(self._change, super().__iter__()))
+
+
+def show_states(browser: Browser, folder: Path) -> None:
+    """Take a picture of the first screen of each state."""
+    settings = TrackSettings(height_m=0.0, offsets=OFFSET_M)
+    for name, state in STATES.items():
+        source, bag = ChangedDrive(state), folder / f"{name}.mcap"
+        write_simulated(source, DRIVE_RANGES, 1, bag, True, None)
+        anchors = state.anchors(source.anchors)
+        feed = SceneUpdater(Scene(), Lock())
+        player = BagPlayer(bag, feed, lambda: mitigation(settings))
+        feed.anchors(anchors)
+        player.index(settings.config(anchors), check=displaced_anchor).join()
+        view = View(feed.scene, feed.lock, f"{name}.mcap", player=player, missing=player.missing)
+        with ViewerServer(view, port=0) as server:
+            browser.open(f"{server.url}#t={state.seconds}", *FIRST_SCREEN)
+            browser.wait("the page", browser.ready)
+            while player.position_s != state.seconds or player.is_behind:
+                time.sleep(0.1)
+            time.sleep(3.0)
+            save(browser, f"state_{name}", 64)
+
+
 def main() -> None:
     PICTURES.mkdir(exist_ok=True)
-    plot_raw_and_corrected()
-    if "map" in sys.argv:
-        return
+    parts = sys.argv[1:] or ["map", "live", "states"]
+    if "map" in parts:
+        plot_raw_and_corrected()
+    if "live" in parts:
+        show_topics()
+    if "states" in parts:
+        with tempfile.TemporaryDirectory() as folder, chromium() as browser:
+            show_states(browser, Path(folder))
+
+
+def show_topics() -> None:
+    """Take pictures of the page of live topics."""
     processes.isolate()
     anchors = SimulatedSource(rate_hz=SIMULATED_HZ).anchors
     with socket.socket() as free:

@@ -216,6 +216,12 @@ class Browser:
         return path
 
 
+def drawn_column(document: Any, figure: str, column: str) -> Any:
+    """Return a column of the source of a named figure, without a browser."""
+    sources = [renderer.data_source for renderer in document.get_model_by_name(figure).renderers]
+    return next(source.data[column] for source in sources if column in source.data)
+
+
 @contextmanager
 def chromium() -> Iterator[Browser]:
     """Return a new browser; skip the test if the system has none."""

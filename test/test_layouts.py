@@ -19,19 +19,8 @@ from uwb_mitigation.types.ros.poses import tag_topic
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer import palette
 
-TYPES = {
-    topics.RANGE_RAW: topics.RANGE_CIR_TYPE,
-    topics.RANGE_TRUTH: topics.RANGE_TRUTH_TYPE,
-    topics.RANGE_CORRECTED: topics.RANGE_CORRECTED_TYPE,
-    topics.POSE: topics.POSE_TYPE,
-    topics.POSE_SMOOTHED: topics.POSE_TYPE,
-    topics.ODOMETRY: topics.ODOMETRY_TYPE,
-    topics.ODOMETRY_TRUTH: topics.ODOMETRY_TYPE,
-    topics.ANCHORS: topics.MARKERS_TYPE,
-    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
-}
 TAGS = [tag_topic(topics.POSE, number) for number in (1, 2, 3)]
-TYPES |= dict.fromkeys(TAGS, topics.POSE_TYPE)
+TYPES = topics.TYPES | dict.fromkeys(TAGS, topics.POSE_TYPE)
 CIR_TYPE = "uwb_mitigation_msgs/msg/Cir"
 DISPLAYS = {
     "rviz_default_plugins/MarkerArray": topics.MARKERS_TYPE,

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,9 @@ from drives import HALL, drive
 
 from benchmarks.position_data import real_runs
 from uwb_mitigation.commands.offline.track import mitigation, read_config
+from uwb_mitigation.commands.positioning import track
+from uwb_mitigation.commands.support.position_options import track_settings
+from uwb_mitigation.commands.view import view
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area
@@ -189,6 +193,11 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
     assert corrected.position.tolist() != expected.position.tolist(), (
         "after a corrected range, its variance counts"
     )
+
+
+@pytest.mark.parametrize("command", [track, view])
+def test_track_and_view_have_the_same_options(command):
+    assert set(signature(track_settings).parameters) <= set(signature(command).parameters)
 
 
 def test_report_is_one_file_with_the_figures_of_track(imported, tmp_path: Path):

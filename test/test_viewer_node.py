@@ -91,7 +91,7 @@ def test_anchor_markers_are_published_without_a_locator(ros: ros_harness.Ros, tm
     threads = psutil.Process(viewer.pid).threads()
     assert len(threads) > 5, "the middleware's are among them"
     assert {os.getpriority(os.PRIO_PROCESS, thread.id) for thread in threads} == {min(os.nice(0) + 10, 19)}, (
-        "ranges are corrected before they are drawn_column"
+        "ranges are corrected before they are drawn"
     )
 
 

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 from bag_material import START_NS, STEP_NS, corrected, record, write_bag, write_corrected
 from bokeh.document import Document
-from browser import Browser
+from browser import Browser, drawn_column
 from command_line import run
 from drives import HALL, drive
 
@@ -31,7 +30,7 @@ from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import anchors_path, dump_anchors, load_anchors
-from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Status
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros.codec import encode_range
 from uwb_mitigation.types.ros.poses import encode_pose, encode_true_position, tag_topic
 from uwb_mitigation.types.ros.topics import (
@@ -48,7 +47,7 @@ from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, interval_cards, recorded_positions
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import AnchorPosition, Scene
+from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import View
 
 COUNT = 400
@@ -295,7 +294,7 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     assert done.returncode == 0, done.stderr
     player, scene = open_bag(bag)
     anchors = load_anchors(anchors_path(bag))
-    scene.set_anchors({anchor.id: AnchorPosition(*anchor.position) for anchor in anchors.anchors})
+    scene.set_anchors(anchors.anchors)
     player.index(EstimatorConfig(anchors)).join()
     timeline = player.timeline
     assert timeline is not None
@@ -321,8 +320,15 @@ def test_index_of_a_drive_has_tracks_errors_and_heat(tmp_path: Path, monkeypatch
     assert player.jump(largest) == timeline.pair(largest)
     assert timeline.deviation_m[largest] == np.nanmax(timeline.deviation_m)
     assert player.position_s == pytest.approx(timeline.time_s[largest], abs=1e-4)
-    mean = timeline.mean_errors(player.seconds)
-    assert np.nanmean(mean["corrected"]) < np.nanmean(mean["raw"])
+    raw_m, corrected_m = np.abs(timeline.range_errors(-np.inf, np.inf)).mean(axis=1)
+    assert corrected_m < raw_m
+    ranges = timeline.ranges((1, 101))
+    assert np.isfinite(ranges.residual_m).mean() > 0.9, "of the whole recording"
+    assert np.isfinite(ranges.gap_db).all()
+    assert np.ptp(drawn_column(document, "history", "age")) > 0.9 * player.seconds
+    assert np.nanmean(drawn_column(document, "positions", "error")) < np.nanmean(
+        drawn_column(document, "positions", "raw")
+    )
     seek(player, player.seconds)
     assert set(scene.tracks) == set(timeline.tracks)
     track = timeline.tracks["tag_101", TrackKind.CORRECTED]
@@ -345,26 +351,6 @@ def test_tag_without_a_position_does_not_stop_the_player(tmp_path: Path, count: 
     seek(player, player.seconds)
     assert latest(scene) == {(1, 7): 4.25 + 2 * count - 2}
     assert "1 anchors received, 3 or more needed" in player.timeline.notices[0]
-
-
-def test_next_bad_range_is_found_and_a_step_advances_by_one_range(tmp_path: Path):
-    path = tmp_path / "bad.mcap"
-    with BagWriter(path, {}) as out:
-        for number in range(50):
-            status = Status.BAD_CIR if number in (10, 30) else Status.OK
-            write_corrected(out, record(number).measurement, replace(corrected(number), status=status))
-    player, _ = open_bag(path)
-    player.index(None).join()
-    assert player.timeline is not None
-    for number in (10, 30):
-        assert player.jump(player.timeline.bad_row(player.position_s, is_next=True)) == (1 + number % 2, 7)
-        assert player.position_s == pytest.approx(number * STEP_NS / 1e9, abs=1e-5)
-    assert player.timeline.bad_row(player.position_s, is_next=True) is None
-    assert player.command("previous_bad") == (1, 7)
-    assert player.command("previous_bad") is None
-    assert player.command("next_bad") == (1, 7)
-    player.step()
-    assert player.position_s == pytest.approx(31 * STEP_NS / 1e9)
 
 
 def test_speed_scales_playback_and_the_second_recording_follows(bag: Path, monkeypatch: pytest.MonkeyPatch):

@@ -5,21 +5,25 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_material import STEP_NS, corrected, record, write_corrected
 from bokeh.document import Document
+from browser import drawn_column
 
 from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import Sample
+from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.page import Page
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import AnchorPosition, NodeStatus, Pose, Scene
+from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.state import View
 from uwb_mitigation.viewer.verdict import DEGRADED, GOOD, HeldVerdict, Verdict
 
@@ -40,8 +44,9 @@ def driven(
     clock = Clock()
     scene = Scene(clock)
     scene.stamp_clock = lambda: clock.now_s + 900.0
-    scene.set_anchors({1: AnchorPosition(0, 0, 0), 2: AnchorPosition(8, 0, 0, "door"), 3: AnchorPosition(0, 6, 0),
-                       4: AnchorPosition(8, 6, 0)})  # fmt: skip
+    scene.set_anchors(
+        [Anchor(id_, (x, y, 0.0), name="door" if id_ == 2 else "") for id_, (x, y) in ANCHORS.items()]
+    )
     for _ in range(count):
         clock.now_s += 0.1
         scene.add_pose("tag_7", Pose(4.0, 3.0, 0.0, stamp_s=clock.now_s + 900.0, sd_m=sd_m))
@@ -137,12 +142,13 @@ def test_better_verdict_is_held_back_and_a_seek_is_not():
         ({"residual": 0.27}, health.BAD, health.BAD),
         ({"residual": 0.13}, health.CHECK, health.CHECK),
         ({"stopped": 5.0}, "", health.BAD),
+        ({"displaced": 0.4}, "", health.BAD),
     ],
 )
 def test_state_of_an_anchor_needs_evidence_and_has_hysteresis(
     changes: dict[str, float], before: str, expected: str
 ):
-    means = dict.fromkeys(("nlos", "lost", "not_ok", "residual", "stopped"), 0.0)
+    means = dict.fromkeys(("nlos", "lost", "not_ok", "residual", "stopped", "displaced"), 0.0)
     means |= {"rate": 10.0, "evidence": 100.0}
     assert health.state(means | changes, before) == expected
 
@@ -151,6 +157,8 @@ def test_radio_without_cirs_is_a_normal_state(tmp_path: Path):
     scene, _ = driven(status=Status.NO_CIR)
     page = controls(scene)
     assert page.verdict[0] == "good"
+    assert page.verdict[3].endswith("no range corrected: no CIRs")
+    assert controls(driven(status=Status.BAD_CIR)[0]).verdict[3].endswith("no range corrected")
     assert {row[0] for row in page.health} == {health.GOOD}
     cards = {title: (value, text) for title, value, text in page.cards}
     assert cards["Ranges corrected, since the start"] == ("none", "0 of 120 ranges corrected: no CIRs")
@@ -172,9 +180,8 @@ def test_clock_jump_dead_tag_and_old_stamps_are_reported():
         clock.now_s += 0.1
         for anchor in ANCHORS:
             scene.add_sample((anchor, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
-    assert [text for _, text in scene.events] == ["clock of tag 7: jump by +3600 s"]
     page = controls(scene)
-    assert "clock of tag 7: jump by +3600 s" in page.incidents[0]
+    assert page.incidents == [(None, "0 s ago: clock of tag 7: jump by +3600 s")]
     assert any("tag 7 are 3600.0 s in the future" in line for line in page.notice)
     assert any("tag 9 are 11.7 s old" in line for line in page.notice)
     clock.now_s += 5.0
@@ -182,6 +189,31 @@ def test_clock_jump_dead_tag_and_old_stamps_are_reported():
     page = controls(scene)
     assert "No ranges of tag 9 for 5 s." in page.notice
     assert [row[0] for row in page.tag_rows] == ["tag 7", "tag 9"]
+
+
+@pytest.mark.parametrize(
+    ("silent", "expected"),
+    [
+        ((1, 7), [(20.0, "anchor 1 of tag 7: lost"), (30.0, "anchor 1 of tag 7: back after 10 s")]),
+        ((None, 7), [(20.0, "tag 7: lost"), (30.0, "tag 7: back after 10 s")]),
+    ],
+)
+def test_lost_anchor_and_lost_tag_are_events(silent, expected: list[tuple[float, str]]):
+    incidents = Incidents()
+    for tenth in range(400):
+        # Anchor 4 is slow: it has data between its ranges.
+        for anchor in (1, 2, 3, 4)[: 4 if tenth % 50 == 0 else 3]:
+            for tag in (7, 8):
+                if not (200 < tenth < 300 and tag == silent[1] and silent[0] in (None, anchor)):
+                    incidents.add_range((anchor, tag), tenth / 10, tenth / 10 + 50.0)
+    assert list(incidents.found) == expected
+
+
+def test_jump_of_a_position_is_an_event_and_motion_is_not():
+    incidents = Incidents()
+    for tenth in range(100):
+        incidents.add_position("tag 7", tenth / 10, 0.5 * tenth + (3.0 if tenth >= 60 else 0.0), 0.0)
+    assert list(incidents.found) == [(6.0, "position of tag 7: jump by 3.5 m")]
 
 
 def test_badge_has_the_age_by_reception_and_by_stamp():
@@ -224,11 +256,9 @@ def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     while player.is_behind:
         player.advance()
     assert scene.ranges <= 3001
-    document = shown(scene, player)
-    strip = next(
-        r.data_source for r in document.get_model_by_name("strip").renderers if "raw" in r.data_source.data
-    )
-    assert np.nanmin(strip.data["age"]) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
+    page = shown(scene, player)
+    assert np.nanmin(drawn_column(page, "strip", "age")) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
+    assert np.ptp(drawn_column(page, "history", "age")) == pytest.approx(player.seconds, abs=1.0)
 
 
 def test_late_positions_give_no_residuals():
@@ -247,12 +277,7 @@ def test_history_of_the_selected_anchor_and_errors_with_standard_deviations():
     for sample in scene.pairs[1, 7].samples:
         sample.true_m = 5.0
         scene.count_error(sample)
-    figures = shown(scene)
-
-    def column(figure: str, name: str) -> np.ndarray:
-        sources = [renderer.data_source.data for renderer in figures.get_model_by_name(figure).renderers]
-        return np.array(next(source[name] for source in sources if name in source))
-
+    column = partial(drawn_column, shown(scene))
     assert column("history", "residual") == pytest.approx(0.6)
     assert (column("history", "rate")[-1], column("history", "NLOS")[-1]) == pytest.approx((10.0, 100.0))
     assert column("positions", "bound") == pytest.approx(0.2)

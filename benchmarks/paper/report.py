@@ -23,7 +23,7 @@ from benchmarks.paper.results import (
 )
 from benchmarks.paper.rooms import ROOM_ROWS, has_rooms, parse_configuration
 from benchmarks.paper.tables import Cell, Provenance, ReportTable
-from uwb_mitigation.calibration.html import render_page
+from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.deepuwb import ROOMS
 from uwb_mitigation.training.evaluation.baselines import scikit_learn
@@ -84,7 +84,20 @@ class Report:
         Raises:
             MissingDependencyError: jinja2 is not installed.
         """
-        return render_page("report.html.j2", Path(__file__).parent / "templates", report=self)
+        try:
+            import jinja2
+        except ModuleNotFoundError as error:
+            raise MissingDependencyError(
+                "a report's page needs jinja2", valid="run `make setup-training`"
+            ) from error
+        environment = jinja2.Environment(
+            loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+            autoescape=True,
+            undefined=jinja2.StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        return environment.get_template("report.html.j2").render(report=self) + "\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

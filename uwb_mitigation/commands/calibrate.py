@@ -32,6 +32,7 @@ BASE_FRAME = "base_link"
 """The robot's frame if the poses do not name it."""
 
 
+@options.with_settings("height", "height_sd", "height_topic", "area", "stamp_offset")
 def calibrate(
     bags: Annotated[
         list[Path],
@@ -43,10 +44,8 @@ def calibrate(
     output: Annotated[
         Path, output_option("FILE", "Bundle to write; the offsets are written next to it as X.offsets.yaml.")
     ],
+    settings: TrackSettings,
     anchors: options.AnchorsOption = None,
-    height: options.HeightOption = None,
-    height_sd: options.HeightSdOption = 0.1,
-    area: options.AreaOption = None,
     truth_topic: Annotated[
         str | None,
         typer.Option(
@@ -90,8 +89,6 @@ def calibrate(
             "Without CIRs and ground truth, a line in the received power is used only if it improves this drive.",
         ),
     ] = None,
-    height_topic: options.HeightTopicOption = None,
-    stamp_offset: options.OffsetOption = 0.0,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with the results.")
     ] = None,
@@ -115,8 +112,7 @@ def calibrate(
     from uwb_mitigation.calibration.site import calibrate_site
     from uwb_mitigation.calibration.solution import solve_with_truth, solve_without_truth
     from uwb_mitigation.commands.support.bundles import bundle_for
-    from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.track_settings import TrackSettings
+    from uwb_mitigation.positioning.geometry import parse_lever_arm
     from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
 
     _check_files(output, report, force)
@@ -124,7 +120,6 @@ def calibrate(
         truth_topic, frames, time_offset, parse_lever_arm(lever_arm), estimate_lever_arm
     )
     pose_options.check()
-    settings = TrackSettings(height, height_sd, height_topic, Area.parse(area), stamp_offset_s=stamp_offset)
     if check and truth_topic is not None:
         raise ParameterError("--check with --truth-topic", valid="either of them")
     anchor_map = read_anchors(bags[0], anchors)
@@ -144,7 +139,7 @@ def calibrate(
                     site,
                     height=settings.height,
                     area=settings.area,
-                    height_sd_m=height_sd,
+                    height_sd_m=settings.height_sd_m,
                     on_progress=on_progress,
                 )
             calibration = calibrate_site(
@@ -226,10 +221,11 @@ def _write(
     bundle, offsets_path = calibration.write(output, source, name)
     print_line(f"Wrote {output} (model {bundle.model_id:08x}) and {offsets_path}.")
     if report is not None:
-        from uwb_mitigation.calibration.page import site_page
         from uwb_mitigation.files import write_atomically
 
-        write_atomically(report, site_page(calibration, name, bundle, (str(output), str(offsets_path))))
+        # As a reader of a format: only this option needs the drawing code.
+        page = importlib.import_module("uwb_mitigation.commands.offline.site_page")
+        write_atomically(report, page.site_page(calibration, name, bundle, (str(output), str(offsets_path))))
         print_line(f"Wrote {report}.")
     return {"model_id": bundle.model_id, "offsets_file": offsets_path}
 

@@ -11,8 +11,8 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support import position_options as options
-from uwb_mitigation.commands.support.bundles import ModelOption, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption, check_replaceable, output_option
+from uwb_mitigation.commands.support.bundles import show_models
+from uwb_mitigation.commands.support.checks import check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line, show_table, warn
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 
@@ -52,25 +52,16 @@ BagArgument = Annotated[
 ]
 
 
+@options.with_settings()
 def track(
     bag: BagArgument,
     output: Annotated[Path, output_option("OUT", "OUT.mcap for one file, any other name for a folder.")],
+    settings: TrackSettings,
     anchors: options.AnchorsOption = None,
     tum: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also write the smoothed track in TUM's format, as evo reads it."),
     ] = None,
-    height: options.HeightOption = None,
-    height_sd: options.HeightSdOption = 0.1,
-    height_topic: options.HeightTopicOption = None,
-    area: options.AreaOption = None,
-    odometry: options.OdometryOption = None,
-    imu: options.ImuOption = None,
-    lever_arm: options.LeverArmOption = None,
-    stamp_offset: options.OffsetOption = 0.0,
-    acceleration: options.AccelerationOption = 0.8,
-    model: ModelOption = None,
-    offsets: OffsetsOption = None,
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Also write an HTML page: verdict, map, errors over time."),
@@ -93,23 +84,23 @@ def track(
 
         uwb-mitigation track drive.mcap -o track.mcap --odometry /odom --imu /imu
     """
-    from uwb_mitigation.commands.offline.track import held_out, mitigation, tum_file, write_tracks
+    from uwb_mitigation.commands.offline.track import (
+        displaced_anchor,
+        held_out,
+        mitigation,
+        tum_file,
+        write_tracks,
+    )
     from uwb_mitigation.commands.offline.track import tum as tum_text
     from uwb_mitigation.files import write_atomically
-    from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
     from uwb_mitigation.positioning.recorded_tracks import track_tags
-    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.bag.writer import BagWriter
     from uwb_mitigation.types.anchors import anchors_path, save_anchors
     from uwb_mitigation.types.offsets import NO_OFFSETS
 
-    motion = odometry, imu, parse_lever_arm(lever_arm), stamp_offset, acceleration
-    settings = TrackSettings(
-        height, height_sd, height_topic, Area.parse(area), *motion, model, offsets or NO_OFFSETS
-    )
     corrector = mitigation(settings)
     config, recorded = _read(bag, anchors, settings, corrector)
-    if not corrector.used and (model or offsets):
+    if not corrector.used and (settings.model or settings.offsets is not NO_OFFSETS):
         raise ParameterError("--model or --offsets", where=str(bag), valid="a bag without corrected ranges")
     show_models(corrector.used)
     several = len(recorded.tags) > 1
@@ -136,9 +127,11 @@ def track(
     for tracked in tracks if tum is not None else []:
         write_atomically(tum_files[tracked.recording.tag_id], tum_text(tracked.smoothed))
     if report is not None:
-        from uwb_mitigation.viewer.recorded_report import write_report
+        from uwb_mitigation.viewer.report import write_report
 
-        write_report(report, bag, config, lambda: mitigation(settings), stamp_offset)
+        write_report(
+            report, bag, config, lambda: mitigation(settings), settings.stamp_offset_s, displaced_anchor
+        )
         print_line(f"Wrote {report}.")
     if png is not None:
         from uwb_mitigation.commands.offline.tracks import Tracks
@@ -150,9 +143,11 @@ def track(
     console.write_json(json, _result(tracks, recorded), {"held_out": residuals})
 
 
+@options.with_settings("height", "height_sd", "height_topic", "area", "stamp_offset", "acceleration")
 def survey(
     bag: BagArgument,
     output: Annotated[Path, output_option("FILE", "The anchors file to write.")],
+    settings: TrackSettings,
     anchors: options.AnchorsOption = None,
     off: Annotated[
         float, typer.Option(help="Standard deviation of the guesses in FILE, m in each coordinate.")
@@ -161,12 +156,6 @@ def survey(
         list[str] | None,
         typer.Option("--fixed", metavar="ID", help="An anchor that is where FILE says; may be repeated."),
     ] = None,
-    height: options.HeightOption = None,
-    height_sd: options.HeightSdOption = 0.1,
-    height_topic: options.HeightTopicOption = None,
-    area: options.AreaOption = None,
-    stamp_offset: options.OffsetOption = 0.0,
-    acceleration: options.AccelerationOption = 0.8,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -177,15 +166,11 @@ def survey(
     ranges: they come from the guesses, or from anchors that are `--fixed`.
     """
     from uwb_mitigation.calibration.survey import survey_anchors
-    from uwb_mitigation.positioning.geometry import Area
-    from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.types.anchors import save_anchors
 
     if not 0.0 < off <= 100.0:
         raise ParameterError(f"off = {off}", valid="more than 0, 100 at most")
     check_replaceable([output], force)
-    motion = None, None, None, stamp_offset, acceleration
-    settings = TrackSettings(height, height_sd, height_topic, Area.parse(area), *motion)
     config, recorded = _read(bag, anchors, settings)
     index = config.anchors.index
     ids = {text: row for identity, row in index.items() for text in (str(identity), format_id(identity))}

@@ -7,16 +7,19 @@ import time
 import webbrowser
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support import position_options as options
-from uwb_mitigation.commands.support.bundles import ModelOption, show_models
-from uwb_mitigation.commands.support.checks import OffsetsOption
+from uwb_mitigation.commands.support.bundles import show_models
+
+if TYPE_CHECKING:
+    from uwb_mitigation.positioning.track_settings import TrackSettings
 
 
+@options.with_settings()
 def view(
     bag: Annotated[
         Path,
@@ -25,6 +28,7 @@ def view(
             help="An MCAP bag or rosbag2 folder with ranges (raw or corrected), or the output of `track`.",
         ),
     ],
+    settings: TrackSettings,
     second: Annotated[
         Path | None,
         typer.Argument(
@@ -32,20 +36,9 @@ def view(
         ),
     ] = None,
     anchors: options.AnchorsOption = None,
-    height: options.HeightOption = None,
-    height_sd: options.HeightSdOption = 0.1,
-    height_topic: options.HeightTopicOption = None,
-    area: options.AreaOption = None,
-    odometry: options.OdometryOption = None,
-    imu: options.ImuOption = None,
-    lever_arm: options.LeverArmOption = None,
-    stamp_offset: options.OffsetOption = 0.0,
-    acceleration: options.AccelerationOption = 0.8,
     floor_plan: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Floor plan: the YAML file of a map of map_server.")
     ] = None,
-    model: ModelOption = None,
-    offsets: OffsetsOption = None,
     namespace: Annotated[
         str | None,
         typer.Option(
@@ -77,12 +70,9 @@ def view(
     """
     from threading import Lock
 
-    from uwb_mitigation.commands.offline.track import mitigation, read_config
-    from uwb_mitigation.positioning.geometry import Area, parse_lever_arm
-    from uwb_mitigation.positioning.track_settings import TrackSettings
+    from uwb_mitigation.commands.offline.track import displaced_anchor, mitigation, read_config
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
-    from uwb_mitigation.types.offsets import NO_OFFSETS
     from uwb_mitigation.viewer.feed import SceneUpdater
     from uwb_mitigation.viewer.floor_plan import load_floor_plan
     from uwb_mitigation.viewer.playback import BagPlayer
@@ -90,10 +80,6 @@ def view(
     from uwb_mitigation.viewer.server import ViewerServer
     from uwb_mitigation.viewer.state import View
 
-    motion = odometry, imu, parse_lever_arm(lever_arm), stamp_offset, acceleration
-    settings = TrackSettings(
-        height, height_sd, height_topic, Area.parse(area), *motion, model, offsets or NO_OFFSETS
-    )
     lock = Lock()
     anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
     paths = [bag] if second is None else [bag, second]
@@ -108,7 +94,7 @@ def view(
                 f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
             )
         config = None if anchor_map is None else read_config(path, anchor_map, settings, console.warn)
-        threads.append(player.index(config, stamp_offset))
+        threads.append(player.index(config, settings.stamp_offset_s, displaced_anchor))
         players.append(player)
     first = players[0]
     first.companion = None if second is None else players[1]

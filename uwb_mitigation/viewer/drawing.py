@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Status
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.headline import WHOLE, live_positions, recorded_positions
+from uwb_mitigation.viewer.headline import WHOLE, Positions, live_positions, recorded_positions
 from uwb_mitigation.viewer.histories import (
     HISTORY_S,
     MAX_RANGE_M,
@@ -21,6 +21,7 @@ from uwb_mitigation.viewer.histories import (
     RATE_RANGES,
     WATERFALL,
     History,
+    RangeColumns,
     Sample,
     Trace,
 )
@@ -38,6 +39,9 @@ from uwb_mitigation.viewer.scene import (
     with_gaps,
 )
 from uwb_mitigation.viewer.state import PageState, drawable, no_data, set_rows
+
+if TYPE_CHECKING:
+    from uwb_mitigation.viewer.playback import BagPlayer
 
 MAX_LABEL = 20
 """Maximum number of characters of a name on the map."""
@@ -74,25 +78,26 @@ class Figures:
         self._draw_errors(scene)
         self._draw_history(scene, history)
         self._draw_positions(scene)
-        self._draw_timeline()
 
     def draw_map(self, scene: Scene) -> None:
-        models = self._models
+        models, timeline = self._models, self._view.timeline
         anchors = []
         for identity, anchor in scene.anchors.items():
             state, residual_m = self._state.health.get(identity, (health.UNKNOWN, math.nan))
             name = anchor.name or format_id(identity)
             label = name[:MAX_LABEL] + (f" {state[0]}" if state != health.UNKNOWN else "")
-            if state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
+            if timeline is not None and identity in timeline.displaced:
+                label += " not here"
+            elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"
-            values = anchor.x, anchor.y, name, str(identity), state, label
+            values = *anchor.position[:2], name, str(identity), state, label
             anchors.append(dict(zip(models.anchors.data, values, strict=True)))
         if self._state.changed("anchors", anchors):
             set_rows(models.anchors, anchors)
         place = scene.anchors.get(self._state.selected[0]) if self._state.selected else None
         if self._state.changed("selected", place):
-            set_rows(models.selected, [{"x": place.x, "y": place.y}] if place else [])
+            set_rows(models.selected, [dict(zip("xy", place.position, strict=False))] if place else [])
         tags: list[dict[str, Any]] = []
         plain_id = plain_tag_id(scene.tags, scene.pairs)
         for name, tag in scene.tags.items():
@@ -107,9 +112,6 @@ class Figures:
                     "protection": drawable(pose.protection_m),
                 })  # fmt: skip
         set_rows(models.tags, tags)
-        set_rows(models.ellipses, [row for row in tags if row["width"] > 0.0 and row["height"] > 0.0])
-        set_rows(models.protection, [row for row in tags if row["protection"] > 0.0])
-        set_rows(models.headings, [row for row in tags if math.isfinite(row["heading"])])
         self._draw_tracks(scene)
         self._draw_accuracy(scene, [sample for _, _, sample in scene.latest()])
         fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
@@ -166,7 +168,7 @@ class Figures:
         models, tag = self._models, next(iter(scene.tags.values()), None)
         if not models.layers["accuracy"][0].visible or len(scene.anchors) < 2:
             return
-        anchors = np.array([(place.x, place.y, finite_or_zero(place.z)) for place in scene.anchors.values()])
+        anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
         height_m = finite_or_zero(tag.pose.z if tag and tag.pose else math.nan)
         sds_m = [sample.sigma_m for sample in shown if sample.sigma_m > 0.0]
         sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
@@ -180,7 +182,7 @@ class Figures:
 
     def fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
-        places = [(place.x, place.y) for place in scene.anchors.values()]
+        places = [anchor.position[:2] for anchor in scene.anchors.values()]
         places += [(tag.pose.x, tag.pose.y) for tag in scene.tags.values() if tag.pose is not None]
         timeline = None if self._player is None else self._player.timeline
         tracks = [view.columns() for view in scene.tracks.values()]
@@ -191,7 +193,7 @@ class Figures:
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # A margin for ellipses and labels; without anchors, one in which the tag can move.
-        margin = 0.05 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
+        margin = 0.1 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
         low, high = low - margin, high + margin
         self._models.extent.data = {name: [float(low[i]), float(high[i])] for i, name in enumerate("xy")}
 
@@ -210,66 +212,65 @@ class Figures:
                 or not is_drawable
             ):
                 continue
-            height_m = 0.0 if pose is None else finite_or_zero(pose.z - place.z)
+            x, y, z = place.position
+            height_m = 0.0 if pose is None else finite_or_zero(pose.z - z)
             raw_m, corrected_m = (
                 math.sqrt(max(finite_or_zero(drawable(value)) ** 2 - height_m * height_m, 0.0))
                 for value in (sample.raw_m, sample.range_m)
             )
-            x1, y1 = (place.x, place.y) if pose is None else (pose.x, pose.y)
-            ends = {"x": place.x, "y": place.y, "x1": x1, "y1": y1}
+            x1, y1 = (x, y) if pose is None else (pose.x, pose.y)
+            ends = {"x": x, "y": y, "x1": x1, "y1": y1}
             rows.append(ends | {"raw": raw_m, "corrected": corrected_m, "status": sample.status.name})
             if pose is not None:
-                middle = {"x": (place.x + x1) / 2, "y": (place.y + y1) / 2}
+                middle = {"x": (x + x1) / 2, "y": (y + y1) / 2}
                 symbols.append(middle | {"status": sample.status.name})
         set_rows(self._models.rays, rows)
         set_rows(self._models.statuses, symbols)
 
+    def _ranges(
+        self, player: BagPlayer | None, scene: Scene, begin_s: float = -math.inf, end_s: float = math.inf
+    ) -> RangeColumns:
+        """Return the ranges of the selected pair: in an interval of an indexed recording, else those of the scene."""
+        pair = self._state.selected or (-1, -1)
+        if player is not None and player.timeline is not None:
+            return player.timeline.ranges(pair, begin_s, end_s)
+        return (scene.pairs.get(pair) or History()).columns()
+
     def _draw_strip(self, scene: Scene, history: History | None) -> None:
         # Also draw a pair without new data, because its ranges age.
         now_s = scene.now_s(self._state.tag_id)
-        if not self._state.changed(
-            "strip", (self._state.selected, now_s, scene.ranges, self._view.timeline is None)
-        ):
+        timeline, player, second = self._view.timeline, self._player, self._view.second
+        if not self._state.changed("strip", (self._state.selected, now_s, scene.ranges, timeline is None)):
             return
-        rows = self._strip_rows(scene, history, now_s)
-        count = 0 if history is None else len(history.samples)
-        none = (
-            f"No range of this pair in the last {HISTORY_S:.0f} s." if count else "No range of this pair yet."
+        if timeline is not None and player is not None:
+            now_s = player.shown_s
+        ranges = self._ranges(player, scene, now_s - HISTORY_S, now_s)
+        others = dict[float, float]()
+        if second is not None:
+            compared = self._ranges(second, second.scene)
+            others = dict(zip(compared.stamp_s.round(6).tolist(), compared.corrected_m.tolist(), strict=True))
+        second_m = [others.get(stamp_s, math.nan) for stamp_s in ranges.stamp_s.round(6).tolist()]
+        columns = (
+            ranges.time_s - now_s,
+            ranges.raw_m,
+            ranges.corrected_m,
+            ranges.true_m,
+            second_m,
+            ranges.status,
         )
-        self._models.show_empty("strip", "" if np.isfinite(rows[:, 1]).any() else none)
-        table = with_gaps(_thin(rows, 3 * MAX_POINTS), NO_DATA_S if history is None else history.max_gap_s)
-        names = ("age", "raw", "corrected", "true", "second")
-        self._models.strip.data = dict(zip(names, table[:, :5].T.astype(np.float32), strict=True))
-        faults = rows[np.isin(rows[:, 5], FAULTS)]
-        columns = {
-            "age": faults[:, 0],
-            "corrected": faults[:, 2],
-            "status": [Status(int(one)).name for one in faults[:, 5]],
-        }
-        if len(faults) or len(self._models.bad.data["age"]):
-            self._models.bad.data = columns
-
-    def _strip_rows(self, scene: Scene, history: History | None, now_s: float) -> NDArray[np.float64]:
-        """Return age, raw, corrected, true and second range, and status of the last minute, float64 (n, 6)."""
-        timeline, pair, second = self._view.timeline, self._state.selected, self._view.second
-        if timeline is not None and pair is not None and self._player is not None:
-            end_s = self._player.shown_s
-            rows = timeline.rows_of(pair, end_s - HISTORY_S, end_s)
-            columns = (timeline.raw_m, timeline.corrected_m, timeline.true_m)
-            stamps, values = timeline.stamp_s[rows], [column[rows] for column in columns]
-            statuses = timeline.status[rows].astype(float)
-        else:
-            samples = () if history is None else tuple(history.samples)
-            stamps = np.array([sample.time_s for sample in samples])
-            triples = [(sample.raw_m, sample.range_m, sample.true_m) for sample in samples]
-            values = list(np.array(triples, np.float64).reshape(-1, 3).T)
-            statuses = np.array([float(sample.status) for sample in samples])
-        other = None if second is None or pair is None else second.scene.pairs.get(pair)
-        ranges = {round(sample.time_s, 6): sample.range_m for sample in other.samples} if other else {}
-        compared = np.array([ranges.get(round(stamp_s, 6), math.nan) for stamp_s in stamps.tolist()])
-        table = np.column_stack([stamps - now_s, *values, compared])
+        table = np.column_stack(columns)[ranges.time_s >= now_s - HISTORY_S]
         table[:, 1:][~(np.abs(table[:, 1:]) < MAX_RANGE_M)] = np.nan
-        return np.column_stack([table, statuses])[stamps >= now_s - HISTORY_S]
+        none = "No range of this pair yet."
+        if history is not None and history.samples:
+            none = f"No range of this pair in the last {HISTORY_S:.0f} s."
+        self._models.show_empty("strip", "" if np.isfinite(table[:, 1]).any() else none)
+        bad = table[np.isin(table[:, 5], FAULTS)]
+        if len(bad) or len(self._models.bad.data["age"]):
+            statuses = [Status(int(status)).name for status in bad[:, 5]]
+            self._models.bad.data = {"age": bad[:, 0], "corrected": bad[:, 2], "status": statuses}
+        shown = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S if history is None else history.max_gap_s)
+        names = "age", "raw", "corrected", "true", "second"
+        self._models.strip.data = dict(zip(names, shown[:, :5].T.astype(np.float32), strict=True))
 
     def _draw_trace(self, scene: Scene, traces: tuple[Trace, ...]) -> None:
         models = self._models
@@ -317,53 +318,57 @@ class Figures:
             data[f"{kind}_share"] = 100.0 * np.cumsum(data[kind]) / max(data[kind].sum(), 1.0)
         self._models.errors.data = data
 
-    def _draw_timeline(self) -> None:
-        """Draw the mean errors of the recordings."""
-        models = self._models
-        for player, source in ((self._player, models.timeline), (self._view.second, models.second_timeline)):
-            if player is not None and player.timeline is not None and self._state.changed(source.name, True):
-                columns = player.timeline.mean_errors(player.seconds)
-                columns["second"] = columns["corrected"]
-                source.data = {name: columns[name] for name in source.data}
-
     def _draw_history(self, scene: Scene, history: History | None) -> None:
-        samples = () if history is None else tuple(history.samples)
+        """Draw residual, rate and NLOS share of the selected pair: in the recording, or in the last minute."""
+        is_recorded = self._player is not None
+        is_complete = self._view.timeline is not None and self._view.timeline.is_complete
+        now_s = 0.0 if is_recorded else finite_or_zero(scene.now_s(self._state.tag_id))
         # All of it moves every second.
-        now_s = scene.now_s(self._state.tag_id)
-        if not self._state.changed(
-            "history", (self._state.selected, len(samples), int(finite_or_zero(now_s)))
-        ):
+        if not self._state.changed("history", (self._state.selected, math.floor(now_s), is_complete)):
             return
-        rows = [
-            (sample.time_s - now_s, drawable(sample.residual_m), sample.interval_s, sample.gap_db)
-            for sample in samples
-        ]
-        age_s, residual_m, interval_s, gap_db = np.array(rows, np.float64).reshape(-1, 4).T
-        is_nlos = np.where(np.isfinite(gap_db), gap_db >= LINE_OF_SIGHT_DB, np.nan)
-        rate_hz, nlos = 1.0 / _rolling_mean(interval_s), 100.0 * _rolling_mean(is_nlos)
-        table = _thin(np.column_stack([age_s, residual_m, rate_hz, nlos]), MAX_POINTS)
-        table = with_gaps(table, NO_DATA_S if history is None else history.max_gap_s)
-        none = "No residuals of this pair yet."
-        self._models.fill(
-            "history", self._models.history, table, "" if np.isfinite(table[:, 1]).any() else none
-        )
+        ranges = self._ranges(self._player, scene)
+        residual_m = np.where(np.abs(ranges.residual_m) < MAX_RANGE_M, ranges.residual_m, np.nan)
+        is_nlos = np.where(np.isfinite(ranges.gap_db), ranges.gap_db >= LINE_OF_SIGHT_DB, np.nan)
+        rate_hz, nlos = 1.0 / _rolling_mean(ranges.interval_s), 100.0 * _rolling_mean(is_nlos)
+        table = np.column_stack([ranges.time_s - now_s, residual_m, rate_hz, nlos])
+        message = "" if np.isfinite(residual_m).any() else "No residuals of this pair yet."
+        table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S if history is None else history.max_gap_s)
+        self._models.fill("history", self._models.history, table, message)
+
+    def _positions(self, player: BagPlayer | None, scene: Scene) -> Positions | None:
+        """Return the positions of the selected tag; None: the tracks of the recording are not known yet."""
+        if player is None:
+            return live_positions(scene, self._state.tag_id)
+        timeline = player.timeline
+        is_complete = timeline is not None and timeline.is_complete
+        return recorded_positions(timeline, self._state.tag_id) if timeline and is_complete else None
 
     def _draw_positions(self, scene: Scene) -> None:
-        """Draw the errors of the positions of the selected tag, with two standard deviations."""
-        timeline, tag_id = self._view.timeline, self._state.tag_id
-        is_complete = timeline is not None and timeline.is_complete
-        second = math.floor(scene.clock()) if self._player is None else -1
-        if not self._state.changed("positions", (tag_id, is_complete, second)):
+        """Draw the errors of the positions of the selected tag with and without correction, with two standard deviations."""
+        second_player, models = self._view.second, self._models
+        own = self._positions(self._player, scene)
+        second = None if second_player is None else self._positions(second_player, second_player.scene)
+        second_s = math.floor(scene.clock()) if self._player is None else -1
+        state = self._state.tag_id, own is None, second is None, second_s
+        if not self._state.changed("positions", state):
             return
-        table = np.zeros((0, 3))
-        if timeline is not None and is_complete:
-            table = recorded_positions(timeline, tag_id).error_columns()
-        elif self._player is None:
-            table = live_positions(scene, tag_id).error_columns()
-            table[:, 0] -= table[-1:, 0]
+        table = _error_columns(own, TrackKind.CORRECTED)
+        now_s = table[-1, 0] if self._player is None and len(table) else 0.0
         message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
-        table = with_gaps(_thin(table, 3 * MAX_POINTS), NO_DATA_S)
-        self._models.fill("positions", self._models.positions, table, message)
+        models.fill("positions", models.positions, _shown_errors(table, now_s), message)
+        for kind, positions in ((TrackKind.RAW, own), (TrackKind.SECOND, second)):
+            source = models.compared_positions[kind]
+            columns = _error_columns(positions, TrackKind.CORRECTED if positions is second else kind)
+            time_s, error_m, _ = _shown_errors(columns, now_s).T.astype(np.float32)
+            source.data = {"time": time_s, kind.name.lower(): error_m}
+
+
+def _error_columns(positions: Positions | None, kind: TrackKind) -> NDArray[np.float64]:
+    return np.zeros((0, 3)) if positions is None else positions.error_columns(kind)
+
+
+def _shown_errors(table: NDArray[np.float64], now_s: float) -> NDArray[np.float64]:
+    return with_gaps(_thin(table - (now_s, 0.0, 0.0), 3 * MAX_POINTS), NO_DATA_S)
 
 
 def _waterfall_image(traces: tuple[Trace, ...]) -> np.ndarray[Any, np.dtype[np.uint8]]:

@@ -31,9 +31,7 @@ from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Estimate
 from uwb_mitigation.viewer.histories import BoundedDict, Sample, Trace
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, AnchorPosition, NodeStatus, Pose, Scene
-
-DIAGNOSTICS = "/diagnostics"
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, NodeStatus, Pose, Scene
 
 MAX_TRUTHS, MAX_WITHOUT_TRUTH = 10_000, 1000
 """Truths and CIRs without corrected ranges, and corrected ranges without truths, that are kept."""
@@ -69,7 +67,7 @@ class SceneUpdater:
             topics.POSE_SMOOTHED: partial(self._position, TrackKind.SMOOTHED),
             topics.ODOMETRY_TRUTH: lambda _, m: self._position(TrackKind.TRUE, str(m.child_frame_id), m),
             topics.ANCHORS: lambda _, message: self.markers(message),
-            DIAGNOSTICS: lambda _, message: self._diagnostics(message),
+            topics.DIAGNOSTICS: lambda _, message: self._diagnostics(message),
         }
         self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
         self._gaps_db: BoundedDict[MeasurementKey, float] = BoundedDict(MAX_TRUTHS)
@@ -160,18 +158,14 @@ class SceneUpdater:
 
     def markers(self, message: Any) -> None:
         """Add the anchors of a visualization_msgs/MarkerArray."""
-        anchors = {
-            anchor.id: AnchorPosition(*anchor.position, anchor.name) for anchor in parse_markers(message)
-        }
-        if anchors:
+        if anchors := parse_markers(message):
             with self.lock:
                 self.scene.set_anchors(anchors)
 
     def anchors(self, anchors: AnchorMap) -> None:
         """Set the anchors of an anchors file."""
-        places = {anchor.id: AnchorPosition(*anchor.position, anchor.name) for anchor in anchors.anchors}
         with self.lock:
-            self.scene.set_anchors(places)
+            self.scene.set_anchors(anchors.anchors)
 
     def _diagnostics(self, message: Any) -> None:
         """Add a diagnostic_msgs/DiagnosticArray."""

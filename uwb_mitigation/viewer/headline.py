@@ -161,38 +161,39 @@ class Positions:
         path = _track(true)
         return _track(columns[rows]), TruePath(path.stamp_ns, path.position * (1.0, 1.0, 0.0))
 
-    def errors(self, kind: TrackKind, interval: tuple[float, float], latest: bool = False) -> TrackErrors:
-        """Return the errors of a track in an interval, or of its latest position there."""
+    def errors(self, kind: TrackKind, interval: tuple[float, float]) -> TrackErrors:
+        """Return the errors of a track in an interval."""
         if (columns := self.track(kind)) is None:
             return NO_ERRORS
-        begin, end = np.searchsorted(columns[:, 0], interval, side="right").tolist()
-        compared = self._compared(kind, slice(max(begin, end - 1) if latest else begin, end))
+        compared = self._compared(kind, slice(*np.searchsorted(columns[:, 0], interval, side="right")))
         return NO_ERRORS if compared is None else track_errors(*compared)
 
-    def error_columns(self) -> NDArray[np.float64]:
+    def error_columns(
+        self, kind: TrackKind, interval: tuple[float, float] = (-math.inf, math.inf)
+    ) -> NDArray[np.float64]:
         """Return time (s), horizontal error and two standard deviations (m) of each position, float64 (n, 3); NaN: unknown."""
-        if (columns := self.track(TrackKind.CORRECTED)) is None:
+        if (columns := self.track(kind)) is None:
             return np.zeros((0, 3))
-        error_m = np.full(len(columns), np.nan)
-        if (compared := self._compared(TrackKind.CORRECTED, slice(None))) is not None:
+        rows = slice(*np.searchsorted(columns[:, 0], interval, side="right"))
+        error_m = np.full(len(columns[rows]), np.nan)
+        if (compared := self._compared(kind, rows)) is not None:
             track, truth = compared
             error_m = np.linalg.norm((track.position - truth.position_at(track.stamp_ns))[:, :2], axis=1)
-        return np.column_stack([columns[:, 0], error_m, 2.0 * columns[:, 4]])
+        return np.column_stack([columns[rows, 0], error_m, 2.0 * columns[rows, 4]])
 
     def current_card(self, position_s: float) -> list[Card]:
         """Return the figure of the latest position."""
-        track = self.track(TrackKind.CORRECTED)
-        if track is None:
+        if self.track(TrackKind.CORRECTED) is None:
             return [["Position", "-", f"no positions of {self.label}"]] if self._names else []
-        interval = position_s - NOW_S, position_s
-        latest = track[slice(*np.searchsorted(track[:, 0], interval, side="right"))]
-        place = f"{self.label}, horizontal"
-        if not len(latest):
-            place = f"no position of {self.label} in the last {NOW_S:.0f} s"
+        latest = self.error_columns(TrackKind.CORRECTED, (position_s - NOW_S, position_s))[-1:]
+        place = (
+            f"{self.label}, horizontal"
+            if len(latest)
+            else f"no position of {self.label} in the last {NOW_S:.0f} s"
+        )
         if self.track(TrackKind.TRUE) is None:
-            return [["Reported standard deviation, now", _metres(latest[-1:, 4]), place]]
-        error_m = self.errors(TrackKind.CORRECTED, interval, latest=True).rmse
-        return [["Position error, now", _metres(error_m), place]]
+            return [["Reported standard deviation, now", _metres(latest[:, 2] / 2.0), place]]
+        return [["Position error, now", _metres(latest[:, 1]), place]]
 
     def interval_cards(self, interval: tuple[float, float], window: str, raw_name: str) -> list[Card]:
         """Return the figures of the positions in an interval.
@@ -235,8 +236,8 @@ def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str] 
     if not corrected_m + raw_m > 0.0:
         return None
     change_percent = 100.0 * (corrected_m / raw_m - 1.0)
-    text = "no change" if abs(change_percent) < 0.5 else f"position error {change_percent:+.0f} %"
-    return text, f"RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
+    text = "no change" if abs(change_percent) < 0.5 else f"{change_percent:+.0f} %"
+    return text, f"position RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
 
 
 def _metres(values_m: Any, statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
+from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.viewer.histories import Pair
 
 LONG_M, VERY_LONG_M = 0.15, 0.3
@@ -34,7 +35,8 @@ STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
 
 Means = Mapping[str, float]
 """Means of a pair or an anchor: `rate` (Hz); `nlos`, `lost`, `not_ok` (%); `residual`, corrected range minus distance to
-the estimated position (m); `evidence`, number of residuals; `stopped`, age of the last range if it is not recent, else 0 (s). NaN: unknown."""
+the estimated position (m); `evidence`, number of residuals; `stopped`, age of the last range if it is not recent, else 0 (s);
+`displaced`, held-out residual (m) of an anchor whose ranges fit another position, else 0. NaN: unknown."""
 
 
 def state(means: Means, before: str = "") -> str:
@@ -45,7 +47,8 @@ def state(means: Means, before: str = "") -> str:
         for limit_m, states in ((VERY_LONG_M, (BAD,)), (LONG_M, (BAD, CHECK)))
     )
     # Without line of sight, ranges may be long although anchor and offset are right.
-    if means["stopped"] > 0.0 or (residual_m > bad_m and not means["nlos"] > NLOS):
+    is_long = residual_m > bad_m and not means["nlos"] > NLOS
+    if means["stopped"] > 0.0 or means["displaced"] > 0.0 or is_long:
         return BAD
     is_suspicious = means["lost"] > LOST or means["not_ok"] > NOT_OK or means["nlos"] > NLOS
     if is_suspicious or residual_m > check_m:
@@ -77,7 +80,8 @@ def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple
 
     If all anchors are wrong in the same way, the cause is probably not in each of them.
     """
-    common = _common_advice(list(anchors.values())) if len(anchors) > 1 else ""
+    is_common = len(anchors) > 1 and not any(means["displaced"] for means in anchors.values())
+    common = _common_advice(list(anchors.values())) if is_common else ""
     return common, {
         anchor_id: ""
         if common
@@ -108,6 +112,11 @@ def _anchor_advice(name: str, means: Means) -> str:
     reads = f"{name} reads {abs(residual_m):.2f} m {'long' if residual_m > 0.0 else 'short'}"
     if means["stopped"] > 0.0:
         return f"{name} has not answered for {means['stopped']:.0f} s: check its power and PAN id."
+    if means["displaced"] > 0.0:
+        return (
+            f"{name} is not where the anchors file says: its ranges differ by {means['displaced']:.2f} m from the track of the "
+            "others, and fit another position. Measure it again."
+        )
     if abs(residual_m) > LONG_M and means["nlos"] > NLOS:
         return f"{reads}, with {means['nlos']:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."
     if abs(residual_m) > LONG_M:
@@ -136,16 +145,10 @@ def predicted_accuracy(
         sd_m: standard deviation of a range, m.
 
     Returns:
-        The values, m, float32 (CELLS, CELLS), NaN where undetermined; lower left corner and size, float64 (2,), m.
+        The values, m, float32 (CELLS, CELLS), infinite where undetermined; lower left corner and size, float64 (2,), m.
     """
     margin_m = 1.0 + 0.1 * np.ptp(anchors[:, :2], axis=0)
     low, size = anchors[:, :2].min(axis=0) - margin_m, np.ptp(anchors[:, :2], axis=0) + 2.0 * margin_m
-    centres = (np.arange(CELLS) + 0.5) / CELLS
-    x, y = np.meshgrid(low[0] + centres * size[0], low[1] + centres * size[1])
-    delta = np.stack([x, y, np.full_like(x, height_m)], axis=-1)[:, :, None, :] - anchors
-    slope = (delta / np.maximum(np.linalg.norm(delta, axis=-1, keepdims=True), 0.05))[..., :2]
-    normal = np.einsum("xymi,xymj->xyij", slope, slope)
-    determinant = normal[..., 0, 0] * normal[..., 1, 1] - normal[..., 0, 1] ** 2
-    trace = normal[..., 0, 0] + normal[..., 1, 1]
-    predicted_m = sd_m * np.sqrt(trace / np.where(determinant > 1e-6, determinant, np.nan))
-    return predicted_m.astype(np.float32), low, size
+    x, y = low[:, None] + (np.arange(CELLS) + 0.5) / CELLS * size[:, None]
+    image = [[dop(anchors, np.array([at_x, at_y, height_m]), level=True).hdop for at_x in x] for at_y in y]
+    return (sd_m * np.array(image)).astype(np.float32), low, size

@@ -7,7 +7,8 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any, TypeVar
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,20 @@ class BoundedDict(OrderedDict[K, V]):
         return value
 
 
+class RangeColumns(NamedTuple):
+    """Ranges of one pair, each float64 (n,); NaN: unknown. See `Sample`; `time_s` is on the clock of the figures."""
+
+    time_s: NDArray[np.float64]
+    stamp_s: NDArray[np.float64]
+    raw_m: NDArray[np.float64]
+    corrected_m: NDArray[np.float64]
+    true_m: NDArray[np.float64]
+    residual_m: NDArray[np.float64]
+    interval_s: NDArray[np.float64]
+    gap_db: NDArray[np.float64]
+    status: NDArray[np.float64]
+
+
 @dataclass(slots=True)
 class Sample:
     """One corrected range of a pair; its truth may arrive later.
@@ -79,6 +94,11 @@ class Sample:
         if truth is not None:
             sample.true_m = truth.range_m
         return sample
+
+
+_VALUES = attrgetter(
+    "time_s", "time_s", "raw_m", "range_m", "true_m", "residual_m", "interval_s", "gap_db", "status"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +164,11 @@ class History:
         self.received += 1
         while self.samples[0].time_s < now_s - HISTORY_S:
             self.samples.popleft()
+
+    def columns(self) -> RangeColumns:
+        """Return the ranges; their times are the stamps."""
+        rows = np.array(list(map(_VALUES, self.samples)), np.float64).reshape(-1, len(RangeColumns._fields))
+        return RangeColumns(*rows.T)
 
     def count_lost(self, sequence: int) -> None:
         """Count missing ranges. Anchors are polled in turn, so the usual step is the median of the latest steps."""

@@ -33,7 +33,6 @@ from bokeh.transform import factor_mark
 from numpy.typing import NDArray
 
 from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.headline import WHOLE
 from uwb_mitigation.viewer.health import BAD, CHECK, GOOD, STATES, STEPS_M, UNKNOWN
 from uwb_mitigation.viewer.histories import HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
 from uwb_mitigation.viewer.palette import (
@@ -74,16 +73,14 @@ COLUMNS = {
     "rx": ("RX, dBm", _CIRS, "mean receive level"),
     "fp": ("FP, dBm", _CIRS, "mean level of the first path"),
     "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
-    "lost": ("lost, %", WHOLE, "share of missing sequence numbers"),
+    "lost": ("lost, %", "all ranges", "share of missing sequence numbers"),
 }
-"""Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}; live, the interval `WHOLE` is
-`LIVE`."""
+"""Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
 FIGURES = {
     "map": "Map",
     "strip": f"Range, last {HISTORY_S:.0f} s",
-    "history": f"Residual, rate and NLOS share, last {HISTORY_S:.0f} s",
-    "timeline": f"Range error over time, {WHOLE}",
+    "history": "Residual, rate and NLOS share",
     "positions": "Position error over time",
     "cir": "Last CIR",
     "waterfall": f"Last {WATERFALL} CIRs",
@@ -100,6 +97,9 @@ _STROKES = {
     TrackKind.TRUE: (2.0, "dashed"),
 }
 """Width and dashes of the lines of each kind, in drawing order."""
+
+_SIZES = {"95 % ellipse": "width", "protection level": "protection", "heading": "heading"}
+"""Columns that are NaN if a tag has none."""
 
 _LIVE = TrackKind.RAW, TrackKind.CORRECTED, TrackKind.SECOND
 
@@ -177,12 +177,12 @@ class Models:
         self.pairs = _source("pairs", "anchor", "tag", "no_data", *COLUMNS)
         self.anchors = _source("anchors", "x", "y", "name", "id", "health", "label")
         self.selected = _source("", "x", "y")
-        self.tags = _source("tags", "x", "y", "name", "status", "label_y")
+        # Glyphs with NaN are not drawn: without a heading, for example.
+        self.tags = _source(
+            "tags", "x", "y", "name", "status", "label_y", "width", "height", "angle", "heading", "protection"
+        )
         # The script of the page fills it with the names that do not cover each other.
-        self.labels = _source("", "x", "y", "text", "offset")
-        self.headings = _source("headings", "x", "y", "heading")
-        self.ellipses = _source("ellipses", "x", "y", "width", "height", "angle", "status")
-        self.protection = _source("protection levels", "x", "y", "protection")
+        self.labels = _source("", "x", "y", "text", "offset", "shift")
         self.tracks = {kind: [_source(kind.value, "x", "y") for _ in FADING] for kind in _STROKES}
         self.accuracy = _source("predicted accuracy", "image", "x", "y", "dw", "dh")
         self.heat = _source("heat map", "x", "y", "mean")
@@ -199,8 +199,10 @@ class Models:
         self.errors = _source("histogram", "left", "right", *kinds, *(f"{kind}_share" for kind in kinds))
         self.history = _source("residuals", "age", "residual", "rate", "NLOS")
         self.positions = _source("position errors", "time", "error", "bound")
-        self.timeline = _source("mean errors", "time", "raw", "corrected")
-        self.second_timeline = _source("mean errors of the second recording", "time", "second")
+        self.compared_positions = {
+            kind: _source(f"position errors, {kind.value}", "time", kind.name.lower())
+            for kind in (TrackKind.RAW, TrackKind.SECOND)
+        }
         self.position = _source("", "time")
         # A figure without data has no axis ranges: invisible corners define them until data arrives.
         self.corners = {
@@ -209,12 +211,13 @@ class Models:
         }
         self.layers: dict[str, list[Any]] = {}
         self.figures = {
-            "map": self._map(plan), "strip": self._strip(), "history": self._history(), "cir": self._cir(),
+            "map": self._map(plan), "strip": self._strip(), "history": self._history(seconds), "cir": self._cir(),
             "waterfall": self._waterfall(), "errors": self._errors(), "distribution": self._distribution(),
-            "positions": self._positions(seconds is not None),
+            "positions": self._positions(seconds),
         }  # fmt: skip
         if seconds is not None:
-            self.figures["timeline"] = self._timeline(seconds)
+            for name in ("history", "positions"):
+                self.figures[name].vspan("time", source=self.position, line_color=NIGHT, line_width=2)
         for name, plot in self.figures.items():
             plot.name = name
         for name, corners in self.corners.items():
@@ -245,15 +248,14 @@ class Models:
 
     def update_legend(self) -> None:
         """Show the entries of the map's legend that the map contains."""
-        for item in self._legend.items:
-            shown = any(
-                renderer.visible and len(renderer.data_source.data["x"]) for renderer in item.renderers
-            )
+        for name, item in self._legend.items():
+            columns = [r.data_source.data[_SIZES.get(name, "x")] for r in item.renderers if r.visible]
+            shown = any(len(column) and not (name in _SIZES and np.isnan(column).all()) for column in columns)
             if item.visible != shown:
                 item.visible = shown
 
     def _map(self, plan: MapImage | None) -> figure:
-        plot = _figure(MAP_HEIGHT, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
+        plot = new_figure(MAP_HEIGHT, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
@@ -291,9 +293,9 @@ class Models:
         self.layers["circles"] = items["raw range"] + items["corrected range"]
         self.layers["heat"] = [*items["mean correction"], bars[0]]
         legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
-        self._legend = Legend(items=[LegendItem(label=legend[name], renderers=items[name]) for name in items])
-        plot.add_layout(self._legend, "below")
-        return _finished(plot)
+        self._legend = {name: LegendItem(label=legend[name], renderers=items[name]) for name in items}
+        plot.add_layout(Legend(items=list(self._legend.values())), "below")
+        return finished(plot)
 
     def _map_layers(self, has_plan: bool) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
         """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
@@ -304,7 +306,7 @@ class Models:
         on_request: dict[str, Any] = {"fill_color": None, "visible": False}
         label = {
             "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
-            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset",
+            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset", "x_offset": "shift",
         }  # fmt: skip
         return [
             ("wall", "scatter", walls, {"marker": "square", "size": 12, "color": GREY}),
@@ -321,17 +323,14 @@ class Models:
                 (kind.value, "line", source, _stroke(kind) | {"line_alpha": alpha})
                 for kind, sources in self.tracks.items() for source, alpha in zip(sources, FADING, strict=True)
             ),
-            ("95 % ellipse", "ellipse", self.ellipses, {
+            ("95 % ellipse", "ellipse", self.tags, {
                 "width": "width", "height": "height", "angle": "angle", "color": BLUE, "fill_alpha": 0.25,
             }),
-            ("protection level", "circle", self.protection, {
+            ("protection level", "circle", self.tags, {
                 "radius": "protection", "fill_color": None, "line_color": NIGHT, "line_dash": "dotted",
             }),
-            ("heading", "ray", self.headings, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
+            ("heading", "ray", self.tags, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
             ("status", "scatter", self.statuses, self._symbols | {"size": 10, "line_width": 2}),
-            ("tag", "scatter", self.tags, {
-                "marker": "star", "size": 13, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
-            }),
             ("anchor", "scatter", self.anchors, {
                 "marker": factor_mark("health", [marker for marker, _ in HEALTH_LOOKS.values()], list(HEALTH_LOOKS)),
                 "size": 15, "line_color": NIGHT, "fill_color": {"field": "health", "transform": anchor},
@@ -339,17 +338,20 @@ class Models:
             ("selected anchor", "scatter", self.selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
             }),
+            ("tag", "scatter", self.tags, {
+                "marker": "star", "size": 18, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,
+            }),
             ("", "text", self.labels, label),
         ]  # fmt: skip
 
     def _strip(self) -> figure:
-        plot = _figure(230, _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
+        plot = new_figure(230, _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
         names = self._lines(plot, self.strip, "age", *self._kinds, TrackKind.TRUE)
         plot.scatter("age", "corrected", source=self.bad, size=8, legend_field="status", **self._symbols)
-        return _finished(plot, "age", *names)
+        return finished(plot, "age", *names)
 
-    def _history(self) -> figure:
-        plot = _figure(230, _AGE, "residual, m", x_range=Range1d(-HISTORY_S, 0))
+    def _history(self, seconds: float | None) -> figure:
+        plot = _time_figure(seconds, "residual, m")
         plot.extra_y_ranges = {"share": Range1d(0, 100)}
         plot.add_layout(LinearAxis(y_range_name="share", axis_label="rate, Hz; NLOS, %"), "right")
         for name, colour, dash, axis in (
@@ -357,23 +359,19 @@ class Models:
         ):  # fmt: skip
             style = {"line_color": colour, "line_dash": dash, "line_width": 2, "y_range_name": axis}
             plot.line("age", name, source=self.history, legend_label=name, **style)
-        return _finished(plot, "age", "residual", "rate", "NLOS")
+        return finished(plot, "age", "residual", "rate", "NLOS")
 
-    def _positions(self, is_recording: bool) -> figure:
-        plot = _figure(230, _TIME if is_recording else _AGE, "m")
+    def _positions(self, seconds: float | None) -> figure:
+        plot = _time_figure(seconds, "m")
         style = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
         plot.varea("time", 0, "bound", source=self.positions, **style)
-        style = {"line_color": NIGHT, "line_width": 1.5, "legend_label": "error"}
-        plot.line("time", "error", source=self.positions, **style)
-        return _finished(plot, "time", "error", "bound")
-
-    def _timeline(self, seconds: float) -> figure:
-        plot = _figure(230, _TIME, "mean |error|, m", x_range=Range1d(0.0, max(seconds, 0.1)))
-        plot.y_range = DataRange1d(start=0.0)
-        names = self._lines(plot, self.timeline, "time", *_LIVE[:2])
-        self._lines(plot, self.second_timeline, "time", *self._kinds[2:])
-        plot.vspan("time", source=self.position, line_color=NIGHT, line_width=2)
-        return _finished(plot, "time", *names)
+        plot.line(
+            "time", "error", source=self.positions, legend_label="corrected", **_stroke(TrackKind.CORRECTED)
+        )
+        for kind in self._kinds:
+            if kind in self.compared_positions:
+                self._lines(plot, self.compared_positions[kind], "time", kind)
+        return finished(plot, "time", "error", "bound")
 
     def _lines(
         self, plot: figure, source: ColumnDataSource, x: str, *kinds: TrackKind, suffix: str = ""
@@ -385,17 +383,19 @@ class Models:
         return names
 
     def _cir(self) -> figure:
-        plot = _figure(230, _SAMPLES, "magnitude", x_range=_trace_range())
+        plot = new_figure(230, _SAMPLES, "magnitude", x_range=_trace_range())
         style = {"fill_color": GREEN, "fill_alpha": 0.15, "line_color": None, "legend_label": "network input"}
         plot.vstrip("from", "to", source=self.marks, **style)
         style = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
         plot.line("sample", "magnitude", source=self.trace, **style)
         plot.vspan("first", source=self.marks, line_color=VERMILLION, line_width=2, legend_label="first path")
         plot.hspan("noise", source=self.marks, line_color=GREY, line_dash="dashed", legend_label="noise")
-        return _finished(plot, "sample", "magnitude")
+        return finished(plot, "sample", "magnitude")
 
     def _waterfall(self) -> figure:
-        plot = _figure(230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0))
+        plot = new_figure(
+            230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0)
+        )
         levels = LinearColorMapper("Cividis256", low=0, high=255)
         # Anchor the image at its first row, the newest, because the axis points down.
         plot.image(
@@ -410,7 +410,7 @@ class Models:
         return plot
 
     def _errors(self) -> figure:
-        plot = _figure(230, "measured - true, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
+        plot = new_figure(230, "range error, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
         low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
         plot.xaxis.ticker = FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
         plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
@@ -420,13 +420,13 @@ class Models:
                 left="left", right="right", bottom=0, top=kind.name.lower(), source=self.errors, color=colour, fill_alpha=0.35,
                 hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
             )  # fmt: skip
-        return _finished(plot, "left", "right", *(kind.name.lower() for kind in self._kinds))
+        return finished(plot, "left", "right", *(kind.name.lower() for kind in self._kinds))
 
     def _distribution(self) -> figure:
-        plot = _figure(230, "measured - true, m", "share of ranges, %", y_range=Range1d(0, 100))
+        plot = new_figure(230, "range error, m", "share of ranges, %", y_range=Range1d(0, 100))
         plot.x_range = Range1d(float(ERROR_EDGES_M[0]), float(ERROR_EDGES_M[-1]))
         names = self._lines(plot, self.errors, "right", *self._kinds, suffix="_share")
-        return _finished(plot, "right", *names)
+        return finished(plot, "right", *names)
 
 
 _SAMPLES, _AGE = "samples (1 ns) from the first path", "time before now, s"
@@ -441,14 +441,22 @@ def _source(title: str, *columns: str) -> ColumnDataSource:
     return ColumnDataSource({column: [] for column in columns}, name=title or None)
 
 
-def _figure(
+def new_figure(
     height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset", **options: Any
 ) -> figure:
+    """Return an empty figure with the style of the page."""
     plot = figure(
         height=height, min_width=200, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, tools=tools, **options
     )  # fmt: skip
     plot.toolbar.update(logo=None, autohide=True)
     return plot
+
+
+def _time_figure(seconds: float | None, y: str) -> figure:
+    """Return a figure of the whole recording, or of the last minute of live topics."""
+    if seconds is None:
+        return new_figure(230, _AGE, y, x_range=Range1d(-HISTORY_S, 0))
+    return new_figure(230, _TIME, y, x_range=Range1d(0.0, max(seconds, 0.1)))
 
 
 def _stroke(kind: TrackKind) -> dict[str, Any]:
@@ -461,7 +469,7 @@ def _colour_bar(mapper: LinearColorMapper, **options: Any) -> ColorBar:
     return ColorBar(color_mapper=mapper, width=10, padding=4, **colours, **options)
 
 
-def _finished(plot: figure, *columns: str) -> figure:
+def finished(plot: figure, *columns: str) -> figure:
     """Put the legend next to the plot, where it covers no data; show values of columns next to the pointer."""
     if columns:
         tips = [(name.replace("_", " "), f"@{name}{{0.000}}") for name in columns]
@@ -472,6 +480,6 @@ def _finished(plot: figure, *columns: str) -> figure:
             plot.add_layout(legend, "above")
         legend.update(
             orientation="horizontal", label_text_font_size="11px", padding=0, margin=0, spacing=8, location="left",
-            border_line_color=None,
+            border_line_color=None, glyph_height=14, label_height=14,
         )  # fmt: skip
     return plot

@@ -16,7 +16,7 @@ from bokeh.events import Reset
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.drawing import Figures
-from uwb_mitigation.viewer.headline import LIVE, RECENT, WHOLE
+from uwb_mitigation.viewer.headline import RECENT, WHOLE
 from uwb_mitigation.viewer.histories import Pair
 from uwb_mitigation.viewer.models import COLUMNS, FIGURES, Models
 from uwb_mitigation.viewer.palette import STATUS_LOOKS
@@ -64,11 +64,7 @@ class Page:
             for model in models.roots:
                 document.add_root(model)
         document.title = view.title
-        columns = {
-            name: (title, LIVE if interval == WHOLE and player is None else interval, description)
-            for name, (title, interval, description) in COLUMNS.items()
-            if name != "second" or compares
-        }
+        columns = {name: column for name, column in COLUMNS.items() if name != "second" or compares}
         document.template = TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
             page_title=view.title,
@@ -80,7 +76,7 @@ class Page:
                 for interval, names in groupby(columns, key=lambda name: columns[name][1])
             ],
             states=health.STATES,
-            figures={name: FIGURES[name] for name in FIGURES if name in models.figures},
+            figures=FIGURES,
             looks=STATUS_LOOKS,
             speeds=player and player.SPEEDS,
             trails={
@@ -180,12 +176,13 @@ class Page:
         )  # fmt: skip
         if self._state.changed("position", position_s):
             models.position.data = {"time": [position_s]}
-        if (timeline := player.timeline) is not None and self._state.changed("marks", True):
+        if (timeline := player.timeline) is not None and self._state.changed("marks", timeline.is_complete):
             relative = timeline.log_s / max(player.seconds, 1e-9)
             largest = timeline.largest_error()
             self._state.set(
                 marks={
                     "bad": np.unique(relative[timeline.bad].round(3)).tolist(),
+                    "incidents": [time_s / max(player.seconds, 1e-9) for time_s, _ in timeline.incidents],
                     "count": int(timeline.bad.sum()),
                     "largest": None if largest is None else float(relative[largest]),
                     "truth": bool(np.isfinite(timeline.true_m).any()),

@@ -10,7 +10,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.mitigation.model.choice import Choice
 from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
@@ -40,8 +41,13 @@ MAX_STEP_S = 1.0
 MAX_MESSAGES = 3000
 """Read at a seek; older ones are skipped."""
 
+MAX_CHECKED = 50_000
+"""A check of the anchors tracks once without each of them: a minute for this number of ranges."""
+
 POSE_PERIOD_S = 0.1
 """Recorded time between two positions of a tag."""
+
+Check = Callable[[Sequence[TagTracks], EstimatorConfig], dict[int, float]]
 
 
 class BagPlayer:
@@ -110,8 +116,16 @@ class BagPlayer:
         """The position that the scene shows: while playing, that of the last message that was read."""
         return min(self._clock_s, self.position_s) if self.playing and self.is_behind else self.position_s
 
-    def index(self, config: EstimatorConfig | None, stamp_offset_s: float = 0.0) -> threading.Thread:
-        """Index the recording in a thread, which is returned; for the arguments see `index_recording`."""
+    def index(
+        self, config: EstimatorConfig | None, stamp_offset_s: float = 0.0, check: Check | None = None
+    ) -> threading.Thread:
+        """Index the recording in a thread, which is returned.
+
+        Args:
+            config: see `index_recording`.
+            stamp_offset_s: see `index_recording`.
+            check: returns `Timeline.displaced` for estimated tracks.
+        """
 
         def run() -> None:
             recording = Recording(self._recording.path, self._recording.prefix)
@@ -125,6 +139,16 @@ class BagPlayer:
             with self._feed.lock:
                 self._feed.scene.heat = timeline.heat
                 self._feed.scene.is_indexed = True
+                self._feed.scene.revision += 1
+            if check is None or config is None or not timeline.estimates:
+                return
+            if len(timeline.log_s) > MAX_CHECKED:
+                timeline.notices.append(
+                    f"The positions of anchors are checked in recordings of up to {MAX_CHECKED} ranges: run `track`."
+                )
+            else:
+                timeline.displaced = check(list(timeline.estimates.values()), config)
+            with self._feed.lock:
                 self._feed.scene.revision += 1
 
         self._stamp_offset_s = stamp_offset_s

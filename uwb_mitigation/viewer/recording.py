@@ -10,25 +10,12 @@ from typing import Any, NamedTuple
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.types.ros import schemas, topics
-from uwb_mitigation.viewer.feed import DECODERS, DIAGNOSTICS
+from uwb_mitigation.viewer.feed import DECODERS
 from uwb_mitigation.viewer.scene import DEFAULT_TAG
 
 POSITIONS = frozenset({topics.POSE, topics.ODOMETRY, topics.POSE_SMOOTHED})
 RANGES = frozenset({topics.RANGE_RAW, topics.RANGE_CORRECTED})
 
-_RANGE_TYPES = {
-    topics.RANGE_RAW: topics.RANGE_CIR_TYPE,
-    topics.RANGE_TRUTH: topics.RANGE_TRUTH_TYPE,
-    topics.RANGE_CORRECTED: topics.RANGE_CORRECTED_TYPE,
-}
-_TYPES = _RANGE_TYPES | {
-    topics.POSE: topics.POSE_TYPE,
-    topics.ODOMETRY: topics.ODOMETRY_TYPE,
-    topics.POSE_SMOOTHED: topics.POSE_TYPE,
-    topics.ODOMETRY_TRUTH: topics.ODOMETRY_TYPE,
-    topics.ANCHORS: topics.MARKERS_TYPE,
-    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
-}
 _POSITION_TOPIC = re.compile(r"(.*)/uwb/(?:(tag_(?:\d+|0x[0-9a-f]+))/)?(pose|odometry|pose_smoothed)")
 
 
@@ -70,15 +57,17 @@ class Recording:
         types, bounds = self._bag.topics, self._bag.bounds_ns
         self.prefix = prefix = _namespace(path, types) if namespace is None else namespace.rstrip("/")
         for channel in self._bag.channels:
-            if kind := _RANGE_TYPES.get(channel.topic.removeprefix(prefix)):
-                check_channel(channel, kind, path)
+            if (plain := channel.topic.removeprefix(prefix)) in DECODERS:
+                check_channel(channel, topics.TYPES[plain], path)
         self._topics: dict[str, tuple[str, str]] = {}
         for topic, kind in types.items():
             plain, tag = topic.removeprefix(prefix), DEFAULT_TAG
             if match := _POSITION_TOPIC.fullmatch(topic):
                 plain, tag = f"/uwb/{match[3]}", match[2] or DEFAULT_TAG
-            is_selected = match[1] == prefix if match else topic in (prefix + plain, DIAGNOSTICS)
-            if is_selected and kind.replace("/msg/", "/") == _TYPES.get(plain, "").replace("/msg/", "/"):
+            is_selected = match[1] == prefix if match else topic in (prefix + plain, topics.DIAGNOSTICS)
+            if is_selected and kind.replace("/msg/", "/") == topics.TYPES.get(plain, "").replace(
+                "/msg/", "/"
+            ):
                 self._topics[topic] = plain, tag
         if topics.POSE in self.contents:
             # Tracks (the output of `track`) are used only if there are no poses.
@@ -114,7 +103,7 @@ def _decode(topic: str, data: bytes) -> Any:
     try:
         if topic in DECODERS:
             return DECODERS[topic](data)
-        return schemas.typestore().deserialize_cdr(data, _TYPES[topic])
+        return schemas.typestore().deserialize_cdr(data, topics.TYPES[topic])
     except Exception:  # rosbags raises various types.
         return None
 

@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from threading import Lock
+from typing import Any
 
+import numpy as np
 from bokeh.embed import file_html
+from bokeh.models import ColumnDataSource, FactorRange, Line
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 
+from uwb_mitigation.files import write_atomically
+from uwb_mitigation.mitigation.correction import Corrector
+from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.viewer.drawing import Figures
-from uwb_mitigation.viewer.models import Models
+from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.models import FIGURES, Models, finished, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
+from uwb_mitigation.viewer.palette import TRACK_COLOURS, TrackKind
+from uwb_mitigation.viewer.playback import BagPlayer, Check
+from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import PageState, View
 from uwb_mitigation.viewer.texts import Texts
+
+SHOWN = "map", "positions", "errors", "distribution"
+"""Figures of the report of a recording."""
+
+_BOX = "low", "begin", "middle", "end", "high"
 
 Rows = Sequence[Sequence[object]]
 """Rows of a table; the first one has the titles."""
@@ -42,8 +59,78 @@ def draw_scene(view: View) -> Models:
     Figures(state).draw(view.scene)
     # On the page, its script selects the labels.
     anchors, tags = models.anchors.data, models.tags.data
-    labels = [(*row, -13) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
-    labels += [(*row, -4) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
-    columns = zip(*labels, strict=True) if labels else ((),) * 4
+    labels = [(*row, -13, 0) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
+    labels += [(*row, -4, 0) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
+    columns = zip(*labels, strict=True) if labels else ((),) * 5
     models.labels.data = dict(zip(models.labels.data, columns, strict=True))
+    for line in (r.glyph for r in models.figures["map"].renderers if isinstance(r.glyph, Line)):
+        line.line_alpha = 0.8
     return models
+
+
+def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Iterable[float]]]) -> figure:
+    """Return a figure with a box for each row and kind.
+
+    Args:
+        name: of the figure.
+        axis: title of the horizontal axis.
+        rows: {kind: {row: ends of the lower line and of the box, middle, ends of the box and of the upper line}}.
+    """
+    names = list(next(iter(rows.values())))
+    plot = new_figure(
+        90 + 20 * len(rows) * len(names), axis, "", y_range=FactorRange(*reversed(names)), name=name
+    )
+    for number, (kind, boxes) in enumerate(rows.items()):
+        columns = np.array([list(box) for box in boxes.values()]).reshape(-1, len(_BOX))
+        # Of each row, the first kind is the upper one.
+        places = [(row, (0.5 * (len(rows) - 1) - number) / len(rows)) for row in boxes]
+        source = ColumnDataSource(dict(zip(_BOX, columns.T, strict=True)) | {"row": places})
+        style = {"source": source, "color": TRACK_COLOURS[kind], "legend_label": kind.value}
+        plot.segment("low", "row", "high", "row", **style)
+        plot.hbar("row", right="end", left="begin", height=0.35, fill_alpha=0.35, **style)
+        plot.scatter("middle", "row", marker="dash", angle=math.pi / 2, size=14, line_width=3, **style)
+    return finished(plot)
+
+
+def write_report(
+    path: Path,
+    bag: Path,
+    config: EstimatorConfig,
+    backend: Callable[[], Corrector],
+    stamp_offset_s: float = 0.0,
+    check: Check | None = None,
+) -> None:
+    """Write the state of the page at the end of a recording.
+
+    Args:
+        path: the file.
+        bag: the recording.
+        config: of the estimators.
+        backend: see `BagPlayer`.
+        stamp_offset_s: see `BagPlayer.index`.
+        check: see `BagPlayer.index`.
+
+    Raises:
+        RecordingError: the bag cannot be read.
+    """
+    feed = SceneUpdater(Scene(), Lock())
+    player = BagPlayer(bag, feed, backend)
+    feed.anchors(config.anchors)
+    player.index(config, stamp_offset_s, check).join()
+    player.seek(player.seconds)
+    while player.is_behind:
+        player.advance()
+    models = draw_scene(View(feed.scene, feed.lock, player=player, missing=player.missing))
+    controls = models.controls
+    state, reason, action, facts = controls.verdict
+    lines = [f"Position {state}" + (f": {reason}. {action}" if reason else ""), facts, *controls.notice]
+    sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
+    sections |= {FIGURES[name]: models.figures[name] for name in SHOWN}
+    sections["Anchors at the end"] = [
+        ("state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"), *controls.health,
+    ]  # fmt: skip
+    sections["Tags at the end"] = [
+        ("tag", "x, y, z, m", "\u03c3, m", "age", "ranges, Hz"),
+        *controls.tag_rows,
+    ]
+    write_atomically(path, render_report(bag.name, lines, sections))

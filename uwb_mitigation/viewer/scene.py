@@ -34,18 +34,17 @@ from uwb_mitigation.viewer.histories import (
     Sample,
     Trace,
 )
+from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
-MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_CELLS, MAX_EVENTS = 256, 64, 64, 4000, 100
+MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_CELLS = 256, 64, 64, 4000
 MAX_TRACK = 3000  # points
 MAX_TEXT = 400  # characters of a name or a message
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
 
 MAX_MOVED_M = 0.2
 """A range has no residual if the tag moves further between the range and its latest position."""
-CLOCK_JUMP_S = 10.0
-"""A larger change of the difference between stamps and the clock is a jump of a clock."""
 STALE_S, STALE = 5.0, 3
 """A node has this diagnostic level if its last diagnostics are older, as in rqt_robot_monitor."""
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
@@ -106,16 +105,6 @@ class TrackView:
 
 
 @dataclass(frozen=True, slots=True)
-class AnchorPosition:
-    """An anchor on the map, m."""
-
-    x: float
-    y: float
-    z: float = math.nan
-    name: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class NodeStatus:
     """The latest diagnostics of one node: level 0 OK, 1 WARN, 2 ERROR, 3 STALE.
 
@@ -159,7 +148,7 @@ class Scene:
             compared with it, because they may come from another computer.
         stamp_clock: returns the time on the clock of the stamps, s, if it is that of this computer.
         ranges, corrected, faults: number of ranges, of those that were corrected, and of those with a status that needs attention.
-        events: (time on the clock of the scene, text) of the latest incidents, such as a clock that jumped.
+        incidents: on the clock of the scene.
         received_s: time of the last range on the scene's clock.
         dropped: number of ranges that the viewer could not read in time.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
@@ -172,7 +161,7 @@ class Scene:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock, self.stamp_clock = clock, time.time
-        self.events: deque[tuple[float, str]] = deque(maxlen=MAX_EVENTS)
+        self.incidents = Incidents()
         # {tag: (latest stamp, its time of reception)}: stamps of different tags may come from different clocks.
         self._latest: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
@@ -184,7 +173,7 @@ class Scene:
         self.tracks: BoundedDict[tuple[str, TrackKind], TrackView] = BoundedDict(4 * MAX_TAGS)
         self.is_indexed = False
         self.heat: BoundedDict[tuple[int, int], list[float]] = BoundedDict(MAX_CELLS)
-        self.anchors: dict[int, AnchorPosition] = {}
+        self.anchors: dict[int, Anchor] = {}
         self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
         self.error_sums_m = np.zeros(2)
@@ -200,20 +189,6 @@ class Scene:
     def latest_stamp_s(self, tag_id: int) -> float:
         """Return the latest stamp of a tag; NaN: none."""
         return self._latest.get(tag_id, (math.nan, math.nan))[0]
-
-    def _check_clock(self, history: History, sample: Sample, tag_id: int) -> None:
-        """Report a jump of the clock of a tag relative to the clock of the scene."""
-        if (latest := history.latest) is None:
-            return
-        jump_s = sample.time_s - latest.time_s - (self.clock() - history.received_s)
-        # A viewer that reads late receives the ranges of some seconds at once.
-        if abs(jump_s) > CLOCK_JUMP_S:
-            self.report_event(f"clock of tag {format_id(tag_id)}: jump by {jump_s:+.0f} s")
-
-    def report_event(self, text: str) -> None:
-        """Add an incident, unless the latest one is the same."""
-        if not self.events or self.events[-1][1] != text:
-            self.events.append((self.clock(), text[:MAX_TEXT]))
 
     def stamp_age_s(self, pair: Pair) -> float:
         """Return the time from the last range of a pair to that of its tag by their stamps: 0 without other ranges.
@@ -248,7 +223,7 @@ class Scene:
         self.ranges += 1
         self.corrected += sample.status.is_corrected
         self.faults += sample.status.is_fault
-        self._check_clock(history, sample, tag_id)
+        self.incidents.add_range(pair, self.clock(), sample.time_s)
         history.add(sample, tag_latest_s)
         history.received_s = self.received_s = self.clock()
         self._compare_with_position(pair, sample)
@@ -280,6 +255,7 @@ class Scene:
                     pose.stamp_s - before.stamp_s
                 )
             entry.pose, entry.received_s = pose, self.clock() if received_s is None else received_s
+            self.incidents.add_position(tag_label(tag[:MAX_TEXT], None), entry.received_s, pose.x, pose.y)
             point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
             self.add_position(tag, TrackKind.CORRECTED, point)
 
@@ -318,8 +294,9 @@ class Scene:
             return
         # On a busy computer, positions arrive late.
         if not abs(pose.stamp_s - sample.time_s) * tag.speed > MAX_MOVED_M:
-            height_m = finite_or_zero(pose.z - anchor.z)
-            sample.residual_m = sample.range_m - math.hypot(pose.x - anchor.x, pose.y - anchor.y, height_m)
+            x, y, z = anchor.position
+            distance_m = math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
+            sample.residual_m = sample.range_m - distance_m
         if not self.is_indexed:
             self._locate_raw(pair, pose, sample)
 
@@ -340,14 +317,16 @@ class Scene:
             point = (sample.time_s, *estimate.position.tolist(), math.nan)
             self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
 
-    def set_anchors(self, anchors: dict[int, AnchorPosition]) -> None:
-        plausible = (
-            (id_, place) for id_, place in anchors.items() if _is_plausible(place.x, place.y, place.z)
-        )
-        anchors_before, self.anchors = self.anchors, dict(islice(plausible, MAX_ANCHORS))
+    def set_anchors(self, anchors: Iterable[Anchor]) -> None:
+        """Set the anchors on Earth; the height of an anchor may be NaN."""
+        plausible = (anchor for anchor in anchors if _is_plausible(*anchor.position))
+        anchors_before, self.anchors = self.anchors, {one.id: one for one in islice(plausible, MAX_ANCHORS)}
         self.revision += 1
         if self.anchors and self.anchors != anchors_before:
-            places = [Anchor(id_, (p.x, p.y, finite_or_zero(p.z))) for id_, p in self.anchors.items()]
+            places = [
+                replace(one, position=(*one.position[:2], finite_or_zero(one.position[2])))
+                for one in self.anchors.values()
+            ]
             self._anchor_map = AnchorMap(places)
             self._raw_locators.clear()
 
@@ -379,7 +358,7 @@ class Scene:
             self.heat.clear()
         self.pairs.clear()
         self.ranges = self.corrected = self.faults = self.dropped = 0
-        self.events.clear()
+        self.incidents = Incidents()
         self.node_statuses.clear()
         self.error_counts[:] = 0
         self.error_sums_m[:] = 0

@@ -41,7 +41,12 @@ class Texts:
         self._state.has_data = any(not row["no_data"] for row in rows)
         set_rows(self._models.pairs, rows)
         anchors = health.anchor_means(pairs)
-        states = {anchor_id: self._health(anchor_id, means) for anchor_id, means in anchors.items()}
+        # If no anchor answers, the cause is not in each of them.
+        is_lost = all(means["stopped"] > 0.0 for means in anchors.values())
+        states = {
+            anchor_id: health.UNKNOWN if is_lost else self._health(anchor_id, means)
+            for anchor_id, means in anchors.items()
+        }
         self._state.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
@@ -65,9 +70,7 @@ class Texts:
             verdict=[shown.state, shown.reason, shown.action, self._facts(scene, shown.accuracy)],
             health=_anchor_rows(anchors, states, names),
             tag_rows=self._tags(scene, pairs),
-            incidents=[
-                f"{self._time(time_s)}: {text}" for time_s, text in list(scene.events)[-MAX_SHOWN_EVENTS:]
-            ],
+            incidents=self._incidents(scene),
             cards=cards,
             nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports],
             notice=notices,
@@ -86,6 +89,7 @@ class Texts:
             means = history.statistics() | {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if missing else 0.0,
+                "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], 0.0),
             }
             if timeline is not None and pair in timeline.losses:
                 lost, received = timeline.losses[pair]
@@ -125,20 +129,20 @@ class Texts:
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
-            corrected, count = self._counts(scene)
-            corrected_text = f"{100.0 * corrected / count:.0f} % of ranges" if corrected else "no range"
-            texts.append(f"{corrected_text} corrected")
-        texts += [
-            f"correction: {card[1]}" for card in self._interval_cards if card[0].startswith("Correction")
-        ]
+            corrected, count, faults = self._counts(scene)
+            not_corrected = "no range corrected" + ("" if faults else ": no CIRs")
+            share = f"{100.0 * corrected / count:.0f} % of ranges corrected"
+            texts.append(share if corrected else not_corrected)
+            cards = [card for card in self._interval_cards if corrected and card[0].startswith("Correction")]
+            texts += [f"correction: {card[1]} ({card[2]})" for card in cards]
         return " \u00b7 ".join(texts)
 
-    def _counts(self, scene: Scene) -> tuple[int, int]:
-        """Return the numbers of corrected and of all ranges."""
+    def _counts(self, scene: Scene) -> tuple[int, int, int]:
+        """Return the numbers of corrected ranges, of all ranges, and of those with a status that needs attention."""
         timeline = self._view.timeline
         if timeline is None:
-            return scene.corrected, scene.ranges
-        return int(np.count_nonzero(timeline.is_corrected)), len(timeline.status)
+            return scene.corrected, scene.ranges, scene.faults
+        return int(timeline.is_corrected.sum()), len(timeline.status), int(timeline.bad.sum())
 
     def _cards(self, scene: Scene) -> list[Card]:
         """Return the large figures."""
@@ -161,7 +165,7 @@ class Texts:
     def _summary(self, scene: Scene) -> str:
         """Return time and counts."""
         count = sum(1 for _ in scene.latest())
-        corrected, ranges = self._counts(scene)
+        corrected, ranges, _ = self._counts(scene)
         texts = [f"{count} pair{'' if count == 1 else 's'}", f"{corrected} corrected ranges of {ranges}"]
         if scene.dropped:
             texts.append(f"{scene.dropped} dropped by the viewer")
@@ -208,8 +212,13 @@ class Texts:
                 )
         return lines
 
-    def _time(self, time_s: float) -> str:
-        return f"{time_s:.1f} s" if self._player else f"{self._view.scene.clock() - time_s:.0f} s ago"
+    def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
+        """Return the incidents: time in the recording, None if they are live; text."""
+        if self._player is not None:
+            return [] if self._view.timeline is None else list(self._view.timeline.incidents)
+        scene.incidents.check(now_s := scene.clock())
+        latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
+        return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
 
 
 def _anchor_rows(

@@ -23,6 +23,7 @@ from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
+from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CORRECTED, FAULTS, RangeMeasurement
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.poses import tag_frame
@@ -35,15 +36,14 @@ from uwb_mitigation.types.ros.topics import (
 )
 from uwb_mitigation.types.stamps import NS_PER_S, to_ns
 from uwb_mitigation.types.tracks import Track, TruePath
-from uwb_mitigation.viewer.histories import MAX_RANGE_M, BoundedDict, Pair
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, BoundedDict, Pair, RangeColumns
+from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.recording import POSITIONS, Recording
-from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_TAGS, add_heat, tag_name, with_gaps
+from uwb_mitigation.viewer.scene import MAX_CELLS, MAX_TAGS, add_heat, tag_label, tag_name
 
 MAX_STAMP_S = 1.0
 """If stamp and log time of a message differ by more, its time is the log time."""
-BINS = 300
-"""Maximum number of points of the error over time."""
 BATCH = 256
 """Number of raw ranges that are corrected in one call."""
 _KINDS = {ODOMETRY_TRUTH: TrackKind.TRUE, POSE_SMOOTHED: TrackKind.SMOOTHED}
@@ -59,13 +59,15 @@ class Timeline:
         time_s: time of each range from the beginning, float64 (n,).
         stamp_s: stamps, s, float64 (n,).
         anchor, tag: ids of each range, uint64 (n,). status: uint8 (n,).
-        raw_m, corrected_m, true_m: float64 (n,); NaN: unknown.
+        raw_m, corrected_m, true_m, residual_m, gap_db: float64 (n,), see `Sample`; NaN: unknown.
         losses: {pair: (missing sequence numbers, ranges)}.
         notices: messages for the page.
         tracks: {(tag, kind): float64 (k, 5), time (s), x, y, z and horizontal standard deviation (m)}.
         estimates: {tag: its estimated tracks}, if the recording contains no positions.
         heat: see `Scene`.
-        is_complete: whether tracks and heat map have been added.
+        incidents: (log time, text).
+        displaced: {anchor whose ranges fit another position: its median held-out residual, m}.
+        is_complete: whether tracks, residuals, heat map and incidents have been added.
     """
 
     log_s: NDArray[np.float64]
@@ -77,11 +79,15 @@ class Timeline:
     raw_m: NDArray[np.float64]
     corrected_m: NDArray[np.float64]
     true_m: NDArray[np.float64]
+    gap_db: NDArray[np.float64]
+    residual_m: NDArray[np.float64]
     losses: dict[Pair, tuple[int, int]] = field(default_factory=dict)
     notices: list[str] = field(default_factory=list)
     tracks: dict[tuple[str, TrackKind], NDArray[np.float64]] = field(default_factory=dict)
     estimates: dict[str, TagTracks] = field(default_factory=dict)
     heat: BoundedDict[tuple[int, int], list[float]] = field(default_factory=lambda: BoundedDict(MAX_CELLS))
+    incidents: list[tuple[float, str]] = field(default_factory=list)
+    displaced: dict[int, float] = field(default_factory=dict)
     is_complete: bool = False
 
     @cached_property
@@ -98,10 +104,12 @@ class Timeline:
     def _rows_of_pairs(self) -> dict[Pair, NDArray[np.intp]]:
         return dict(_rows_by_pair(self.anchor, self.tag))
 
-    def rows_of(self, pair: Pair, begin_s: float, end_s: float) -> NDArray[np.intp]:
-        """Return the rows of a pair in an interval of the log time."""
+    def ranges(self, pair: Pair, begin_s: float = -np.inf, end_s: float = np.inf) -> RangeColumns:
+        """Return the ranges of a pair in an interval of the log time."""
         rows = self._rows_of_pairs.get(pair, np.zeros(0, np.intp))
-        return rows[slice(*np.searchsorted(self.log_s[rows], (begin_s, end_s + 1e-6), side="right"))]
+        rows = rows[slice(*np.searchsorted(self.log_s[rows], (begin_s, end_s + 1e-6), side="right"))]
+        columns = {name: getattr(self, name)[rows] for name in RangeColumns._fields if name != "interval_s"}
+        return RangeColumns(interval_s=np.diff(columns["stamp_s"], prepend=np.nan), **columns)
 
     @cached_property
     def deviation_m(self) -> NDArray[np.float64]:
@@ -130,24 +138,6 @@ class Timeline:
         rows = slice(*np.searchsorted(self.log_s, (begin_s, end_s), side="right"))
         errors = np.stack([self.raw_m[rows], self.corrected_m[rows]]) - self.true_m[rows]
         return errors[:, (np.abs(errors) <= MAX_RANGE_M).all(axis=0)]
-
-    def mean_errors(self, seconds: float) -> dict[str, NDArray[np.float32]]:
-        """Return the mean absolute errors over time: `time`, `raw` and `corrected`, float32 (k,); NaN: a gap."""
-        errors = np.abs(np.stack([self.raw_m - self.true_m, self.corrected_m - self.true_m]))
-        is_valid = (errors < MAX_RANGE_M).all(axis=0)
-        if not is_valid.any():
-            # Without truth, only the size of the corrections is known.
-            errors = np.stack([np.full(len(self.time_s), np.nan), self.deviation_m])
-            is_valid = np.isfinite(errors[1])
-        width_s = max(seconds / BINS, 1.0)
-        row = (np.maximum(self.time_s[is_valid], 0.0) // width_s).astype(np.intp)
-        count = np.bincount(row)
-        filled = count > 0
-        means = [np.bincount(row, values)[filled] / count[filled] for values in errors[:, is_valid]]
-        columns = with_gaps(
-            np.stack([(np.flatnonzero(filled) + 0.5) * width_s, *means], axis=1), 1.5 * width_s
-        )
-        return dict(zip(("time", "raw", "corrected"), columns.T.astype(np.float32), strict=True))
 
 
 def index_recording(
@@ -207,7 +197,8 @@ def index_recording(
                 track_s = np.interp(since_ns, stamp_ns - stamp_ns[0], timeline.time_s[rows])
                 sd_m = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
                 timeline.tracks[name, kind] = np.column_stack([track_s, track.position, sd_m])
-        _add_heat(timeline)
+        _add_positions(timeline, config.anchors)
+    timeline.incidents = _incidents(timeline, recording.seconds)
     timeline.is_complete = True
     return timeline
 
@@ -284,12 +275,14 @@ class _Reader:
             self._late[name], self._delays_s[name] = int(rows.sum()), float(np.median(delay_s[rows]))
         names = ", ".join(f"{name} by {self._delays_s[name]:+.1f} s" for name in self._late)
         notice = f"Stamps differ from the log time, and the log time is used: {names[:300]}." if names else ""
-        truths = self._truths.array()
+        truths, measured = self._truths.array(), self.table.raw.array()
         timeline = Timeline(
             log_s=log_s,
             time_s=np.where(is_late, log_s, stamp_s),
             stamp_s=ranges["stamp_ns"] / NS_PER_S,
             true_m=np.append(truths["true_m"], np.nan)[match(ranges, truths)],
+            gap_db=np.append(measured["gap_db"], np.nan)[match(ranges, measured)],
+            residual_m=np.full(len(ranges), np.nan),
             losses={
                 pair: (_lost(ranges["sequence"][rows]), len(rows))
                 for pair, rows in _rows_by_pair(ranges["anchor"], ranges["tag"])
@@ -321,15 +314,45 @@ def _lost(sequence: NDArray[np.uint32]) -> int:
     return int(np.maximum(np.rint(step / np.median(step)) - 1.0, 0.0).sum()) if len(step) else 0
 
 
-def _add_heat(timeline: Timeline) -> None:
-    """Add the mean correction along the tracks."""
+def _add_positions(timeline: Timeline, anchors: AnchorMap) -> None:
+    """Add what ranges and tracks yield together: residuals, and the mean correction along the tracks."""
+    known = np.array(sorted(anchors.index), np.uint64)
+    place = anchors.position[[anchors.index[int(one)] for one in known]]
     tracks = {name: track for (name, kind), track in timeline.tracks.items() if kind is TrackKind.CORRECTED}
     for tag_id in np.unique(timeline.tag):
         track = tracks.get(tag_name(int(tag_id), tracks, timeline.losses))
         if track is None or not len(track):
             continue
         rows = np.flatnonzero(timeline.tag == tag_id)
-        x, y = (np.interp(timeline.time_s[rows], track[:, 0], axis) for axis in track[:, 1:3].T)
+        x, y, z = (np.interp(timeline.time_s[rows], track[:, 0], axis) for axis in track[:, 1:4].T)
+        index = np.minimum(np.searchsorted(known, timeline.anchor[rows]), len(known) - 1)
+        distance_m = np.linalg.norm(np.column_stack([x, y, np.nan_to_num(z)]) - place[index], axis=1)
+        age_s = timeline.time_s[rows] - track[_latest(track, timeline.time_s[rows]), 0]
+        is_known = (known[index] == timeline.anchor[rows]) & (np.abs(age_s) < NO_DATA_S)
+        timeline.residual_m[rows] = np.where(is_known, timeline.corrected_m[rows] - distance_m, np.nan)
         correction = timeline.raw_m[rows] - timeline.corrected_m[rows]
         for row in np.flatnonzero(np.abs(correction) < MAX_RANGE_M):
             add_heat(timeline.heat, float(x[row]), float(y[row]), float(correction[row]))
+
+
+def _latest(track: NDArray[np.float64], time_s: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the row of the latest position at each time, or the first row."""
+    rows: NDArray[np.intp] = np.maximum(np.searchsorted(track[:, 0], time_s, side="right") - 1, 0)
+    return rows
+
+
+def _incidents(timeline: Timeline, seconds: float) -> list[tuple[float, str]]:
+    """Return the incidents of ranges and positions until the end, in the order of their times."""
+    ranges = Incidents()
+    columns = (timeline.anchor, timeline.tag, timeline.log_s, timeline.stamp_s)
+    for anchor_id, tag_id, log_s, stamp_s in zip(*(column.tolist() for column in columns), strict=True):
+        ranges.add_range((anchor_id, tag_id), log_s, stamp_s)
+    streams = [ranges]
+    for (name, kind), track in timeline.tracks.items():
+        if kind is TrackKind.CORRECTED:
+            streams.append(Incidents())
+            for time_s, x, y in track[:, :3].tolist():
+                streams[-1].add_position(tag_label(name, None), time_s, x, y)
+    for stream in streams:
+        stream.check(seconds)
+    return sorted(incident for stream in streams for incident in stream.found)

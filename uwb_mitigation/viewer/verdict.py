@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -15,6 +16,8 @@ GOOD, DEGRADED, LOST, UNDETERMINED, WAITING = "good", "degraded", "lost", "not d
 MAX_SD_M = 0.5
 """A horizontal standard deviation from which the position is degraded: the limit of a reliable range."""
 MIN_ANCHORS = 3
+MAX_HEADLINE = 60
+"""Maximum number of characters of a reason with its explanation."""
 HOLD_S = 2.0
 """Time for which a better verdict must hold before it is shown."""
 RADIUS95 = math.sqrt(5.991 / 2.0)
@@ -63,7 +66,7 @@ def verdict(
     if tag_id is None:
         tag = next(iter(scene.tags.values()))
     if tag is None or tag.pose is None:
-        reason, _, action = remedy.removeprefix("unknown: ").partition(". Remedy: ")
+        reason, action = _of_remedy(remedy)
         return _verdict(UNDETERMINED, reason or f"no position of {name}", action or "See the notices below.")
     if scene.age_s(tag) > NO_DATA_S:
         reason = f"no position of {name} for {scene.age_s(tag):.0f} s"
@@ -75,9 +78,10 @@ def verdict(
     received = sum(means["stopped"] == 0.0 for means in anchors.values())
     reason = action = ""
     if remedy:
-        reason, _, action = remedy.partition(". Remedy: ")
+        reason, action = _of_remedy(remedy)
     elif bad:
-        worst = max(bad, key=lambda key: (anchors[key]["stopped"], abs(anchors[key]["residual"])))
+        names_of_worst = ("stopped", "displaced", "residual")
+        worst = max(bad, key=lambda key: [abs(anchors[key][name]) for name in names_of_worst])
         reason, _, action = (common or advice[worst]).partition(": ")
     elif anchors and received < MIN_ANCHORS:
         reason, action = f"{received} anchors received", "Drive closer to the anchors, or add some."
@@ -86,6 +90,15 @@ def verdict(
     elif sd_m > MAX_SD_M:
         reason, action = f"uncertain by {sd_m:.2f} m", "Add an anchor, or set height and area of the locator."
     return _verdict(DEGRADED if reason else GOOD, reason, action, accuracy)
+
+
+def _of_remedy(remedy: str) -> tuple[str, str]:
+    """Return a reason that fits a headline, and the explanation with the remedy, of a determination."""
+    text, _, action = re.sub(r"^(from \d+ ranges: )?(unknown: )?", "", remedy).partition(". Remedy: ")
+    if len(text) <= MAX_HEADLINE:
+        return text, action
+    reason, _, explanation = text.partition(": ")
+    return reason, f"{explanation}. Remedy: {action}"
 
 
 def _verdict(state: str, reason: str, action: str, accuracy: str = "") -> Verdict:

@@ -30,6 +30,19 @@ PX4_BEACON = "/fmu/in/ranging_beacon"
 PX4_LOCAL_POSITION = "/fmu/out/vehicle_local_position"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
+TYPES = {
+    RANGE_RAW: RANGE_CIR_TYPE,
+    RANGE_TRUTH: RANGE_TRUTH_TYPE,
+    RANGE_CORRECTED: RANGE_CORRECTED_TYPE,
+    POSE: POSE_TYPE,
+    POSE_SMOOTHED: POSE_TYPE,
+    ODOMETRY: ODOMETRY_TYPE,
+    ODOMETRY_TRUTH: ODOMETRY_TYPE,
+    ANCHORS: MARKERS_TYPE,
+    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+}
+"""Types of what the viewer shows."""
+
 
 def relative(topic: str) -> str:
     """Return the name that a node uses, so that the topic is in its namespace."""

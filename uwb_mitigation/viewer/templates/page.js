@@ -53,7 +53,12 @@ function start(doc) {
   const texts = (id, name, make) => on(name, () => $(id).replaceChildren(...controls[name].map(make)));
   for (const [id, name] of [["tags", "tag_rows"], ["health", "health"], ["nodes", "nodes"]])
     texts(id, name, (cells) => element("tr", cells.map((text) => element("td", text))));
-  texts("events", "incidents", (text) => element("li", text));
+  texts("events", "incidents", ([time, text]) => {
+    if (time === null) return element("li", text);
+    const button = element("button", `${time.toFixed(1)} s: ${text}`);
+    button.addEventListener("click", () => send("seek", time));
+    return element("li", button);
+  });
   texts("notice", "notice", (text) => element("div", text));
   texts("cards", "cards", (lines) => element("div", lines.map((text, i) => element(i === 1 ? "strong" : "span", text))));
   on("verdict", () => {
@@ -156,18 +161,27 @@ function start(doc) {
   // A name that would cover another one is hidden: tags come first, then the selected anchor.
   const [anchors, labels] = ["id", "offset"].map((column) => map.renderers.map((r) => r.data_source).find((s) => column in s.data));
   const placeLabels = () => {
-    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame, boxes = [], shown = {x: [], y: [], text: [], offset: []};
-    const place = (x, y, text, offset) => {
-      const half = 3.5 * text.length + 2, px = x_scale.compute(x), bottom = y_scale.compute(y) + offset;
-      const box = [px - half, bottom - 15, px + half, bottom];
-      if (boxes.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) return;
-      boxes.push(box);
-      for (const [name, value] of Object.entries({x, y, text, offset})) shown[name].push(value);
+    const {x_scale, y_scale, bbox} = Bokeh.index.find_one(map).frame, boxes = [], shown = {x: [], y: [], text: [], offset: [], shift: []};
+    // Above the marker, or below it where it would leave the frame or cover another one.
+    const place = (x, y, text, ...offsets) => {
+      const half = 3.5 * text.length + 2, px = x_scale.compute(x), py = y_scale.compute(y);
+      const shift = Math.max(bbox.left - px + half, 0) + Math.min(bbox.right - px - half, 0);
+      for (const offset of offsets) {
+        const bottom = py + offset, box = [px - half + shift, bottom - 15, px + half + shift, bottom];
+        if (box[1] < bbox.top || boxes.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
+        boxes.push(box);
+        for (const [name, value] of Object.entries({x, y, text, offset, shift})) shown[name].push(value);
+        return;
+      }
     };
-    tags.data.name.forEach((name, i) => place(tags.data.x[i], tags.data.label_y[i], name, -4));
+    tags.data.x.forEach((x, i) => {
+      const [px, py] = [x_scale.compute(x), y_scale.compute(tags.data.y[i])];
+      boxes.push([px - 8, py - 3, px + 8, py + 8]);
+    });
+    tags.data.name.forEach((name, i) => place(tags.data.x[i], tags.data.label_y[i], name, -4, 2 * (y_scale.compute(tags.data.y[i]) - y_scale.compute(tags.data.label_y[i])) + 28));
     const isSelected = (i) => controls.selected && BigInt(controls.selected[0]) == anchors.data.id[i];
     const order = [...anchors.data.name.keys()].sort((a, b) => isSelected(b) - isSelected(a));
-    for (const i of order) place(anchors.data.x[i], anchors.data.y[i], anchors.data.label[i], -13);
+    for (const i of order) place(anchors.data.x[i], anchors.data.y[i], anchors.data.label[i], isSelected(i) ? -16 : -13, 28);
     if (JSON.stringify(shown) !== JSON.stringify(labels.data)) labels.setv({data: shown}, {sync: false});
   };
   tags.properties.data.change.connect(placeLabels);
@@ -190,7 +204,7 @@ function start(doc) {
 
   const legend = (figure) => [...figure.above, ...figure.below].find((part) => part.items);
   for (const figure of figures) if (legend(figure)) new ResizeObserver(([{contentRect: {width}}]) => {
-    legend(figure).ncols = Math.max(2, Math.floor(width / (figure === map ? 140 : 110)));
+    legend(figure).ncols = Math.max(2, Math.floor(width / (figure === map ? 125 : 110)));
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
@@ -239,11 +253,12 @@ function start(doc) {
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
-      const {bad, count, largest, truth} = controls.marks;
+      const {bad, count, incidents, largest, truth} = controls.marks;
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
-        + (largest == null ? "" : mark(largest, "currentColor", "max"));
-      $("marks-legend").textContent = `| ranges that need attention: ${count || "none"}` + (largest == null ? "" : `; max: largest ${truth ? "error" : "correction"}`);
+        + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("")
+        + (largest == null ? "" : mark(largest, "currentColor", `max ${truth ? "error" : "correction"}`));
+      $("marks-legend").textContent = `| ${count} bad ranges, \u25c6 ${incidents.length} events`;
     });
   }
   on("player", () => {

@@ -1,0 +1,99 @@
+"""What went wrong and when: anchors and tags that were lost and came back, positions and clocks that jumped."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from uwb_mitigation.errors import format_id
+from uwb_mitigation.viewer.histories import NO_DATA_INTERVALS, NO_DATA_S, BoundedDict, Pair
+
+MAX_EVENTS, MAX_SOURCES = 100, 1000
+CHECK_S = 0.5
+"""Interval of the search for sources that have stopped."""
+CLOCK_JUMP_S = 10.0
+"""A larger change of the difference between stamps and the clock is a jump of a clock."""
+JUMP_M, MAX_SPEED = 0.5, 10.0
+"""A position jumps if it moves further than this, plus the time since the last one times this speed, m/s."""
+SMOOTHING = 0.1
+"""Weight of the latest interval in the mean interval of a source."""
+
+
+@dataclass(slots=True)
+class _Source:
+    """Times of data: the latest one, the mean interval, its latest stamp or place, and whether it was reported as lost."""
+
+    time_s: float
+    interval_s: float = math.inf
+    stamp_s: float = math.nan
+    place: tuple[float, float] = (math.nan, math.nan)
+    is_lost: bool = False
+
+
+class Incidents:
+    """Finds incidents in ranges and positions, which are added in the order of their times on one clock.
+
+    Attributes:
+        found: (time, s; text) of the latest incidents.
+    """
+
+    def __init__(self) -> None:
+        self.found: deque[tuple[float, str]] = deque(maxlen=MAX_EVENTS)
+        # A tag comes before its anchors.
+        self._sources: BoundedDict[tuple[int | None, int | str], _Source] = BoundedDict(MAX_SOURCES)
+        self._check_s = -math.inf
+
+    def add_range(self, pair: Pair, time_s: float, stamp_s: float) -> None:
+        """Add a range at a time; `stamp_s` is on the clock of its tag."""
+        source, passed_s = self._add((None, pair[1]), time_s)
+        jump_s, source.stamp_s = stamp_s - source.stamp_s - passed_s, stamp_s
+        # Ranges that are read late arrive at once.
+        if abs(jump_s) > CLOCK_JUMP_S:
+            self.found.append((time_s, f"clock of tag {format_id(pair[1])}: jump by {jump_s:+.0f} s"))
+        self._add(pair, time_s)
+
+    def add_position(self, label: str, time_s: float, x: float, y: float) -> None:
+        """Add a position of a tag."""
+        source, passed_s = self._add((None, label), time_s)
+        moved_m, source.place = math.dist(source.place, (x, y)), (x, y)
+        if moved_m > JUMP_M + MAX_SPEED * passed_s:
+            self.found.append((time_s, f"position of {label}: jump by {moved_m:.1f} m"))
+
+    def _add(self, key: tuple[int | None, int | str], time_s: float) -> tuple[_Source, float]:
+        """Return a source and the time since its last data."""
+        if time_s >= self._check_s:
+            self.check(time_s)
+        if (source := self._sources.get(key)) is None:
+            source = self._sources.add(key, _Source(time_s))
+            return source, math.nan
+        passed_s, source.time_s = time_s - source.time_s, time_s
+        if source.is_lost:
+            source.is_lost = False
+            self.found.append((time_s, f"{_name(key)}: back after {passed_s:.0f} s"))
+            if key[0] is None:
+                # The tag was away, not its anchors.
+                for (_, tag), other in self._sources.items():
+                    other.time_s = time_s if tag == key[1] else other.time_s
+        else:
+            mean_s = source.interval_s if math.isfinite(source.interval_s) else passed_s
+            source.interval_s = mean_s + SMOOTHING * (passed_s - mean_s)
+        return source, passed_s
+
+    def check(self, now_s: float) -> None:
+        """Report the sources without data at a time."""
+        self._check_s = now_s + CHECK_S
+        for key, source in self._sources.items():
+            tag = self._sources.get((None, key[1]), source)
+            is_late = now_s - source.time_s > max(NO_DATA_S, NO_DATA_INTERVALS * source.interval_s)
+            if is_late and not tag.is_lost and not source.is_lost:
+                source.is_lost = True
+                self.found.append((source.time_s, f"{_name(key)}: lost"))
+
+
+def _name(key: tuple[int | None, int | str]) -> str:
+    anchor_id, tag = key
+    if isinstance(tag, str):
+        return f"position of {tag}"
+    name = f"tag {format_id(tag)}"
+    return name if anchor_id is None else f"anchor {format_id(anchor_id)} of {name}"
