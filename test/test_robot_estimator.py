@@ -246,7 +246,7 @@ def test_prediction_after_the_last_range_uses_the_motion():
 def _filter(lever=(0.4, -0.3, 0.2), yaw=0.7) -> OdometryFilter:
     rng = np.random.default_rng(3)
     start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.04, 0.09, 0.01]))
-    start.update(1, 5.0, 0.01)
+    start.update(1, 5.0, 0.01, True)
     start.P[FIRST_ERROR:, FIRST_ERROR:] += 0.001
     one = OdometryFilter(HALL, NoiseModel(), start, PathPoint(1, 0.3, 0.2, 0.5), lever, (yaw, 0.2))
     one.state.x[:] += 0.01 * rng.normal(size=len(one.state.x))
@@ -275,11 +275,11 @@ def test_derivatives_of_the_filter_are_those_of_its_equations():
     def residual(x):
         other = _filter()
         other.state.x[:] = x
-        z, sd = other.update(1, 5.0, 0.01)
+        z, sd = other.update(1, 5.0, 0.01, True)
         return -z * sd
 
     x = one.state.x.copy()
-    one.update(1, 5.0, 0.01)
+    one.update(1, 5.0, 0.01, True)
     H = np.array([(residual(x + step * e) - residual(x - step * e)) / (2 * step) for e in np.eye(n)])
     np.testing.assert_allclose(one.state.H, H, atol=1e-5)
 

@@ -3,8 +3,8 @@
 State: motion (0 to k - 1), the offset that the tag's ranges have in common (k), the persisting error of each anchor's ranges
 (k + 1, ...), and behind them the constant errors of up to `MAX_CONSTANT` anchors. While the position is searched, offset and
 errors are only considered (S. F. Schmidt, 1966): they keep their uncertainty and their correlations, so that no candidate
-position explains its ranges by wrong offsets. Afterwards they are estimated. Only ranges with a variance, i.e. corrected ones,
-have constant errors as states: those of other ranges would follow obstacles. The variance of what remains is estimated from
+position explains its ranges by wrong offsets. Afterwards they are estimated. Only ranges that a model corrected have constant
+errors as states: those of raw ranges would follow obstacles, also if their variance is known. The variance of what remains is estimated from
 residuals, see `persisting_variance`, and widens the published covariance.
 """
 
@@ -153,7 +153,7 @@ class RobustUpdate:
         variances += (1.0 - decay * decay) * self._error_variance
 
     def update_range(
-        self, anchor: int, range_m: float, distance_m: float, variance_m2: float
+        self, anchor: int, range_m: float, distance_m: float, variance_m2: float, is_corrected: bool
     ) -> tuple[float, float]:
         """Update with a range; `H` is set.
 
@@ -162,24 +162,24 @@ class RobustUpdate:
             range_m: measured range, m.
             distance_m: predicted distance, m.
             variance_m2: of its error, including the persisting part; NaN: unknown.
+            is_corrected: whether a model corrected it: its anchor has a constant error.
 
         Returns:
             The innovation divided by its standard deviation, and this standard deviation in m.
         """
-        has_constant = variance_m2 > 0.0
-        constant = self._constant_row(anchor) if has_constant else 0
+        constant = self._constant_row(anchor) if is_corrected else 0
         model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
         row = k + 1 + anchor
         variance, error_variance = model.variance(variance_m2), float(self._error_variance[anchor])
         # The part of the variance that the persisting error does not explain is white noise.
-        share = CORRECTED_WHITE if has_constant else model.white
+        share = CORRECTED_WHITE if is_corrected else model.white
         white = max(share * variance, variance - error_variance)
         self._error_variance[anchor] = error_variance + 0.1 * ((1.0 - share) * variance - error_variance)
         H[k:] = 0.0
         H[k] = H[row] = 1.0
         residual = range_m - distance_m - x.item(k)
         innovation = residual - x.item(row)
-        if has_constant:
+        if is_corrected:
             H[constant] = 1.0
             innovation -= x.item(constant)
             # Near an anchor the distance is not linear in the position: variance of its second-order term (Bar-Shalom, Li,
