@@ -134,7 +134,8 @@ class RangeTable:
         ):
             raw_ranges = _ranges(raw, raw_rows, unknown_m2, tag, offset_ns)
             ranges = _ranges(corrected, corrected_rows, corrected["variance_m2"], tag, offset_ns)
-            if not len(ranges) or np.array_equal(ranges.range_m, raw_ranges.range_m):
+            is_same = not np.any(ranges.is_corrected) and np.array_equal(ranges.range_m, raw_ranges.range_m)
+            if not len(ranges) or is_same:
                 ranges = raw_ranges
             tags.append(
                 TagRecording(
