@@ -37,7 +37,7 @@ from uwb_mitigation.positioning.online.robust_update import (
     CONSTANT_SD,
     CORRECTED_WHITE,
     MAX_CONSTANT,
-    SCALE,
+    OFFSET_SCALE,
     RobustUpdate,
 )
 from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
@@ -561,4 +561,4 @@ def test_small_errors_do_not_reduce_the_variance_of_the_common_offset():
     state.consistency = 0.5
     of_offset = 0.01**2 / state.P[6, 6]
     published = state.covariance_scale() * of_offset + state.hidden_offset_covariance()
-    np.testing.assert_allclose(published, SCALE * of_offset)
+    np.testing.assert_allclose(published, OFFSET_SCALE * of_offset)
