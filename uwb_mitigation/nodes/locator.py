@@ -226,9 +226,7 @@ class Locator(ManagedNode):
                 feed: TopicFeed = topic.TopicFeed(self, mapping, "", self._on_mapped_range, self.now_ns)
                 self.destroy_at_close(feed, lambda feed: feed.stop()).start()
                 return mapping.range_sd
-        kind, name = (
-            (RangeCir, source) if source else (RangeCorrected, topics.relative(topics.RANGE_CORRECTED))
-        )
+        kind, name = RangeCir if source else RangeCorrected, source or topics.relative(topics.RANGE_CORRECTED)
         self._decode = (lambda data: _uncorrected(decode_range(data))) if source else decode_corrected
         ranges = endpoints.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
         self._ranges = self.destroy_at_close(ranges, self.destroy_subscription)
@@ -263,11 +261,8 @@ class Locator(ManagedNode):
 
     def _saved_state(self) -> dict[str, Any]:
         """Return the state for a process that replaces this one: the keys of its file."""
-        motion = (
-            None
-            if self._robot is None or self._robot.state.map_to_odom is None
-            else asdict(self._robot.state)
-        )
+        state = None if self._robot is None else self._robot.state
+        motion = None if state is None or state.map_to_odom is None else asdict(state)
         return {"anchors": self._digest, "tag": self._plain_tag, "motion": motion}
 
     def _on_lost(self, info: Any) -> None:

@@ -214,11 +214,8 @@ class OdometryInput:
         (x, y, z, yaw), variance, begin, _, gap_m = self._held_pose
         cosine, sine = math.cos(yaw), math.sin(yaw)
         position = np.array([x + cosine * pose[0] - sine * pose[1], y + sine * pose[0] + cosine * pose[1], z])
-        drift, turn, distance = (
-            point.drift - begin.drift,
-            point.turn - begin.turn,
-            point.distance_m - begin.distance_m,
-        )
+        drift, turn = point.drift - begin.drift, point.turn - begin.turn
+        distance = point.distance_m - begin.distance_m
         of_yaw = variance[3] + point.yaw_variance - begin.yaw_variance + drift**2 + turn**2
         moved = point.position_variance - begin.position_variance
         moved += (SCALE_SD**2 + of_yaw) * (gap_m + distance) ** 2
@@ -242,11 +239,8 @@ class OdometryInput:
         held_estimate, new = self.carried_on(base.stamp_ns), base.heading
         if held_estimate is None or held_estimate.heading is None:
             return base
-        delta, of_held, of_new = (
-            base.position - held_estimate.position,
-            held_estimate.covariance,
-            base.covariance,
-        )
+        delta = base.position - held_estimate.position
+        of_held, of_new = held_estimate.covariance, base.covariance
         error = float(delta[:2] @ np.linalg.solve((of_held + of_new)[:2, :2], delta[:2]))
         turn, of_turn = 0.0, math.inf
         if new is not None:
@@ -318,11 +312,8 @@ class OdometryInput:
             state.odom_frame = frame
             state.base_frame = state.base_frame or message.child_frame_id
             self._log.info(f"odometry of {state.base_frame} in {frame}")
-        position, twist, covariance = (
-            message.pose.pose.position,
-            message.twist.twist,
-            message.twist.covariance,
-        )
+        position, twist = message.pose.pose.position, message.twist.twist
+        covariance = message.twist.covariance
         stamp_ns = to_ns(message.header.stamp)
         pose = (position.x, position.y, yaw_of(message.pose.pose.orientation))
         velocity = (twist.linear.x, twist.linear.y, twist.angular.z)
@@ -341,10 +332,8 @@ class OdometryInput:
         is_current = 0 <= stamp_ns - state.map_to_odom_ns <= CURRENT_S * NS_PER_S
         is_newer = self._held_pose is None or self._replace_ns is not None
         if state.map_to_odom is not None and point is not None and is_current and is_newer:
-            self._held_pose, self._replace_ns = (
-                _Held(state.map_to_odom, state.variance, point, stamp_ns, 0.0),
-                None,
-            )
+            self._held_pose = _Held(state.map_to_odom, state.variance, point, stamp_ns, 0.0)
+            self._replace_ns = None
 
     def _hold(self, stamp_ns: int, pose: Vector, speed: float, begin: PathPoint) -> None:
         """Hold the transform from before a crash or gap, unless it was old, or the odometry was reset meanwhile."""

@@ -164,7 +164,7 @@ def _ranges(
     index = np.flatnonzero((rows["tag"] == tag) & (anchor >= 0))
     index = index[np.argsort(rows["stamp_ns"][index], kind="stable")]
     measured, is_corrected = rows[index], np.zeros(len(index), np.bool_)
-    if "status" in rows.dtype.fields:
+    if rows.dtype == _CORRECTED:
         is_corrected |= np.isin(measured["status"], CORRECTED)
     # As in `MultiTagEstimator`.
     variance_m2 = np.where(np.logical_or.accumulate(is_corrected), variance_m2[index], np.nan)

@@ -76,23 +76,6 @@ class RobustUpdate:
         residual_square: running mean of the products of two residuals of an anchor in a row, m^2: of their errors without noise.
     """
 
-    __slots__ = (
-        "H",
-        "P",
-        "_constant_rows",
-        "_error_variance",
-        "_errors",
-        "_last_residual",
-        "_medians",
-        "_model",
-        "_offset",
-        "_short_variance",
-        "consistency",
-        "estimates_errors",
-        "residual_square",
-        "x",
-    )
-
     def __init__(self, anchors: AnchorMap, model: NoiseModel, motion: NDArray[np.float64]) -> None:
         self._model, self._offset = model, len(motion)
         n = len(motion) + 1 + len(anchors)
