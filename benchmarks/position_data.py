@@ -105,7 +105,10 @@ class Run:
         results = mitigation.correct([record.measurement for record in self.read_records()])
         range_m = np.maximum([result.range_m for result in results], 0.0)
         return replace(
-            self.ranges, range_m=range_m, variance_m2=np.array([result.variance_m2 for result in results])
+            self.ranges,
+            range_m=range_m,
+            variance_m2=np.array([result.variance_m2 for result in results]),
+            is_corrected=np.array([result.status.is_corrected for result in results]),
         )
 
 

@@ -39,7 +39,7 @@ def drive(
     model: NoiseModel | None = None,
     path=circuit,
 ) -> tuple[Ranges, TruePath]:
-    """Return ranges to the anchors in turn, with white noise, correlated errors and a common offset."""
+    """Return corrected ranges to the anchors in turn, with white noise, correlated errors and a common offset."""
     model = model or NoiseModel()
     rng = np.random.default_rng(seed)
     n = round(seconds * rate_hz)
@@ -58,7 +58,7 @@ def drive(
     distance = np.linalg.norm(position - anchors.position[anchor], axis=1)
     stamp_ns = np.rint(time_s * NANOSECONDS).astype(np.int64)
     nothing = np.full(n, np.nan)
-    ranges = Ranges(stamp_ns, anchor, distance + error, np.full(n, model.range_sd**2), nothing, 7)
+    ranges = Ranges(stamp_ns, anchor, distance + error, np.full(n, model.range_sd**2), nothing, 7, True)
     return ranges, TruePath(stamp_ns, position)
 
 

@@ -37,7 +37,7 @@ from uwb_mitigation.positioning.online.robust_update import (
     CONSTANT_SD,
     CORRECTED_WHITE,
     MAX_CONSTANT,
-    SCALE,
+    OFFSET_SCALE,
     RobustUpdate,
 )
 from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
@@ -105,7 +105,7 @@ def test_filter_agrees_with_filterpy():
         filterpy_filter.update(np.array([[range_m]]), slope, expected, R=np.array([[white]]))
         claimed[row] += 0.1 * ((1 - CORRECTED_WHITE) * variance - claimed[row])
         own_filter.predict(stamp)
-        own_filter.update(row, range_m, variance)
+        own_filter.update(row, range_m, variance, True)
         np.testing.assert_allclose(own_filter.x, filterpy_filter.x[:, 0], atol=1e-8)
     np.testing.assert_allclose(own_filter.P, filterpy_filter.P, atol=1e-8)
 
@@ -115,10 +115,10 @@ def test_constant_errors_of_corrected_ranges_are_estimated():
     ranges.range_m[:] += np.array([0.2, -0.2, 0.2, -0.2, 0.0])[ranges.anchor]
     with_variance = TagEstimator(EstimatorConfig(HALL, height=Height(1.0)))
     without = TagEstimator(EstimatorConfig(HALL, height=Height(1.0)))
-    unknown = replace(ranges, variance_m2=np.full(len(ranges), np.nan))
+    raw = replace(ranges, is_corrected=False)
     last = slice(len(ranges) // 2, None)
     corrected_rmse = track_errors(with_variance.run(ranges).take(last), truth).rmse
-    assert corrected_rmse < 0.8 * track_errors(without.run(unknown).take(last), truth).rmse
+    assert corrected_rmse < 0.8 * track_errors(without.run(raw).take(last), truth).rmse
 
 
 def test_number_of_constant_errors_is_bounded():
@@ -126,7 +126,7 @@ def test_number_of_constant_errors_is_bounded():
     own_filter = RangeFilter(anchors, PLAIN, 0.0, np.zeros(3), np.eye(3))
     for time_s, row in enumerate([*range(len(anchors))] * 2):
         own_filter.predict(0.1 * time_s)
-        own_filter.update(row, float(np.linalg.norm(anchors.position[row])), 0.01)
+        own_filter.update(row, float(np.linalg.norm(anchors.position[row])), 0.01, True)
     assert len(own_filter.x) == FIRST_ERROR + len(anchors) + MAX_CONSTANT
     # The latest ones have a state each.
     latest = own_filter.state._constant_rows
@@ -151,7 +151,7 @@ def test_covariance_stays_valid_and_the_state_finite(steps, estimates_errors: bo
     for dt, row, range_m, variance in steps:
         now += dt
         one.predict(now)
-        one.update(row, range_m, variance)
+        one.update(row, range_m, variance, variance > 0.01)
     np.testing.assert_allclose(one.P, one.P.T, atol=1e-9 * np.abs(one.P).max())
     assert np.linalg.eigvalsh((one.P + one.P.T) / 2).min() > -1e-9 * np.abs(one.P).max()
     assert np.isfinite(one.x).all()
@@ -561,4 +561,4 @@ def test_small_errors_do_not_reduce_the_variance_of_the_common_offset():
     state.consistency = 0.5
     of_offset = 0.01**2 / state.P[6, 6]
     published = state.covariance_scale() * of_offset + state.hidden_offset_covariance()
-    np.testing.assert_allclose(published, SCALE * of_offset)
+    np.testing.assert_allclose(published, OFFSET_SCALE * of_offset)

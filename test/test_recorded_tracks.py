@@ -26,10 +26,12 @@ from uwb_mitigation.commands.support.position_options import track_settings
 from uwb_mitigation.commands.view import view
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
-from uwb_mitigation.positioning.geometry import Area
+from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.positioning.tag_locator import TagLocator
 from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
+from uwb_mitigation.recordings.recorded_ranges import RangeTable
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
@@ -39,6 +41,7 @@ from uwb_mitigation.types.measurement import (
     Status,
 )
 from uwb_mitigation.types.offsets import read_offsets
+from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, interval_cards
 from uwb_mitigation.viewer.playback import BagPlayer
@@ -178,6 +181,7 @@ def test_variance_of_ranges_without_cir_is_that_of_real_errors(tmp_path: Path):
 def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
     ranges, _ = drive(seconds=8)
     raw, passed, mixed = (TagLocator(HALL, height_m=1.0) for _ in range(3))
+    table = RangeTable()
     for row in range(len(ranges)):
         anchor, range_m = HALL.anchors[ranges.anchor[row]].id, float(ranges.range_m[row])
         measurement = RangeMeasurement(
@@ -185,7 +189,9 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
         )
         result = CorrectedRange(range_m, range_m, 0.0, 0.25, Status.NO_CIR, CorrectedBy.HOST, 1)
         expected, found = raw.add(measurement), passed.add(measurement, result)
-        corrected = mixed.add(measurement, replace(result, status=Status.OK) if row < 5 else result)
+        result = replace(result, status=Status.OK) if row == 100 else result
+        table.add_corrected(measurement_key(measurement), result)
+        corrected = mixed.add(measurement, result)
         if expected is not None:
             assert found is not None
             assert found.position.tolist() == expected.position.tolist()
@@ -193,6 +199,9 @@ def test_radio_without_cirs_is_located_live_as_from_raw_ranges():
     assert corrected.position.tolist() != expected.position.tolist(), (
         "after a corrected range, its variance counts"
     )
+    (recorded,) = table.by_tag(HALL, 0.0, {}).tags
+    *_, last = TagEstimator(EstimatorConfig(HALL, height=Height(1.0))).run(recorded.ranges)
+    assert last.position.tolist() == corrected.position.tolist(), "recordings are located as live"
 
 
 @pytest.mark.parametrize("command", [track, view])

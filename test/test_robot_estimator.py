@@ -12,8 +12,8 @@ import pytest
 from conftest import REPOSITORY
 from drives import HALL, NANOSECONDS, Robot, drive, wrapped
 
-from benchmarks.position_data import real_runs
-from benchmarks.positions import evaluate, odometry_faults
+from benchmarks.position_data import GEOMETRIES, load_geometry, real_runs
+from benchmarks.positions import evaluate, locate, odometry_faults
 from uwb_mitigation.positioning.batch.smoother import smooth
 from uwb_mitigation.positioning.config import RobotData
 from uwb_mitigation.positioning.geometry import Area
@@ -26,6 +26,7 @@ from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.online.robot_estimator import KNOWN_YAW_SD, RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
+from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.types.tracks import Imu, Odometry
 
 
@@ -254,7 +255,7 @@ def test_prediction_after_the_last_range_uses_the_motion():
 def _filter(lever=(0.4, -0.3, 0.2), yaw=0.7) -> OdometryFilter:
     rng = np.random.default_rng(3)
     start = RangeFilter(HALL, NoiseModel(), 0.0, np.array([5.0, 4.0, 1.0]), np.diag([0.04, 0.09, 0.01]))
-    start.update(1, 5.0, 0.01)
+    start.update(1, 5.0, 0.01, True)
     start.P[FIRST_ERROR:, FIRST_ERROR:] += 0.001
     one = OdometryFilter(HALL, NoiseModel(), start, PathPoint(1, 0.3, 0.2, 0.5), lever, (yaw, 0.2))
     one.state.x[:] += 0.01 * rng.normal(size=len(one.state.x))
@@ -283,11 +284,11 @@ def test_derivatives_of_the_filter_are_those_of_its_equations():
     def residual(x):
         other = _filter()
         other.state.x[:] = x
-        z, sd = other.update(1, 5.0, 0.01)
+        z, sd = other.update(1, 5.0, 0.01, True)
         return -z * sd
 
     x = one.state.x.copy()
-    one.update(1, 5.0, 0.01)
+    one.update(1, 5.0, 0.01, True)
     H = np.array([(residual(x + step * e) - residual(x - step * e)) / (2 * step) for e in np.eye(n)])
     np.testing.assert_allclose(one.state.H, H, atol=1e-5)
 
@@ -401,12 +402,29 @@ def test_smoothed_track_has_headings_from_the_start():
     assert rms(distance) < rms(robot.errors(live)[0])
 
 
-def test_real_robot_reaches_the_documented_errors():
+@pytest.fixture
+def data() -> Path:
     root = Path(os.environ.get("UWB_MITIGATION_DATA", REPOSITORY.parent / "shared" / "data"))
-    folder = root / "chemnitz_labyrinth"
-    if not folder.is_dir():
-        pytest.skip(f"the Labyrinth data set is not at {folder}: set UWB_MITIGATION_DATA to run this test")
-    runs, _ = real_runs(root)
+    if not root.is_dir():
+        pytest.skip(f"the data sets are not at {root}: set UWB_MITIGATION_DATA to run this test")
+    return root
+
+
+def test_constant_errors_of_most_anchors_do_not_mislead_the_robust_loss(data: Path):
+    run = load_geometry("box", "3", str(data / "geometries" / GEOMETRIES), "box", 2, 3)
+    assert track_errors(locate(run, run.ranges), run.truth).rmse < 0.3
+
+
+def test_first_sharp_turn_with_late_odometry_does_not_exceed_the_heading(data: Path):
+    run = load_geometry("hall", "5", str(data / "geometries" / GEOMETRIES), "ceiling_hall", 2, 5, 90.0)
+    assert run.robot is not None
+    late = replace(run.robot, odometry=odometry_faults(run.robot.odometry)["late by 1 s"])
+    exceeded = track_errors(locate(run, run.ranges, late), run.truth).heading_exceeded
+    assert not exceeded > 0.01
+
+
+def test_real_robot_reaches_the_documented_errors(data: Path):
+    runs, _ = real_runs(data)
     entry = evaluate(next(run for run in runs if run.set_name == "labyrinth"), calibrate=False)
     row = entry["rows"]["odometry_locator"]
     assert row["rmse_m"] <= 0.07

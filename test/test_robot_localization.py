@@ -118,6 +118,7 @@ def _drive(seed: int) -> Drive:
         np.array([row.range_m for row in corrected]),
         np.array([row.variance_m2 for row in corrected]),
         np.full(len(measured), np.nan),
+        is_corrected=True,
     )
     config, motion = EstimatorConfig(source.anchors, height=Height(0.0, 0.05)), source.motion()
     robot = RobotData(motion.odometry, motion.imu)

@@ -427,7 +427,9 @@ class _Fold:
         """Return the error of the live position at each range, (r,), m; NaN: no position, or no reference."""
         site, height = self.site, self.reference.height
         variance_m2 = np.broadcast_to(variance_m2, len(range_m))
-        corrected = replace(site.ranges, range_m=range_m, variance_m2=variance_m2)
+        corrected = replace(
+            site.ranges, range_m=range_m, variance_m2=variance_m2, is_corrected=np.isfinite(variance_m2)
+        )
         error_m = np.full(len(range_m), np.nan)
         axes = slice(0, 3 if height is None and site.height_m is None else 2)
         for number in range(len(site.tags)):

@@ -135,7 +135,8 @@ class Locator(ManagedNode):
             raise ParameterError(
                 "parameter anchors is empty", valid="anchors:=FILE of {id, x, y, z}, or a topic"
             )
-        model = NoiseModel(acceleration=self.value("acceleration"), range_sd=self.value("range_sd"))
+        range_sd = self._subscribe_to_ranges(self.value("ranges")) or self.value("range_sd")
+        model = NoiseModel(acceleration=self.value("acceleration"), range_sd=range_sd)
         height = Height(self.value("height"), self.value("height_sd")) if self.value("level") else None
         area = Area.parse(self.value("area"))
         self._lever_arm = parse_lever_arm(self.value("lever_arm")) or (0.0, 0.0, 0.0)
@@ -176,7 +177,6 @@ class Locator(ManagedNode):
             # Some publishers send the anchors once for late subscribers, others repeatedly.
             for qos in (endpoints.LATCHED, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)):
                 self.subscription(markers.ANCHOR_TYPES[kind], topic, self._on_anchors, qos)
-        self._subscribe_to_ranges(self.value("ranges"))
         if topic := self.value("height_topic"):
             self.subscription(PoseWithCovarianceStamped, topic, self._on_height)
         self.steady_timer(PERIOD_S, self._on_timer)
@@ -207,37 +207,26 @@ class Locator(ManagedNode):
         values |= diagnostics.percentiles("processing", durations_ns)
         return "host", level, text, values
 
-    def _subscribe_to_mapping(self, name: str) -> bool:
-        """Subscribe to the topics of a mapping; return False if `name` is that of a topic."""
-        # Mapping files need pandas and pydantic, which other ranges do not.
-        topic = importlib.import_module("uwb_mitigation.nodes.feeds.topic")
-        mapping: Mapping | None = topic.find_mapping(name)
-        if mapping is None:
-            return False
-        # Constant errors are estimated for corrected ranges only: a default of the data sheet is no variance.
-        is_default = mapping.range_sd in (0.0, self.value("range_sd"))
-        variance_m2 = math.nan if is_default else mapping.range_sd**2
-
-        def on_range(measurement: RangeMeasurement) -> None:
-            if self._estimator is not None and self.is_active:
-                self._update_lever_arm(measurement.tag_id, lambda: measurement.frame_id)
-                self._add(self._estimator, *_uncorrected(measurement, variance_m2), has_variance=True)
-
-        feed: TopicFeed = topic.TopicFeed(self, mapping, "", on_range, self.now_ns)
-        self.destroy_at_close(feed, lambda feed: feed.stop()).start()
-        return True
-
-    def _subscribe_to_ranges(self, source: str) -> None:
-        if source and self._subscribe_to_mapping(source):
-            return
-        kind, name = (
-            (RangeCir, source) if source else (RangeCorrected, topics.relative(topics.RANGE_CORRECTED))
-        )
-        self._decode = (
-            (lambda data: _uncorrected(decode_range(data), math.nan)) if source else decode_corrected
-        )
+    def _subscribe_to_ranges(self, source: str) -> float:
+        """Subscribe to the topics of a mapping or to a topic; return the standard deviation in the mapping, m, 0: unknown."""
+        if source:
+            # Mapping files need pandas and pydantic, which other ranges do not.
+            topic = importlib.import_module("uwb_mitigation.nodes.feeds.topic")
+            mapping: Mapping | None = topic.find_mapping(source)
+            if mapping is not None:
+                feed: TopicFeed = topic.TopicFeed(self, mapping, "", self._on_mapped_range, self.now_ns)
+                self.destroy_at_close(feed, lambda feed: feed.stop()).start()
+                return mapping.range_sd
+        kind, name = RangeCir if source else RangeCorrected, source or topics.relative(topics.RANGE_CORRECTED)
+        self._decode = (lambda data: _uncorrected(decode_range(data))) if source else decode_corrected
         ranges = endpoints.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
         self._ranges = self.destroy_at_close(ranges, self.destroy_subscription)
+        return 0.0
+
+    def _on_mapped_range(self, measurement: RangeMeasurement) -> None:
+        if self._estimator is not None and self.is_active:
+            self._update_lever_arm(measurement.tag_id, lambda: measurement.frame_id)
+            self._add(self._estimator, *_uncorrected(measurement))
 
     def _on_anchors(self, message: Any) -> None:
         """Use the first anchors that a topic sends."""
@@ -263,11 +252,8 @@ class Locator(ManagedNode):
 
     def _saved_state(self) -> dict[str, Any]:
         """Return the state for a process that replaces this one: the keys of its file."""
-        motion = (
-            None
-            if self._robot is None or self._robot.state.map_to_odom is None
-            else asdict(self._robot.state)
-        )
+        state = None if self._robot is None else self._robot.state
+        motion = None if state is None or state.map_to_odom is None else asdict(state)
         return {"anchors": self._digest, "tag": self._plain_tag, "motion": motion}
 
     def _on_lost(self, info: Any) -> None:
@@ -288,14 +274,12 @@ class Locator(ManagedNode):
             self.get_logger().warning(f"a message cannot be read: {error}", throttle_duration_sec=10.0)
             return
         self._update_lever_arm(key.tag_id, lambda: decode_frame_id(data))
-        self._add(estimator, key, corrected, corrected.status.is_corrected)
+        self._add(estimator, key, corrected)
 
-    def _add(
-        self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange, has_variance: bool
-    ) -> None:
+    def _add(self, estimator: MultiTagEstimator, key: MeasurementKey, corrected: CorrectedRange) -> None:
         began_ns = time.perf_counter_ns()
         stamp_ns = key.stamp_ns + self._offset_ns
-        measured = corrected.range_m, corrected.variance_m2, has_variance
+        measured = corrected.range_m, corrected.variance_m2, corrected.status.is_corrected
         result = estimator.add(key.tag_id, key.anchor_id, stamp_ns, *measured)
         if result is None:
             if key.anchor_id in estimator.unknown_anchors and key.anchor_id not in self._unknown_anchors:
@@ -463,8 +447,8 @@ class Locator(ManagedNode):
             tag.add_height(float(message.pose.pose.position.z), float(message.pose.covariance[14]))
 
 
-def _uncorrected(measurement: RangeMeasurement, variance_m2: float) -> tuple[MeasurementKey, CorrectedRange]:
-    """Return a raw range as a corrected one; a variance of NaN is replaced by `range_sd`."""
+def _uncorrected(measurement: RangeMeasurement) -> tuple[MeasurementKey, CorrectedRange]:
+    """Return a raw range with the status of one that was not corrected; its variance is `range_sd`."""
     range_m = measurement.range_m
-    corrected = CorrectedRange(range_m, range_m, 0.0, variance_m2, Status.NO_CIR, CorrectedBy.HOST, 0)
+    corrected = CorrectedRange(range_m, range_m, 0.0, math.nan, Status.NO_CIR, CorrectedBy.HOST, 0)
     return measurement_key(measurement), corrected

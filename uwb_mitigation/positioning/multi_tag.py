@@ -211,7 +211,7 @@ class MultiTagEstimator:
         tag = self.tags.get(tag_id)
         if not is_corrected and (tag is None or not tag.is_corrected) and variance_m2 < math.inf:
             variance_m2 = math.nan
-        measurement = TagRange(stamp_ns, row, range_m, variance_m2)
+        measurement = TagRange(stamp_ns, row, range_m, variance_m2, is_corrected)
         if not measurement.is_valid or (tag is None and len(self.tags) >= MAX_TAGS):
             self.invalid += 1
             return None

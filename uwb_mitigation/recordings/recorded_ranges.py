@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -134,11 +134,8 @@ class RangeTable:
         ):
             raw_ranges = _ranges(raw, raw_rows, unknown_m2, tag, offset_ns)
             ranges = _ranges(corrected, corrected_rows, corrected["variance_m2"], tag, offset_ns)
-            is_tag = (corrected["tag"] == tag) & (corrected_rows >= 0)
-            if not np.isin(corrected["status"][is_tag], CORRECTED).any():
-                # As in `MultiTagEstimator`.
-                ranges = replace(ranges, variance_m2=np.full(len(ranges), np.nan))
-            if not len(ranges) or np.array_equal(ranges.range_m, raw_ranges.range_m):
+            is_same = not np.any(ranges.is_corrected) and np.array_equal(ranges.range_m, raw_ranges.range_m)
+            if not len(ranges) or is_same:
                 ranges = raw_ranges
             tags.append(
                 TagRecording(
@@ -166,9 +163,13 @@ def _ranges(
     """Return the usable ranges of a tag in the order of their stamps; their received powers are not read."""
     index = np.flatnonzero((rows["tag"] == tag) & (anchor >= 0))
     index = index[np.argsort(rows["stamp_ns"][index], kind="stable")]
-    measured = rows[index]
-    columns = measured["range_m"], variance_m2[index], np.full(len(index), np.nan)
-    return Ranges(measured["stamp_ns"] + offset_ns, anchor[index], *columns, int(tag))
+    measured, is_corrected = rows[index], np.zeros(len(index), np.bool_)
+    if rows.dtype == _CORRECTED:
+        is_corrected |= np.isin(measured["status"], CORRECTED)
+    # As in `MultiTagEstimator`.
+    variance_m2 = np.where(np.logical_or.accumulate(is_corrected), variance_m2[index], np.nan)
+    columns = measured["range_m"], variance_m2, np.full(len(index), np.nan)
+    return Ranges(measured["stamp_ns"] + offset_ns, anchor[index], *columns, int(tag), is_corrected)
 
 
 def read_ranges(

@@ -57,6 +57,7 @@ class Ranges(TimeSeries):
         range_m: float64 (n,), finite.
         variance_m2, rx_power_dbm: float64 (n,); NaN: unknown.
         tag_id: of all of them.
+        is_corrected: whether a model corrected a range, of each bool (n,) or of all.
     """
 
     anchor: NDArray[np.intp]
@@ -64,10 +65,11 @@ class Ranges(TimeSeries):
     variance_m2: NDArray[np.float64]
     rx_power_dbm: NDArray[np.float64]
     tag_id: int = 0
+    is_corrected: NDArray[np.bool_] | bool = False
 
     @classmethod
     def joined(cls, groups: Sequence[Ranges]) -> Ranges:
-        """Concatenate ranges; the tag id is 0."""
+        """Concatenate raw ranges; the tag id is 0."""
         names = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
         columns: Any = (np.concatenate([getattr(group, name) for group in groups]) for name in names)
         return cls(*columns)

@@ -109,7 +109,9 @@ class RangeFilter:
         vx += cross
         vv += q
 
-    def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
+    def update(
+        self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool
+    ) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
         # Python numbers are faster here than NumPy.
         state, (u, v, w) = self.state, self._anchors[anchor].tolist()
@@ -118,7 +120,7 @@ class RangeFilter:
         distance = math.sqrt(x * x + y * y + z * z)
         divisor, H = max(distance, SHORTEST_M), state.H
         H[0], H[1], H[2] = x / divisor, y / divisor, z / divisor
-        return state.update_range(anchor, range_m, distance, variance_m2)
+        return state.update_range(anchor, range_m, distance, variance_m2, is_corrected)
 
     def update_height(self, height_m: float, variance_m2: float) -> tuple[float, float]:
         """Update with the height of the tag; return as `RobustUpdate.update_range`."""

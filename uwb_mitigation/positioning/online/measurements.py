@@ -17,12 +17,14 @@ class TagRange(NamedTuple):
         anchor: row of the anchor in the map.
         range_m: m.
         variance_m2: of its error, m^2; NaN: unknown.
+        is_corrected: whether a model corrected it.
     """
 
     stamp_ns: int
     anchor: int
     range_m: float
     variance_m2: float = math.nan
+    is_corrected: bool = False
 
     @property
     def is_valid(self) -> bool:

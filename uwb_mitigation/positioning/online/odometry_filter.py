@@ -115,7 +115,9 @@ class OdometryFilter:
         P[YAW, YAW] += max(point.yaw_variance - before.yaw_variance, 0.0)
         self.state.predict_errors(distance / (self._model.persistence_s * WALKING_SPEED) + dt / STATIONARY_S)
 
-    def update(self, anchor: int, range_m: float, variance_m2: float) -> tuple[float, float]:
+    def update(
+        self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool
+    ) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
         arm_x, arm_y = self._arm()
         vector = self.state.x[:3] - self._anchors[anchor]
@@ -124,7 +126,7 @@ class OdometryFilter:
         H = self.state.H
         H[:3] = vector / max(distance, SHORTEST_M)
         H[YAW] = H[1] * arm_x - H[0] * arm_y
-        return self.state.update_range(anchor, range_m, distance, variance_m2)
+        return self.state.update_range(anchor, range_m, distance, variance_m2, is_corrected)
 
     def set_height(self, height_m: float, variance_m2: float) -> None:
         """Set the height of the antenna: the odometry is horizontal, so that ranges only determine it, unless it is constant."""

@@ -147,7 +147,7 @@ class TagEstimator:
         if isinstance(measurement, TagHeight):
             self._add_height(measurement)
             return None
-        stamp_ns, anchor, _, _ = measurement
+        stamp_ns, anchor, range_m, variance_m2, _ = measurement
         time_s = self.seconds(stamp_ns)
         if time_s < self._time_s:
             if time_s < self._time_s - WINDOW_S:
@@ -165,7 +165,7 @@ class TagEstimator:
             # Not every anchor had its turn since the gap: check the geometry later.
             self._next_check_s = time_s + WINDOW_S
         self._time_s = time_s
-        self._recent.append((time_s, *measurement[1:]))
+        self._recent.append((time_s, anchor, range_m, variance_m2))
         self._states[anchor].received_s = time_s
         if self.filter is None:
             self._search(measurement)
@@ -395,7 +395,8 @@ def run_estimator(
     if heights is not None:
         waiting.extend(rows_of(heights.stamp_ns, heights.height_m, heights.variance_m2))
     latest_ns = None
-    for row in rows_of(ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.variance_m2):
+    is_corrected = np.broadcast_to(ranges.is_corrected, len(ranges))
+    for row in rows_of(ranges.stamp_ns, ranges.anchor, ranges.range_m, ranges.variance_m2, is_corrected):
         while waiting and waiting[0][0] <= row[0]:
             height_ns, *height = waiting.popleft()
             # A height is valid at the time of the latest range: skip those in a gap of the ranges.
