@@ -64,7 +64,7 @@ FIT_SD = 1.5
 MAX_FIT_SD = math.radians(8.0)
 """A fit with a larger standard deviation confirms no heading."""
 
-LATE_SD, MIN_CHANGE, CHANGES = 3.0, math.radians(16.0), 4.0
+LATE_SD, MIN_CHANGE, CHANGES = 3.0, math.radians(16.0), 2.5
 """Until late stamps are excluded, a change of the yaw rate that the odometry does not show yet is within this many standard deviations of
 the heading: in the time of the delay at least this rotation, and this multiple of the range of yaw rates before."""
 
