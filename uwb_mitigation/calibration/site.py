@@ -38,14 +38,15 @@ from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, form
 from uwb_mitigation.files import write_all_atomically
 from uwb_mitigation.mitigation.correction import CorrectionRule
 from uwb_mitigation.mitigation.model import graph
-from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.evaluation.intervals import sigmas95_of
+from uwb_mitigation.training.evaluation.intervals import fit_intervals
+from uwb_mitigation.training.fit.model_card import card_of
 from uwb_mitigation.types.anchors import AnyAnchors, as_anchors
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import Offsets, dump_offsets
@@ -58,8 +59,8 @@ MIN_LABELLED = 40
 MAX_OFFSET_M = 1.0
 """Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
 
-SD_M = NoiseModel().range_sd
-"""Published standard deviation of ranges that no network corrects: what the locator assumes without a calibration."""
+MAX_SD_M = NoiseModel().range_sd
+"""Offsets alone do not make ranges less accurate than the locator assumes without a calibration."""
 
 HEIGHT_SD_M = 0.1
 """Standard deviation of measured heights for the locator of a test."""
@@ -158,6 +159,11 @@ class SiteCalibration:
                 return f"{drive}the live position is worse than with {self._baseline_text}"
             if not errors.range_gain(self.chosen, self.baseline).mean >= MIN_GAIN:
                 return f"{drive}the ranges are not better than with {self._baseline_text}"
+        if self.solution.truth is None and self.baseline == RAW and not self.live_position_change < 0.0:
+            # With the variance of calibrated ranges, the live error increases by up to 20 % in layouts of real deployments.
+            return (
+                "the live position is not expected to improve: the locator estimates the common offset itself"
+            )
         return ""
 
     @property
@@ -244,23 +250,12 @@ class SiteCalibration:
         )
         network = universal.model if model.network is None else graph.float_model(model.network)
         if not model.has_network:
-            sd_m, error_m = float(np.float32(SD_M)), self.held_out_error_m
-            is_known = np.isfinite(error_m)
             network = graph.float_model(scaled(float_network(universal), 0.0))
-            sources = self.site.sources
-            card = replace(
-                card,
-                quantised=False,
-                early_path=False,
-                ood_bands=None,
-                variance_m2=float(np.float32(sd_m**2)),
-                scale=((0.0, sd_m),),
-                interval95_sigmas=sigmas95_of(
-                    error_m[is_known], np.full(is_known.sum(), sd_m), self.data.configurations[is_known]
-                ),
-                radios=sources.radios,
-                segments=sources.segments,
-            )
+            residual_m = self.held_out_error_m * self.solution.residual_scale
+            fitted = output.stem, universal.architecture, self.data, model.linear_bias
+            card = replace(card_of(*fitted, self.data, residual_m, training), needs_cir=False)
+            if not model.linear_bias.needs_power:
+                card = _with_limited_sd(card)
         bundle, content = build_bundle(output, network, card)
         offsets_path = offsets_file(output)
         comment = (
@@ -269,6 +264,18 @@ class SiteCalibration:
         )
         write_all_atomically({output: content, offsets_path: dump_offsets(self.offsets, comment)}, ModelError)
         return bundle, offsets_path
+
+
+def _with_limited_sd(card: ModelCard) -> ModelCard:
+    """Return the card with a standard deviation of at most `MAX_SD_M`; its 95 % interval is unchanged."""
+    factor = min(MAX_SD_M / math.sqrt(card.variance_m2), 1.0)
+    variance_m2 = float(np.float32(card.variance_m2 * factor**2))
+    return replace(
+        card,
+        variance_m2=variance_m2,
+        scale=((0.0, float(np.float32(math.sqrt(variance_m2)))),),
+        interval95_sigmas=min(card.interval95_sigmas / factor, 1e3),
+    )
 
 
 def offsets_file(bundle: Path) -> Path:
@@ -366,19 +373,23 @@ def calibrate_site(
     else:
         notes.append("no networks: the recording has no CIRs that the universal model was trained for")
     levels = {_name(COMMON, simplest): (ONE, simplest), _name(OFFSETS, simplest): (PAIR, simplest)}
-    # Errors that persist for metres look like offsets in each half of a drive. Behind obstacles that the network corrects only in
-    # part they exist at most sites, and the locator estimates the constant errors of corrected ranges itself.
-    needs_separate = []
-    if not solution.offsets_differ or (site.has_cirs and solution.truth is None):
-        needs_separate.append(_name(OFFSETS, simplest))
-    base = select(evaluate(levels), list(levels), needs_separate)
+    names, needs_separate = list(levels), list[str]()
+    if site.has_cirs and solution.truth is None:
+        # What the network leaves behind walls looks like offsets or a line, on each drive the same. The locator estimates constant
+        # errors of anchors itself.
+        names, kinds = names[:1], []
+    elif not solution.offsets_differ:
+        # Errors that persist for metres look like offsets in each half of a drive.
+        needs_separate = names[1:]
+    base = select(evaluate(levels), names, needs_separate)
     level = OFFSETS if levels[base][0] == PAIR else COMMON
     larger = {_name(level, kind): (levels[base][0], kind) for kind in kinds}
     corrections = without | {COMMON: (ONE, models.NO_MODEL)} | levels | larger
     if solution.truth is None:
         needs_separate += larger
+    names = [base, *larger] if site.has_cirs and solution.truth is None else [COMMON, base, *larger]
     held_out = evaluate(corrections)
-    chosen = select(held_out, list(dict.fromkeys([COMMON, base, *larger])), needs_separate)
+    chosen = select(held_out, list(dict.fromkeys(names)), needs_separate)
     level, kind = corrections[chosen]
     data, raw_error_m = _labelled(site, solution, level)
     on_test(1.0)
@@ -414,6 +425,7 @@ class _Fold:
     ) -> HeldOut:
         """Return the errors of corrections, {name: (level of the offsets, kind of the model)}."""
         site, (training_site, solution) = self.site, self.training
+        block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         for name, (level, kind) in corrections.items():
             data, _ = _labelled(training_site, solution, level)
@@ -426,13 +438,18 @@ class _Fold:
             corrected_m = np.maximum(range_m - _offsets_m(site, solution.offsets(level)), 0.0)
             residual_m[name] = self.reference.errors_of(corrected_m - common_m) + common_m
             if solution.truth is not None:
-                variance_m2 = np.full(len(range_m), np.nan if level == NONE else SD_M**2)
-                if model.has_network:
+                if level != NONE and not model.has_network:
+                    intervals = fit_intervals(residual_m[name], predicted_m, block.astype(str))
+                    variance_m2 = intervals.variance_of(predicted_m)
+                    if kind == models.NO_MODEL:
+                        variance_m2 = np.minimum(variance_m2, MAX_SD_M**2)
+                elif model.has_network:
                     unscored = np.zeros(len(range_m), np.float32)
                     rule = CorrectionRule(universal.card)
                     variance_m2 = rule.apply(predicted_m.astype(np.float32), unscored)[1].astype(np.float64)
+                else:
+                    variance_m2 = np.full(len(range_m), np.nan)
                 live_m[name] = self._live_errors_m(corrected_m, variance_m2)
-        block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         return HeldOut(block, residual_m, live_m, is_separate)
 
     def _live_errors_m(

@@ -87,6 +87,8 @@ class SiteSolution:
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
         stationary_positions: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several
             positions.
+        residual_scale: without ground truth, the size of the errors of ranges relative to that of their differences from
+            `true_m`, which contain the error of the track of the other anchors.
     """
 
     rows: NDArray[np.intp]
@@ -107,6 +109,7 @@ class SiteSolution:
     track_of: NDArray[np.intp]
     stationary_positions: Mapping[str, tuple[float, float, float]]
     offsets_differ: bool = True
+    residual_scale: float = 1.0
 
     def offsets(self, level: str) -> Offsets:
         """Return the offset of each pair, with the level `ONE` the common offset for all, and with `NONE` none."""
@@ -256,6 +259,7 @@ class _RangesOnly:
             track=calibration.fit.position,
             track_of=observations.knot_segment,
             stationary_positions=_stationary_positions(calibration),
+            residual_scale=self._residual_scale(has_truth),
         )
 
     def _offsets_differ(self) -> bool:
@@ -265,6 +269,20 @@ class _RangesOnly:
             return False
         deviations = [self._calibration.deviation(tag, row) for tag, row in pairs]
         return sum((value / sd) ** 2 for value, sd in deviations) > float(chdtri(len(pairs) - 1, BY_CHANCE))
+
+    def _residual_scale(self, has_truth: NDArray[np.bool_]) -> float:
+        fit, segments = self._calibration.fit, self._calibration.segments
+        if not has_truth.any():
+            return 1.0
+        anchors = len(np.unique(fit.observations.anchor))
+        # The track follows errors: of m ranges with d unknowns, (m - d) / m of the variance remains in the residuals.
+        redundancy = max(1.0 - fit.config.dims / anchors, 0.25)
+        joint_m = fit.residual_m[fit.observations.observation_index] / math.sqrt(redundancy)
+        residual_m = segments.ranges.range_m - fit.prior.rows @ fit.parameters - self._calibration.distance_m
+        of_joint, of_residuals = (
+            float(np.quantile(np.abs(error_m[has_truth]), 0.68)) for error_m in (joint_m, residual_m)
+        )
+        return min(1.0, of_joint / max(of_residuals, 1e-3))
 
     def _errors_of(self, has_truth: NDArray[np.bool_], range_m: NDArray[np.float64]) -> NDArray[np.float64]:
         fit, segments = self._calibration.fit, self._calibration.segments
