@@ -25,6 +25,7 @@ from uwb_mitigation.calibration.held_out import (
 from uwb_mitigation.calibration.site_data import SiteData, read_site
 from uwb_mitigation.calibration.solution import (
     MAX_OFFSET_SD_M,
+    NONE,
     ONE,
     PAIR,
     SEVERAL,
@@ -35,6 +36,7 @@ from uwb_mitigation.calibration.solution import (
 )
 from uwb_mitigation.errors import DatasetError, ModelError, ParameterError, format_id
 from uwb_mitigation.files import write_all_atomically
+from uwb_mitigation.mitigation.correction import CorrectionRule
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
@@ -44,7 +46,7 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
-from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
+from uwb_mitigation.training.fit.model_card import card_of
 from uwb_mitigation.types.anchors import AnyAnchors, as_anchors
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.offsets import Offsets, dump_offsets
@@ -66,6 +68,9 @@ HEIGHT_SD_M = 0.1
 COMMON, OFFSETS = "common offset", "offsets"
 """What is subtracted: one offset from all ranges, or one from the ranges of each pair."""
 
+SHIPPED = "shipped model alone"
+"""The universal network without offsets: what is used without a calibration."""
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SiteCalibration:
@@ -76,6 +81,7 @@ class SiteCalibration:
         data: the ranges of `solution.rows`, with the offsets subtracted. raw_error_m: their errors as measured, (n,).
         held_out: errors of `raw` and of each correction on the halves of the drive, each corrected by the other half, and on
             each drive of the check.
+        baseline: what is used without a calibration: `SHIPPED` if it applies, otherwise `raw`.
         chosen: name of the selected correction. level: what has a separate offset. model: fitted to all ranges.
         notes: all notes.
     """
@@ -85,6 +91,7 @@ class SiteCalibration:
     data: Dataset
     raw_error_m: NDArray[np.float64]
     held_out: tuple[HeldOut, ...]
+    baseline: str
     chosen: str
     level: str
     model: models.SiteModel
@@ -117,33 +124,27 @@ class SiteCalibration:
         return {name: self.held_out[0].mae_m(name) for name in self.held_out[0].residual_m}
 
     @property
-    def raw_mae_m(self) -> float:
-        """Return the MAE of the measured ranges."""
-        return self.mae_m[RAW]
-
-    @property
-    def calibrated_mae_m(self) -> float:
-        """Return the MAE of the chosen correction on the held-out halves."""
-        return self.mae_m[self.chosen]
-
-    @property
     def live_position_change(self) -> float:
-        """Return the promised change of the live position error on another drive, a share from -1 to 0; NaN: unknown.
+        """Return the promised change of the live position error on another drive, relative to the baseline; NaN: unknown.
 
         It is the upper end of an interval. The locator estimates the common offset itself, so that the promise without ground
         truth is that of the other corrections.
         """
         error_sets = decisive(self.held_out)
         if self.solution.truth is not None:
-            return -min(errors.live_gain(self.chosen, RAW).low for errors in error_sets)
-        gain = min(errors.range_gain(self.chosen, COMMON).low for errors in error_sets)
+            return -min(errors.live_gain(self.chosen, self.baseline).low for errors in error_sets)
+        common = COMMON if self.baseline == RAW else _name(COMMON, models.NETWORK)
+        gain = min(errors.range_gain(self.chosen, common).low for errors in error_sets)
         return -PROMISED_SHARE * max(gain, 0.0)
 
     @property
     def refusal(self) -> str:
         """Return why the calibration does not help; empty: it does."""
         common, sd = self.solution.common
-        if self.solution.truth is None and self.chosen == COMMON and abs(common) < SEVERAL * sd:
+        is_offset_only = (
+            self.level == ONE and not self.model.linear_bias.needs_power and not self.model.network
+        )
+        if self.solution.truth is None and is_offset_only and abs(common) < SEVERAL * sd:
             return f"no offset is significant: {common:.2f} m with a standard deviation of {sd:.2f} m"
         for (tag, anchor), (value, sd) in self.pairs.items():
             # The common offset is not that of an anchor that differs from it.
@@ -154,28 +155,33 @@ class SiteCalibration:
                 )
         for errors in self.held_out:
             drive = "on the drive of the check " if errors is not self.held_out[0] else ""
-            if errors.live_gain(self.chosen, RAW).mean < -MAX_INCREASE:
-                return f"{drive}the live position becomes worse"
-            if not errors.range_gain(self.chosen, RAW).mean >= MIN_GAIN:
-                return f"{drive}the ranges do not improve"
+            if errors.live_gain(self.chosen, self.baseline).mean < -MAX_INCREASE:
+                return f"{drive}the live position is worse than with {self._baseline_text}"
+            if not errors.range_gain(self.chosen, self.baseline).mean >= MIN_GAIN:
+                return f"{drive}the ranges are not better than with {self._baseline_text}"
+        if self.solution.truth is None and self.baseline == RAW and not self.live_position_change < 0.0:
+            # With the variance of calibrated ranges, the live error increases by up to 20 % in layouts of real deployments.
+            return (
+                "the live position is not expected to improve: the locator estimates the common offset itself"
+            )
         return ""
+
+    @property
+    def _baseline_text(self) -> str:
+        return "raw ranges" if self.baseline == RAW else f"the {SHIPPED}"
 
     def summary(self) -> str:
         """Return the result in a few sentences."""
-        truth, change = self.solution.truth, self.live_position_change
-        text = "The live position error on another drive is not expected to change. "
-        if change < 0.0:
-            text = f"The live position error on another drive decreases by at least {-change:.0%}. "
-        if not math.isnan(raw_m := self.held_out[0].live_rmse_m(RAW)):
-            text = (
-                f"Live position error on held-out halves (against {truth}): {raw_m:.3f} m raw, "
-                f"{self.held_out[0].live_rmse_m(self.chosen):.3f} m calibrated ({change:+.0%} or better). "
-            )
+        truth, change, halves = self.solution.truth, self.live_position_change, self.held_out[0]
+        text = f"Compared with {self._baseline_text}, the live position error on another drive "
+        text += f"decreases by at least {-change:.0%}. " if change < 0.0 else "is not expected to change. "
+        compared = list(dict.fromkeys((RAW, self.baseline, self.chosen)))
+        if truth is not None:
+            errors = ", ".join(f"{halves.live_rmse_m(name):.3f} m {name}" for name in compared)
+            text += f"Live position error on held-out halves (against {truth}): {errors}. "
         kind = "residual against the other anchors" if truth is None else f"error against {truth}"
-        text += (
-            f"Mean absolute range {kind}: {self.raw_mae_m:.3f} m raw, {self.calibrated_mae_m:.3f} m calibrated "
-            f"({self.chosen})."
-        )
+        errors = ", ".join(f"{halves.mae_m(name):.3f} m {name}" for name in compared)
+        text += f"Mean absolute range {kind}: {errors}."
         if self.refusal:
             text = f"Calibration does not help: {self.refusal}. " + text
         return text
@@ -189,9 +195,13 @@ class SiteCalibration:
             "offsets_of": self.level,
             "live_position_change": self.live_position_change,
             "live_position_m": {name: halves.live_rmse_m(name) for name in halves.residual_m},
-            "raw_mae_m": self.raw_mae_m,
-            "calibrated_mae_m": self.calibrated_mae_m,
-            "check_mae_m": [[errors.mae_m(RAW), errors.mae_m(self.chosen)] for errors in self.held_out[1:]],
+            "compared_with": self.baseline,
+            "raw_mae_m": self.mae_m[RAW],
+            "baseline_mae_m": self.mae_m[self.baseline],
+            "calibrated_mae_m": self.mae_m[self.chosen],
+            "check_mae_m": [
+                [errors.mae_m(self.baseline), errors.mae_m(self.chosen)] for errors in self.held_out[1:]
+            ],
             "truth": solution.truth or "none",
             "refused": None,
             "chosen": self.chosen,
@@ -199,7 +209,6 @@ class SiteCalibration:
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(self.data),
             "outliers": solution.outliers,
-            "network_factor": [model.factor, solution.network_sd],
             "line": model.linear_bias,
             "positions": solution.stationary_positions,
             "notes": self.notes,
@@ -231,20 +240,23 @@ class SiteCalibration:
             "recipe": {"line": model.linear_bias.needs_power, "network": model.has_network},
             "metrics_m": {row: {"mae": round(value, 4)} for row, value in self.mae_m.items()},
         }
-        residual_m = self.held_out_error_m * self.solution.residual_scale
-        ood_bands = ood_bands_of(self.data) if model.has_network else None
-        fitted = output.stem, universal.architecture, self.data, model.linear_bias
-        card = card_of(*fitted, self.data, residual_m, training, ood_bands)
-        if model.has_network:
-            # The drive does not cover the whole site, so the limits include those of the universal model.
-            (low, high), (lowest, highest) = universal.card.correction_limits_m, card.correction_limits_m
-            card = replace(card, correction_limits_m=(min(low, lowest), max(high, highest)))
-        elif not model.linear_bias.needs_power:
-            card = _with_limited_sd(card)
-        network = model.network or scaled(float_network(universal), model.factor)
-        bundle, content = build_bundle(
-            output, graph.float_model(network), replace(card, needs_cir=model.has_network)
+        card = replace(
+            universal.card,
+            name=output.stem,
+            linear_bias=model.linear_bias,
+            training=training,
+            needs_cir=model.has_network,
+            quantised=universal.card.quantised and model.network is None,
         )
+        network = universal.model if model.network is None else graph.float_model(model.network)
+        if not model.has_network:
+            network = graph.float_model(scaled(float_network(universal), 0.0))
+            residual_m = self.held_out_error_m * self.solution.residual_scale
+            fitted = output.stem, universal.architecture, self.data, model.linear_bias
+            card = replace(card_of(*fitted, self.data, residual_m, training), needs_cir=False)
+            if not model.linear_bias.needs_power:
+                card = _with_limited_sd(card)
+        bundle, content = build_bundle(output, network, card)
         offsets_path = offsets_file(output)
         comment = (
             f"Offsets of the radios, m, for model {bundle.model_id:08x} ({output.name}): use both together.\n"
@@ -345,27 +357,39 @@ def calibrate_site(
 
     def evaluate(corrections: Mapping[str, tuple[str, str]]) -> list[HeldOut]:
         """Return the errors of corrections, {name: (level of the offsets, kind of the model)}, on the halves and on each drive."""
-        one, other = (fold.evaluate(corrections, fine_tune, is_separate=is_separate) for fold in folds)
-        drives = (fold.evaluate(corrections, fine_tune, is_separate=True) for fold in checks)
+        one, other = (
+            fold.evaluate(universal, corrections, fine_tune, is_separate=is_separate) for fold in folds
+        )
+        drives = (fold.evaluate(universal, corrections, fine_tune, is_separate=True) for fold in checks)
         return [one.merged(other, is_first), *drives]
 
-    levels = {COMMON: (ONE, models.NO_MODEL), OFFSETS: (PAIR, models.NO_MODEL)}
-    # Errors that persist for metres look like offsets in each half of a drive.
-    needs_separate = [] if solution.offsets_differ else [OFFSETS]
-    base = select(evaluate(levels), list(levels), needs_separate)
-    kinds, notes = [models.LINE], list(solution.notes)
+    notes, kinds, simplest = list(solution.notes), [models.LINE], models.NO_MODEL
+    without = {RAW: (NONE, models.NO_MODEL)}
     if site.has_cirs:
-        kinds = [models.NETWORK, models.NETWORK_LINE, *([models.FINE_TUNED] if fine_tune else [])]
+        without[SHIPPED] = NONE, models.NETWORK
+        kinds, simplest = [models.NETWORK_LINE, *([models.FINE_TUNED] if fine_tune else [])], models.NETWORK
         if without_cir := int((~site.is_usable).sum()):
             notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
     else:
         notes.append("no networks: the recording has no CIRs that the universal model was trained for")
-    corrections = levels | {f"{base} + {kind}": (levels[base][0], kind) for kind in kinds}
+    levels = {_name(COMMON, simplest): (ONE, simplest), _name(OFFSETS, simplest): (PAIR, simplest)}
+    names, needs_separate = list(levels), list[str]()
+    if site.has_cirs and solution.truth is None:
+        # What the network leaves behind walls looks like offsets or a line, on each drive the same. The locator estimates constant
+        # errors of anchors itself.
+        names, kinds = names[:1], []
+    elif not solution.offsets_differ:
+        # Errors that persist for metres look like offsets in each half of a drive.
+        needs_separate = names[1:]
+    base = select(evaluate(levels), names, needs_separate)
+    level = OFFSETS if levels[base][0] == PAIR else COMMON
+    larger = {_name(level, kind): (levels[base][0], kind) for kind in kinds}
+    corrections = without | {COMMON: (ONE, models.NO_MODEL)} | levels | larger
     if solution.truth is None:
-        needs_separate = [name for name, (_, kind) in corrections.items() if kind == models.LINE]
+        needs_separate += larger
+    names = [base, *larger] if site.has_cirs and solution.truth is None else [COMMON, base, *larger]
     held_out = evaluate(corrections)
-    candidates = [base, *list(corrections)[2:]]
-    chosen = select(held_out, candidates, needs_separate)
+    chosen = select(held_out, list(dict.fromkeys(names)), needs_separate)
     level, kind = corrections[chosen]
     data, raw_error_m = _labelled(site, solution, level)
     on_test(1.0)
@@ -375,6 +399,7 @@ def calibrate_site(
         data=data,
         raw_error_m=raw_error_m,
         held_out=tuple(held_out),
+        baseline=list(without)[-1],
         chosen=chosen,
         level=level,
         model=models.fit_model(kind, data, site.universal_m[solution.rows], fine_tune),
@@ -392,41 +417,46 @@ class _Fold:
 
     def evaluate(
         self,
+        universal: Bundle,
         corrections: Mapping[str, tuple[str, str]],
         fine_tune: models.FineTune | None,
         *,
         is_separate: bool,
     ) -> HeldOut:
-        """Return the errors of `RAW` and of corrections, {name: (level of the offsets, kind of the model)}."""
+        """Return the errors of corrections, {name: (level of the offsets, kind of the model)}."""
         site, (training_site, solution) = self.site, self.training
-        raw_m = site.ranges.range_m
-        residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
+        residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         for name, (level, kind) in corrections.items():
             data, _ = _labelled(training_site, solution, level)
             model = models.fit_model(kind, data, training_site.universal_m[solution.rows], fine_tune)
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
-            corrected_m = np.maximum(raw_m - _offsets_m(site, solution.offsets(level)) - predicted_m, 0.0)
-            residual_m[name] = self.reference.errors_of(corrected_m)
+            range_m = site.ranges.range_m - predicted_m
+            # Without ground truth the reference of ranges without offsets contains no common offset, because the locator
+            # estimates it.
+            common_m = solution.common[0] if level == NONE and solution.truth is None else 0.0
+            corrected_m = np.maximum(range_m - _offsets_m(site, solution.offsets(level)), 0.0)
+            residual_m[name] = self.reference.errors_of(corrected_m - common_m) + common_m
             if solution.truth is not None:
-                variance_m2 = fit_intervals(residual_m[name], predicted_m, block.astype(str)).variance_of(
-                    predicted_m
-                )
-                if kind == models.NO_MODEL:
-                    variance_m2 = np.minimum(variance_m2, MAX_SD_M**2)
+                if level != NONE and not model.has_network:
+                    intervals = fit_intervals(residual_m[name], predicted_m, block.astype(str))
+                    variance_m2 = intervals.variance_of(predicted_m)
+                    if kind == models.NO_MODEL:
+                        variance_m2 = np.minimum(variance_m2, MAX_SD_M**2)
+                elif model.has_network:
+                    unscored = np.zeros(len(range_m), np.float32)
+                    rule = CorrectionRule(universal.card)
+                    variance_m2 = rule.apply(predicted_m.astype(np.float32), unscored)[1].astype(np.float64)
+                else:
+                    variance_m2 = np.full(len(range_m), np.nan)
                 live_m[name] = self._live_errors_m(corrected_m, variance_m2)
-        # Without ground truth the reference of the raw ranges contains no common offset, because the locator estimates it.
-        residual_m[RAW] = residual_m[next(iter(corrections))] + solution.common[0]
-        if solution.truth is not None:
-            live_m[RAW] = self._live_errors_m(raw_m, np.nan)
         return HeldOut(block, residual_m, live_m, is_separate)
 
     def _live_errors_m(
-        self, range_m: NDArray[np.float64], variance_m2: NDArray[np.float64] | float
+        self, range_m: NDArray[np.float64], variance_m2: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the error of the live position at each range, (r,), m; NaN: no position, or no reference."""
         site, height = self.site, self.reference.height
-        variance_m2 = np.broadcast_to(variance_m2, len(range_m))
         corrected = replace(
             site.ranges, range_m=range_m, variance_m2=variance_m2, is_corrected=np.isfinite(variance_m2)
         )
@@ -446,6 +476,11 @@ class _Fold:
             has_position = track.stamp_ns[index] == ranges.stamp_ns
             error_m[rows[has_position]] = np.linalg.norm(difference[has_position, axes], axis=1)
         return error_m
+
+
+def _name(offsets: str, kind: str) -> str:
+    """Return the name of a correction: what is subtracted, and the kind of the model."""
+    return f"{offsets} + {kind}" if kind else offsets
 
 
 def _check_offsets(pairs: Pairs) -> None:

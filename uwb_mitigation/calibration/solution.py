@@ -89,7 +89,6 @@ class SiteSolution:
             positions.
         residual_scale: without ground truth, the size of the errors of ranges relative to that of their differences from
             `true_m`, which contain the error of the track of the other anchors.
-        network_sd: standard deviation of the network's factor in the joint solution; 0: not estimated.
     """
 
     rows: NDArray[np.intp]
@@ -111,18 +110,17 @@ class SiteSolution:
     stationary_positions: Mapping[str, tuple[float, float, float]]
     offsets_differ: bool = True
     residual_scale: float = 1.0
-    network_sd: float = 0.0
 
     def offsets(self, level: str) -> Offsets:
-        """Return the offset of each pair, or with the level `ONE` the common offset for all."""
-        if level == ONE:
-            return Offsets(self.common[0])
+        """Return the offset of each pair, with the level `ONE` the common offset for all, and with `NONE` none."""
+        if level != PAIR:
+            return Offsets(self.common[0] if level == ONE else 0.0)
         sds = {pair: sd for pair, (_, sd) in self.pairs.items() if math.isfinite(sd)}
         values = {pair: value for pair, (value, _) in self.pairs.items()}
         return Offsets(self.common[0], pairs=values, pair_sd=sds)
 
 
-ONE, PAIR = "one", "pair"
+NONE, ONE, PAIR = "none", "one", "pair"
 """What has a separate offset."""
 
 
@@ -262,7 +260,6 @@ class _RangesOnly:
             track_of=observations.knot_segment,
             stationary_positions=_stationary_positions(calibration),
             residual_scale=self._residual_scale(has_truth),
-            network_sd=calibration.value(NETWORK)[1],
         )
 
     def _offsets_differ(self) -> bool:
