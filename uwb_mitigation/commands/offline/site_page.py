@@ -95,9 +95,6 @@ def _details(calibration: SiteCalibration) -> Iterable[str]:
     if solution.alignment is not None:
         arms = "; ".join(", ".join(f"{value:.3f}" for value in arm) for arm in solution.alignment.lever_arm_m)
         yield f"Localisation {solution.truth}: time offset {solution.alignment.time_offset_s:.3f} s, lever arm {arms} m."
-    if calibration.model.has_network and solution.network_sd:
-        factor = f"{calibration.model.factor:.2f} +- {solution.network_sd:.2f}"
-        yield f"Factor of the universal network's predictions: {factor}."
 
 
 def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
