@@ -124,6 +124,16 @@ class SiteCalibration:
         return {name: self.held_out[0].mae_m(name) for name in self.held_out[0].residual_m}
 
     @property
+    def raw_mae_m(self) -> float:
+        """Return the MAE of the measured ranges."""
+        return self.mae_m[RAW]
+
+    @property
+    def calibrated_mae_m(self) -> float:
+        """Return the MAE of the chosen correction on the held-out halves."""
+        return self.mae_m[self.chosen]
+
+    @property
     def live_position_change(self) -> float:
         """Return the promised change of the live position error on another drive, relative to the baseline; NaN: unknown.
 
@@ -196,9 +206,9 @@ class SiteCalibration:
             "live_position_change": self.live_position_change,
             "live_position_m": {name: halves.live_rmse_m(name) for name in halves.residual_m},
             "compared_with": self.baseline,
-            "raw_mae_m": self.mae_m[RAW],
+            "raw_mae_m": self.raw_mae_m,
             "baseline_mae_m": self.mae_m[self.baseline],
-            "calibrated_mae_m": self.mae_m[self.chosen],
+            "calibrated_mae_m": self.calibrated_mae_m,
             "check_mae_m": [
                 [errors.mae_m(self.baseline), errors.mae_m(self.chosen)] for errors in self.held_out[1:]
             ],
