@@ -245,17 +245,19 @@ class Figures:
         if timeline is not None and player is not None:
             now_s = player.shown_s
         ranges = self._ranges(player, scene, now_s - HISTORY_S, now_s)
-        others = dict[float, float]()
+        second_m_at = dict[float, float]()
         if second is not None:
             compared = self._ranges(second, second.scene)
-            others = dict(zip(compared.stamp_s.round(6).tolist(), compared.corrected_m.tolist(), strict=True))
-        second_m = [others.get(stamp_s, math.nan) for stamp_s in ranges.stamp_s.round(6).tolist()]
+            second_m_at = dict(
+                zip(compared.stamp_s.round(6).tolist(), compared.corrected_m.tolist(), strict=True)
+            )
+        compared_m = [second_m_at.get(stamp_s, math.nan) for stamp_s in ranges.stamp_s.round(6).tolist()]
         columns = (
             ranges.time_s - now_s,
             ranges.raw_m,
             ranges.corrected_m,
             ranges.true_m,
-            second_m,
+            compared_m,
             ranges.status,
         )
         table = np.column_stack(columns)[ranges.time_s >= now_s - HISTORY_S]

@@ -320,12 +320,15 @@ class Scene:
     def set_anchors(self, anchors: Iterable[Anchor]) -> None:
         """Set the anchors on Earth; the height of an anchor may be NaN."""
         plausible = (anchor for anchor in anchors if _is_plausible(*anchor.position))
-        anchors_before, self.anchors = self.anchors, {one.id: one for one in islice(plausible, MAX_ANCHORS)}
+        anchors_before, self.anchors = (
+            self.anchors,
+            {anchor.id: anchor for anchor in islice(plausible, MAX_ANCHORS)},
+        )
         self.revision += 1
         if self.anchors and self.anchors != anchors_before:
             places = [
-                replace(one, position=(*one.position[:2], finite_or_zero(one.position[2])))
-                for one in self.anchors.values()
+                replace(anchor, position=(*anchor.position[:2], finite_or_zero(anchor.position[2])))
+                for anchor in self.anchors.values()
             ]
             self._anchor_map = AnchorMap(places)
             self._raw_locators.clear()

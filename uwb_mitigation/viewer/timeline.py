@@ -316,8 +316,8 @@ def _lost(sequence: NDArray[np.uint32]) -> int:
 
 def _add_positions(timeline: Timeline, anchors: AnchorMap) -> None:
     """Add what ranges and tracks yield together: residuals, and the mean correction along the tracks."""
-    known = np.array(sorted(anchors.index), np.uint64)
-    place = anchors.position[[anchors.index[int(one)] for one in known]]
+    ids = np.array(sorted(anchors.index), np.uint64)
+    place = anchors.position[[anchors.index[int(anchor_id)] for anchor_id in ids]]
     tracks = {name: track for (name, kind), track in timeline.tracks.items() if kind is TrackKind.CORRECTED}
     for tag_id in np.unique(timeline.tag):
         track = tracks.get(tag_name(int(tag_id), tracks, timeline.losses))
@@ -325,10 +325,10 @@ def _add_positions(timeline: Timeline, anchors: AnchorMap) -> None:
             continue
         rows = np.flatnonzero(timeline.tag == tag_id)
         x, y, z = (np.interp(timeline.time_s[rows], track[:, 0], axis) for axis in track[:, 1:4].T)
-        index = np.minimum(np.searchsorted(known, timeline.anchor[rows]), len(known) - 1)
+        index = np.minimum(np.searchsorted(ids, timeline.anchor[rows]), len(ids) - 1)
         distance_m = np.linalg.norm(np.column_stack([x, y, np.nan_to_num(z)]) - place[index], axis=1)
         age_s = timeline.time_s[rows] - track[_latest(track, timeline.time_s[rows]), 0]
-        is_known = (known[index] == timeline.anchor[rows]) & (np.abs(age_s) < NO_DATA_S)
+        is_known = (ids[index] == timeline.anchor[rows]) & (np.abs(age_s) < NO_DATA_S)
         timeline.residual_m[rows] = np.where(is_known, timeline.corrected_m[rows] - distance_m, np.nan)
         correction = timeline.raw_m[rows] - timeline.corrected_m[rows]
         for row in np.flatnonzero(np.abs(correction) < MAX_RANGE_M):

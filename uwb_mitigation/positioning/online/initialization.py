@@ -70,17 +70,17 @@ def candidate_positions(
         return []
     (x,), (cost,), (hessian,) = local_optima(anchors, range_m[None], sd_m, model, height, area)
     result: list[CandidatePosition] = []
-    left = np.flatnonzero(np.isfinite(cost))
-    left = left[np.argsort(cost[left])]
-    while len(left):
-        best = left[0]
+    remaining = np.flatnonzero(np.isfinite(cost))
+    remaining = remaining[np.argsort(cost[remaining])]
+    while len(remaining):
+        best = remaining[0]
         information = hessian[best] + 1e-6 * np.eye(3)
         result.append(CandidatePosition(x[best].copy(), np.linalg.inv(information), float(cost[best])))
-        offset = x[left] - x[best]
+        offset = x[remaining] - x[best]
         same = (np.sum(offset * offset, axis=1) < 0.25) | (
             np.sum(offset @ information * offset, axis=1) < 4.0
         )
-        left = left[~same]
+        remaining = remaining[~same]
     return result
 
 
@@ -105,7 +105,7 @@ def local_optima(
     Returns:
         positions float64 (m, n, 3), losses (m, n), infinite where implausible, and Hessians (m, n, 3, 3).
     """
-    x = np.concatenate([_starts(anchors, one, height) for one in range_m])
+    x = np.concatenate([_starts(anchors, set_m, height) for set_m in range_m])
     sets = len(range_m), len(x) // len(range_m)
     of_starts = np.repeat(range_m, sets[1], axis=0)
     problem = _Trilateration(anchors, of_starts, sd_m, model, *_height_prior(len(x), height))
