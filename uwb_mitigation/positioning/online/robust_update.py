@@ -47,12 +47,6 @@ OFFSET_SCALE = 4.0
 """Smallest factor of the part of published covariances from the common offset: small persisting errors say nothing about it. With
 `SCALE` instead, twice as many of a hundred runs (simulated drives, Hanyang, labyrinth) exceed protection levels in 0.5 %."""
 
-SHORT_M, SHORT_FACTOR, MEDIAN_STEP_M = 0.12, 20.0, 0.01
-"""Obstacles lengthen ranges only. If those of three anchors stay too short by more than `SHORT_M` (running medians, which change
-by `MEDIAN_STEP_M` with each range), anchors have constant errors, and the robust loss would follow those that agree by chance: raw
-ranges then have a larger variance, by `SHORT_FACTOR` times the excess of the third square. Chosen on simulated drives: in the
-layout `box`, whose anchors have errors of 0.3 m, the RMSE decreases by 11 %; in sites and flats it changes by at most 2 %."""
-
 RESIDUAL_RATE = 0.001
 """As `CONSISTENCY_RATE`, for products of residuals: a thousand ranges, because most of their errors are constant."""
 
@@ -83,7 +77,6 @@ class RobustUpdate:
         self._error_variance = (1.0 - model.white) * model.range_sd**2 + anchors.sd**2
         self.estimates_errors, self.consistency = False, 1.0
         self.residual_square, self._last_residual = 0.0, [0.0] * len(anchors)
-        self._medians, self._short_variance = [0.0] * len(anchors), 0.0
         self._constant_rows: dict[int, int] = {}
         self.H, self.x, self.P = np.zeros(n), np.zeros(n), np.zeros((n, n))
         self.x[: len(motion)] = motion
@@ -102,7 +95,7 @@ class RobustUpdate:
     def copy(self) -> RobustUpdate:
         """Return an independent copy."""
         twin = copy.copy(self)
-        for name in ("H", "P", "_constant_rows", "_error_variance", "_last_residual", "_medians", "x"):
+        for name in ("H", "P", "_constant_rows", "_error_variance", "_last_residual", "x"):
             setattr(twin, name, getattr(self, name).copy())
         twin._bind()
         return twin
@@ -166,8 +159,6 @@ class RobustUpdate:
         model, x, H, P, k = self._model, self.x, self.H, self.P, self._offset
         row = k + 1 + anchor
         variance, error_variance = model.variance(variance_m2), float(self._error_variance[anchor])
-        if not is_corrected:
-            variance += self._short_variance
         # The part of the variance that the persisting error does not explain is white noise.
         share = CORRECTED_WHITE if is_corrected else model.white
         white = max(share * variance, variance - error_variance)
@@ -184,11 +175,6 @@ class RobustUpdate:
             curvature = (P.item(0, 0) + P.item(1, 1)) / max(distance_m, SHORTEST_M)
             white += 0.5 * curvature * curvature
         z, sd = self.update(H, innovation, white)
-        if self.estimates_errors and not is_corrected:
-            medians = self._medians
-            medians[anchor] += math.copysign(MEDIAN_STEP_M, residual - medians[anchor])
-            third = min(sorted(medians)[min(2, len(medians) - 1)], 0.0)
-            self._short_variance = SHORT_FACTOR * max(third * third - SHORT_M**2, 0.0)
         residual /= math.sqrt(model.inflation(z))
         # White noise does not contribute to the mean of this product.
         square = residual * self._last_residual[anchor]
