@@ -14,9 +14,10 @@ from firmware_on_model import ModelBus, ranging, use_virtual_time
 from benchmarks.equipment.dw1000_model.air import Air, Chip, Host
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios.dw1000 import structures
-from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
+from uwb_mitigation.radios.dw1000.native import Io, NativeRadio, load_native
 from uwb_mitigation.radios.settings import RadioSettings, RadioState, RadioStatus, Role, status_warning
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.messages import SetRadio
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 pytestmark = NEEDS_CC
@@ -254,10 +255,10 @@ def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[in
 @pytest.mark.parametrize(("rate_kbps", "refused"), [(6800, True), (850, False)])
 def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refused: bool):
     """FINAL must not be sent within 1 ms after POLL with more power than the average limit."""
-    config = structures.config(RadioSettings(rate_kbps=rate_kbps, preamble=64))
-    config.reply_us = 999
-    radio = load_native().native_radio_new(ctypes.byref(structures.Io()), ctypes.byref(config), 1)
-    assert (load_native().native_radio_configure(radio, ctypes.byref(config)) is not None) == refused
+    _, payload = messages.encode(SetRadio(RadioSettings(rate_kbps=rate_kbps, preamble=64, reply_us=999)))
+    settings = payload, len(payload), 0, 0
+    radio = load_native().native_radio_new(ctypes.byref(Io()), *settings, 1)
+    assert (load_native().native_radio_configure(radio, *settings) is not None) == refused
     load_native().native_radio_free(radio)
 
 

@@ -15,116 +15,24 @@ static void send_radio(uwb_ranger *ranger, const uint32_t *request, const char *
         uwb_radio_t fixed;
         uint8_t tail[8 * UWB_MAX_ANCHORS + 120];
     } message;
-    const uwb_twr_config *const config = ranger->config_changed ? &ranger->new_config : &ranger->twr.config;
-    const int chip_is_configured = ranger->twr.running && !ranger->config_changed;
-    const uwb_dw1000_settings *const radio = chip_is_configured ? &ranger->twr.chip.settings : &config->radio;
-    uwb_radio_t *const fixed = &message.fixed;
-    memset(&message, 0, sizeof message);
-    fixed->request_sequence = request != NULL ? *request : 0;
-    fixed->accepted = refusal == NULL;
-    fixed->address = ranger->twr.address;
-    fixed->antenna_delay = radio->antenna_delay;
-    fixed->tx_power = radio->tx_power;
-    fixed->reply_us = config->reply_us;
-    fixed->timeout_us = config->timeout_us;
-    fixed->interval_us = config->interval_us;
-    fixed->pan = config->pan;
-    fixed->rate = radio->rate_kbps;
-    fixed->preamble = radio->preamble;
-    fixed->window = config->window;
-    fixed->channel = radio->channel;
-    fixed->prf = radio->prf_mhz;
-    fixed->preamble_code = radio->preamble_code;
-    fixed->decawave_sfd = radio->decawave_sfd;
-    fixed->role = config->role;
-    fixed->report = config->report;
-    fixed->bias_correction = config->bias_correction;
-    fixed->anchor_count = config->anchor_count;
-    size_t at = 8u * config->anchor_count;
-    memcpy(message.tail, config->anchors, at);
-    for (; refusal != NULL && *refusal != 0 && at < sizeof message.tail; refusal++) {
-        message.tail[at++] = (uint8_t)*refusal;
+    const uwb_twr_config *const requested = ranger->config_changed ? &ranger->new_config : NULL;
+    size_t bytes = uwb_twr_write_settings(&ranger->twr, requested, (uint8_t *)&message);
+    message.fixed.request_sequence = request != NULL ? *request : 0;
+    message.fixed.accepted = refusal == NULL;
+    for (; refusal != NULL && *refusal != 0 && bytes < sizeof message; refusal++) {
+        ((uint8_t *)&message)[bytes++] = (uint8_t)*refusal;
     }
     const uint16_t flags = request != NULL ? UWB_FLAG_ANSWER : 0;
-    (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO, flags, now_us(ranger), &message, sizeof *fixed + at, 0);
+    (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO, flags, now_us(ranger), &message, bytes, 0);
 }
 
 /* Send RADIO_STATUS. */
 static void send_status(uwb_ranger *ranger) {
-    struct {
-        uwb_radio_status_t fixed;
-        uwb_radio_anchor_t anchors[UWB_MAX_ANCHORS];
-    } message;
-    const uwb_twr *const twr = &ranger->twr;
-    const uwb_twr_counts *const counts = &twr->counts;
-    const uint64_t at_us = now_us(ranger);
-    const uint8_t known = twr->config.role == UWB_ROLE_TAG ? twr->known : 0;
-    memset(&message, 0, sizeof message);
-    message.fixed = (uwb_radio_status_t){
-        .tried = counts->tried,
-        .ranged = counts->ranged,
-        .no_answer = counts->no_answer,
-        .late = counts->late,
-        .timeout = counts->timeout,
-        .damaged = counts->damaged,
-        .implausible = counts->implausible,
-        .broken = counts->broken,
-        .refused = counts->refused,
-        .restarts = counts->restarts,
-        .temperature = ranger->board.temperature,
-        .voltage = ranger->voltage,
-        .state = uwb_twr_state(twr),
-        .anchor_count = known,
-    };
-    for (uint8_t i = 0; i < known; i++) {
-        const uwb_twr_anchor *const anchor = &twr->anchors[i];
-        const uint64_t age_ms = (at_us - anchor->last_seen_us) / 1000;
-        message.anchors[i] = (uwb_radio_anchor_t){
-            .address = anchor->address,
-            .tried = anchor->tried,
-            .ranged = anchor->ranged,
-            .rx_power = anchor->rx_power_dbm,
-            .age_ms = anchor->last_seen_us == 0 || age_ms > UINT32_MAX ? UINT32_MAX : (uint32_t)age_ms,
-        };
-    }
-    const size_t bytes = sizeof message.fixed + known * sizeof message.anchors[0];
-    (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO_STATUS, 0, at_us, &message, bytes, UWB_ANSWER_RESERVE_BYTES);
-}
-
-/* Parse SET_RADIO; returns NULL, or the reason why it is refused. */
-static const char *parse_set_radio(const uwb_ranger *ranger, const uint8_t *payload, size_t bytes, uwb_twr_config *config) {
-    uwb_set_radio_t fixed;
-    if (bytes < sizeof fixed) {
-        return "SET_RADIO is too short";
-    }
-    memcpy(&fixed, payload, sizeof fixed);
-    if (fixed.anchor_count > UWB_MAX_ANCHORS || bytes < sizeof fixed + 8u * fixed.anchor_count) {
-        return "more anchors than 32, or than SET_RADIO contains";
-    }
-    memset(config, 0, sizeof *config);
-    config->radio = (uwb_dw1000_settings){
-        .channel = fixed.channel,
-        .prf_mhz = fixed.prf,
-        .preamble_code = fixed.preamble_code,
-        .decawave_sfd = fixed.decawave_sfd,
-        .rate_kbps = fixed.rate,
-        .preamble = fixed.preamble,
-        .tx_power = fixed.tx_power,
-        .antenna_delay = fixed.antenna_delay,
-    };
-    config->address = fixed.address;
-    config->pan = fixed.pan;
-    config->role = fixed.role;
-    config->report = fixed.report;
-    config->bias_correction = fixed.bias_correction;
-    config->anchor_count = fixed.anchor_count;
-    config->window = fixed.window;
-    config->reply_us = fixed.reply_us;
-    config->timeout_us = fixed.timeout_us;
-    uwb_twr_set_default_times(config, uwb_twr_defaults.reply_us, uwb_twr_defaults.timeout_us);
-    config->interval_us = fixed.interval_us;
-    memcpy(config->anchors, payload + sizeof fixed, 8u * fixed.anchor_count);
-    return uwb_twr_config_error(&ranger->twr, config);
+    uint64_t message[UWB_TWR_STATUS_BYTES / sizeof(uint64_t)];
+    const size_t bytes =
+        uwb_twr_write_status(&ranger->twr, ranger->board.temperature, ranger->voltage, (uint8_t *)message);
+    (void)uwb_board_send(&ranger->board, UWB_TYPE_RADIO_STATUS, 0, now_us(ranger), message, bytes,
+                         UWB_ANSWER_RESERVE_BYTES);
 }
 
 /* Handle GET_RADIO and SET_RADIO; returns whether the frame has one of these types. */
@@ -134,7 +42,8 @@ static int handle_frame(void *context, const uwb_header_t *header, const uint8_t
     (void)at_us;
     if (header->type == UWB_TYPE_SET_RADIO) {
         uwb_twr_config config;
-        refusal = parse_set_radio(ranger, payload, bytes, &config);
+        refusal = uwb_twr_read_settings(payload, bytes, uwb_twr_defaults.reply_us, uwb_twr_defaults.timeout_us, &config);
+        refusal = refusal != NULL ? refusal : uwb_twr_config_error(&ranger->twr, &config);
         if (refusal == NULL) {
             ranger->new_config = config;
             ranger->config_changed = 1;

@@ -28,6 +28,9 @@ extern "C" {
 /* Memory for a measurement with `samples` complex samples. */
 #define UWB_TWR_MEASUREMENT_BYTES(samples) (sizeof(uwb_range_cir_t) + 4u * (samples))
 
+#define UWB_TWR_SETTINGS_BYTES (sizeof(uwb_radio_t) + 8u * UWB_MAX_ANCHORS)
+#define UWB_TWR_STATUS_BYTES (sizeof(uwb_radio_status_t) + UWB_MAX_ANCHORS * sizeof(uwb_radio_anchor_t))
+
 /* Configuration of a tag or an anchor. Only tags use reply_us, timeout_us, interval_us and the list of anchors. */
 typedef struct {
     uwb_dw1000_settings radio;
@@ -164,6 +167,17 @@ uwb_twr_event uwb_twr_step(uwb_twr *twr, uint64_t until_us);
 
 /* Return the state of the radio, a UWB_RADIO_STATE_*. */
 uint8_t uwb_twr_state(const uwb_twr *twr);
+
+/* Write a payload of RADIO with the active settings, or the requested ones if they are not NULL: at most
+ * UWB_TWR_SETTINGS_BYTES, without a text. Returns its bytes. */
+size_t uwb_twr_write_settings(const uwb_twr *twr, const uwb_twr_config *requested, uint8_t *payload);
+
+/* Read a payload of SET_RADIO; the given times replace times of 0. Returns NULL, or the reason why it is malformed. */
+const char *uwb_twr_read_settings(const uint8_t *payload, size_t bytes, uint32_t reply_us, uint32_t timeout_us,
+                                  uwb_twr_config *config);
+
+/* Write a payload of RADIO_STATUS: at most UWB_TWR_STATUS_BYTES. Returns its bytes. */
+size_t uwb_twr_write_status(const uwb_twr *twr, float temperature, float voltage, uint8_t *payload);
 
 /* Return the bytes of the measurement of the last exchange. */
 size_t uwb_twr_measurement_bytes(const uwb_twr *twr);

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from ctypes import POINTER, c_double, c_int, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
-from dataclasses import dataclass
+from ctypes import POINTER, c_char_p, c_double, c_int, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
@@ -23,9 +23,10 @@ from uwb_mitigation.mitigation.embedded.compiling import (
     firmware_folder,
     load_library,
 )
-from uwb_mitigation.radios.dw1000 import structures
-from uwb_mitigation.radios.settings import RadioSettings
-from uwb_mitigation.radios.wire.layout import Mode
+from uwb_mitigation.radios.settings import RadioSettings, RadioStatus
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType, Mode
+from uwb_mitigation.radios.wire.messages import SetRadio
 
 NOMINAL_DELAY_TICKS = 16436
 """Antenna delay of a chip's transmitter, and of its receiver."""
@@ -105,13 +106,16 @@ class ModelledAir:
 
         Without a serial link, the board only ranges.
         """
+        settings.check()
+        _, payload = messages.encode(SetRadio(settings))
         board: int = self._library.radio_air_add_board(
             self._air,
             ppm,
             clock_ticks,
             delay_ticks,
             delay_ticks,
-            ctypes.byref(structures.config(settings)),
+            payload,
+            len(payload),
             0x9E3779B97F4A7C15 * (self._boards + 1) % 2**64,
         )
         self._boards += 1
@@ -168,9 +172,12 @@ class ModelledAir:
         return ranges, values
 
     def counts(self, board: int) -> dict[str, int]:
-        """Return the counts of exchanges; see `uwb_twr_counts`."""
-        counts: structures.TwrCounts = self._library.radio_air_counts(self._air, board)[0]
-        return counts.as_dict()
+        """Return the counts of exchanges of a board that has run; see `RadioStatus`."""
+        buffer = ctypes.create_string_buffer(MAX_PAYLOAD_BYTES)
+        count = self._library.radio_air_status(self._air, board, buffer)
+        status = messages.decode(MessageType.RADIO_STATUS, buffer.raw[:count])
+        assert isinstance(status, RadioStatus)
+        return asdict(status)
 
     def address(self, board: int) -> int:
         """Return the active address; 0 before the board's program has started its chip."""
@@ -208,7 +215,7 @@ def _library() -> ctypes.CDLL:
         "free": (None, (air,)),
         "add_board": (
             c_int,
-            (air, c_double, c_uint64, c_uint16, c_uint16, POINTER(structures.Config), c_uint64),
+            (air, c_double, c_uint64, c_uint16, c_uint16, c_char_p, c_size_t, c_uint64),
         ),
         "set_serial_link": (None, (air, board, c_double, c_int, c_double, c_double)),
         "set_pair": (
@@ -232,10 +239,11 @@ def _library() -> ctypes.CDLL:
         "run": (c_double, (air, c_double)),
         "results": (c_uint32, (air, POINTER(c_void_p), POINTER(c_void_p))),
         "clear_results": (None, (air,)),
-        "counts": (POINTER(structures.TwrCounts), (air, board)),
+        "status": (c_size_t, (air, board, c_void_p)),
         "address": (c_uint64, (air, board)),
-        "write": (c_int, (air, board, ctypes.c_char_p, c_size_t)),
+        "write": (c_int, (air, board, c_char_p, c_size_t)),
         "read": (c_size_t, (air, board, c_void_p)),
         "measurements_lost": (c_uint64, (air, board)),
+        "result_bytes": (c_size_t, ()),
     }
     return load_library("radio_air_", (*objects, *model_objects()), signatures)

@@ -1,5 +1,6 @@
 /* Boards with the firmware's exchange on modelled chips, behind functions that are easy to call from another language:
  * for the tests and for `python -m benchmarks radio`. Time is virtual. */
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -226,13 +227,14 @@ void radio_air_free(radio_air *air) {
 }
 
 int radio_air_add_board(radio_air *air, double ppm, uint64_t clock_ticks, uint16_t tx_delay, uint16_t rx_delay,
-                    const uwb_twr_config *config, uint64_t random) {
+                    const uint8_t *settings, size_t bytes, uint64_t random) {
     radio_board *const board = calloc(1, sizeof *board);
-    if (board == NULL || air->count == MAX_BOARDS) {
+    if (board == NULL || air->count == MAX_BOARDS ||
+        uwb_twr_read_settings(settings, bytes, uwb_twr_defaults.reply_us, uwb_twr_defaults.timeout_us,
+                              &board->config) != NULL) {
         abort();
     }
     board->air = air;
-    board->config = *config;
     board->random = random;
     board->chip = dw1000_chip_new(air->air, ppm, clock_ticks, tx_delay, rx_delay);
     air->boards[air->count] = board;
@@ -288,8 +290,9 @@ void radio_air_clear_results(radio_air *air) {
     air->store_used = 0;
 }
 
-const uwb_twr_counts *radio_air_counts(const radio_air *air, int board) {
-    return &air->boards[board]->ranger.twr.counts;
+/* Writes a payload of RADIO_STATUS of a board that has run; returns its bytes. */
+size_t radio_air_status(const radio_air *air, int board, uint8_t *payload) {
+    return uwb_twr_write_status(&air->boards[board]->ranger.twr, NAN, NAN, payload);
 }
 
 uint64_t radio_air_address(const radio_air *air, int board) {
@@ -320,9 +323,7 @@ size_t radio_air_read(radio_air *air, int board, uint8_t *bytes) {
     return count;
 }
 
-/* Return the size of a structure, to check bindings. */
-size_t radio_air_size(int which) {
-    const size_t sizes[] = {sizeof(uwb_dw1000_io), sizeof(uwb_dw1000_settings), sizeof(uwb_twr_config),
-                            sizeof(uwb_twr_counts), sizeof(uwb_twr_anchor), sizeof(radio_result)};
-    return sizes[which];
+/* Return the size of a row of results, to check bindings. */
+size_t radio_air_result_bytes(void) {
+    return sizeof(radio_result);
 }

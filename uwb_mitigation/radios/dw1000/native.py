@@ -8,8 +8,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
-from ctypes import POINTER, c_char_p, c_float, c_int, c_size_t, c_uint32, c_uint64, c_void_p
-from dataclasses import replace
+from ctypes import CFUNCTYPE, POINTER, c_char_p, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError
@@ -21,24 +20,32 @@ from uwb_mitigation.mitigation.embedded.compiling import (
     firmware_folder,
     load_library,
 )
-from uwb_mitigation.radios.dw1000 import structures
 from uwb_mitigation.radios.dw1000.bus import Bus
-from uwb_mitigation.radios.settings import (
-    AGE_UNKNOWN_MS,
-    STATE_PROBLEMS,
-    AnchorStatus,
-    RadioSettings,
-    RadioState,
-    RadioStatus,
-)
+from uwb_mitigation.radios.settings import STATE_PROBLEMS, RadioSettings, RadioState, RadioStatus
 from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.layout import MessageType
+from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
+from uwb_mitigation.radios.wire.messages import RadioConfigured, SetRadio
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 _OPTIONS = ("-std=c99", "-O2", "-fPIC", *WARNINGS)
 _RANGED, _FAULT = 1, 2
 
 _loading = threading.Lock()
+
+_FUNCTIONS: dict[str, Any] = {
+    "transfer": CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t, c_void_p, c_void_p, c_size_t),
+    "speed": CFUNCTYPE(None, c_void_p, c_int),
+    "reset": CFUNCTYPE(None, c_void_p),
+    "now_us": CFUNCTYPE(c_uint64, c_void_p),
+    "wait": CFUNCTYPE(None, c_void_p, c_uint64),
+    "sleep": CFUNCTYPE(None, c_void_p, c_uint32),
+}
+
+
+class Io(ctypes.Structure):
+    """`uwb_dw1000_io`: functions of a bus; each gets the context first."""
+
+    _fields_ = (("context", c_void_p), *_FUNCTIONS.items())
 
 
 class NativeRadio:
@@ -59,26 +66,23 @@ class NativeRadio:
     ) -> None:
         self._bus = bus
         self._library = load_native()
-        config = self._config(settings)
         self._stamp_clock = stamp_clock
-        self._settings = settings
         self._failure: BaseException | None = None
+        self._payload = ctypes.create_string_buffer(MAX_PAYLOAD_BYTES)
         # The library keeps pointers to these objects until the radio is closed.
-        self._io = structures.Io(
-            None,
-            structures.TRANSFER(self._transfer),
-            structures.SPEED(lambda _, fast: self._catch_exception(lambda: self._bus.speed(bool(fast)))),
-            structures.RESET(lambda _: self._catch_exception(lambda: self._bus.reset()))
-            if bus.has_reset
-            else structures.RESET(),
-            structures.NOW(lambda _: time.monotonic_ns() // 1000),
-            structures.WAIT(lambda _, until_us: self._catch_exception(lambda: self._bus.pause())),
-            structures.SLEEP(lambda _, us: time.sleep(us * 1e-6)),
+        catch = self._catch_exception
+        self._io = Io(
+            transfer=_FUNCTIONS["transfer"](self._transfer),
+            speed=_FUNCTIONS["speed"](lambda _, fast: catch(lambda: self._bus.speed(bool(fast)))),
+            now_us=_FUNCTIONS["now_us"](lambda _: time.monotonic_ns() // 1000),
+            wait=_FUNCTIONS["wait"](lambda _, until_us: catch(lambda: self._bus.pause())),
+            sleep=_FUNCTIONS["sleep"](lambda _, us: time.sleep(us * 1e-6)),
         )
+        if bus.has_reset:
+            self._io.reset = _FUNCTIONS["reset"](lambda _: catch(lambda: self._bus.reset()))
         self._radio = self._library.native_radio_new(
-            ctypes.byref(self._io), ctypes.byref(config), secrets.randbits(64)
+            ctypes.byref(self._io), *self._encoded(settings), secrets.randbits(64)
         )
-        self._temperature_c = self._voltage = float("nan")
 
     def exchange(self, timeout_s: float) -> RangeMeasurement | None:
         """Perform one exchange; return None after the timeout. An exchange may end after it.
@@ -105,10 +109,9 @@ class NativeRadio:
         Raises:
             ParameterError: the settings are invalid or not supported by this radio.
         """
-        refusal = self._library.native_radio_configure(self._radio, ctypes.byref(self._config(settings)))
+        refusal = self._library.native_radio_configure(self._radio, *self._encoded(settings))
         if refusal is not None:
             raise ParameterError(f"radio settings: {refusal.decode()}")
-        self._settings = settings
 
     @property
     def address(self) -> int:
@@ -119,16 +122,9 @@ class NativeRadio:
     @property
     def settings(self) -> RadioSettings:
         """Active settings; contains the chip's own values once it has started."""
-        chip: structures.ChipSettings = self._library.native_radio_settings(self._radio)[0]
-        return replace(
-            self._settings,
-            address=self.address or self._settings.address,
-            preamble_code=chip.preamble_code,
-            tx_power=chip.tx_power,
-            antenna_delay=chip.antenna_delay,
-            reply_us=self._times_us[0],
-            timeout_us=self._times_us[1],
-        )
+        radio = self._decoded(MessageType.RADIO, self._library.native_radio_settings)
+        assert isinstance(radio, RadioConfigured)
+        return radio.settings
 
     def read_sensors(self) -> None:
         """Measure the chip's temperature and voltage, for `status`.
@@ -136,35 +132,13 @@ class NativeRadio:
         Raises:
             LinkError: the bus is lost.
         """
-        temperature, voltage = c_float(), c_float()
-        sensors = self._library.native_radio_sensors
-        if not self._call(sensors, ctypes.byref(temperature), ctypes.byref(voltage)):
-            self._temperature_c, self._voltage = temperature.value, voltage.value
+        self._call(self._library.native_radio_sensors)
 
     def status(self) -> RadioStatus:
         """Return the status: state and counts."""
-        counts: structures.TwrCounts = self._library.native_radio_counts(self._radio)[0]
-        count = c_size_t()
-        table = self._library.native_radio_anchors(self._radio, ctypes.byref(count))
-        now_us = time.monotonic_ns() // 1000
-        return RadioStatus(
-            **counts.as_dict(),
-            temperature_c=self._temperature_c,
-            voltage=self._voltage,
-            state=self._state(),
-            anchors=tuple(
-                AnchorStatus(
-                    anchor.address,
-                    anchor.tried,
-                    anchor.ranged,
-                    anchor.rx_power_dbm,
-                    min((now_us - anchor.last_seen_us) // 1000, AGE_UNKNOWN_MS - 1)
-                    if anchor.last_seen_us
-                    else AGE_UNKNOWN_MS,
-                )
-                for anchor in table[: count.value]
-            ),
-        )
+        status = self._decoded(MessageType.RADIO_STATUS, self._library.native_radio_status)
+        assert isinstance(status, RadioStatus)
+        return status
 
     def close(self) -> None:
         """Free the radio; the bus stays open. May be called twice."""
@@ -172,13 +146,16 @@ class NativeRadio:
             self._library.native_radio_free(self._radio)
             self._radio = None
 
-    def _config(self, settings: RadioSettings) -> structures.Config:
-        config = structures.config(settings, 0, 0)
-        self._library.uwb_twr_set_default_times(
-            ctypes.byref(config), self._bus.reply_us, self._bus.timeout_us
-        )
-        self._times_us = config.reply_us, config.timeout_us
-        return config
+    def _encoded(self, settings: RadioSettings) -> tuple[bytes, int, int, int]:
+        """Return a payload of SET_RADIO, its size, and the default times of a tag on this bus."""
+        settings.check()
+        _, payload = messages.encode(SetRadio(settings))
+        return payload, len(payload), self._bus.reply_us, self._bus.timeout_us
+
+    def _decoded(self, kind: MessageType, write: Callable[..., int]) -> messages.Message:
+        """Return the message whose payload a function writes."""
+        count = write(self._radio, self._payload)
+        return messages.decode(kind, self._payload.raw[:count])
 
     def _call(self, function: Callable[..., int], *arguments: Any) -> int:
         """Call a function that uses the bus; raise what a callback has raised."""
@@ -241,20 +218,17 @@ def _compiled() -> ctypes.CDLL:
     )
     options = (*_OPTIONS, f"-I{firmware / 'src'}")
     objects = compile_objects(c_compiler(), options, (*sources, firmware / "native" / "native_radio.c"))
-    radio = c_void_p
+    radio, settings = c_void_p, (c_char_p, c_size_t, c_uint32, c_uint32)
     signatures: Signatures = {
-        "new": (c_void_p, (POINTER(structures.Io), POINTER(structures.Config), c_uint64)),
+        "new": (c_void_p, (POINTER(Io), *settings, c_uint64)),
         "free": (None, (radio,)),
-        "configure": (c_char_p, (radio, POINTER(structures.Config))),
+        "configure": (c_char_p, (radio, *settings)),
         "exchange": (c_int, (radio, c_uint64)),
         "measurement": (c_void_p, (radio, POINTER(c_size_t), POINTER(c_uint64))),
         "state": (c_int, (radio,)),
         "address": (c_uint64, (radio,)),
-        "settings": (POINTER(structures.ChipSettings), (radio,)),
-        "counts": (POINTER(structures.TwrCounts), (radio,)),
-        "anchors": (POINTER(structures.TwrAnchor), (radio, POINTER(c_size_t))),
-        "sensors": (c_int, (radio, POINTER(c_float), POINTER(c_float))),
+        "settings": (c_size_t, (radio, c_void_p)),
+        "status": (c_size_t, (radio, c_void_p)),
+        "sensors": (c_int, (radio,)),
     }
-    library = load_library("native_radio_", objects, signatures)
-    library.uwb_twr_set_default_times.argtypes = (POINTER(structures.Config), c_uint32, c_uint32)
-    return library
+    return load_library("native_radio_", objects, signatures)
