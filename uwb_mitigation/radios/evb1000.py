@@ -7,10 +7,10 @@ period. A request with its answer takes 1 to 2 ms; there is no interrupt and no 
 from __future__ import annotations
 
 import contextlib
-import os
-import select
 import struct
+import termios
 import time
+from collections.abc import Iterator
 from functools import partial
 
 import serial
@@ -65,6 +65,7 @@ class Evb1000Bus:
         self._address = address
         self._fast = False
         self._port: serial.Serial | None = address.open()
+        self._port.write_timeout = ANSWER_TIMEOUT_S
         try:
             self.version = self._read_version()
         except LinkError:
@@ -82,13 +83,16 @@ class Evb1000Bus:
         size = 3 + (count if out is None else 0)
         error: LinkError | None = None
         for timeout_s in (ANSWER_TIMEOUT_S, *[REPEATED_TIMEOUT_S] * (MAX_TRIES - 1)):
-            if error is None:
-                self._read_some(0.0)
-            else:
+            if error is not None:
                 self.repeated += 1
                 self._discard_input()
-            self._send(request)
-            answer = self._receive(size, timeout_s)
+            with self._open_port() as port:
+                if port.timeout != timeout_s:
+                    port.timeout = timeout_s
+                port.reset_input_buffer()
+                port.write(request)
+                answer = port.read(size)
+                answer += port.read(port.in_waiting)
             if len(answer) < size:
                 error = self._error(f"received {len(answer)} of {size} octets within {timeout_s} s")
             elif len(answer) > size or answer[0] != _START or answer[1] or answer[-1] != _END:
@@ -100,7 +104,7 @@ class Evb1000Bus:
                 if error is not None:
                     # The answer to the first request may be late.
                     self._discard_input()
-                return answer[2:-1]
+                return bytes(answer[2:-1])
         assert error is not None
         raise error
 
@@ -136,59 +140,32 @@ class Evb1000Bus:
     def _query(self) -> str:
         """Return the answer to `deca?` up to its first NUL; a stale octet follows the NUL."""
         self._discard_input()
-        self._send(b"deca?")
-        answer = b""
-        until = time.monotonic() + ANSWER_TIMEOUT_S
-        while b"\0" not in answer and time.monotonic() < until:
-            answer += self._read_some(until - time.monotonic())
+        with self._open_port() as port:
+            port.timeout = ANSWER_TIMEOUT_S
+            port.write(b"deca?")
+            answer = port.read_until(b"\0")
         self._discard_input()
-        return answer.partition(b"\0")[0].decode("ascii", "replace")
+        return str(answer.partition(b"\0")[0], "ascii", "replace")
 
     def _discard_input(self) -> None:
         """Discard the rest of earlier answers."""
-        with contextlib.suppress(LinkError):
+        with self._open_port() as port:
+            port.timeout = QUIET_S
             until = time.monotonic() + ANSWER_TIMEOUT_S
-            while time.monotonic() < until and self._read_some(QUIET_S):
+            while time.monotonic() < until and port.read(1 << 13):
                 pass
 
-    def _send(self, data: bytes) -> None:
-        fd = self._fd()
-        until = time.monotonic() + ANSWER_TIMEOUT_S
-        try:
-            while data:
-                _, writable, _ = select.select([], [fd], [], max(0.0, until - time.monotonic()))
-                if not writable:
-                    raise self._error("the board does not accept data")
-                data = data[os.write(fd, data) :]
-        except OSError as error:
-            raise self._lost(error.strerror or str(error)) from error
-
-    def _receive(self, count: int, timeout_s: float) -> bytes:
-        """Return an answer of `count` octets; fewer after the timeout, more if there are stray octets."""
-        answer = b""
-        until = time.monotonic() + timeout_s
-        while len(answer) < count and (piece := self._read_some(until - time.monotonic())):
-            answer += piece
-        return answer
-
-    def _read_some(self, within_s: float) -> bytes:
-        """Read at least one octet; return no octets after a timeout."""
-        fd = self._fd()
-        try:
-            readable, _, _ = select.select([fd], [], [], max(0.0, within_s))
-            piece = os.read(fd, 1 << 13) if readable else b""
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise self._lost(error.strerror or str(error)) from error
-        if readable and not piece:
-            raise self._lost("unplugged")
-        return piece
-
-    def _fd(self) -> int:
+    @contextlib.contextmanager
+    def _open_port(self) -> Iterator[serial.Serial]:
+        """Yield the port; translate the errors of the block."""
         if self._port is None:
             raise self._lost("closed")
-        return int(self._port.fileno())
+        try:
+            yield self._port
+        except serial.SerialTimeoutException as error:
+            raise self._error("the board does not accept data") from error
+        except (OSError, termios.error) as error:
+            raise self._lost(getattr(error, "strerror", None) or str(error)) from error
 
     def _error(self, what: str, valid: str = _REMEDY) -> LinkError:
         return LinkError(what, where=str(self._address), valid=valid)
