@@ -56,11 +56,6 @@ const uint8_t *native_radio_measurement(const native_radio *radio, size_t *bytes
     return radio->twr.measurement;
 }
 
-/* Returns a UWB_RADIO_STATE_*. */
-int native_radio_state(const native_radio *radio) {
-    return uwb_twr_state(&radio->twr);
-}
-
 /* Active address; 0 until the chip has started. */
 uint64_t native_radio_address(const native_radio *radio) {
     return radio->twr.address;

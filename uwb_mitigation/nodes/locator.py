@@ -7,9 +7,8 @@ import hashlib
 import importlib
 import math
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, replace
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, Transform, 
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 from visualization_msgs.msg import MarkerArray
 
@@ -58,9 +56,6 @@ from uwb_mitigation.types.tracks import Estimate, Heading
 if TYPE_CHECKING:
     from uwb_mitigation.nodes.feeds.topic import TopicFeed
     from uwb_mitigation.recordings.mapping.mapping import Mapping
-
-BATCH = 64
-"""Maximum number of queued ranges that one callback processes."""
 
 PERIOD_S = 0.2
 """Period of smoothed poses, of markers, and of predictions without ranges."""
@@ -109,7 +104,6 @@ class Locator(ManagedNode):
     def __init__(self, *, other_parameters: Collection[str] = ()) -> None:
         super().__init__("locator", LOCATOR, other_parameters)
         self._estimator: MultiTagEstimator | None = None
-        self._ranges: Subscription | None = None
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None
         self._tf_type: Any = None
@@ -187,7 +181,7 @@ class Locator(ManagedNode):
 
     def close(self) -> None:
         super().close()
-        self._outputs, self._anchors_out, self._tf, self._estimator, self._ranges = {}, None, None, None, None
+        self._outputs, self._anchors_out, self._tf, self._estimator = {}, None, None, None
         self._robot, self._transform_ns = None, {}
 
     def describe(self) -> diagnostics.Description:
@@ -220,7 +214,7 @@ class Locator(ManagedNode):
         kind, name = RangeCir if source else RangeCorrected, source or topics.relative(topics.RANGE_CORRECTED)
         self._decode = (lambda data: _uncorrected(decode_range(data))) if source else decode_corrected
         ranges = endpoints.create_raw_subscription(self, kind, name, self._on_range, self._on_lost)
-        self._ranges = self.destroy_at_close(ranges, self.destroy_subscription)
+        self.destroy_at_close(ranges, self.destroy_subscription)
         return 0.0
 
     def _on_mapped_range(self, measurement: RangeMeasurement) -> None:
@@ -259,12 +253,11 @@ class Locator(ManagedNode):
     def _on_lost(self, info: Any) -> None:
         self._lost += info.total_count_change
 
-    def _on_range(self, data: bytes, number: int) -> None:
+    def _on_range(self, messages: Iterator[tuple[bytes, int]]) -> None:
         # Subscriptions stay active while a lifecycle node is inactive.
-        if self._estimator is not None and self._ranges is not None and self.is_active:
-            # Also process the queued messages; the executor then finds the queue empty.
-            for message_data, _ in chain([(data, number)], endpoints.take_queued(self._ranges, BATCH)):
-                self._take(self._estimator, message_data)
+        if self._estimator is not None and self.is_active:
+            for data, _ in messages:
+                self._take(self._estimator, data)
 
     def _take(self, estimator: MultiTagEstimator, data: bytes) -> None:
         try:

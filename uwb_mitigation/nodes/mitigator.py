@@ -6,9 +6,8 @@ import importlib.util
 import threading
 import time
 from array import array
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD, Scaling
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
+from uwb_mitigation.nodes.support.endpoints import BATCH
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.support.parameter_tables import MITIGATOR
 from uwb_mitigation.types.measurement import (
@@ -45,9 +45,6 @@ from uwb_mitigation.types.ros.codec import decode_range, encode_corrected
 # ONNX Runtime is imported later: fail early if it is missing.
 if importlib.util.find_spec("onnxruntime") is None:
     raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
-
-BATCH = 64
-"""Maximum batch size: correcting queued ranges in a batch takes a fifth of the time of single ranges."""
 
 
 def load_corrector(model: str, backend: str = "onnxruntime") -> Corrector:
@@ -100,7 +97,7 @@ class Mitigator(ManagedNode):
         self._subscribe = subscribe
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
-        self._sensor_ranges: endpoints.SensorRanges | None = None
+        self._sensor_ranges: endpoints.SensorRanges
         self._mitigation: Corrector | None = None
         self._prepared: tuple[str, Corrector] | None = None
         self._shipped: tuple[Bundle, ...] = ()
@@ -116,10 +113,7 @@ class Mitigator(ManagedNode):
 
     def open(self) -> None:
         self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
-        if self.value("sensor_ranges"):
-            self._sensor_ranges = self.destroy_at_close(
-                endpoints.SensorRanges(self), endpoints.SensorRanges.close
-            )
+        self._sensor_ranges = endpoints.SensorRanges(self)
         if self._subscribe:
             # Subscribe to serialised messages: decoding them here takes a third of the time of rclpy.
             self._raw = self.destroy_at_close(
@@ -139,7 +133,7 @@ class Mitigator(ManagedNode):
 
     def close(self) -> None:
         super().close()
-        self._raw = self._sensor_ranges = self._corrected = None
+        self._raw = self._corrected = None
 
     def correct(self, measurements: Sequence[RangeMeasurement]) -> None:
         """Publish the corrected ranges of measurements; while inactive, do nothing."""
@@ -151,9 +145,8 @@ class Mitigator(ManagedNode):
             results = mitigation.correct(measurements)
             for measurement, corrected in zip(measurements, results, strict=True):
                 publisher.publish(encode_corrected(measurement, corrected))
-                if self._sensor_ranges is not None:
-                    m = measurement
-                    self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
+                m = measurement
+                self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
             now_ns = self.now_ns()
             self.health.add_time(time.perf_counter_ns() - began_ns)
             for measurement, corrected in zip(measurements, results, strict=True):
@@ -215,15 +208,14 @@ class Mitigator(ManagedNode):
     def _publisher_count(self) -> int:
         return self._raw.get_publisher_count() if self._raw is not None else 0
 
-    def _on_raw(self, data: bytes, number: int) -> None:
+    def _on_raw(self, messages: Iterator[tuple[bytes, int]]) -> None:
         # Subscriptions stay active while a lifecycle node is inactive.
-        if self._mitigation is None or self._raw is None:
+        if self._mitigation is None:
             return
         batch = []
-        # Also process the queued messages; the executor then finds the queue empty.
-        for message_data, sequence in chain([(data, number)], endpoints.take_queued(self._raw, BATCH - 1)):
+        for data, sequence in messages:
             self.health.loss_counter.add(sequence)
-            measurement = self._decode(message_data)
+            measurement = self._decode(data)
             if measurement is not None:
                 batch.append(measurement)
         if batch:

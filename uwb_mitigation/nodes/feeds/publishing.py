@@ -50,14 +50,10 @@ class RangePublisher:
         self._consumer = consumer
         self._frame_id: str = node.value("frame_id")
         self._ranges = node.publisher(RangeCir, topics.RANGE_RAW)
-        self._sensor_ranges: endpoints.SensorRanges | None = None
         self._bag = self._open_bag() if node.value("record") else None
         if corrections:
             self._corrected = node.publisher(RangeCorrected, topics.RANGE_CORRECTED)
-            if node.value("sensor_ranges"):
-                self._sensor_ranges = node.destroy_at_close(
-                    endpoints.SensorRanges(node), endpoints.SensorRanges.close
-                )
+            self._sensor_ranges = endpoints.SensorRanges(node)
         if recording:
             prepare_encoders()
             self._truths = node.publisher(RangeTruth, topics.RANGE_TRUTH)
@@ -91,8 +87,7 @@ class RangePublisher:
             c.stamp_ns, c.tag_id, c.anchor_id, c.sequence, c.device_time, raw_m, _NO_CIR, self._frame_id
         )
         self._corrected.publish(encode_corrected(measurement, c.corrected))
-        if self._sensor_ranges is not None:
-            self._sensor_ranges.publish(c.anchor_id, c.stamp_ns, self._frame_id, c.corrected)
+        self._sensor_ranges.publish(c.anchor_id, c.stamp_ns, self._frame_id, c.corrected)
 
     def publish_records(self, records: Sequence[tuple[Record, int]]) -> None:
         """Publish records of a recording, [(record, stamp_ns), ...], with their ground truth."""

@@ -21,7 +21,7 @@ from uwb_mitigation.mitigation.embedded.compiling import (
     load_library,
 )
 from uwb_mitigation.radios.dw1000.bus import Bus
-from uwb_mitigation.radios.settings import STATE_PROBLEMS, RadioSettings, RadioState, RadioStatus
+from uwb_mitigation.radios.settings import STATE_PROBLEMS, RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
 from uwb_mitigation.radios.wire.messages import RadioConfigured, SetRadio
@@ -94,7 +94,7 @@ class NativeRadio:
         event = self._call(self._library.native_radio_exchange, until_us)
         if event == _FAULT:
             text = STATE_PROBLEMS.get(
-                self._state(), "the DW1000 was reset, or did not finish a command in time"
+                self.status().state, "the DW1000 was reset, or did not finish a command in time"
             )
             raise LinkError(text, where=self._bus.name)
         return self._measurement() if event == _RANGED else None
@@ -165,9 +165,6 @@ class NativeRadio:
             raise self._failure
         return result
 
-    def _state(self) -> RadioState:
-        return RadioState(self._library.native_radio_state(self._radio))
-
     def _measurement(self) -> RangeMeasurement:
         count, measured_us = c_size_t(), c_uint64()
         data = self._library.native_radio_measurement(
@@ -225,7 +222,6 @@ def _compiled() -> ctypes.CDLL:
         "configure": (c_char_p, (radio, *settings)),
         "exchange": (c_int, (radio, c_uint64)),
         "measurement": (c_void_p, (radio, POINTER(c_size_t), POINTER(c_uint64))),
-        "state": (c_int, (radio,)),
         "address": (c_uint64, (radio,)),
         "settings": (c_size_t, (radio, c_void_p)),
         "status": (c_size_t, (radio, c_void_p)),
