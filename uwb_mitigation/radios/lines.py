@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import re
 import socket
-import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -300,7 +299,7 @@ class LinePort(StreamPort):
             return PortReport(self.device, hardware, self.problem, self._warning(), "receiving", values)
 
     def _warning(self) -> str:
-        session, text = self.session, self.monitor.warning(time.monotonic())
+        session, text = self.session, self.monitor.warning()
         if text and not session.received:
             remedy = (
                 "is the sender's address right?"

@@ -76,13 +76,11 @@ class ExchangeMonitor:
         unexpected: causes that are a warning also next to ranges, if more than `FAILURE_SHARE` of the exchanges fail.
 
     Attributes:
-        period_s: duration that is considered.
         remedies: see above.
         totals: number of all failed exchanges, {cause: count}.
     """
 
     def __init__(self, remedies: Mapping[str, str], unexpected: Iterable[str] = ()) -> None:
-        self.period_s = PERIOD_S
         self.remedies, self._unexpected = remedies, frozenset(unexpected)
         self.totals: Counter[str] = Counter()
         self._failures: deque[tuple[float, str, int]] = deque()
@@ -114,9 +112,10 @@ class ExchangeMonitor:
         self._ranges.clear()
         self._last_range_s = None
 
-    def warning(self, now_s: float) -> str:
-        """Return what is wrong with the exchanges of the period; empty if there are ranges."""
-        begin_s = now_s - self.period_s
+    def warning(self, interval_s: float = 0.0) -> str:
+        """Return what is wrong with the latest exchanges of a radio with this interval; empty if there are ranges."""
+        now_s = time.monotonic()
+        begin_s = now_s - max(PERIOD_S, 3.0 * interval_s)
         while self._failures and self._failures[0][0] < begin_s:
             self._failures.popleft()
         while self._ranges and self._ranges[0] < begin_s:

@@ -11,7 +11,6 @@ from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError, format_id
 from uwb_mitigation.radios.port import (
-    PERIOD_S,
     ExchangeMonitor,
     PortAddress,
     PortReport,
@@ -180,9 +179,7 @@ class BoardPort(StreamPort):
                 problems.append(STATE_PROBLEMS.get(status.state, ""))
                 warning = status_warning(status)
             if radio is None or radio.role is Role.TAG or radio.report:
-                interval_s = radio.interval_us / 1e6 if radio is not None else 0.0
-                self.monitor.period_s = max(PERIOD_S, 3 * interval_s)
-                exchanges = self.monitor.warning(time.monotonic())
+                exchanges = self.monitor.warning(radio.interval_us / 1e6 if radio is not None else 0.0)
                 warning = warning or (f"connected; {exchanges}" if exchanges else "")
             return PortReport(
                 self.device, hardware, next(filter(None, problems), ""), warning, "connected", values

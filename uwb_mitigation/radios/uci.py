@@ -14,7 +14,6 @@ from uwb_mitigation.radios.fira.calibration import OriginalsFile
 from uwb_mitigation.radios.fira.codes import EXCHANGE_CAUSES
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import (
-    PERIOD_S,
     ExchangeMonitor,
     PortAddress,
     PortReport,
@@ -152,7 +151,6 @@ class UciPort(StreamPort):
                 values["unit of the first-path positions"] = unit
             values |= {name.replace("_", " "): count for name, count in session.totals().items()}
             values |= {"openings": self.openings}
-            self.monitor.period_s = max(PERIOD_S, 3 * s.effective_interval_ms / 1e3)
             hardware = f"UCI board {format_id(s.address)}"
             activity = "ranging" if s.role is Role.TAG else "answering"
             return PortReport(self.device, hardware, self.problem, self._warning(), activity, values)
@@ -169,7 +167,8 @@ class UciPort(StreamPort):
                 f"bytes or notifications are lost between board and host, {damages} times in {counts['ranges']} ranges, "
                 f"of which {counts['without_cir']} have no CIR: use another cable or USB port, and stop other programs"
             )
-        if session.settings.delivers and (warning := self.monitor.warning(time.monotonic())):
+        interval_s = session.settings.effective_interval_ms / 1e3
+        if session.settings.delivers and (warning := self.monitor.warning(interval_s)):
             return warning
         if counts["ranges"] >= _MIN_RANGES:
             if counts["without_cir"] > _CIR_SHARE * counts["ranges"]:

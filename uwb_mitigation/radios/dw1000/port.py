@@ -11,7 +11,7 @@ from functools import partial
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.dw1000.native import NativeRadio, load_native
-from uwb_mitigation.radios.port import PERIOD_S, ExchangeMonitor, OnEvent, PortReport, RadioPort, started
+from uwb_mitigation.radios.port import ExchangeMonitor, OnEvent, PortReport, RadioPort, started
 from uwb_mitigation.radios.settings import (
     DEFAULT_RADIO,
     EXCHANGE_REMEDIES,
@@ -128,8 +128,7 @@ class ChipPort(RadioPort):
             is_tag = self._requested_settings.role is Role.TAG
             warning = "" if settings is None else status_warning(status)
             if is_tag or self._requested_settings.report:
-                self.monitor.period_s = max(PERIOD_S, 3 * self._requested_settings.interval_us / 1e6)
-                warning = warning or self.monitor.warning(time.monotonic())
+                warning = warning or self.monitor.warning(self._requested_settings.interval_us / 1e6)
             hardware = "no radio" if settings is None else f"radio {format_id(settings.address)}"
             values: dict[str, object] = {"openings": self.openings}
             values |= radio_values(settings, status)
