@@ -6,7 +6,7 @@ A board that runs the model itself also publishes on `/uwb/range_corrected`.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
@@ -33,19 +33,13 @@ class Driver(ManagedNode):
     Args:
         ended: set when a replay has ended.
         consumer: in-process consumer of measurements; `/uwb/range_raw` is then published only if it has subscribers.
-        other_parameters: see `ManagedNode`.
 
     Attributes:
         exit_code: exit code of the process; valid when `ended` is set.
     """
 
-    def __init__(
-        self,
-        ended: threading.Event,
-        consumer: Mitigator | None = None,
-        other_parameters: Collection[str] = (),
-    ) -> None:
-        super().__init__("driver", DRIVER, other_parameters)
+    def __init__(self, ended: threading.Event, consumer: Mitigator | None = None) -> None:
+        super().__init__("driver")
         self._ended = ended
         self._consumer = consumer
         self.exit_code = 0

@@ -7,7 +7,7 @@ import hashlib
 import importlib
 import math
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ from uwb_mitigation.nodes import markers
 from uwb_mitigation.nodes.robot_motion import HOLD_S, MotionState, OdometryInput, transform_type
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
-from uwb_mitigation.nodes.support.parameter_tables import LOCATOR
 from uwb_mitigation.nodes.support.respawn import StateFile
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height, parse_lever_arm
@@ -96,13 +95,10 @@ class Locator(ManagedNode):
 
     If the anchors file is missing or invalid, the node stays unconfigured, and log and diagnostics name the reason;
     configure it again after the file is fixed.
-
-    Args:
-        other_parameters: see `ManagedNode`.
     """
 
-    def __init__(self, *, other_parameters: Collection[str] = ()) -> None:
-        super().__init__("locator", LOCATOR, other_parameters)
+    def __init__(self) -> None:
+        super().__init__("locator")
         self._estimator: MultiTagEstimator | None = None
         self._anchors_out: Publisher | None = None
         self._tf: Publisher | None = None

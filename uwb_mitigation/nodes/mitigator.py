@@ -6,7 +6,7 @@ import importlib.util
 import threading
 import time
 from array import array
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -28,7 +28,6 @@ from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
 from uwb_mitigation.nodes.support.endpoints import BATCH
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
-from uwb_mitigation.nodes.support.parameter_tables import MITIGATOR
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     Cir,
@@ -88,11 +87,10 @@ class Mitigator(ManagedNode):
 
     Args:
         subscribe: whether to subscribe to the topic of raw ranges.
-        other_parameters: see `ManagedNode`.
     """
 
-    def __init__(self, *, subscribe: bool = True, other_parameters: Collection[str] = ()) -> None:
-        super().__init__("mitigator", MITIGATOR, other_parameters)
+    def __init__(self, *, subscribe: bool = True) -> None:
+        super().__init__("mitigator")
         self.health = MitigatorHealth(self._publisher_count)
         self._subscribe = subscribe
         self._raw: Subscription | None = None

@@ -21,7 +21,6 @@ from uwb_mitigation.errors import MissingDependencyError, ParameterError, format
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
-from uwb_mitigation.nodes.support.parameter_tables import PX4
 from uwb_mitigation.positioning.geodetic import parse_origin, to_geodetic
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.ros import topics
@@ -56,7 +55,7 @@ class Px4(ManagedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("px4", PX4)
+        super().__init__("px4")
         try:
             import px4_msgs.msg as messages
         except ImportError as error:

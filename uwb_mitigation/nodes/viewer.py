@@ -25,7 +25,6 @@ from uwb_mitigation.nodes import markers
 from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
-from uwb_mitigation.nodes.support.parameter_tables import VIEWER
 from uwb_mitigation.types.anchors import AnchorMap, load_anchors
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.topics import relative
@@ -53,7 +52,7 @@ class Viewer(ManagedNode):
     """Lifecycle: configure subscribes, activate serves the page, deactivate ends it."""
 
     def __init__(self) -> None:
-        super().__init__("viewer", VIEWER)
+        super().__init__("viewer")
         self._subscribed: dict[str, Subscription] = {}
         self._range_node: Node | None = None
         self._ranges: dict[str, Subscription] = {}

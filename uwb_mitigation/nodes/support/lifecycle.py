@@ -6,7 +6,7 @@ import json
 import os
 import time
 import traceback
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +30,12 @@ from uwb_mitigation.errors import (
 )
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.nodes.support import diagnostics, endpoints
-from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER, STANDARD, TABLES, Parameter
+from uwb_mitigation.nodes.support.parameter_tables import (
+    ALL_TABLES,
+    RESPAWN_FOLDER,
+    STANDARD,
+    Parameter,
+)
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.topics import relative
 
@@ -61,18 +66,17 @@ class ManagedNode(LifecycleNode):
     the transition has opened, so that it can be requested again.
 
     Args:
-        table: the node's parameters.
-        other_parameters: names of parameters of other nodes in this process.
+        name: of the node; its parameters are those in `ALL_TABLES`.
 
     Attributes:
         error: the error of the latest transition; None after success.
         given_parameters: {name: value} of all parameters given at start-up, also those of other nodes.
     """
 
-    def __init__(self, name: str, table: Sequence[Parameter], other_parameters: Collection[str] = ()) -> None:
+    def __init__(self, name: str) -> None:
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
         self.given_parameters: dict[str, Any] = self._take_given_parameters()
-        self._declare(table, other_parameters)
+        self._declare({row.name: row for row in ALL_TABLES[name]})
         self.error: UwbMitigationError | None = None
         self._state = "unconfigured"
         self.now_ns = clock_reader(self.get_clock())
@@ -244,40 +248,34 @@ class ManagedNode(LifecycleNode):
             self.undeclare_parameter(name)
         return {name: declared[name].value for name in names}
 
-    def _declare(self, table: Sequence[Parameter], other_parameters: Collection[str]) -> None:
-        """Declare a table, refuse unknown parameters, and check every later value.
+    def _declare(self, rows: Mapping[str, Parameter]) -> None:
+        """Declare the parameters of a table, refuse unknown parameters, and check every later value.
 
         Raises:
             ParameterError: a parameter given at start-up is unknown, or its value has the wrong type or range.
         """
-        rows = {row.name: row for row in table}
-        for row in table:
+        for row in rows.values():
             try:
                 self.declare_parameter(row.name, row.default, _descriptor(row))
             except (InvalidParameterTypeException, InvalidParameterValueException) as error:
                 raise ParameterError(f"parameter {row.name}: {error}", valid=row.valid) from error
             row.check(self.value(row.name))
-        self._refuse_unknown({*rows, *other_parameters})
+        self._refuse_unknown(rows.keys())
 
         def check(values: Mapping[str, Any]) -> None:
             for name in values.keys() & rows.keys():
                 rows[name].check(values[name])
 
         refuse_errors(self, check)
-        self._keep_live_parameters({row.name for row in table if row.live})
+        self._keep_live_parameters({row.name for row in rows.values() if row.live})
 
     def _refuse_unknown(self, names: Collection[str]) -> None:
         """Raise ParameterError for a parameter of no node; log the parameters of other nodes in one line."""
-        all_nodes = {row.name for table in TABLES.values() for row in table}
-        ignored = [
-            name
-            for name in sorted(self.given_parameters)
-            if name not in names and not name.startswith(STANDARD)
-        ]
-        for name in ignored:
-            if name not in all_nodes:
-                check_name("parameter", name, names, valid="--help lists them")
-        if ignored:
+        all_names = {row.name for table in ALL_TABLES.values() for row in table}
+        given = [name for name in sorted(self.given_parameters) if not name.startswith(STANDARD)]
+        for name in given:
+            check_name("parameter", name, all_names, valid="--help lists them")
+        if ignored := [name for name in given if name not in names]:
             self.get_logger().info(f"ignored parameters of other nodes: {', '.join(ignored)}")
 
     def _keep_live_parameters(self, live: Collection[str]) -> None:

@@ -20,7 +20,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
-from uwb_mitigation.nodes.support.parameter_tables import TABLES
 
 NodeT = TypeVar("NodeT", bound=Node)
 
@@ -85,45 +84,30 @@ def make_executor(context: Context | None = None) -> Executor:
     return EventsExecutor(context=context)
 
 
-def load_node(name: str) -> Callable[[threading.Event], list[Node]]:
-    """Import an executable and return the function that makes its nodes.
+def load_node(name: str) -> Callable[[threading.Event], Iterator[Node]]:
+    """Import an executable and return the function that makes its nodes, one after the other.
 
     The function gets the event that ends the process. `pipeline` is driver and mitigator in one process, and a locator
     if `anchors` is given: measurements go to the mitigator in memory, and `/uwb/range_raw` is published only while it
     has subscribers. Names, topics, parameters and diagnostics are the same as of separate nodes.
     """
-    if name == "pipeline":
-        return _load_pipeline()
-    node_class = _load_class(name)
-    # The end of a replay ends the process.
-    return lambda stop: [node_class(stop) if name == "driver" else node_class()]
+    names = ("mitigator", "driver", "locator") if name == "pipeline" else (name,)
+    modules = {each: importlib.import_module(f"uwb_mitigation.nodes.{each}") for each in names}
+    classes = {each: getattr(module, each.capitalize()) for each, module in modules.items()}
 
-
-def _load_class(name: str) -> Any:
-    return getattr(importlib.import_module(f"uwb_mitigation.nodes.{name}"), name.capitalize())
-
-
-def _load_pipeline() -> Callable[[threading.Event], list[Node]]:
-    names = ("driver", "mitigator", "locator")
-    driver_class, mitigator_class, locator_class = map(_load_class, names)
-    # Parameters on the command line reach all nodes.
-    other_parameters = {row.name for name in names for row in TABLES[name]}
-
-    def make_pipeline(stop: threading.Event) -> list[Node]:
-        nodes: list[Node] = []
-        try:
-            mitigator = mitigator_class(subscribe=False, other_parameters=other_parameters)
-            nodes.append(mitigator)
-            nodes.insert(0, driver_class(stop, mitigator, other_parameters=other_parameters))
+    def make_nodes(stop: threading.Event) -> Iterator[Node]:
+        if name == "pipeline":
+            mitigator = classes["mitigator"](subscribe=False)
+            yield mitigator
+            yield classes["driver"](stop, mitigator)
+            # Parameters on the command line reach all nodes.
             if mitigator.given_parameters.get("anchors"):
-                nodes.append(locator_class(other_parameters=other_parameters))
-        except BaseException:
-            for node in nodes:
-                node.destroy_node()
-            raise
-        return nodes
+                yield classes["locator"]()
+        else:
+            # The end of a replay ends the process.
+            yield classes[name](stop) if name == "driver" else classes[name]()
 
-    return make_pipeline
+    return make_nodes
 
 
 def run_node(name: str) -> None:
@@ -132,19 +116,20 @@ def run_node(name: str) -> None:
 
 
 def _run(name: str) -> int:
-    """Initialise ROS, make the nodes, spin them, and destroy them in order; return the exit code.
+    """Initialise ROS, make the nodes, spin them, and destroy them in reverse order; return the exit code.
 
     SIGINT and SIGTERM set the event that the nodes get. ROS's own handlers would shut the context down while
     callbacks still publish.
     """
-    nodes: Sequence[Node] = ()
+    nodes: list[Node] = []
     try:
         _initialise()
         try:
             # Load before the handlers are installed: until then a signal terminates the process immediately.
             make_nodes = load_node(name)
             stop = stop_event()
-            nodes = make_nodes(stop)
+            # If one cannot be made, the list contains those before it.
+            nodes.extend(make_nodes(stop))
         except (RuntimeError, NameValidationException) as error:  # rcl's errors are RuntimeErrors
             raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
         spin(nodes, stop)
@@ -157,7 +142,7 @@ def _run(name: str) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     finally:
-        for node in nodes:
+        for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown()
     return max((int(getattr(node, "exit_code", 0)) for node in nodes), default=0)
