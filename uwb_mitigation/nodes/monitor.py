@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
-from rich.console import Console, Group
+from rich.console import Console, Group, JustifyMethod
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -33,6 +33,8 @@ MAX_LATENCIES = 100_000
 
 MAX_TRUTHS = 10_000
 """Number of latest truths that wait for their corrected ranges."""
+
+_COLUMNS = ("anchor", "tag", "rate\nHz", "raw\nm", "corrected\nm", "sigma\nm", "status", "true\nm", "label")
 
 _RECENT = 1000
 """Number of latest stamps of a topic that are stored while the other topic is not received yet."""
@@ -120,10 +122,8 @@ class RangeStatistics:
         pair.truth, pair.corrected = truth, corrected
         pair.arrivals_s.append(arrival_s)
         if truth is not None and math.isfinite(truth.range_m) and math.isfinite(corrected.range_raw_m):
-            raw_m, corrected_m = (
-                abs(range_m - truth.range_m) for range_m in (corrected.range_raw_m, corrected.range_m)
-            )
-            self.errors[truth.label] += (1, raw_m, corrected_m)
+            raw_m, corrected_m = corrected.range_raw_m - truth.range_m, corrected.range_m - truth.range_m
+            self.errors[truth.label] += (1, abs(raw_m), abs(corrected_m))
 
 
 class Monitor(Node):
@@ -159,38 +159,24 @@ def _text(value: float, digits: int = 3) -> str:
 
 def live_table(statistics: RangeStatistics, title: str, width: int = 80) -> Table:
     """Return a table with one row for each anchor-tag pair, which fits into `width` columns if ids are short."""
-    table = Table(title=title, title_justify="left")
-    columns = [
-        "anchor",
-        "tag",
-        "rate\nHz",
-        "raw\nm",
-        "corrected\nm",
-        "sigma\nm",
-        "status",
-        "true\nm",
-        "label",
-    ]
     omitted: set[str] = set()
     if all(pair.truth is None for pair in statistics.pairs.copy().values()):
         omitted |= {"true\nm", "label"}
     if width < 80:
         omitted |= {"rate\nHz", "label"}
-    for column in columns:
-        if column not in omitted:
-            table.add_column(
-                column,
-                justify="left" if column in ("status", "label") else "right",
-                overflow="fold",
-                no_wrap=column not in ("anchor", "tag"),
-            )
+    shown = [column for column in _COLUMNS if column not in omitted]
+    table = Table(title=title, title_justify="left")
+    for column in shown:
+        is_id = column in ("anchor", "tag")
+        justify: JustifyMethod = "left" if column in ("status", "label") else "right"
+        table.add_column(column, justify=justify, overflow="fold", no_wrap=not is_id)
     for (anchor, tag), pair in sorted(statistics.pairs.copy().items()):
         corrected, truth = pair.corrected, pair.truth
         if corrected is None:
             continue
         sigma_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
         true_m = math.nan if truth is None else truth.range_m
-        cells: tuple[str | Text, ...] = (
+        cells: list[str | Text] = [
             format_id(anchor),
             format_id(tag),
             _text(pair.rate_hz(), 1),
@@ -198,8 +184,9 @@ def live_table(statistics: RangeStatistics, title: str, width: int = 80) -> Tabl
             Text(corrected.status.name, style="green" if corrected.status is Status.OK else "yellow"),
             _text(true_m),
             "" if truth is None else truth.label,
-        )
-        table.add_row(*(cell for column, cell in zip(columns, cells, strict=True) if column not in omitted))
+        ]
+        cell_of = dict(zip(_COLUMNS, cells, strict=True))
+        table.add_row(*(cell_of[column] for column in shown))
     return table
 
 

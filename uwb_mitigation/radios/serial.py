@@ -107,7 +107,7 @@ class BoardPort(StreamPort):
         self._status: BoardStatus | None = None
         self._radio: RadioSettings | None = None
         self._radio_status: RadioStatus | None = None
-        self._delivered = {"corrections published": 0}
+        self._corrections = 0
         if settings.radio is not None:
             self.session.set_radio(settings.radio)
         if settings.mode is Mode.DEVICE:
@@ -146,14 +146,10 @@ class BoardPort(StreamPort):
     def report(self) -> PortReport:
         """Return the present state."""
         with self._lock:
-            hello, clock, radio, status = (
-                self.session.hello,
-                self.session.clock,
-                self._radio,
-                self._radio_status,
-            )
+            hello, clock = self.session.hello, self.session.clock
+            radio, status = self._radio, self._radio_status
             uncertainty_us = clock.uncertainty_ns / 1e3 if clock.synchronised else math.nan
-            values: dict[str, object] = dict(self._delivered)
+            values: dict[str, object] = {"corrections published": self._corrections}
             hardware = "no board"
             if hello is not None:
                 hardware = f"board {format_id(hello.board_id)}"
@@ -202,18 +198,14 @@ class BoardPort(StreamPort):
 
     def _observed(self, received: list[Event]) -> list[Any]:
         """Update the state for the diagnostics; return the events and the messages for the log."""
-        observed: list[Any] = []
-        for event in received:
-            observed.append(event)
-            if (message := self._message(event)) is not None:
-                observed.append(message)
-        return observed
+        observed = [item for event in received for item in (event, self._message(event))]
+        return [item for item in observed if item is not None]
 
     def _message(self, event: Event) -> PortMessage | None:
         level, text = logging.INFO, ""
         match event:
             case Correction():
-                self._delivered["corrections published"] += 1
+                self._corrections += 1
             case BoardStatus():
                 self._status = event
             case RadioStatus():
@@ -235,10 +227,8 @@ class BoardPort(StreamPort):
             case events.Disconnected(loss=loss):
                 self.monitor.reset()
                 if not self.closed:
-                    level, text = (
-                        logging.WARNING,
-                        f"disconnected from the board: {loss.value}; waiting for it",
-                    )
+                    level = logging.WARNING
+                    text = f"disconnected from the board: {loss.value}; waiting for it"
             case Log(level=severity, text=board_text):
                 level = logging.WARNING if severity >= LogLevel.WARNING else logging.INFO
                 text = f"board: {board_text}"
