@@ -22,20 +22,10 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from uwb_mitigation.errors import (
-    ParameterError,
-    UwbMitigationError,
-    check_name,
-    missing_dependency,
-)
+from uwb_mitigation.errors import ParameterError, UwbMitigationError, check_name, missing_dependency
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.nodes.support import diagnostics, endpoints
-from uwb_mitigation.nodes.support.parameter_tables import (
-    ALL_TABLES,
-    RESPAWN_FOLDER,
-    STANDARD,
-    Parameter,
-)
+from uwb_mitigation.nodes.support.parameter_tables import ALL_TABLES, RESPAWN_FOLDER, STANDARD, Parameter
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.topics import relative
 

@@ -14,12 +14,7 @@ from uwb_mitigation.errors import ParameterError, did_you_mean
 
 ParameterValue = bool | int | float | str
 
-_TYPE_NAMES = {
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    str: "a text",
-}
+_TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
 @dataclass(frozen=True, slots=True)

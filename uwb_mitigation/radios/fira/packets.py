@@ -58,11 +58,7 @@ class Packet:
 
 
 def encode_packets(
-    group: int,
-    opcode: int,
-    payload: bytes,
-    kind: PacketType = PacketType.COMMAND,
-    size: int = COMMAND_BYTES,
+    group: int, opcode: int, payload: bytes, kind: PacketType = PacketType.COMMAND, size: int = COMMAND_BYTES
 ) -> bytes:
     """Return the packets of a message, in fragments of `size` bytes."""
     fragments = [payload[start : start + size] for start in range(0, len(payload), size)] or [b""]

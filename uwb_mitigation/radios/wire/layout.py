@@ -200,11 +200,7 @@ _TABLES = (
         "RANGE_CIR",
         Field("tag_id", "Q", "identity of the tag"),
         Field("anchor_id", "Q", "identity of the anchor"),
-        Field(
-            "device_time",
-            "Q",
-            "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits",
-        ),
+        Field("device_time", "Q", "DW1000 ticks of 1 / (128 x 499.2 MHz) at the reception, 40 bits"),
         Field("sequence", "I", "number of the exchange; wraps"),
         Field("range", "f", "m, measured; NaN = no range"),
         Field("sample_period", "f", "s"),
