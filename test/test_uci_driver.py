@@ -100,7 +100,7 @@ def open_pair(links: Path) -> list[PortEvents]:
 def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
     boards: EmulatedUciBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(uci, "PERIOD_S", 1.0)
+    monkeypatch.setattr("uwb_mitigation.radios.port.PERIOD_S", 1.0)
     tag, anchor = open_pair(tmp_path / "uci")
     with tag:
         with anchor:

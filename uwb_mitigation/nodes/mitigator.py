@@ -114,12 +114,9 @@ class Mitigator(ManagedNode):
         self._sensor_ranges = endpoints.SensorRanges(self)
         if self._subscribe:
             # Subscribe to serialised messages: decoding them here takes a third of the time of rclpy.
-            self._raw = self.destroy_at_close(
-                endpoints.create_raw_subscription(
-                    self, RangeCir, topics.relative(topics.RANGE_RAW), self._on_raw, self._on_lost
-                ),
-                self.destroy_subscription,
-            )
+            name = topics.relative(topics.RANGE_RAW)
+            raw = endpoints.create_raw_subscription(self, RangeCir, name, self._on_raw, self._on_lost)
+            self._raw = self.destroy_at_close(raw, self.destroy_subscription)
 
     def begin(self) -> None:
         self._offsets = read_offsets(str(self.value("offsets")))

@@ -27,7 +27,7 @@ from uwb_mitigation.radios.port import (
 from uwb_mitigation.radios.settings import PortMessage, ValueReader, read_baud, read_capture, read_ports
 from uwb_mitigation.recordings.live_ranges import LiveConverter
 from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
-from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping
+from uwb_mitigation.recordings.mapping.mapping import Mapping, StartDialogue, load_mapping
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 MAX_LINE = 1 << 16
@@ -220,7 +220,7 @@ class LineSession:
             self.counts[_TOO_LONG] += not self._is_partial
             self._incomplete, self._incomplete_stamp_ns, self._is_partial = b"", 0, True
         if self._start is not None:
-            self._converse(data, now_ns, bool(measurements))
+            self._converse(self._start, data, now_ns, bool(measurements))
         return measurements
 
     def _read(self, line: str, stamp_ns: int) -> list[RangeMeasurement]:
@@ -238,10 +238,8 @@ class LineSession:
             self.stamp_offset_s = (measured.stamp_ns - stamp_ns) / 1e9
         return measurements
 
-    def _converse(self, data: bytes, now_ns: int, has_ranges: bool) -> None:
+    def _converse(self, start: StartDialogue, data: bytes, now_ns: int, has_ranges: bool) -> None:
         """Start the output of a board without ranges."""
-        start = self._start
-        assert start is not None
         if has_ranges:
             self._is_waking, self._pause_ns, self._wakes = False, FIRST_PAUSE_NS, 0
             self._due_ns = now_ns + 3 * FIRST_PAUSE_NS
@@ -301,12 +299,8 @@ class LinePort(StreamPort):
     def _warning(self) -> str:
         session, text = self.session, self.monitor.warning()
         if text and not session.received:
-            remedy = (
-                "is the sender's address right?"
-                if self._is_udp
-                else f"is the baud rate {self._settings.baud} right?"
-            )
-            return f"{text}: nothing was received; {remedy}"
+            setting = "sender's address" if self._is_udp else f"baud rate {self._settings.baud}"
+            return f"{text}: nothing was received; is the {setting} right?"
         if text and session.example:
             count = session.counts[_NO_MATCH]
             return f"{text}: {count} lines do not match the mapping {session.mapping.name}, such as {session.example}"

@@ -445,10 +445,8 @@ class PortAddress:
         if self.device:
             return self.device if os.path.exists(self.device) else None
         for port in list_ports.comports():
-            if (port.vid, port.pid) == (self.vendor, self.product) and self.serial_number in (
-                "",
-                port.serial_number,
-            ):
+            is_wanted = self.serial_number in ("", port.serial_number)
+            if is_wanted and (port.vid, port.pid) == (self.vendor, self.product):
                 return str(port.device)
         return None
 

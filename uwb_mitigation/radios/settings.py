@@ -211,14 +211,10 @@ def read_addresses(value: ValueReader, name: str, highest: int = 2**64 - 2) -> t
         with contextlib.suppress(ValueError):
             address = parse_id(text)
         if not 0 < address <= highest:
-            valid = (
-                "1 to 65534"
-                if highest == 0xFFFE
-                else "a number below 65536, or 0x and up to 16 hexadecimal digits"
-            )
-            raise ParameterError(
-                f"parameter {PREFIX}{name} = {text!r:.40}", valid=f"{valid}; several with commas"
-            )
+            what, valid = f"parameter {PREFIX}{name} = {text!r:.40}", "1 to 65534"
+            if highest > 0xFFFE:
+                valid = "a number below 65536, or 0x and up to 16 hexadecimal digits"
+            raise ParameterError(what, valid=f"{valid}; several with commas")
         addresses.append(address)
     return tuple(addresses)
 

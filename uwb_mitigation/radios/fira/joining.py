@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from uwb_mitigation.radios.fira.messages import Diagnostics, RangeRecord, merge
 
@@ -57,25 +57,32 @@ class RangeArrival:
     is_complete: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Waiting(Generic[_Content]):
-    """A notification whose counterpart has not arrived.
+class _Arrival(NamedTuple):
+    """How a notification has arrived.
 
     Attributes:
         arrived_ns: time of arrival.
         gap_ns: time since the message before it.
+        adjacent: the message before it is its counterpart.
         strict: notifications were lost or damaged shortly before.
         follows: the message before it belongs to the previous exchange.
         damages: number of damaged places in the stream before it.
-        notifications: number of notifications in the content.
     """
 
-    content: _Content
     arrived_ns: int
     gap_ns: int
+    adjacent: bool
     strict: bool
     follows: bool
     damages: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting(Generic[_Content]):
+    """A content whose counterpart has not arrived, from a number of notifications."""
+
+    content: _Content
+    arrival: _Arrival
     notifications: int = 1
 
 
@@ -125,14 +132,15 @@ class DiagnosticsMatcher:
             now_ns: time of the arrival.
         """
         sequence = arrival.sequence
-        adjacent, strict, follows, gap_ns = self._observe(True, sequence, damages, now_ns)
+        observed = self._observe(True, sequence, damages, now_ns)
         waiting = self._diagnostics.pop(sequence, None)
         if waiting is not None:
-            accepted = self._accept(waiting, adjacent, strict, damages, gap_ns, range_first=False)
-            diagnostics = waiting.content if accepted else None
+            diagnostics = (
+                waiting.content if self._accept(waiting.arrival, observed, range_first=False) else None
+            )
             self._complete(arrival, diagnostics, waiting.notifications, now_ns)
         elif self._unanswered < UNSUPPORTED_RANGES and sequence not in self._ranges:
-            self._ranges[sequence] = _Waiting(arrival, now_ns, gap_ns, strict, follows, damages)
+            self._ranges[sequence] = _Waiting(arrival, observed)
         else:
             self._finish(arrival, None)
         self.expire(now_ns)
@@ -140,19 +148,19 @@ class DiagnosticsMatcher:
     def add_diagnostics(self, diagnostics: Diagnostics, damages: int, now_ns: int) -> None:
         """Add diagnostics; see `add_range`."""
         sequence = diagnostics.sequence
-        adjacent, strict, follows, gap_ns = self._observe(False, sequence, damages, now_ns)
-        self._unanswered = 0
+        observed = self._observe(False, sequence, damages, now_ns)
+        strict, self._unanswered = observed.strict, 0
         if (incomplete := self._incomplete.pop(sequence, None)) is not None:
             since_ns, arrival, first, notifications = incomplete
             self._delays_ns.append(now_ns - since_ns)
             merged = first if strict else merge(first, diagnostics)
             self._complete(arrival, merged, notifications + 1, now_ns)
         elif (waiting := self._ranges.pop(sequence, None)) is not None:
-            accepted = self._accept(waiting, adjacent, strict, damages, gap_ns, range_first=True)
-            self._delays_ns.append(now_ns - waiting.arrived_ns)
+            accepted = self._accept(waiting.arrival, observed, range_first=True)
+            self._delays_ns.append(now_ns - waiting.arrival.arrived_ns)
             self._complete(waiting.content, diagnostics if accepted else None, 1, now_ns)
         else:
-            arrived = _Waiting(diagnostics, now_ns, gap_ns, strict, follows, damages)
+            arrived = _Waiting(diagnostics, observed)
             if (expired_ns := self._expired_ns.pop(sequence, None)) is not None:
                 self._delays_ns.append(now_ns - expired_ns)
             if sequence == self._completed and not strict:
@@ -169,7 +177,7 @@ class DiagnosticsMatcher:
     def expire(self, now_ns: int) -> None:
         """Complete the ranges that have waited too long for their diagnostics."""
         for sequence, old in list(self._diagnostics.items()):
-            if now_ns - old.arrived_ns > self._max_timeout_ns or len(self._diagnostics) > MAX_WAITING:
+            if now_ns - old.arrival.arrived_ns > self._max_timeout_ns or len(self._diagnostics) > MAX_WAITING:
                 del self._diagnostics[sequence]
         timeout_ns = self._timeout_ns()
         for sequence, (since_ns, arrival, diagnostics, _) in list(self._incomplete.items()):
@@ -178,10 +186,10 @@ class DiagnosticsMatcher:
                 self._expected_notifications = max(self._expected_notifications - 1, 1)
                 self._finish(arrival, diagnostics)
         for sequence, waiting in list(self._ranges.items()):
-            if now_ns - waiting.arrived_ns > timeout_ns or len(self._ranges) > MAX_WAITING:
+            if now_ns - waiting.arrival.arrived_ns > timeout_ns or len(self._ranges) > MAX_WAITING:
                 del self._ranges[sequence]
                 self._unanswered += 1
-                self._expired_ns[sequence] = waiting.arrived_ns
+                self._expired_ns[sequence] = waiting.arrival.arrived_ns
                 if len(self._expired_ns) > MAX_WAITING:
                     del self._expired_ns[next(iter(self._expired_ns))]
                 self._finish(waiting.content, None)
@@ -192,10 +200,7 @@ class DiagnosticsMatcher:
             return self._max_timeout_ns
         return min(max(DELAY_FACTOR * max(self._delays_ns), SHORT_TIMEOUT_NS), self._max_timeout_ns)
 
-    def _observe(
-        self, is_range: bool, sequence: int, damages: int, now_ns: int
-    ) -> tuple[bool, bool, bool, int]:
-        """Return whether a message follows its counterpart, may be damaged, follows the previous exchange; and the gap."""
+    def _observe(self, is_range: bool, sequence: int, damages: int, now_ns: int) -> _Arrival:
         before = self._latest_sequences.get(is_range)
         second = not is_range and sequence == before
         if is_range and before is not None:
@@ -216,24 +221,16 @@ class DiagnosticsMatcher:
         adjacent = latest == (not is_range, sequence) and not second
         if adjacent:
             self._range_first[not is_range] += 1
-        return adjacent, self._strict > 0, latest is not None and latest[1] == sequence - self._step, gap_ns
+        follows = latest is not None and latest[1] == sequence - self._step
+        return _Arrival(now_ns, gap_ns, adjacent, self._strict > 0, follows, damages)
 
-    def _accept(
-        self,
-        waiting: _Waiting[_Content],
-        adjacent: bool,
-        strict: bool,
-        damages: int,
-        gap_ns: int,
-        *,
-        range_first: bool,
-    ) -> bool:
+    def _accept(self, first: _Arrival, second: _Arrival, *, range_first: bool) -> bool:
+        """Return whether two notifications with one sequence number belong together."""
         pairs = self._range_first.total()
         usual = pairs >= ORDER_MESSAGES and self._range_first[range_first] >= ORDER_SHARE * pairs
-        simultaneous = 2 * gap_ns < min(waiting.gap_ns, self._interval_ns)
-        accepted = not (strict or waiting.strict) or (
-            adjacent and waiting.follows and (simultaneous or (usual and waiting.damages == damages))
-        )
+        simultaneous = 2 * second.gap_ns < min(first.gap_ns, self._interval_ns)
+        is_likely = simultaneous or (usual and first.damages == second.damages)
+        accepted = not (first.strict or second.strict) or (second.adjacent and first.follows and is_likely)
         self.counts["refused"] += not accepted
         return accepted
 

@@ -149,11 +149,7 @@ class BoardSession:
     @property
     def model_matches(self) -> bool:
         """False if the connected board has another model than the expected one."""
-        return (
-            self.hello is None
-            or self._expected_model_id is None
-            or self.hello.model_id == self._expected_model_id
-        )
+        return self.hello is None or self._expected_model_id in (None, self.hello.model_id)
 
     def closed(self, now_ns: int) -> list[Event]:
         """Begin again after the port was opened, lost or closed: discard partly received and unsent bytes."""
@@ -245,11 +241,9 @@ class BoardSession:
             self.counts["withheld"] += 1
             return []
         if not self._in_sequence(frame):
-            return (
-                self._disconnect(Loss.OUT_OF_SEQUENCE, now_ns)
-                if self._consecutive_stale >= _MAX_CONSECUTIVE_STALE
-                else []
-            )
+            if self._consecutive_stale >= _MAX_CONSECUTIVE_STALE:
+                return self._disconnect(Loss.OUT_OF_SEQUENCE, now_ns)
+            return []
         at_ns = 0
         if frame.type in _STAMPED and not frame.flags & Flag.ANSWER:
             at_ns = self.clock.stamp(frame.time_us, stamp_ns)
@@ -406,12 +400,10 @@ class BoardSession:
         if request is not None:
             _add_bounded(self._sync_send_times_ns, request, stamp_ns)
         self._num_syncs += 1
-        if self._num_syncs < FIRST_SYNCS:
-            self._next_sync_ns = now_ns + FIRST_SYNC_INTERVAL_NS
-        else:
-            self._next_sync_ns = now_ns + round(
-                SYNC_INTERVAL_NS * (0.7 + self._num_syncs * _GOLDEN_RATIO % 0.6)
-            )
+        interval_ns = FIRST_SYNC_INTERVAL_NS
+        if self._num_syncs >= FIRST_SYNCS:
+            interval_ns = round(SYNC_INTERVAL_NS * (0.7 + self._num_syncs * _GOLDEN_RATIO % 0.6))
+        self._next_sync_ns = now_ns + interval_ns
 
     def _send(self, kind: MessageType, payload: bytes) -> int | None:
         """Queue a frame; return its sequence number, or None if the queue is full."""
