@@ -10,6 +10,7 @@ import enum
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -293,6 +294,12 @@ class CorrectedRange:
     reason: str = field(default="", compare=False)
 
 
+_CIR_NUMBERS = attrgetter(
+    "start_index", "first_path_index", "scale", "preamble_count", "rx_power_dbm", "first_path_power_dbm"
+)
+"""Returns the columns of a CIR in `RangeColumns`, in their order."""
+
+
 # Not frozen, because this takes 1 % of the time of a correction.
 @dataclass(slots=True, eq=False)
 class RangeColumns:
@@ -335,18 +342,7 @@ class RangeColumns:
             cirs = [measurement.cir for measurement in members]
             tag_id = np.array([m.tag_id for m in members], np.uint64)
             anchor_id = np.array([m.anchor_id for m in members], np.uint64)
-            numbers = [
-                (
-                    m.range_m,
-                    m.cir.start_index,
-                    m.cir.first_path_index,
-                    m.cir.scale,
-                    m.cir.preamble_count,
-                    m.cir.rx_power_dbm,
-                    m.cir.first_path_power_dbm,
-                )
-                for m in members
-            ]
+            numbers = [(m.range_m, *_CIR_NUMBERS(m.cir)) for m in members]
             range_m, *others = np.array(numbers, np.float64).T
             samples = np.array([cir.samples for cir in cirs]) if len(cirs) > 1 else cirs[0].samples[None]
             columns = RangeColumns(tag_id, anchor_id, range_m, cirs[0].encoding, samples, *others)

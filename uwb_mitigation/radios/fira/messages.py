@@ -157,15 +157,9 @@ def parse_ranges(payload: bytes) -> RangeNotification:
     for start in range(_RANGE_HEADER.size, expected, _RANGE_RECORD_BYTES):
         status, _, distance_cm = struct.unpack_from("<BBH", payload, start + width)
         rssi = payload[start + width + 17]
-        valid = status == STATUS_OK and distance_cm != _INVALID_CM
-        records.append(
-            RangeRecord(
-                int.from_bytes(payload[start : start + width], "little"),
-                status,
-                distance_cm / 100 if valid else math.nan,
-                -rssi / 2 if rssi else math.nan,
-            )
-        )
+        peer = int.from_bytes(payload[start : start + width], "little")
+        range_m = distance_cm / 100 if status == STATUS_OK and distance_cm != _INVALID_CM else math.nan
+        records.append(RangeRecord(peer, status, range_m, -rssi / 2 if rssi else math.nan))
     return RangeNotification(handle, sequence, tuple(records))
 
 
@@ -217,32 +211,26 @@ def merge(first: Diagnostics, second: Diagnostics) -> Diagnostics:
 
 def _frame(frame: int, action: int, fields: Mapping[int, bytes]) -> FrameReport:
     # A field of a size that its type does not have is skipped, like a field of an unknown type.
-    emitter, offset, metrics = fields.get(5, b""), fields.get(4, b""), fields.get(6, b"")
-    return FrameReport(
-        frame,
-        action == 0,
-        int.from_bytes(emitter, "little") if len(emitter) in (2, 8) else None,
-        int.from_bytes(offset, "little", signed=True) / (1 << 26) * 1e6 if len(offset) == 4 else math.nan,
-        tuple(_metrics(metrics, start) for start in range(0, len(metrics), _METRICS.size))
-        if len(metrics) % _METRICS.size == 0
-        else (),
-        _cir_blocks(fields.get(7, b"")),
-        8 in fields or 9 in fields,
-    )
+    address, offset, segments = fields.get(5, b""), fields.get(4, b""), fields.get(6, b"")
+    emitter = int.from_bytes(address, "little") if len(address) in (2, 8) else None
+    offset_ppm = math.nan
+    if len(offset) == 4:
+        offset_ppm = int.from_bytes(offset, "little", signed=True) / (1 << 26) * 1e6
+    starts = range(0, len(segments), _METRICS.size) if len(segments) % _METRICS.size == 0 else ()
+    metrics = tuple(_metrics(segments, start) for start in starts)
+    cirs = _cir_blocks(fields.get(7, b""))
+    return FrameReport(frame, action == 0, emitter, offset_ppm, metrics, cirs, 8 in fields or 9 in fields)
 
 
 def _metrics(data: bytes, start: int) -> SegmentMetrics:
     receiver, _, rx, index, level, position, peak, _, _ = _METRICS.unpack_from(data, start)
-    return SegmentMetrics(
-        receiver >> 4,
-        receiver & 7,
-        bool(receiver & 8),
-        -rx / 256 if rx else math.nan,
-        -level / 256 if level else math.nan,
-        index,
-        position / 64,
-        peak,
-    )
+    rx_dbm, first_path_dbm = (-value / 256 if value else math.nan for value in (rx, level))
+    return SegmentMetrics(*_source(receiver), rx_dbm, first_path_dbm, index, position / 64, peak)
+
+
+def _source(receiver: int) -> tuple[int, int, bool]:
+    """Return the antenna port, the segment, and whether it is the primary one."""
+    return receiver >> 4, receiver & 7, bool(receiver & 8)
 
 
 def _cir_blocks(data: bytes) -> tuple[CirBlock, ...]:
@@ -255,7 +243,7 @@ def _cir_blocks(data: bytes) -> tuple[CirBlock, ...]:
             return ()
         taps = _taps(data[start : start + count * tap_bytes], tap_bytes // 2)
         start += count * tap_bytes
-        blocks.append(CirBlock(receiver >> 4, receiver & 7, bool(receiver & 8), offset, taps))
+        blocks.append(CirBlock(*_source(receiver), offset, taps))
     return tuple(blocks)
 
 

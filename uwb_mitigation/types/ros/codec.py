@@ -66,9 +66,8 @@ class MeasurementKey(NamedTuple):
 
 def measurement_key(measurement: RangeMeasurement) -> MeasurementKey:
     """Return the key of a measurement."""
-    return MeasurementKey(
-        measurement.stamp_ns, measurement.tag_id, measurement.anchor_id, measurement.sequence
-    )
+    m = measurement
+    return MeasurementKey(m.stamp_ns, m.tag_id, m.anchor_id, m.sequence)
 
 
 def encode_range(measurement: RangeMeasurement) -> bytes:
@@ -77,42 +76,22 @@ def encode_range(measurement: RangeMeasurement) -> bytes:
     Raises:
         RecordingError: a value does not fit its field.
     """
-    cir = measurement.cir
-    samples = cir.samples
+    m, cir, samples = measurement, measurement.cir, measurement.cir.samples
     if samples.dtype != np.int16 or samples.ndim != 1:
         raise RecordingError(
             f"CIR samples are {samples.dtype} of shape {samples.shape}", valid="int16 of one dimension"
         )
     try:
-        return b"".join(
-            (
-                _encode_header(measurement),
-                _RANGE_CIR.pack(
-                    measurement.tag_id,
-                    measurement.anchor_id,
-                    measurement.sequence,
-                    measurement.device_time,
-                    measurement.range_m,
-                    cir.sample_period_s,
-                    cir.start_index,
-                    cir.first_path_index,
-                    cir.encoding,
-                    cir.scale,
-                    len(samples),
-                ),
-                samples.astype("<i2", copy=False).tobytes(),
-                _CIR_COUNTS.pack(cir.preamble_count, cir.noise_threshold),
-                b"\0\0" if len(samples) % 2 else b"",
-                _CIR_POWERS.pack(
-                    cir.rx_power_dbm,
-                    cir.first_path_power_dbm,
-                    cir.channel,
-                    cir.prf_mhz,
-                    cir.radio,
-                    cir.segment,
-                ),
-            )
+        fields = _RANGE_CIR.pack(
+            m.tag_id, m.anchor_id, m.sequence, m.device_time, m.range_m, cir.sample_period_s,
+            cir.start_index, cir.first_path_index, cir.encoding, cir.scale, len(samples),
+        )  # fmt: skip
+        powers = _CIR_POWERS.pack(
+            cir.rx_power_dbm, cir.first_path_power_dbm, cir.channel, cir.prf_mhz, cir.radio, cir.segment
         )
+        data, padding = samples.astype("<i2", copy=False).tobytes(), b"\0\0" if len(samples) % 2 else b""
+        counts = _CIR_COUNTS.pack(cir.preamble_count, cir.noise_threshold)
+        return b"".join((_encode_header(m), fields, data, counts, padding, powers))
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
         raise _encoding_error("RangeCir", measurement, error) from error
 
@@ -123,10 +102,9 @@ def encode_truth(measurement: RangeMeasurement, truth: Truth) -> bytes:
     Raises:
         RecordingError: a value does not fit its field.
     """
+    m = measurement
     try:
-        data = _encode_header(measurement) + _TRUTH.pack(
-            measurement.tag_id, measurement.anchor_id, measurement.sequence, truth.range_m
-        )
+        data = _encode_header(m) + _TRUTH.pack(m.tag_id, m.anchor_id, m.sequence, truth.range_m)
         data = _append_string(data, truth.label)
         return _append_string(data, truth.configuration)
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
@@ -139,19 +117,12 @@ def encode_corrected(measurement: RangeMeasurement, corrected: CorrectedRange) -
     Raises:
         RecordingError: a value does not fit its field.
     """
+    m, c = measurement, corrected
     try:
-        return _encode_header(measurement) + _CORRECTED.pack(
-            measurement.tag_id,
-            measurement.anchor_id,
-            measurement.sequence,
-            corrected.range_m,
-            corrected.range_raw_m,
-            corrected.correction_m,
-            corrected.variance_m2,
-            corrected.status,
-            corrected.origin,
-            corrected.model_id,
-        )
+        return _encode_header(m) + _CORRECTED.pack(
+            m.tag_id, m.anchor_id, m.sequence, c.range_m, c.range_raw_m, c.correction_m, c.variance_m2, c.status,
+            c.origin, c.model_id,
+        )  # fmt: skip
     except (struct.error, OverflowError, UnicodeEncodeError) as error:
         raise _encoding_error("RangeCorrected", measurement, error) from error
 
@@ -183,31 +154,11 @@ def decode_range(data: bytes) -> RangeMeasurement:
         raise RecordingError(
             "message with an unknown radio or segment", where=f"radio {radio}, segment {segment}"
         )
-    return RangeMeasurement(
-        stamp_ns,
-        tag_id,
-        anchor_id,
-        sequence,
-        ticks,
-        range_m,
-        Cir(
-            np.frombuffer(data, "<i2", count, offset),
-            _ENCODINGS[encoding],
-            start,
-            first_path,
-            period,
-            scale,
-            preamble_count,
-            noise_threshold,
-            rx_power,
-            first_path_power,
-            channel,
-            prf,
-            _RADIOS[radio],
-            _SEGMENTS[segment],
-        ),
-        frame_id,
-    )
+    cir = Cir(
+        np.frombuffer(data, "<i2", count, offset), _ENCODINGS[encoding], start, first_path, period, scale,
+        preamble_count, noise_threshold, rx_power, first_path_power, channel, prf, _RADIOS[radio], _SEGMENTS[segment],
+    )  # fmt: skip
+    return RangeMeasurement(stamp_ns, tag_id, anchor_id, sequence, ticks, range_m, cir, frame_id)
 
 
 def decode_truth(data: bytes) -> tuple[MeasurementKey, Truth]:
@@ -286,21 +237,16 @@ class RangeBatch:
         self._header = table[:, :start]
         self._sequence = column(start + 16, "<u4")
         end = start + _RANGE_CIR.size
-        self.columns = RangeColumns(
-            column(start, "<u8"),
-            column(start + 8, "<u8"),
-            column(start + 32, "<f4").astype(np.float64),
-            first.cir.encoding,
-            np.ascontiguousarray(table[:, end : end + samples.nbytes]).view("<i2"),
-            column(start + 40, "<i4"),
-            column(start + 44, "<f4").astype(np.float64),
-            column(start + 52, "<f4").astype(np.float64),
-            column(end + samples.nbytes, "<u2"),
-            column(powers, "<f4").astype(np.float64),
-            column(powers + 4, "<f4").astype(np.float64),
-            first.cir.radio,
-            first.cir.segment,
+        offsets = start + 32, start + 44, start + 52, powers, powers + 4
+        range_m, first_path, scale, rx_dbm, first_path_dbm = (
+            column(offset, "<f4").astype(np.float64) for offset in offsets
         )
+        tags, anchors = column(start, "<u8"), column(start + 8, "<u8")
+        cirs = np.ascontiguousarray(table[:, end : end + samples.nbytes]).view("<i2")
+        starts, counts = column(start + 40, "<i4"), column(end + samples.nbytes, "<u2")
+        shape = first.cir.encoding, cirs, starts, first_path, scale
+        source = first.cir.radio, first.cir.segment
+        self.columns = RangeColumns(tags, anchors, range_m, *shape, counts, rx_dbm, first_path_dbm, *source)
 
     @staticmethod
     def key(message: bytes) -> tuple[int, bytes]:
