@@ -144,7 +144,9 @@ class Mitigator(ManagedNode):
                 self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
             now_ns = self.now_ns()
             self.health.add_time(time.perf_counter_ns() - began_ns)
-            for measurement, corrected in zip(measurements, results, strict=True):
+            pairs = [m.tag_id for m in measurements], [m.anchor_id for m in measurements]
+            offsets_m = mitigation.offsets.lookup(*pairs).tolist()
+            for measurement, corrected, offset_m in zip(measurements, results, offsets_m, strict=True):
                 choice = mitigation.choose(CirKind.of(measurement.cir))
                 if self.health.add(choice, measurement, corrected.status) and len(mitigation.bundles) > 1:
                     first = f"tag {format_id(measurement.tag_id)}, anchor {format_id(measurement.anchor_id)}"
@@ -153,8 +155,7 @@ class Mitigator(ManagedNode):
                     else:
                         self.get_logger().warning(f"ranges are not corrected: {choice} (first: {first})")
                 if corrected.status is Status.OK and measurement.cir.power_gap_db < LINE_OF_SIGHT_DB:
-                    (offset_m,) = mitigation.offsets.lookup([measurement.tag_id], [measurement.anchor_id])
-                    self.health.los_m.append(corrected.correction_m - float(offset_m))
+                    self.health.los_m.append(corrected.correction_m - offset_m)
                 self._meter.add(now_ns - measurement.stamp_ns)
 
     def subscription_count(self) -> int:
