@@ -12,14 +12,7 @@ from ctypes import CFUNCTYPE, POINTER, c_char_p, c_int, c_size_t, c_uint32, c_ui
 from typing import Any
 
 from uwb_mitigation.errors import LinkError, ParameterError
-from uwb_mitigation.mitigation.embedded.compiling import (
-    WARNINGS,
-    Signatures,
-    c_compiler,
-    compile_objects,
-    firmware_folder,
-    load_library,
-)
+from uwb_mitigation.mitigation.embedded import compiling
 from uwb_mitigation.radios.dw1000.bus import Bus
 from uwb_mitigation.radios.settings import STATE_PROBLEMS, RadioSettings, RadioStatus
 from uwb_mitigation.radios.wire import messages
@@ -27,7 +20,7 @@ from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
 from uwb_mitigation.radios.wire.messages import RadioConfigured, SetRadio
 from uwb_mitigation.types.measurement import RangeMeasurement
 
-_OPTIONS = ("-std=c99", "-O2", "-fPIC", *WARNINGS)
+_OPTIONS = ("-std=c99", "-O2", "-fPIC", *compiling.WARNINGS)
 _RANGED, _FAULT = 1, 2
 
 _loading = threading.Lock()
@@ -209,14 +202,13 @@ def load_native() -> ctypes.CDLL:
 
 @functools.cache
 def _compiled() -> ctypes.CDLL:
-    firmware = firmware_folder()
-    sources = tuple(
-        sorted([*(firmware / "src").glob("uwb_dw1000*.c"), *(firmware / "src").glob("uwb_twr*.c")])
-    )
-    options = (*_OPTIONS, f"-I{firmware / 'src'}")
-    objects = compile_objects(c_compiler(), options, (*sources, firmware / "native" / "native_radio.c"))
+    firmware = compiling.firmware_folder()
+    folder = firmware / "src"
+    shared = sorted([*folder.glob("uwb_dw1000*.c"), *folder.glob("uwb_twr*.c")])
+    sources = (*shared, firmware / "native" / "native_radio.c")
+    objects = compiling.compile_objects(compiling.c_compiler(), (*_OPTIONS, f"-I{folder}"), sources)
     radio, settings = c_void_p, (c_char_p, c_size_t, c_uint32, c_uint32)
-    signatures: Signatures = {
+    signatures: compiling.Signatures = {
         "new": (c_void_p, (POINTER(Io), *settings, c_uint64)),
         "free": (None, (radio,)),
         "configure": (c_char_p, (radio, *settings)),
@@ -227,4 +219,4 @@ def _compiled() -> ctypes.CDLL:
         "status": (c_size_t, (radio, c_void_p)),
         "sensors": (c_int, (radio,)),
     }
-    return load_library("native_radio_", objects, signatures)
+    return compiling.load_library("native_radio_", objects, signatures)

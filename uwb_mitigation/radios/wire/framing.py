@@ -13,15 +13,8 @@ from typing import NamedTuple
 from cobs import cobs
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.radios.wire.layout import (
-    CRC_BYTES,
-    HEADER,
-    HEADER_BYTES,
-    MAX_ENCODED_BYTES,
-    MAX_FRAME_BYTES,
-    MAX_PAYLOAD_BYTES,
-    PROTOCOL_VERSION,
-)
+from uwb_mitigation.radios.wire import layout
+from uwb_mitigation.radios.wire.layout import CRC_BYTES, HEADER_BYTES, MAX_ENCODED_BYTES, PROTOCOL_VERSION
 
 DELIMITER = b"\0"
 
@@ -33,7 +26,7 @@ _SLICE_BYTES = 1 << 16
 
 _CORRUPT = ("bad_cobs", "bad_length", "bad_crc", "oversize")
 _MIN_FRAME_BYTES = HEADER_BYTES + CRC_BYTES
-_header = HEADER.as_struct()
+_header = layout.HEADER.as_struct()
 
 
 class WireFrame(NamedTuple):
@@ -55,8 +48,10 @@ def encode_frame(frame: WireFrame, version: int = PROTOCOL_VERSION) -> bytes:
     Raises:
         ParameterError: the payload is longer than `MAX_PAYLOAD_BYTES`.
     """
-    if len(frame.payload) > MAX_PAYLOAD_BYTES:
-        raise ParameterError(f"a payload of {len(frame.payload)} bytes", valid=f"at most {MAX_PAYLOAD_BYTES}")
+    if len(frame.payload) > layout.MAX_PAYLOAD_BYTES:
+        raise ParameterError(
+            f"a payload of {len(frame.payload)} bytes", valid=f"at most {layout.MAX_PAYLOAD_BYTES}"
+        )
     body = _header.pack(version, frame.type, frame.flags, frame.sequence, frame.time_us) + frame.payload
     return b"".join(
         (DELIMITER, cobs.encode(body + zlib.crc32(body).to_bytes(CRC_BYTES, "little")), DELIMITER)
@@ -148,7 +143,7 @@ class FrameDecoder:
         except cobs.DecodeError:
             counts["bad_cobs"] += 1
             return None
-        if not _MIN_FRAME_BYTES <= len(body) <= MAX_FRAME_BYTES:
+        if not _MIN_FRAME_BYTES <= len(body) <= layout.MAX_FRAME_BYTES:
             counts["bad_length"] += 1
             return None
         if zlib.crc32(body) != _CRC_RESIDUE:

@@ -11,19 +11,9 @@ from typing import TypeVar
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings, RadioStatus
-from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire import events, messages
 from uwb_mitigation.radios.wire.clock import DeviceClock
-from uwb_mitigation.radios.wire.events import (
-    COUNTS,
-    OFFSETS_PROBLEM,
-    RADIO_PROBLEM,
-    Connected,
-    Disconnected,
-    Event,
-    LinkState,
-    Loss,
-    Refused,
-)
+from uwb_mitigation.radios.wire.events import Event, LinkState, Loss
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame
 from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION, Flag, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import Correction, Hello, RadioConfigured, SetOffsets, SetRadio
@@ -118,7 +108,7 @@ class BoardSession:
         self.hello: Hello | None = None
         self.radio: RadioConfigured | None = None
         self.foreign_version: int | None = None
-        self.counts = COUNTS.copy()
+        self.counts = events.COUNTS.copy()
         self.clock = DeviceClock()
         self._decoder = FrameDecoder()
         self._encoder = FrameEncoder()
@@ -198,34 +188,34 @@ class BoardSession:
 
     def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Event]:
         """Return the events in the received bytes, in order. Never raises; invalid bytes are counted."""
-        events: list[Event] = []
+        observed: list[Event] = []
         frames = self._decoder.feed(data)
         if frames:
             self._last_received_ns = now_ns
         for frame in frames:
-            events += self._handle(frame, now_ns, stamp_ns)
-        events += self._check_foreign_versions(now_ns)
-        return events + self.tick(now_ns, stamp_ns)
+            observed += self._handle(frame, now_ns, stamp_ns)
+        observed += self._check_foreign_versions(now_ns)
+        return observed + self.tick(now_ns, stamp_ns)
 
     def tick(self, now_ns: int, stamp_ns: int) -> list[Event]:
         """Repeat requests, synchronise the clock, and check for a timeout."""
-        events: list[Event] = []
+        observed: list[Event] = []
         if self.state is LinkState.READY and self.idle_ns(now_ns) > LINK_TIMEOUT_NS:
-            events += self._disconnect(Loss.TIMEOUT, now_ns)
+            observed += self._disconnect(Loss.TIMEOUT, now_ns)
         if now_ns >= self._next_request_ns:
             self._next_request_ns = now_ns + REQUEST_INTERVAL_NS
             if self.state is not LinkState.READY:
                 self._send(MessageType.GET_INFO, b"")
-                return events
+                return observed
             if self._send_request(self._offsets_request) and self._offsets:
-                events.append(Refused(OFFSETS_PROBLEM, self._offsets_request.unanswered))
+                observed.append(events.Refused(events.OFFSETS_PROBLEM, self._offsets_request.unanswered))
             if self._mode_request.pending:
                 self._send_request(self._mode_request)
             elif self._send_request(self._radio_request):
-                events.append(Refused(RADIO_PROBLEM, self._radio_request.unanswered))
+                observed.append(events.Refused(events.RADIO_PROBLEM, self._radio_request.unanswered))
         if self.state is LinkState.READY and now_ns >= self._next_sync_ns:
             self._send_sync(now_ns, stamp_ns)
-        return events
+        return observed
 
     def _handle(self, frame: WireFrame, now_ns: int, stamp_ns: int) -> list[Event]:
         try:
@@ -269,10 +259,10 @@ class BoardSession:
         hello = messages.decode(frame.type, frame.payload)
         assert isinstance(hello, Hello)
         boot = (hello.board_id, hello.boot_id)
-        events: list[Event] = []
+        observed: list[Event] = []
         if self.state is LinkState.READY:
             if boot != self._boot_key:
-                events += self._disconnect(Loss.RESET, now_ns)
+                observed += self._disconnect(Loss.RESET, now_ns)
             elif not self._in_sequence(frame):
                 return []
         if boot != self._boot_key:
@@ -295,14 +285,14 @@ class BoardSession:
             self._offsets_request.repeat(self._offsets_request.message)
             self._offsets_confirmed = False
             self._next_request_ns = now_ns
-            events.append(Connected(hello))
+            observed.append(events.Connected(hello))
         elif frame.flags & Flag.ANSWER and self._mode_request.is_answered_by(hello.request_sequence):
             requested = hello.mode if self._mode is None else self._mode
             text = f"the board is in mode {requested.name}"
             if hello.mode != requested:
                 text = f"the board stays in mode {hello.mode.name} instead of {requested.name}: does it have a model?"
-            events.append(PortMessage(logging.INFO if hello.mode == requested else logging.WARNING, text))
-        return events
+            observed.append(PortMessage(logging.INFO if hello.mode == requested else logging.WARNING, text))
+        return observed
 
     @property
     def _offsets(self) -> Offsets:
@@ -328,11 +318,11 @@ class BoardSession:
             return []
         self._offsets_confirmed = answer.accepted
         text = f"it can store {answer.slots} offsets, but {len(self._offsets)} were requested"
-        return [] if answer.accepted else [Refused(OFFSETS_PROBLEM, text)]
+        return [] if answer.accepted else [events.Refused(events.OFFSETS_PROBLEM, text)]
 
     def _handle_radio(self, radio: RadioConfigured, answer: bool) -> list[Event]:
         if answer and self._radio_request.is_answered_by(radio.request_sequence) and not radio.accepted:
-            return [Refused(RADIO_PROBLEM, radio.text)]
+            return [events.Refused(events.RADIO_PROBLEM, radio.text)]
         self.radio = radio
         return [radio]
 
@@ -393,7 +383,7 @@ class BoardSession:
             request.sent.clear()
         self._sync_send_times_ns.clear()
         self._next_request_ns = now_ns
-        return [Disconnected(loss)] if was_ready else []
+        return [events.Disconnected(loss)] if was_ready else []
 
     def _send_sync(self, now_ns: int, stamp_ns: int) -> None:
         request = self._send(MessageType.TIME_SYNC, b"")
