@@ -226,11 +226,8 @@ class Mitigator(ManagedNode):
         try:
             message = deserialize_message(data, RangeCir)
             cir = message.cir
-            if (
-                cir.encoding not in tuple(Encoding)
-                or cir.radio not in tuple(RadioType)
-                or cir.segment not in tuple(Segment)
-            ):
+            kinds = (cir.encoding, Encoding), (cir.radio, RadioType), (cir.segment, Segment)
+            if any(value not in tuple(kind) for value, kind in kinds):
                 cir.encoding, cir.samples = int(Encoding.COMPLEX_INT16), array("h")
                 cir.radio = cir.segment = 0
             return decode_range(serialize_message(message))

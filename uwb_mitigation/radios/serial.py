@@ -120,10 +120,8 @@ class BoardPort(StreamPort):
             if settings.radio != before.radio:
                 self._refused.pop(events.RADIO_PROBLEM, None)
                 self.session.set_radio(settings.radio or DEFAULT_RADIO)
-            if settings.mode is Mode.DEVICE and (settings.mode, settings.offsets) != (
-                before.mode,
-                before.offsets,
-            ):
+            has_new_offsets = (settings.mode, settings.offsets) != (before.mode, before.offsets)
+            if settings.mode is Mode.DEVICE and has_new_offsets:
                 self._refused.pop(events.OFFSETS_PROBLEM, None)
                 self.session.set_offsets(settings.offsets)
             if settings.mode is not None and settings.mode != before.mode:

@@ -414,13 +414,9 @@ class CorrectedColumns:
     @classmethod
     def joined(cls, chunks: Sequence[CorrectedColumns]) -> CorrectedColumns:
         """Concatenate ranges of one origin."""
-        columns: dict[str, Any] = {
-            column.name: chunks[0].origin
-            if column.name == "origin"
-            else np.concatenate([getattr(chunk, column.name) for chunk in chunks])
-            for column in fields(cls)
-        }
-        return cls(**columns)
+        names = [column.name for column in fields(cls) if column.name != "origin"]
+        columns: Any = {name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names}
+        return cls(origin=chunks[0].origin, **columns)
 
     def __len__(self) -> int:
         """The number of ranges."""
