@@ -28,6 +28,7 @@ from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
 from uwb_mitigation.nodes.support.endpoints import BATCH
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
+from uwb_mitigation.nodes.support.sensor_ranges import SensorRanges
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     Cir,
@@ -95,7 +96,7 @@ class Mitigator(ManagedNode):
         self._subscribe = subscribe
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
-        self._sensor_ranges: endpoints.SensorRanges
+        self._sensor_ranges: SensorRanges
         self._mitigation: Corrector | None = None
         self._prepared: tuple[str, Corrector] | None = None
         self._shipped: tuple[Bundle, ...] = ()
@@ -111,7 +112,7 @@ class Mitigator(ManagedNode):
 
     def open(self) -> None:
         self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
-        self._sensor_ranges = endpoints.SensorRanges(self)
+        self._sensor_ranges = SensorRanges(self)
         if self._subscribe:
             # Subscribe to serialised messages: decoding them here takes a third of the time of rclpy.
             name = topics.relative(topics.RANGE_RAW)

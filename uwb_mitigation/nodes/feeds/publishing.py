@@ -16,8 +16,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import ParameterError, RecordingError
-from uwb_mitigation.nodes.support import endpoints
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
+from uwb_mitigation.nodes.support.sensor_ranges import SensorRanges
 from uwb_mitigation.radios.wire.messages import Correction
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
 from uwb_mitigation.types.ros import topics
@@ -53,7 +53,7 @@ class RangePublisher:
         self._bag = self._open_bag() if node.value("record") else None
         if corrections:
             self._corrected = node.publisher(RangeCorrected, topics.RANGE_CORRECTED)
-            self._sensor_ranges = endpoints.SensorRanges(node)
+            self._sensor_ranges = SensorRanges(node)
         if recording:
             prepare_encoders()
             self._truths = node.publisher(RangeTruth, topics.RANGE_TRUTH)

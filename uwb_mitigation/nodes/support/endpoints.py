@@ -1,4 +1,4 @@
-"""Publishers and subscriptions with their quality of service (REP-2003), and ranges as sensor_msgs/Range.
+"""Publishers and subscriptions with their quality of service (REP-2003).
 
 History, depth and reliability can be overridden by the standard parameters `qos_overrides.TOPIC.publisher.POLICY` and
 `qos_overrides.TOPIC.subscription.POLICY`.
@@ -7,12 +7,11 @@ History, depth and reliability can be overridden by the standard parameters `qos
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -24,23 +23,11 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from std_msgs.msg import Header
 
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, format_id
-from uwb_mitigation.types.measurement import CorrectedRange
-from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, relative
+from uwb_mitigation.errors import MissingDependencyError, ParameterError
 from uwb_mitigation.types.stamps import NS_PER_S
-
-if TYPE_CHECKING:
-    from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 
 DEPTH = 1000
 """Queue depth: a subscriber that stalls for 1 s at 1 kHz loses no range."""
-
-MAX_SENSOR_RANGE_M = 300.0
-"""Maximum range of a DW1000 in free space (data sheet, section 1)."""
-
-MAX_SENSOR_TOPICS = 256
-"""Maximum number of sensor_msgs/Range topics; bounded because ids are received over the air."""
-
 
 # The other policies are ROS's defaults: reliable, volatile, keep last.
 RANGES = QoSProfile(depth=DEPTH)
@@ -177,47 +164,6 @@ def header(stamp_ns: int, frame_id: str) -> Header:
     """Return a message header."""
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
-
-
-class SensorRanges:
-    """Publishes ranges as sensor_msgs/Range on `uwb/range_corrected/anchor_ID`; an invalid range is +Inf (REP-117).
-
-    sensor_msgs has no radiation type for radio, so it is 0; the field of view is the full circle.
-
-    Args:
-        node: the publishers exist until its `close`. Without its parameter `sensor_ranges`, nothing is published.
-    """
-
-    def __init__(self, node: ManagedNode) -> None:
-        self._node = node
-        self._publishers: dict[int, Publisher] = {}
-        self._kind: Any = None
-        if node.value("sensor_ranges"):
-            # Import on demand: sensor_msgs takes a twelfth of the start-up time of a node.
-            self._kind = message_type("sensor_msgs/msg/Range")
-
-    def publish(self, anchor_id: int, stamp_ns: int, frame_id: str, corrected: CorrectedRange) -> None:
-        if self._kind is None:
-            return
-        publisher = self._publishers.get(anchor_id)
-        if publisher is None:
-            if len(self._publishers) == MAX_SENSOR_TOPICS:
-                text = f"more than {MAX_SENSOR_TOPICS} anchors: no topic for anchor {format_id(anchor_id)}"
-                self._node.get_logger().warning(text, throttle_duration_sec=60.0)
-                return
-            topic = f"{relative(RANGE_CORRECTED)}/anchor_{format_id(anchor_id)}"
-            publisher = self._publishers[anchor_id] = self._node.publisher(self._kind, topic)
-            publisher.on_activate(None)
-        valid = math.isfinite(corrected.range_m) and math.isfinite(corrected.variance_m2)
-        publisher.publish(
-            self._kind(
-                header=header(stamp_ns, frame_id),
-                field_of_view=2 * math.pi,
-                max_range=MAX_SENSOR_RANGE_M,
-                range=float(corrected.range_m) if valid else math.inf,
-                variance=float(corrected.variance_m2) if valid else math.inf,
-            )
-        )
 
 
 @contextmanager
