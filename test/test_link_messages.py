@@ -13,20 +13,12 @@ import pytest
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.radios.wire import layout, messages
 from uwb_mitigation.radios.wire.layout import MessageType, Mode
-from uwb_mitigation.radios.wire.messages import (
-    BoardStatus,
-    Correction,
-    Hello,
-    Log,
-    SetMode,
-    TimeSyncReply,
-)
+from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, Log, SetMode, TimeSyncReply
 from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, RangeMeasurement, Status
 
 HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.DEVICE, 99, 3, 4224, 1, 2, 3, "uwb-nano33")
-CORRECTION = Correction(
-    5, 1, 2, 3, 2**40 - 1, CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, CorrectedBy.DEVICE, 0xCAFE), 7100
-)
+CORRECTED = CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, CorrectedBy.DEVICE, 0xCAFE)
+CORRECTION = Correction(5, 1, 2, 3, 2**40 - 1, CORRECTED, 7100)
 SMALL = [
     HELLO,
     CORRECTION,
@@ -40,9 +32,8 @@ SMALL = [
 
 
 def measurement(samples: np.ndarray, **cir: object) -> RangeMeasurement:
-    return RangeMeasurement(
-        11, 2**64 - 1, 2, 2**32 - 1, 2**40 - 1, 3.25, Cir(np.asarray(samples, np.int16), **cir)
-    )
+    cir = Cir(np.asarray(samples, np.int16), **cir)
+    return RangeMeasurement(11, 2**64 - 1, 2, 2**32 - 1, 2**40 - 1, 3.25, cir)
 
 
 def round_trip(message: messages.Message) -> messages.Message | None:
@@ -82,9 +73,7 @@ def test_payload_that_is_too_short_is_an_error_that_names_the_type(kind):
     [
         ("sample_count", "H", 2033),
         ("sample_count", "H", 3),
-        ("samples_offset", "H", 70),
-        ("samples_offset", "H", 73),
-        ("samples_offset", "H", 65534),
+        *(("samples_offset", "H", offset) for offset in (70, 73, 65534)),
         ("encoding", "B", 2),
         ("device_time", "Q", 2**40),
     ],
@@ -136,20 +125,9 @@ def test_text_that_is_not_utf8_is_shown_with_replacements():
 
 
 def test_long_firmware_name_is_cut_between_characters():
-    hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name="ü" * 8 + "é")
-    assert round_trip(hello).firmware_name == "ü" * 8
-    hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name="x" * 15 + "é")
-    assert round_trip(hello).firmware_name == "x" * 15
-
-
-@pytest.mark.parametrize("table", [layout.HEADER, *layout.PAYLOADS.values()], ids=lambda table: table.name)
-def test_every_field_is_aligned_and_every_fixed_part_is_a_multiple_of_8(table):
-    codes = {field.name: field.code for field in table.fields}
-    for name, offset in table.offsets().items():
-        code = codes[name]
-        size = 1 if code.endswith("s") else struct.calcsize("<" + code)
-        assert offset % size == 0, name
-    assert table.as_struct().size % 8 == 0
+    for text in ("ü" * 8, "x" * 15):
+        hello = Hello(1, 0, 0, Mode.HOST, 1, firmware_name=f"{text}é")
+        assert round_trip(hello).firmware_name == text
 
 
 @pytest.mark.parametrize(("compiler", "language"), [("cc", "c"), ("c++", "c++")])
@@ -158,7 +136,5 @@ def test_c_header_compiles_and_its_assertions_hold(compiler, language, tmp_path)
         pytest.skip(f"no compiler: {compiler}")
     header = tmp_path / "uwb_protocol.h"
     header.write_text(generated.c_header())
-
-    subprocess.run(
-        [compiler, "-x", language, "-Wall", "-Wextra", "-Werror", "-fsyntax-only", str(header)], check=True
-    )
+    options = ("-Wall", "-Wextra", "-Werror", "-fsyntax-only")
+    subprocess.run([compiler, "-x", language, *options, str(header)], check=True)
