@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 from compilers import NEEDS_CC
-from dw1000_driver import TICK_M, TXDLYS, TXSTRT, WAIT4RESP, WRAP
 from firmware_on_model import REPLY_US, ranging, use_virtual_time
 from spidev_on_model import dw1000, program, replace_spidev
 
@@ -22,6 +21,8 @@ from uwb_mitigation.types.measurement import RangeMeasurement
 pytestmark = NEEDS_CC
 OTHERS = 0x0123456789ABCDEF
 POLL, ANSWER, FINAL, REPORT = 3, 4, 5, 6
+TXSTRT, TXDLYS, WAIT4RESP = 2, 4, 0x80
+WRAP, TICK_M = 1 << 40, 299_792_458 / (128 * 499.2e6)
 
 
 @pytest.fixture
@@ -50,14 +51,8 @@ def parsed(octets: list[int] | None) -> SimpleNamespace | None:
     def number(at: int, size: int) -> int:
         return int.from_bytes(data[at : at + size], "little")
 
-    return SimpleNamespace(
-        pan=number(3, 2),
-        source=number(13, 8),
-        kind=data[22],
-        tag=number(23, 4),
-        anchor=number(27, 4),
-        stamps=tuple(number(31 + 5 * k, 5) for k in range(3)),
-    )
+    ids = {"pan": number(3, 2), "source": number(13, 8), "tag": number(23, 4), "anchor": number(27, 4)}
+    return SimpleNamespace(**ids, kind=data[22], stamps=tuple(number(31 + 5 * k, 5) for k in range(3)))
 
 
 def await_kind(driver: dw1000.DW1000, kind: int, seconds: float) -> tuple[SimpleNamespace, int] | None:
@@ -126,9 +121,8 @@ def test_anchor_ranges_with_an_independent_tag(air: Air):
         for turn in range(8):
             host.delay(20e-3)
             number = 0x7A600000 + turn
-            answer, answered = ask(
-                driver, host, frame(POLL, pan, own, (number, 0), (REPLY_US, 0, 0)), TXSTRT | WAIT4RESP
-            )
+            poll = frame(POLL, pan, own, (number, 0), (REPLY_US, 0, 0))
+            answer, answered = ask(driver, host, poll, TXSTRT | WAIT4RESP)
             if answer is None or answer.kind != ANSWER:
                 continue
             leaves = (answered + REPLY_US * 63898) % WRAP & ~511
@@ -152,27 +146,24 @@ def test_anchor_ranges_with_an_independent_tag(air: Air):
     assert sum(found) / len(found) == pytest.approx(12.5, abs=0.005)
 
 
-def test_frames_without_a_leading_edge_yield_no_range(air: Air):
-    tag, anchor = air.chip(), air.chip()
-    air.set_pair(tag, anchor, Pair(6.0))
-    for chip in (tag, anchor):
-        chip.set_edge_loss(0.2)
-    ranges: list[RangeMeasurement] = []
-    air.program(tag, ranging(RadioSettings(), ranges, 0.3))
-    air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR), [], 0.3))
-    air.run(1.0)
-    assert len(ranges) > 5
-    assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in ranges)
-
-
-@pytest.mark.parametrize("preamble", [1024, 4096])
-def test_default_delays_grow_with_the_frame_length(air: Air, preamble: int):
-    slow = {"rate_kbps": 110, "preamble": preamble}
+@pytest.mark.parametrize(
+    ("radio", "edge_loss", "count"),
+    [
+        ({}, 0.2, 6),
+        # The default delays grow with the length of the frames.
+        *(({"rate_kbps": 110, "preamble": preamble}, 0.0, 3) for preamble in (1024, 4096)),
+    ],
+)
+def test_frames_without_a_leading_edge_or_long_ones_yield_no_wrong_range(
+    air: Air, radio: dict[str, int], edge_loss: float, count: int
+):
     tag, anchor = air.chip(ppm=5.0), air.chip(ppm=-5.0)
     air.set_pair(tag, anchor, Pair(6.0))
+    for chip in (tag, anchor):
+        chip.set_edge_loss(edge_loss)
     ranges: list[RangeMeasurement] = []
-    air.program(tag, ranging(RadioSettings(**slow), ranges, 0.6))
-    air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR, **slow), [], 0.6))
+    air.program(tag, ranging(RadioSettings(**radio), ranges, 0.6))
+    air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR, **radio), [], 0.6))
     air.run(1.0)
-    assert len(ranges) >= 3
+    assert len(ranges) >= count
     assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in ranges)

@@ -64,9 +64,8 @@ def replay_through_both(ros: Ros, count: int, *driver: str) -> tuple[list[RangeC
 def test_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Path):
     raw, corrected = replay_through_both(ros, 300, "source:=mcap", f"path:={bag}", "rate:=10.0")
     assert len(corrected) == 300
-    assert [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range_raw) for m in corrected] == [
-        (m.header, m.sequence, m.anchor_id, m.tag_id, m.range) for m in raw
-    ]
+    sent = [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range) for m in raw]
+    assert [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range_raw) for m in corrected] == sent
 
 
 def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
@@ -74,9 +73,8 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     mitigation = Mitigation(load_bundle(default_model_path()), median_at_rest=True)
     with open_decaranging(log) as source:
         expected = mitigation.correct([record.measurement for record in source])
-    _, corrected = replay_through_both(
-        ros, len(expected), "source:=decaranging", f"path:={log}", "rate:=200.0"
-    )
+    given = ("source:=decaranging", f"path:={log}", "rate:=200.0")
+    _, corrected = replay_through_both(ros, len(expected), *given)
     assert [m.range for m in corrected] == [np.float32(item.range_m) for item in expected]
     assert [m.variance for m in corrected] == [np.float32(item.variance_m2) for item in expected]
     assert [m.status for m in corrected] == [int(item.status) for item in expected]
@@ -100,11 +98,7 @@ def test_stamps_are_on_the_nodes_clock_and_spaced_as_recorded(ros: Ros, bag: Pat
 
 @pytest.mark.parametrize(
     ("parameters", "named"),
-    [
-        (("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"),
-        (("source:=mcap",), "path"),
-        (("rate:=.nan",), "rate"),
-    ],
+    [(("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"), (("rate:=.nan",), "rate")],
 )
 def test_driver_without_a_source_exits_with_an_error(ros: Ros, parameters: tuple[str, ...], named: str):
     driver = ros.start("driver", *parameters)

@@ -62,10 +62,8 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     mitigator.wait_for_output(reason)
     assert mitigator.output.count(reason) == 1
     status = ros.diagnosis("mitigator", lambda status: any(reason in v.value for v in status.values))
-    assert re.fullmatch(
-        r"DW3000 STS .*: model dw3000_sts .* \(tag-anchor 1-2, 1-3\)",
-        diagnostic_values(status)["models by radio"],
-    )
+    used = r"DW3000 STS .*: model dw3000_sts .* \(tag-anchor 1-2, 1-3\)"
+    assert re.fullmatch(used, diagnostic_values(status)["models by radio"])
 
     assert ros.set_parameter("mitigator", "model", "universal").successful
     status = ros.diagnosis("mitigator", lambda status: "DW3000 STS" in status.message)
@@ -91,10 +89,8 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
 
 def open_pair(links: Path) -> list[PortEvents]:
     boards = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
-    return [
-        PortEvents(uci, UciPortSettings(PortAddress(f"{links}{number}"), board))
-        for number, board in enumerate(boards)
-    ]
+    settings = [UciPortSettings(PortAddress(f"{links}{n}"), board) for n, board in enumerate(boards)]
+    return [PortEvents(uci, each) for each in settings]
 
 
 def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
@@ -107,9 +103,8 @@ def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
             tag.wait_for(RangeMeasurement, 5)
             wait_until(lambda: tag.port.report().warning == "")
             boards.set_faults(UciFaults(offset_m=-3.0))
-            wait_until(
-                lambda: re.search("negative distance.*antenna delay", tag.port.report().warning, re.DOTALL)
-            )
+            negative = "negative distance.*antenna delay"
+            wait_until(lambda: re.search(negative, tag.port.report().warning, re.DOTALL))
             boards.set_faults(UciFaults())
             wait_until(lambda: tag.port.report().warning == "")
         silent = r"no range for \d.*reception timeout: are the other boards on"
