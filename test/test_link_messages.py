@@ -19,16 +19,9 @@ from uwb_mitigation.types.measurement import Cir, CorrectedBy, CorrectedRange, R
 HELLO = Hello(0xB0A2D, 0xCAFE, 157, Mode.DEVICE, 99, 3, 4224, 1, 2, 3, "uwb-nano33")
 CORRECTED = CorrectedRange(2.5, 3.0, 0.5, 0.25, Status.OK, CorrectedBy.DEVICE, 0xCAFE)
 CORRECTION = Correction(5, 1, 2, 3, 2**40 - 1, CORRECTED, 7100)
-SMALL = [
-    HELLO,
-    CORRECTION,
-    Log(layout.LogLevel.WARNING, "antenna délay"),
-    BoardStatus(1, 2, 3, 4, Mode.DEVICE, 41.5),
-    TimeSyncReply(17, 2**60),
-    SetMode(Mode.DEVICE),
-    MessageType.GET_INFO,
-    MessageType.TIME_SYNC,
-]
+LOG, STATUS = Log(layout.LogLevel.WARNING, "antenna délay"), BoardStatus(1, 2, 3, 4, Mode.DEVICE, 41.5)
+REQUESTS = [SetMode(Mode.DEVICE), MessageType.GET_INFO, MessageType.TIME_SYNC]
+GROWING = [HELLO, CORRECTION, STATUS, TimeSyncReply(17, 2**60), *REQUESTS]
 
 
 def measurement(samples: np.ndarray, **cir: object) -> RangeMeasurement:
@@ -40,11 +33,7 @@ def round_trip(message: messages.Message) -> messages.Message | None:
     return messages.decode(*messages.encode(message), stamp_ns=getattr(message, "stamp_ns", 0))
 
 
-@pytest.mark.parametrize(
-    "message",
-    [*(message for message in SMALL if not isinstance(message, Log)), measurement([])],
-    ids=lambda message: type(message).__name__,
-)
+@pytest.mark.parametrize("message", [*GROWING, measurement([])], ids=lambda message: type(message).__name__)
 def test_payload_may_grow_at_its_end_unless_its_tail_runs_to_the_end(message):
     kind, payload = messages.encode(message)
 
@@ -91,7 +80,11 @@ def test_measurement_with_an_impossible_field_is_an_error(field, code, value):
 
 @pytest.mark.parametrize(
     ("message", "field"),
-    [(HELLO, "mode"), (SMALL[3], "mode"), (SMALL[5], "mode"), (CORRECTION, "status"), (SMALL[2], "level")],
+    [
+        *((message, "mode") for message in (HELLO, STATUS, REQUESTS[0])),
+        (CORRECTION, "status"),
+        (LOG, "level"),
+    ],
 )
 def test_unknown_value_of_an_enumeration_is_an_error(message, field):
     kind, payload = messages.encode(message)
@@ -102,16 +95,18 @@ def test_unknown_value_of_an_enumeration_is_an_error(message, field):
         messages.decode(kind, bytes(broken))
 
 
+LARGE = {"preamble": {"preamble_count": 65536}, "float": {"rx_power_dbm": 1e39}}
+
+
 @pytest.mark.parametrize(
     "message",
     [
         measurement([0] * 2034),
-        measurement([], preamble_count=65536),
-        measurement([], rx_power_dbm=1e39),
+        *(measurement([], **fields) for fields in LARGE.values()),
         SetMode(-1),
         TimeSyncReply(2**32, 0),
     ],
-    ids=["samples", "preamble", "float", "negative", "32 bits"],
+    ids=["samples", *LARGE, "negative", "32 bits"],
 )
 def test_value_too_large_for_its_field_is_refused(message):
     with pytest.raises(ParameterError):

@@ -2,7 +2,7 @@
 
 Other cases are tested elsewhere: all transitions of the driver, a paused clock, a model that is swapped while driving, and
 publishers with another QoS (`test_reliability`), two tags and a best-effort height (`test_locator`), Ctrl-C with a board in
-each of its states (`test_serial_driver`), during imports and at the start (`test_entry`), several pipelines (`test_pipeline`).
+each of its states (`test_serial_driver`), during imports and at the start (`test_entry`), several pipelines (`test_nodes`).
 """
 
 from __future__ import annotations

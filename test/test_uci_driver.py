@@ -87,20 +87,20 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
 
 
-def open_pair(links: Path) -> list[PortEvents]:
-    boards = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
-    settings = [UciPortSettings(PortAddress(f"{links}{n}"), board) for n, board in enumerate(boards)]
-    return [PortEvents(uci, each) for each in settings]
-
-
-def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
+def test_a_tag_without_ranges_is_a_warning_and_closing_restores_the_calibration(
     boards: EmulatedUciBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(uci, "PERIOD_S", 1.0)
-    tag, anchor = open_pair(tmp_path / "uci")
+    before = [dict(model._calibration) for model in boards._models]
+    settings = UciSettings(), UciSettings(Role.ANCHOR, 2, (1,))
+    tag, anchor = (
+        PortEvents(uci, UciPortSettings(PortAddress(f"{tmp_path}/uci{number}"), board))
+        for number, board in enumerate(settings)
+    )
     with tag:
         with anchor:
             tag.wait_for(RangeMeasurement, 5)
+            assert boards._models[0]._calibration != before[0]
             wait_until(lambda: tag.port.report().warning == "")
             boards.set_faults(UciFaults(offset_m=-3.0))
             negative = "negative distance.*antenna delay"
@@ -109,16 +109,6 @@ def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
             wait_until(lambda: tag.port.report().warning == "")
         silent = r"no range for \d.*reception timeout: are the other boards on"
         wait_until(lambda: re.match(silent, tag.port.report().warning, re.DOTALL))
-
-
-def test_the_calibration_of_a_board_is_restored_when_its_port_is_closed(
-    boards: EmulatedUciBoards, tmp_path: Path
-):
-    before = [dict(model._calibration) for model in boards._models]
-    tag, anchor = open_pair(tmp_path / "uci")
-    with tag, anchor:
-        tag.wait_for(RangeMeasurement, 3)
-        assert boards._models[0]._calibration != before[0]
     assert [model._calibration for model in boards._models] == before
     assert not boards._models[0].sessions
 
