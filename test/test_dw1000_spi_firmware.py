@@ -5,18 +5,20 @@ The exchange for the other driver is written here from the layout of the frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import pytest
 from compilers import NEEDS_CC
-from firmware_on_model import REPLY_US, ranging, use_virtual_time
-from spidev_on_model import dw1000, program, replace_spidev
+from firmware_on_model import CLOCK, REPLY_US, begin, host, ranging, use_virtual_time
 
 from benchmarks.equipment.dw1000_model.air import ANTENNA_DELAY_TICKS, Air, Host
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.radios.settings import RadioSettings, Role
 from uwb_mitigation.types.measurement import RangeMeasurement
+
+pytest.importorskip("spidev", reason="spidev is for Linux")
+dw1000 = pytest.importorskip("dw1000_spi.dw1000", reason="the develop requirements bring dw1000-spi")
 
 pytestmark = NEEDS_CC
 OTHERS = 0x0123456789ABCDEF
@@ -25,9 +27,44 @@ TXSTRT, TXDLYS, WAIT4RESP = 2, 4, 0x80
 WRAP, TICK_M = 1 << 40, 299_792_458 / (128 * 499.2e6)
 
 
+SYSTEM_CALL_S = 60e-6
+"""Approximate duration of a transaction with Python on a Raspberry Pi."""
+
+
+class FakeSpiDev:
+    """Replacement for `spidev.SpiDev`; the program that opens it determines the chip."""
+
+    max_speed_hz = 0
+    mode = 0
+
+    def open(self, _bus: int, _select: int) -> None:
+        self._host = host()
+
+    def xfer2(self, data: list[int]) -> list[int]:
+        self._host.delay(SYSTEM_CALL_S)
+        return list(self._host.spi(bytes(data), self.max_speed_hz))
+
+    def close(self) -> None:
+        pass
+
+
+def program(run: Callable[[dw1000.DW1000, Host], None]) -> Callable[[Host], None]:
+    """Return a program that opens the driver and passes it to `run`."""
+
+    def started(running: Host) -> None:
+        begin(running)
+        with dw1000.DW1000(0, 0, 5, 64, 6.8, 128, 9, False) as driver:
+            driver.write_register([0x98], list(ANTENNA_DELAY_TICKS.to_bytes(2, "little")))
+            driver.write_register([0xEE, 0x84, 0x30], list(ANTENNA_DELAY_TICKS.to_bytes(2, "little")))
+            run(driver, running)
+
+    return started
+
+
 @pytest.fixture
 def air(monkeypatch: pytest.MonkeyPatch) -> Iterator[Air]:
-    replace_spidev(monkeypatch)
+    monkeypatch.setattr(dw1000, "spidev", SimpleNamespace(SpiDev=FakeSpiDev))
+    monkeypatch.setattr(dw1000, "time", CLOCK)
     use_virtual_time(monkeypatch)
     with Air(2) as air:
         yield air

@@ -15,11 +15,11 @@ import serial
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from faulty_board import FaultyBoard
 from port_events import PortEvents, wait_until
 from ros_harness import Process, Ros, diagnostic_values, stamped_after
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
+from benchmarks.equipment.board import Board
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import ParameterError
@@ -30,6 +30,7 @@ from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import SerialSettings
+from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION
 from uwb_mitigation.radios.wire.messages import Hello
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import CorrectedBy, RangeMeasurement
@@ -41,6 +42,53 @@ pytestmark = pytest.mark.ros
 LOST = "board: measurements_lost"
 RAW = "/uwb/range_raw"
 CORRECTED = "/uwb/range_corrected"
+FLOOD_BYTES = 4096
+
+
+class FaultyBoard(EmulatedBoard):
+    """An emulated board whose firmware fails: it hangs, sends noise, or speaks another version of the protocol.
+
+    Args:
+        version: protocol version that the board speaks.
+        boot_noise: bytes of noise before each HELLO.
+    """
+
+    def __init__(self, *arguments, version: int = PROTOCOL_VERSION, boot_noise: int = 0, **options) -> None:
+        self._version, self._boot_noise = version, boot_noise
+        self._mute_until = self._flood_until = 0.0
+        super().__init__(*arguments, **options)
+
+    def mute(self, seconds: float) -> None:
+        """Send nothing for a while, as firmware that hangs."""
+        with self._lock:
+            self._mute_until = time.monotonic() + seconds
+            self._backlog.clear()
+
+    def flood(self, seconds: float) -> None:
+        """Send noise as fast as the port accepts it."""
+        with self._lock:
+            self._flood_until = time.monotonic() + seconds
+
+    def reset(self) -> None:
+        # The thread of the board must not write the backlog while it grows.
+        with self._lock:
+            super().reset()
+            self._backlog[:0] = self._random.bytes(self._boot_noise)
+
+    def _create_board(self) -> Board:
+        return Board(
+            self._identity, self._corrector, mode=self._mode, boot_id=self._boots, version=self._version
+        )
+
+    def _exchange(self, timeout_s: float) -> None:
+        with self._lock:
+            if time.monotonic() < self._flood_until and len(self._backlog) < FLOOD_BYTES:
+                self._backlog += self._random.bytes(FLOOD_BYTES)
+        super()._exchange(timeout_s)
+
+    def _transmit(self, data: bytes) -> None:
+        if time.monotonic() >= self._mute_until:
+            super()._transmit(data)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,6 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseWithCovarianceStamped, Vector3
 from rclpy.qos import QoSProfile
 from ros_harness import Ros, diagnostic_values
@@ -119,7 +118,6 @@ def test_driver_reports_a_type_that_is_not_installed(ros: Ros):
 @pytest.mark.ros
 def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
     received = ros.collect(RangeCir, "/uwb/range_raw")
-    diagnostics = ros.collect(DiagnosticArray, "/diagnostics")
     ros.start("driver", "source:=topic", "map:=string_json")
     sender = ros.node.create_publisher(String, "/uwb/json", QoSProfile(depth=100))
     texts = ["{", '{"tag": 7}', '{"tag": -1, "ranges": [{"anchor": 1, "range_m": 4.5}]}']
@@ -133,12 +131,8 @@ def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
     ros.spin_until(sent)
     assert {(message.tag_id, message.anchor_id, message.range) for message in received} == {(7, 1, 4.5)}
 
-    def counted() -> dict[str, str]:
-        statuses = [status for message in diagnostics for status in message.status if "driver" in status.name]
-        return diagnostic_values(statuses[-1]) if statuses else {}
-
     for reason in ("range is not a number", "message that cannot be used"):
-        ros.spin_until(lambda reason=reason: int(counted().get(reason, 0)) > 2)
+        ros.diagnosis("driver", lambda s, reason=reason: int(diagnostic_values(s).get(reason, 0)) > 2)
 
 
 # The mappings ----------------------------------------------------------------------------------------------------
@@ -164,10 +158,8 @@ def types(monkeypatch: pytest.MonkeyPatch) -> None:
         "gtec_msgs": ("Ranging", "UWBRanging", "PozyxRangingWithCir"),
         "nlink_parser": ("LinktrackNodeframe3", "LinktrackTagframe0"),
     }.items():
-        module = ModuleType(f"{package}.msg")
-        for name in names:
-            setattr(module, name, SimpleNamespace)
-        monkeypatch.setitem(sys.modules, package, ModuleType(package))
+        module = SimpleNamespace(**dict.fromkeys(names, SimpleNamespace))
+        monkeypatch.setitem(sys.modules, package, module)
         monkeypatch.setitem(sys.modules, f"{package}.msg", module)
 
 
@@ -188,17 +180,15 @@ def test_gtec_messages(types: None):
     assert (convert.published[0].sequence, convert.published[0].cir.rx_power_dbm) == (12, -81.5)
     convert = Convert("gtec_uwbranging")
     registers = {"firstPathAmp1": 4889, "firstPathAmp2": 13876, "firstPathAmp3": 10464, "maxGrowthCIR": 9048}
-    message = SimpleNamespace(
-        anchorId=2, tagId=7, range=4310, seq=1, firstPath=749 * 64 + 32, rxPreamCount=1024, channel=5.0, prf=64, **registers
-    )  # fmt: skip
+    registers |= {"firstPath": 749 * 64 + 32, "rxPreamCount": 1024, "channel": 5.0, "prf": 64}
+    message = SimpleNamespace(anchorId=2, tagId=7, range=4310, seq=1, **registers)
     assert convert.take(message) == [(7, 2, 4.31)]
     cir = convert.published[0].cir
     assert (cir.first_path_index, cir.preamble_count, cir.channel) == (749.5, 1024, 5)
     assert cir.rx_power_dbm == pytest.approx(-91.2, abs=0.1)
     convert = Convert("gtec_pozyx_cir")
-    message = SimpleNamespace(
-        originId=0x6A40, destinationId=0x6A41, range=2500, seq=1, rxPower=-79.0, channel=5.0, cir=np.array([1, -2, 3, 4], np.int16)
-    )  # fmt: skip
+    fields = {"rxPower": -79.0, "channel": 5.0, "cir": np.array([1, -2, 3, 4], np.int16)}
+    message = SimpleNamespace(originId=0x6A40, destinationId=0x6A41, range=2500, seq=1, **fields)
     assert convert.take(message) == [(0x6A40, 0x6A41, 2.5)]
     assert convert.published[0].cir.samples.tolist() == [1, -2, 3, 4]
 
@@ -215,9 +205,8 @@ def test_standard_messages():
     convert = Convert("string_at")
     assert convert.take(String(data=line)) == [(4, 0, 0.72), (4, 2, 1.31)]
     assert [measured.cir.rx_power_dbm for measured in convert.published] == [-77.6, -75.13]
-    assert Convert("string_json").take(
-        String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
-    ) == [(1, 2, 3.0)]
+    message = String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
+    assert Convert("string_json").take(message) == [(1, 2, 3.0)]
 
 
 def test_lines_of_text_are_read_with_a_pattern():
