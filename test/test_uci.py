@@ -261,6 +261,8 @@ def test_of_two_primary_segments_the_sts_is_used():
     cir = reading(blocks, (levels(739, 739.5, 740, 0), levels())).cir
     assert (cir.segment, cir.start_index, cir.rx_power_dbm) == (Segment.STS, 357, -81.0)
     assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 16, 5))
+    # The levels of another segment are not those of its taps.
+    assert reading(blocks[1:], (levels(739, 739.5, 740, 0),)).cir.start_index == 0
 
 
 @pytest.mark.parametrize(
@@ -317,12 +319,14 @@ def test_diagnostics_after_the_next_range_are_joined_on_a_good_link():
     assert len(run.measured_ranges) >= 47
 
 
-def test_a_damaged_sequence_number_is_not_joined():
-    run = Bench().start().exchange(*range(1, 101))
+@pytest.mark.parametrize("is_swapped", [False, True], ids=["range first", "diagnostics first"])
+def test_a_damaged_sequence_number_is_not_joined(is_swapped: bool):
+    run = bench(swap=float(is_swapped)).start().exchange(*range(1, 101))
     count = len(run.measured_ranges)
     # The range of exchange 101 claims to be 102, whose own range and the diagnostics of 101 are lost.
-    run.step(run.range(102, 9.0), 18)
-    run.step(run.diagnostics(102), 18)
+    packets = [run.range(102, 9.0), run.diagnostics(102)]
+    for packet in packets[::-1] if is_swapped else packets:
+        run.step(packet, 18)
     run.step(ms=500)
     assert [(m.range_m, len(m.cir)) for m in run.measured_ranges[count:]] == [(9.0, 0)]
 
