@@ -179,6 +179,12 @@ def test_the_settings_of_a_session_are_those_that_worked_on_a_real_board():
     assert packet[-6:] == bytes.fromhex("e80101e90178")
 
 
+def test_a_damaged_length_hides_packets_only_until_a_timeout():
+    decoder = PacketDecoder()
+    assert decoder.feed(RANGE_PACKET[:3] + b"\xff" + RANGE_PACKET[4:] + RANGE_PACKET, 0) == []
+    assert [message.content.sequence for message in decoder.feed(b"", MAX_GAP_NS + 1)] == [7]
+
+
 def test_a_long_command_is_sent_in_fragments():
     sent = encode_packets(1, 3, bytes(600))
     assert [sent[0], sent[254], sent[508]] == [0x31, 0x31, 0x21]
@@ -469,12 +475,16 @@ def test_responses_have_no_effect_before_their_command():
     assert run.session.state
 
 
-def test_a_board_that_restarts_by_itself_ranges_again():
-    run = Bench().start()
-    run.step(run.board.boot())
-    run.start().exchange(1)
+@pytest.mark.parametrize("is_reset", [True, False], ids=["the board", "the session"])
+def test_a_board_or_session_that_restarts_ranges_again_and_keeps_its_counts(is_reset: bool):
+    run = Bench().start().exchange(1, 2, 3)
+    before = run.session.totals()
+    run.board.sessions[run.handle].active = False
+    run.step(run.board.boot() if is_reset else run.board._state(run.handle, 3))
+    run.start().exchange(1, 2)
     assert run.session.starts == 2
-    assert run.measured_ranges
+    assert [m.sequence for m in run.measured_ranges] == [1, 2, 3, 1, 2]
+    assert all(run.session.totals()[name] >= count for name, count in before.items())
 
 
 class Ending(UciBoardModel):
@@ -603,7 +613,7 @@ def test_random_bytes_are_no_text():
 
 
 @given(st.binary(max_size=600), st.integers(1, 40))
-@settings(max_examples=100)
+@settings(max_examples=300)
 def test_no_bytes_make_a_session_fail(data: bytes, piece: int):
     run = Bench().start()
     good = run.range(1)

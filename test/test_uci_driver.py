@@ -46,24 +46,30 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     capture = tmp_path / "capture.txt"
     options = ("radio.window:=16", "radio.anchors:=[2, 3]", f"capture:={capture}")
     node = ros.start("driver", "source:=uci", f"port:={ports}", *options)
-    ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in raw} and len(raw) > 20)
-    assert {len(message.cir.samples) for message in raw} == {32}
+
+    # On a busy computer, diagnostics may be too late for their range; `test_uci` counts them in virtual time.
+    def with_cirs() -> list[RangeCir]:
+        return [message for message in raw if message.cir.samples]
+
+    ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in with_cirs()} and len(with_cirs()) > 20)
+    assert {len(message.cir.samples) for message in with_cirs()} == {32}
     assert all(abs(message.range - 3.0) < 0.2 for message in raw)
 
     status = ros.diagnosis("driver", lambda status: "ranging" in status.message)
     assert diagnostic_values(status)["radio 0: CIR taps"] == "16"
 
-    assert {(m.cir.radio, m.cir.segment) for m in raw} == {(Cir.DW3000, Cir.STS)}
-    ros.spin_until(lambda: len(corrected) > 20)
+    assert {(m.cir.radio, m.cir.segment) for m in with_cirs()} == {(Cir.DW3000, Cir.STS)}
+    ros.spin_until(lambda: sum(m.status != RangeCorrected.NO_CIR for m in corrected) > 20)
     experimental = load_bundle(shipped_model_path("dw3000_sts")).model_id
-    assert {(m.model_id, m.status) for m in corrected} == {(experimental, RangeCorrected.OK)}
-    assert all(0 < abs(m.range - (m.range_raw - 0.5)) < 0.1 for m in corrected)
+    used = [m for m in corrected if m.status != RangeCorrected.NO_CIR]
+    assert {(m.model_id, m.status) for m in used} == {(experimental, RangeCorrected.OK)}
+    assert all(0 < abs(m.range - (m.range_raw - 0.5)) < 0.1 for m in used)
     reason = "model dw3000_sts (experimental), id "
     mitigator.wait_for_output(reason)
     assert mitigator.output.count(reason) == 1
     status = ros.diagnosis("mitigator", lambda status: any(reason in v.value for v in status.values))
-    used = r"DW3000 STS .*: model dw3000_sts .* \(tag-anchor 1-2, 1-3\)"
-    assert re.fullmatch(used, diagnostic_values(status)["models by radio"])
+    models = r"DW3000 STS .*: model dw3000_sts .* \(tag-anchor 1-2, 1-3\)"
+    assert re.search(models, diagnostic_values(status)["models by radio"])
 
     assert ros.set_parameter("mitigator", "model", "universal").successful
     status = ros.diagnosis("mitigator", lambda status: "DW3000 STS" in status.message)
