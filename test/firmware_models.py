@@ -62,25 +62,13 @@ def mlp_bundle(folder: Path) -> Bundle:
 
 def strict_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:
     """Bundle whose OOD detector rates random measurements as in distribution, between, and out of distribution."""
-    lead = Band(-40.0, -12.0, 10.0)
+    peak, lead = Band(0.5, 3.0, 2.0), Band(-40.0, -12.0, 10.0)
     if scaling is Scaling.MAX:
-        return exact_bundle(
-            folder,
-            samples,
-            scale=SCALE,
-            ood_bands=OodBands(0.125, Band(0.5, 3.0, 2.0), lead_level_db=lead),
-            preprocessing=Preprocessing(samples, scaling),
-        )
-    ood_bands = OodBands(
-        0.125,
-        Band(0.5, 3.0, 2.0),
-        Band(-90.0, -81.0, 40.0),
-        Band(-5.0, 8.0, 20.0),
-        Band(-10.0, 200.0, 50.0),
-        Band(20.0, 101.0, 70.0),
-        lead,
-    )
-    return exact_bundle(folder, samples, scale=SCALE, ood_bands=ood_bands)
+        preprocessing, bands = Preprocessing(samples, scaling), OodBands(0.125, peak, lead_level_db=lead)
+        return exact_bundle(folder, samples, scale=SCALE, ood_bands=bands, preprocessing=preprocessing)
+    levels = Band(-90.0, -81.0, 40.0), Band(-5.0, 8.0, 20.0)
+    shape = Band(-10.0, 200.0, 50.0), Band(20.0, 101.0, 70.0)
+    return exact_bundle(folder, samples, scale=SCALE, ood_bands=OodBands(0.125, peak, *levels, *shape, lead))
 
 
 def random_cir(random: np.random.Generator) -> Cir:
@@ -98,21 +86,14 @@ def random_cir(random: np.random.Generator) -> Cir:
     if random.random() < 0.1 and len(samples):
         samples[random.integers(0, len(samples), 30)] = random.choice([32767, -32768, 32766])
     start = int(random.choice([0, 700, -5, 2**31 - 1, -(2**31)]))
-    first = random.choice(
-        [math.nan, math.inf, 1e30, -1e30, 3e9, start + random.uniform(0, 120)], p=[0.05] * 5 + [0.75]
-    )
+    hostile = [math.nan, math.inf, 1e30, -1e30, 3e9]
+    first = random.choice([*hostile, start + random.uniform(0, 120)], p=[0.05] * 5 + [0.75])
     limits = [np.nextafter(np.float32(limit), np.float32(1)) for limit in (1e-30, 1e30)]
     odd = [0.0, -1.0, math.nan, math.inf, 1e-30, 1e30, 1e-40, 1e-29, *limits]
     scale = random.choice([1.0, 0.37, 12.5, *odd], p=[0.4, 0.2, 0.2, *[0.2 / len(odd)] * len(odd)])
     preamble = int(random.choice([0, 1, 118, 65535], p=[0.1, 0.2, 0.6, 0.1]))
-    return Cir(
-        samples,
-        encoding,
-        start_index=start,
-        first_path_index=single(first),
-        scale=single(scale),
-        preamble_count=preamble,
-    )
+    floats = {"first_path_index": single(first), "scale": single(scale)}
+    return Cir(samples, encoding, start, preamble_count=preamble, **floats)
 
 
 def random_measurement(random: np.random.Generator) -> RangeMeasurement:

@@ -1,9 +1,14 @@
-"""The events of a port that tests wait for."""
+"""The events of a port that tests wait for, and pseudo-terminals in place of boards."""
 
 from __future__ import annotations
 
+import os
+import select
+import threading
 import time
-from collections.abc import Callable
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -58,3 +63,29 @@ def wait_until(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+@contextmanager
+def terminal(answer: Callable[[bytes], bytes] | None = None, sent: bytes = b"") -> Iterator[str]:
+    """Yield the name of a port whose other side has sent something, and then answers what it receives."""
+    controller, device = os.openpty()
+    tty.setraw(device)
+    os.write(controller, sent)
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.is_set():
+            if select.select([controller], [], [], 0.05)[0]:
+                os.write(controller, answer(os.read(controller, 100)))
+
+    thread = threading.Thread(target=run)
+    if answer is not None:
+        thread.start()
+    try:
+        yield os.ttyname(device)
+    finally:
+        stop.set()
+        if answer is not None:
+            thread.join()
+        os.close(controller)
+        os.close(device)

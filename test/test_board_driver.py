@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tty
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from port_events import PortEvents, wait_until
+from port_events import PortEvents, terminal, wait_until
 
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
@@ -111,46 +111,22 @@ def test_faulty_channel_delivers_only_sent_messages(link):
 
 @pytest.mark.parametrize("exclusive", [True, False])
 def test_port_in_use_is_reported_with_the_program(exclusive: bool):
-    controller, device = os.openpty()
-    name = os.ttyname(device)
-    program = (
-        f"import serial; port = serial.Serial({name!r}, exclusive={exclusive}); print(1, flush=True); input()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        other.stdout.readline()
-        with PortEvents(serial, SerialSettings(PortAddress(name))) as events:
-            text = "in use by" if exclusive else "also open in"
-            wait_until(lambda: text in events.port.problem)
-            assert f"(process {other.pid})" in events.port.problem
-        if exclusive:
-            with pytest.raises(LinkError, match=rf"in use by .*\(process {other.pid}\)"):
-                Evb1000Bus(PortAddress(name))
-        other.stdin.close()
-    os.close(controller)
-    os.close(device)
-
-
-def test_an_old_answer_of_an_evb1000_is_not_taken_for_its_version():
-    controller, device = os.openpty()
-    tty.setraw(device)
-
-    def answer() -> None:
-        os.write(controller, b"yold\0")
-        received = b""
-        while b"deca?" not in received:
-            received += os.read(controller, 64)
-        os.write(controller, b"ynew\0\3")
-
-    with ThreadPoolExecutor() as pool:
-        answered = pool.submit(answer)
-        bus = Evb1000Bus(PortAddress(os.ttyname(device)))
-        answered.result()
-    assert bus.version == "new"
-    bus.close()
-    os.close(controller)
-    os.close(device)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    program = "import serial; port = serial.Serial({!r}, exclusive={}); print(1, flush=True); input()"
+    with terminal() as name:
+        with subprocess.Popen([sys.executable, "-c", program.format(name, exclusive)], **pipes) as other:
+            other.stdout.readline()
+            with PortEvents(serial, SerialSettings(PortAddress(name))) as events:
+                text = "in use by" if exclusive else "also open in"
+                wait_until(lambda: text in events.port.problem)
+                assert f"(process {other.pid})" in events.port.problem
+                assert f"(process {os.getpid()})" not in events.port.problem
+            if exclusive:
+                with pytest.raises(LinkError, match=rf"in use by .*\(process {other.pid}\)"):
+                    Evb1000Bus(PortAddress(name))
+            other.stdin.close()
+        with closing(PortAddress(name).open()) as port:
+            assert not os.get_blocking(port.fileno()), "a board that does not read must not stop the driver"
 
 
 @pytest.mark.parametrize(
@@ -167,19 +143,14 @@ def test_address_names_a_file_or_a_usb_device(text, address):
 
 
 def test_usb_device_is_found_by_its_ids_and_serial_number(monkeypatch):
-    class Info:
-        def __init__(self, device: str, vid: int | None, serial_number: str | None) -> None:
-            self.device, self.vid, self.pid, self.serial_number = device, vid, 0x805A, serial_number
-
-    ports = [
-        Info("/dev/ttyS0", None, None),
-        Info("/dev/ttyACM0", 0x2341, "A"),
-        Info("/dev/ttyACM1", 0x2341, "B"),
-    ]
+    devices = (("ttyS0", None, 1, None), ("ttyS1", 0x2341, 1, "A"), ("ttyACM0", 0x2341, 0x805A, "A"))
+    devices += (("ttyACM1", 0x2341, 0x805A, "B"),)
+    names = ("device", "vid", "pid", "serial_number")
+    ports = [SimpleNamespace(**dict(zip(names, device, strict=True))) for device in devices]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
 
-    assert PortAddress.parse("usb:2341:805a").find() == "/dev/ttyACM0"
-    assert PortAddress.parse("usb:2341:805a:B").find() == "/dev/ttyACM1"
+    assert PortAddress.parse("usb:2341:805a").find() == "ttyACM0"
+    assert PortAddress.parse("usb:2341:805a:B").find() == "ttyACM1"
     assert PortAddress.parse("usb:2341:805a:C").find() is None
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from uwb_mitigation.mitigation.embedded.compiling import firmware_folder, run_tool
+from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, firmware_folder, run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
@@ -19,18 +19,8 @@ pytestmark = pytest.mark.skipif(
     shutil.which("arm-none-eabi-g++") is None, reason="apt install gcc-arm-none-eabi"
 )
 SOURCES = firmware_folder() / "src"
-KERNELS = {
-    f"uwb_{name}"
-    for name in (
-        "quantise",
-        "conv_first",
-        "conv_residual",
-        "conv_reduce_odd",
-        "conv_reduce_even",
-        "dense",
-        "dot",
-    )
-}
+_STEPS = ("quantise", "conv_first", "conv_residual", "conv_reduce_odd", "conv_reduce_even", "dense", "dot")
+KERNELS = {f"uwb_{step}" for step in _STEPS}
 
 # ArduinoCore-mbed, variant ARDUINO_NANO33BLE: platform.txt and cflags.txt. The assembler gets no -mfloat-abi.
 FPU = "-mfpu=fpv4-sp-d16"
@@ -119,13 +109,8 @@ def test_library_properties_follow_the_rules_of_the_library_manager():
 
 
 C_VARIANTS = [SOFTFP, ("-mfloat-abi=hard", FPU), ("-mfloat-abi=soft",), (*SOFTFP, "-DUWB_PORTABLE")]
-ASSEMBLER_VARIANTS = [
-    (FPU,),
-    (),
-    ("-mthumb", "-mfloat-abi=hard", FPU),
-    ("-mthumb", "-mfloat-abi=soft"),
-    (FPU, "-DUWB_PORTABLE"),
-]
+_THUMB = ("-mthumb", "-mfloat-abi=hard", FPU), ("-mthumb", "-mfloat-abi=soft")
+ASSEMBLER_VARIANTS = [(FPU,), (), *_THUMB, (FPU, "-DUWB_PORTABLE")]
 
 
 @pytest.mark.parametrize("c_flags", C_VARIANTS, ids=lambda flags: " ".join(flags))
@@ -143,8 +128,8 @@ def test_c_and_assembler_agree_for_every_combination_of_flags(
         assert not {name for name in undefined if name.startswith("uwb_")}, assembler_flags
 
 
-@pytest.mark.parametrize("cpu", ["cortex-m3", "cortex-m0"])
-def test_other_processors_use_portable_c(tmp_path: Path, built: Path, cpu: str):
-    objects = compile_each((*C, f"-mcpu={cpu}"), built)
+@pytest.mark.parametrize("cpu", ["cortex-m0", "cortex-m3", "cortex-m7", "cortex-m33"])
+def test_library_links_without_warnings_for_other_processors(tmp_path: Path, built: Path, cpu: str):
+    objects = compile_each((*C, *WARNINGS, "-O0", f"-mcpu={cpu}"), built)
     objects += compile_each((*ASSEMBLER, f"-mcpu={cpu}"), built, "*.S")
     assert not {name for name in undefined_symbols(objects, tmp_path) if name.startswith("uwb_")}

@@ -26,7 +26,7 @@ from benchmarks.firmware import CLOCK_HZ
 from benchmarks.paper import published
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded import toolchain
-from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, firmware_folder, run_tool
+from uwb_mitigation.mitigation.embedded.compiling import run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target
 from uwb_mitigation.mitigation.model import requantisation
@@ -145,16 +145,13 @@ def check_corrections(
     return set(result.records["range_status"].tolist())
 
 
-def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(tmp_path: Path):
+@pytest.mark.parametrize("is_strict", [False, True], ids=["any CIR", "with an OOD detector"])
+def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(is_strict: bool, tmp_path: Path):
+    bundle_in = firmware_models.strict_bundle if is_strict else firmware_models.exact_bundle
     random = np.random.default_rng(3)
     measurements = [firmware_models.random_measurement(random) for _ in range(500)]
-    assert check_corrections(firmware_models.exact_bundle(tmp_path), measurements, tmp_path) == {0, 1, 2, 3}
-
-
-def test_out_of_distribution_measurements_are_corrected_as_by_the_mitigator(tmp_path: Path):
-    random = np.random.default_rng(4)
-    measurements = [firmware_models.random_measurement(random) for _ in range(300)]
-    check_corrections(firmware_models.strict_bundle(tmp_path), measurements, tmp_path, 0.22)
+    statuses = check_corrections(bundle_in(tmp_path), measurements, tmp_path, 0.22 * is_strict)
+    assert statuses >= {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize(
@@ -214,12 +211,3 @@ def test_image_of_the_dwm1001_dev_fits_and_is_written_as_hex(tmp_path: Path):
     assert lines[-1] == ":00000001FF"
     for line in lines:
         assert sum(bytes.fromhex(line[1:])) % 256 == 0
-
-
-@pytest.mark.parametrize("cpu", ["cortex-m0", "cortex-m3", "cortex-m7", "cortex-m33"])
-def test_library_compiles_without_warnings_for_other_processors(cpu: str, tmp_path: Path):
-    sources = firmware_folder() / "src"
-    command = ("arm-none-eabi-gcc", f"-mcpu={cpu}", "-mthumb", "-std=c99", *WARNINGS, f"-I{sources}")
-    # Check only the syntax; the Cortex-M4 images are compiled with -Os.
-    run_tool([*command, "-fsyntax-only", *map(str, sources.glob("*.c"))])
-    run_tool([*command, "-c", *map(str, (sources / "cortex_m4").glob("*.S"))], folder=tmp_path)

@@ -1,7 +1,8 @@
-"""The C header: errors, and exact floats."""
+"""The C header: errors, and exact floats; `export-c` and `python -m benchmarks firmware`."""
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +11,13 @@ import firmware_models
 import model_material
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from benchmarks import cli as benchmarks
 from benchmarks.equipment import random_networks
-from uwb_mitigation.errors import ModelError
+from uwb_mitigation.commands import cli
+from uwb_mitigation.errors import MissingDependencyError, ModelError
+from uwb_mitigation.mitigation.embedded import toolchain
 from uwb_mitigation.mitigation.embedded.export import export_bundle, format_number
 from uwb_mitigation.mitigation.embedded.packing import pack
 from uwb_mitigation.mitigation.model import graph
@@ -38,10 +43,40 @@ def test_value_that_is_not_a_finite_float32_is_refused(value: float):
 
 
 def test_shipped_model_is_exported_with_its_identity(tmp_path: Path):
-    bundle = load_bundle(default_model_path())
-    text = export_bundle(bundle, tmp_path / "new" / "folder").read_text()
+    bundle, folder, result = (
+        load_bundle(default_model_path()),
+        tmp_path / "new" / "folder",
+        tmp_path / "result.json",
+    )
+    done = CliRunner().invoke(cli.app, ["board", "export-c", "-o", str(folder), "--json", str(result)])
+    assert done.exit_code == 0, done.output
+    values = json.loads(result.read_text())
+    assert (values["model_id"], values["k"]) == (bundle.model_id, 157)
+    text = Path(values["header"]).read_text()
     assert f"0x{bundle.model_id:08x}u" in text
     assert format_number(bundle.linear_bias.per_rx_power) in text
+
+
+@pytest.mark.skipif(bool(toolchain.missing_tools()), reason=toolchain.APT)
+def test_bench_firmware_writes_the_documented_keys(tmp_path: Path):
+    bundle = firmware_models.exact_bundle(tmp_path, 8)
+    result = tmp_path / "result.json"
+    arguments = ["firmware", "--model", str(bundle.path), "--inputs", "20", "--json", str(result)]
+    done = CliRunner().invoke(benchmarks.app, arguments)
+    assert done.exit_code == 0, done.output
+    rows = json.loads(result.read_text())["rows"]
+    promised = {"model", "k", "k0", "instructions", "cycles_estimated", "ram_bytes", "flash_bytes"}
+    assert [row["kernels"] for row in rows] == ["cortex_m4", "portable"]
+    for row in rows:
+        assert promised <= row.keys()
+        assert (row["mismatches"], row["inputs"]) == (0, 20)
+        assert row["instructions"] < row["cycles_estimated"] < 2 * row["instructions"]
+
+
+def test_missing_tools_are_named_with_the_install_command(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PATH", "/nonexistent")
+    with pytest.raises(MissingDependencyError, match=r"qemu-system-arm.*apt install gcc-arm-none-eabi"):
+        toolchain.require_tools()
 
 
 def test_float_bundle_is_refused_with_the_remedy(tmp_path: Path):
@@ -69,30 +104,22 @@ def test_shapes_without_kernels_are_refused(architecture: Remnet, names: str):
         pack(model_material.random_int8(architecture))
 
 
-def test_scale_without_exact_integers_is_refused_by_layer_and_channel():
+def test_weights_and_scales_without_exact_integers_are_refused_by_layer():
     weights = random_networks.remnet(16, 3)
     scales = weights.weight_scale["module2.skip"].copy()
     # A requantisation by 1/64: every 64th accumulator is a tie, and ties go to even.
     unit = weights.activation_scale["module2.skip"] / weights.activation_scale["module2.sum"]
     scales[5] = unit / np.float32(64)
-    inexact = replace(weights, weight_scale={**weights.weight_scale, "module2.skip": scales})
-    with pytest.raises(ModelError, match=r"module2\.skip.*channel 5"):
-        pack(inexact)
-
-
-def test_weights_of_more_than_7_bits_are_refused_by_layer():
-    weights = random_networks.remnet(16, 3)
     larger = weights.weight["module1.residual"].copy()
     larger[3, 2, 1] = -64
-    with pytest.raises(ModelError, match=r"7 bits.*module1\.residual|module1\.residual.*7 bits"):
-        pack(replace(weights, weight={**weights.weight, "module1.residual": larger}))
-
-
-def test_sum_without_exact_integers_is_refused_by_name():
-    weights = random_networks.remnet(16, 3)
-    scales = {**weights.activation_scale, "module1.sum": weights.activation_scale["first"] / np.float32(3)}
-    with pytest.raises(ModelError, match=r"module1\.sum"):
-        pack(replace(weights, activation_scale=scales))
+    third = {"module1.sum": weights.activation_scale["first"] / np.float32(3)}
+    for changes, problem in (
+        ({"weight_scale": weights.weight_scale | {"module2.skip": scales}}, r"module2\.skip.*channel 5"),
+        ({"weight": weights.weight | {"module1.residual": larger}}, r"module1\.residual.*7 bits"),
+        ({"activation_scale": weights.activation_scale | third}, r"module1\.sum"),
+    ):
+        with pytest.raises(ModelError, match=problem):
+            pack(replace(weights, **changes))
 
 
 def test_hostile_name_cannot_end_a_c_comment(tmp_path: Path):

@@ -24,9 +24,8 @@ from uwb_mitigation.commands.doctor import LIBRARIES, MODULES
 
 NAME = "uwb_mitigation"
 MESSAGES = "uwb_mitigation_msgs"
-EXECUTABLES = set(
-    re.findall(r'"([\w-]+) = uwb_mitigation\.commands\.entry:', (REPOSITORY / "setup.py").read_text())
-)
+SETUP = (REPOSITORY / "setup.py").read_text()
+EXECUTABLES = set(re.findall(r'"([\w-]+) = uwb_mitigation\.commands\.entry:', SETUP))
 NOT_ON_PYPI = {"launch", "launch_ros", "tf2_msgs"}
 """ROS packages that are not in an ament index without ROS."""
 
@@ -128,9 +127,8 @@ def test_messages_are_installed_as_an_interface_package():
 def test_colcon_build_without_the_messages_names_the_right_command(tmp_path: Path):
     environment = os.environ | {"COLCON": "1", "AMENT_PREFIX_PATH": str(tmp_path)}
     command = [sys.executable, "setup.py", "-q", "build", "-b", str(tmp_path / "build")]
-    refused = subprocess.run(
-        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=False
-    )
+    place = {"cwd": REPOSITORY, "env": environment, "capture_output": True}
+    refused = subprocess.run(command, **place, text=True, check=False)
     assert refused.returncode == 1
     (line,) = refused.stderr.splitlines()[-1:]
     problem, _, build = line.partition("; run: ")
@@ -139,7 +137,7 @@ def test_colcon_build_without_the_messages_names_the_right_command(tmp_path: Pat
     manifest = tmp_path / "share" / MESSAGES / "package.xml"
     manifest.parent.mkdir(parents=True)
     manifest.touch()
-    subprocess.run(command, cwd=REPOSITORY, env=environment, check=True, capture_output=True)
+    subprocess.run(command, **place, check=True)
 
 
 def without(absent: Iterable[str], name: str) -> list[str]:
@@ -170,12 +168,11 @@ def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: 
 @pytest.mark.parametrize(
     ("name", "absent", "excerpt"),
     [
-        ("mitigator", "onnxruntime", "error: onnxruntime is not installed (run uwb-mitigation doctor)"),
-        ("mitigator", "yaml", "error: pyyaml is not installed (run uwb-mitigation doctor)"),
-        ("driver", "serial", "error: pyserial is not installed (run uwb-mitigation doctor)"),
-        ("monitor", "rich", "error: rich is not installed (run uwb-mitigation doctor)"),
-        ("mitigator", "rclpy", "error: ROS 2 is not set up: rclpy is missing"),
-        ("mitigator", "uwb_mitigation_msgs", "error: ROS 2 is not set up: uwb_mitigation_msgs is missing"),
+        ("mitigator", "onnxruntime", "onnxruntime is not installed (run uwb-mitigation doctor)"),
+        ("driver", "serial", "pyserial is not installed (run uwb-mitigation doctor)"),
+        ("monitor", "rich", "rich is not installed (run uwb-mitigation doctor)"),
+        ("mitigator", "rclpy", "ROS 2 is not set up: rclpy is missing"),
+        ("mitigator", "uwb_mitigation_msgs", "ROS 2 is not set up: uwb_mitigation_msgs is missing"),
     ],
 )
 def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, name: str, absent: str, excerpt: str):
@@ -183,7 +180,7 @@ def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, name: str, a
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(excerpt)
+    assert line.startswith(f"error: {excerpt}")
 
 
 CORRECT_WITH_THE_FIRMWARE = """
@@ -201,14 +198,9 @@ print(uwb_mitigation.__file__, default_model_path(), firmware_folder(), sep="\\n
 @pytest.mark.parametrize("layout", ["lib/python3/site-packages", "."], ids=["prefix", "pip --target"])
 def test_models_and_firmware_backend_need_no_checkout(tmp_path: Path, layout: str):
     packages = tmp_path / layout
-    steps = [
-        *("build", "-b", tmp_path / "build"),
-        *("build_py", "-d", packages),
-        *("install_data", "-d", tmp_path),
-    ]
-    subprocess.run(
-        [sys.executable, "setup.py", "-q", *steps], cwd=REPOSITORY, check=True, capture_output=True
-    )
+    steps = ("build", "-b", tmp_path / "build", "build_py", "-d", packages, "install_data", "-d", tmp_path)
+    command = [sys.executable, "setup.py", "-q", *steps]
+    subprocess.run(command, cwd=REPOSITORY, check=True, capture_output=True)
     environment = os.environ | {"PYTHONPATH": str(packages), "AMENT_PREFIX_PATH": ""}
     command = [sys.executable, "-c", CORRECT_WITH_THE_FIRMWARE]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -226,9 +218,8 @@ def test_manifest_is_valid(folder: str):
     assert manifest.package_format == 3
     assert manifest.licenses == ["Apache-2.0"]
     assert manifest.get_build_type() == ("ament_cmake" if folder else "ament_python")
-    assert [group.name for group in manifest.member_of_groups] == (
-        ["rosidl_interface_packages"] if folder else []
-    )
+    groups = [group.name for group in manifest.member_of_groups]
+    assert groups == (["rosidl_interface_packages"] if folder else [])
 
 
 def imported(paths: Iterable[Path], at_start: bool = False) -> Iterator[str]:

@@ -75,11 +75,8 @@ def launch(generate, file: str, **overrides: str) -> list:
 def values_of(arguments: dict) -> dict[str, str]:
     """Return the default of each argument."""
     values = {name: str(REPOSITORY / "params" / f"{name.removesuffix('_params')}.yaml") for name in arguments}
-    return values | {
-        name: argument.default_value
-        for name, argument in arguments.items()
-        if isinstance(getattr(argument, "default_value", None), str)
-    }
+    defaults = {name: getattr(argument, "default_value", None) for name, argument in arguments.items()}
+    return values | {name: default for name, default in defaults.items() if isinstance(default, str)}
 
 
 def settings(node) -> dict[str, object]:
@@ -105,16 +102,10 @@ def test_both_nodes_start_with_their_arguments_and_are_respawned(generate):
 
 
 def test_one_process_accepts_the_arguments_of_both_nodes(generate):
-    (pipeline,) = launch(
-        generate, "uwb.launch.py", source="serial", port="/dev/x", model="m.onnx", one_process="true"
-    )
+    overrides = {"source": "serial", "port": "/dev/x", "model": "m.onnx"}
+    (pipeline,) = launch(generate, "uwb.launch.py", **overrides, one_process="true")
     assert (pipeline.executable, pipeline.name, pipeline.respawn) == ("pipeline", None, True)
-    assert settings(pipeline) == {
-        "source": "serial",
-        "port": "/dev/x",
-        "model": "m.onnx",
-        "use_sim_time": False,
-    }
+    assert settings(pipeline) == overrides | {"use_sim_time": False}
     assert [Path(file).name for file in pipeline.parameters[:2]] == ["driver.yaml", "mitigator.yaml"]
 
 
@@ -143,21 +134,20 @@ def test_displays_start_if_they_are_installed(generate, tmp_path: Path, monkeypa
     assert rviz.arguments == ["-d", ["share/uwb_mitigation", "rviz", "uwb.rviz"]]
 
 
-@pytest.mark.parametrize("one_process", ["false", "true"])
-def test_finished_recording_is_not_replayed(generate, one_process: str, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("one_process", "respawning"),
+    [("false", {"driver": False, "mitigator": True}), ("true", {"pipeline": False})],
+)
+def test_finished_recording_is_not_replayed(generate, one_process: str, respawning: dict, tmp_path: Path):
     overrides = {"source": "mcap", "path": str(tmp_path), "one_process": one_process}
-    respawning = {node.executable: node.respawn for node in launch(generate, "uwb.launch.py", **overrides)}
-    assert respawning == (
-        {"pipeline": False} if one_process == "true" else {"driver": False, "mitigator": True}
-    )
+    nodes = launch(generate, "uwb.launch.py", **overrides)
+    assert {node.executable: node.respawn for node in nodes} == respawning
 
 
 @pytest.mark.parametrize("text", ["0xdeca010203040506", "'0xdeca010203040506'"])
 def test_64_bit_address_reaches_the_driver_as_a_string(generate, text: str):
     overrides = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
-    (driver,) = (
-        node for node in launch(generate, "uwb.launch.py", **overrides) if node.executable == "driver"
-    )
+    driver, _ = launch(generate, "uwb.launch.py", **overrides)
     for name in ("radio.address", "radio.anchors"):
         assert settings(driver)[name] == "0xdeca010203040506"
 
@@ -171,18 +161,12 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
     for node, table in TABLES.items():
         for row in table:
             assert {row.name, f"{node}_{row.name}"} & set(arguments), row
-    nodes = {
-        node.executable: settings(node) for node in launch(generate, "uwb.launch.py", **overrides, **examples)
-    }
+    started = launch(generate, "uwb.launch.py", **overrides, **examples)
+    nodes = {node.executable: settings(node) for node in started}
     assert nodes["driver"]["frame_id"] == "1234", "a text stays a string"
+    radio = {"radio.address": 34, "radio.pan": 7}
     expected = {
-        "driver": {
-            "radio.address": 34,
-            "offsets": 0.25,
-            "rate": 2.0,
-            "radio.pan": 7,
-            "port": "usb:2341:805a",
-        },
+        "driver": radio | {"offsets": 0.25, "rate": 2.0, "port": "usb:2341:805a"},
         "mitigator": {"offsets": 0.25},
         "locator": {"level": True, "height": 0.1, "publish_tf": True, "rate": 20.0, "area": "0,0,0,9,9,3"},
         "viewer": {"port": 8080},
@@ -197,23 +181,24 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
     ("overrides", "excerpt"),
     [
         ({"source": "mcpa", "path": "a.mcap"}, "source = 'mcpa'"),
-        ({"source": "simulated", "locate": "yess"}, "locate:=yess"),
-        ({"source": "simulated", "use_sim_time": "1.0"}, "use_sim_time:=1.0"),
-        ({"source": "simulated", "respawn": ""}, "respawn:="),
-        ({"source": "simulated", "log_level": "loud"}, "log_level:=loud"),
-        ({"source": "simulated", "sensor_ranges": "maybe"}, "sensor_ranges = 'maybe'"),
-        ({"source": "simulated", "simulated_rate": "-1"}, "simulated_rate = -1"),
-        ({"source": "simulated", "height": "1.0"}, "height:=1.0.*locate:=true"),
-        ({"source": "serial"}, "serial without a port"),
-        ({"source": "uci"}, "uci without a port"),
+        ({"locate": "yess"}, "locate:=yess"),
+        ({"use_sim_time": "1.0"}, "use_sim_time:=1.0"),
+        ({"respawn": ""}, "respawn:="),
+        ({"log_level": "loud"}, "log_level:=loud"),
+        ({"sensor_ranges": "maybe"}, "sensor_ranges = 'maybe'"),
+        ({"simulated_rate": "-1"}, "simulated_rate = -1"),
+        ({"height": "1.0"}, "height:=1.0.*locate:=true"),
+        *(({"source": source}, f"{source} without a port") for source in ("serial", "uci")),
         ({"source": "decaranging"}, "decaranging without a path"),
-        ({"source": "mcap", "path": "absent.mcap"}, "path = absent.mcap: no such file"),
-        ({"source": "uci", "path": "absent.uci"}, "path = absent.uci: no such file"),
+        *(
+            ({"source": source, "path": "absent"}, "path = absent: no such file")
+            for source in ("mcap", "uci")
+        ),
     ],
 )
 def test_invalid_argument_stops_the_launch(generate, overrides: dict[str, str], excerpt: str):
     with pytest.raises(RuntimeError, match=excerpt):
-        launch(generate, "uwb.launch.py", **overrides)
+        launch(generate, "uwb.launch.py", **{"source": "simulated"} | overrides)
 
 
 class Context(dict):
@@ -295,19 +280,10 @@ def test_missing_parameter_file_stops_the_launch(generate, file: str, argument: 
 def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate):
     boards = "left=/dev/uwb/1A2B right=usb:2341:805a:3C4D"
     nodes = launch(generate, "boards.launch.py", boards=boards, mode="device")
-    assert [(node.namespace, node.executable) for node in nodes] == [
-        ("left", "driver"),
-        ("left", "mitigator"),
-        ("right", "driver"),
-        ("right", "mitigator"),
-    ]
-    assert settings(nodes[2]) == {
-        "source": "serial",
-        "port": "usb:2341:805a:3C4D",
-        "mode": "device",
-        "frame_id": "right_uwb_antenna",
-        "use_sim_time": False,
-    }
+    expected = [(name, node) for name in ("left", "right") for node in ("driver", "mitigator")]
+    assert [(node.namespace, node.executable) for node in nodes] == expected
+    given = {"source": "serial", "port": "usb:2341:805a:3C4D", "mode": "device", "use_sim_time": False}
+    assert settings(nodes[2]) == given | {"frame_id": "right_uwb_antenna"}
     assert all(node.respawn for node in nodes)
 
 
@@ -342,9 +318,8 @@ def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(
         "share/nav2_bringup": ["launch", "navigation_launch.py"],
     }
     *pushed, navigation = included["share/nav2_bringup"]
-    assert [(action.kind, action.values[0].perform(context)) for action in pushed] == [
-        ("push", "robot1")
-    ] * pushes
+    performed = [(action.kind, action.values[0].perform(context)) for action in pushed]
+    assert performed == [("push", "robot1")] * pushes
     overrides = {name: value.perform(context) for name, value in navigation.launch_arguments}
     assert overrides == {"namespace": "robot1", "params_file": "nav2.yaml"}
     nodes = [entity for entity in entities if entity.kind == "node"]
@@ -354,15 +329,9 @@ def test_nav2_gets_the_transform_of_the_locator_in_its_namespace_and_no_amcl(
     assert nodes[1].parameters[1]["node_names"] == [nodes[0].name]
     # The arguments for the locator, as uwb.launch.py understands them.
     (group,) = included["share/uwb_mitigation"]
-    overrides = {
-        name: value if isinstance(value, str) else value.perform(context)
-        for name, value in group.launch_arguments
-    }
+    given = dict(group.launch_arguments)
+    overrides = {n: value if isinstance(value, str) else value.perform(context) for n, value in given.items()}
     (locator,) = launch(generate, "uwb.launch.py", **overrides, anchors="a.yaml")
     assert locator.namespace == "robot1"
-    assert settings(locator) == {
-        "publish_tf": True,
-        "odometry": "odom",
-        "anchors": "a.yaml",
-        "use_sim_time": False,
-    }
+    given = {"publish_tf": True, "odometry": "odom", "anchors": "a.yaml", "use_sim_time": False}
+    assert settings(locator) == given

@@ -25,6 +25,7 @@ from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios import lines, uci
 from uwb_mitigation.radios.lines import LineSession, LineSettings, UdpAddress
 from uwb_mitigation.radios.port import PortAddress
+from uwb_mitigation.radios.settings import PortMessage
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import FieldRule, Mapping, load_mapping
 from uwb_mitigation.types.measurement import RangeMeasurement
@@ -32,6 +33,7 @@ from uwb_mitigation.types.measurement import RangeMeasurement
 MAPPINGS = {"pans": "dwm1001_pans", "at": "string_at", "json": "string_json", "cli": "dwm3001_cli"}
 LEC = "DIST,2,AN0,022E,7.94,8.03,0.00,3.44,AN1,9280,7.95,0.00,-1.20,15.68,POS,6.95,5.37,-1.97,52"
 LES = "022E[7.94,8.03,0.00]=3.44 9280[7.95,0.00,-1.20]=15.68 le_us=3082 est[6.97,5.17,-1.77,53]"
+GOOD = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}'
 DEFAULTS = {row.name: row.default for row in DRIVER}
 S = 10**9
 
@@ -78,36 +80,23 @@ def test_a_timeout_of_the_cli_image_is_counted_and_not_a_range():
     session = session_of("dwm3001_cli")
     text = ' [mac_address=0x0001, status="SUCCESS", distance[cm]=245, loc_az=1.5, RSSI[dBm]=-66.5];\r\n'
     assert read(session, text + ' [mac_address=0x0002, status="RX_TIMEOUT"]}\r\n') == [(1, 1, 2.45)]
-    assert read(session, '{"Block":1, "results":[{"Addr":"0xdc4c","Status":"Ok","D_cm":42}]}\n') == [
-        (1, 0xDC4C, 0.42)
-    ]
+    text = '{"Block":1, "results":[{"Addr":"0xdc4c","Status":"Ok","D_cm":42}]}\n'
+    assert read(session, text) == [(1, 0xDC4C, 0.42)]
     assert session.counts["status differs ['SUCCESS', 'Ok']"] == 1
     assert session.counts["lines that do not match"] == 0
 
 
 def test_boards_without_an_own_id_are_different_tags():
     assert read(session_of("dwm1001_pans", 2), LEC + "\n")[0] == (3, 0x022E, 3.44)
-    assert read(session_of("string_json", 2), '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4}]}\n') == [
-        (7, 1, 4.0)
-    ]
+    assert read(session_of("string_json", 2), f"{GOOD}\n") == [(7, 1, 4.31)]
 
 
 def test_hostile_bytes_are_counted_and_the_next_line_is_read():
     session = session_of("string_json")
-    good = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}\n'
-    hostile = [
-        b"\xff\xfe\x00\x01",
-        b"[" * 60_000,
-        b"x" * 300_000,
-        good[:30].encode(),
-        b'"x"',
-        b"null",
-        b"9" * 5000,
-    ]
-    hostile += [
-        f'{{"tag": 1, "ranges": [{{"anchor": 1, "range_m": {value}}}]}}'.encode()
-        for value in ("[1]", '"a"', "{}")
-    ]
+    good = f"{GOOD}\n"
+    hostile = [b"\xff\xfe\x00\x01", b"[" * 60_000, b"x" * 300_000, b"9" * 5000, b'"x"', b"null"]
+    hostile += [good[:30].encode()]
+    hostile += [good.replace("7", "1").replace("4.31", value).encode() for value in ("[1]", '"a"', "{}")]
     for data in hostile:
         assert read(session, data) == []
         assert read(session, b"\n" + good.encode()) == [(7, 1, 4.31)]
@@ -133,7 +122,7 @@ def test_a_long_line_takes_no_more_steps_than_its_length(name: str, text: str):
 
 def test_the_stamp_is_that_of_the_first_byte_unless_the_mapping_gives_a_time():
     session = session_of("string_json")
-    good = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}'
+    good = GOOD
     assert read(session, good[:20], 100) == []
     stamps = [m.stamp_ns for m in session.receive(f"{good[20:]}\n{good}\n{good}".encode(), 0, 200)]
     stamps += [m.stamp_ns for m in session.receive(b"\n", 0, 300)]
@@ -197,10 +186,10 @@ def open_board(path: Path, kind: str, **settings: object) -> PortEvents:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_board_vanishes_and_returns(tmp_path: Path, kind: str):
-    with (
-        TextBoards(kind, links=tmp_path / "b", rate_hz=50.0) as boards,
-        open_board(tmp_path / "b0", kind) as events,
-    ):
+    emulated = TextBoards(kind, links=tmp_path / "b", rate_hz=50.0)
+    with emulated as boards, open_board(tmp_path / "b0", kind) as events:
+        (message,) = events.wait_for(PortMessage)
+        assert "ranges of tag" in message.text
         events.wait_for(lambda event: isinstance(event, RangeMeasurement) and event.range_m > 0, 8)
         boards.inject(0, b"\xff\x00garbage\r\n" + b"A" * 100_000 + b"\n")
         boards.unplug(0)
@@ -263,9 +252,8 @@ def test_a_board_without_ranges_is_explained(tmp_path: Path):
         wait_until(lambda: events.port.device)
         assert "no range yet: nothing was received; is the baud rate 115200" in events.port.report().warning
         terminal.write(bytearray(b"x\nrst:0x1 (POWERON_RESET)\n"))
-        wait_until(
-            lambda: "do not match the mapping AT+RANGE, such as 'rst:0x1" in events.port.report().warning
-        )
+        text = "do not match the mapping AT+RANGE, such as 'rst:0x1"
+        wait_until(lambda: text in events.port.report().warning)
         assert events.port.report().values["lines that do not match"] == 1
     terminal.unplug()
 
@@ -273,14 +261,13 @@ def test_a_board_without_ranges_is_explained(tmp_path: Path):
 def test_datagrams_are_received(tmp_path: Path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
-        number = probe.getsockname()[1]
-    address = UdpAddress(host="127.0.0.1", number=number)
-    settings = LineSettings(address, load_mapping("string_json"))
-    with TextBoards("json", udp=("127.0.0.1", number), rate_hz=50.0), PortEvents(lines, settings) as events:
+        place = host, number = probe.getsockname()
+    settings = LineSettings(UdpAddress(host=host, number=number), load_mapping("string_json"))
+    with TextBoards("json", udp=place, rate_hz=50.0), PortEvents(lines, settings) as events:
         events.wait_for(RangeMeasurement, 8)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for data in (b"", b"\xff" * 60_000, b'{"tag": 9, "ranges": [{"anchor": 3, "range_m": 1.5}]}'):
-                sender.sendto(data, ("127.0.0.1", number))
+                sender.sendto(data, place)
         (measured,) = events.wait_for(lambda event: getattr(event, "tag_id", 0) == 9)
         assert (measured.range_m, events.port.openings) == (1.5, 1)
         with PortEvents(lines, settings) as second:
@@ -289,10 +276,8 @@ def test_datagrams_are_received(tmp_path: Path):
 
 def test_a_capture_replays_the_ranges_also_with_another_mapping(tmp_path: Path):
     path = tmp_path / "capture.txt"
-    with (
-        TextBoards(links=tmp_path / "b", rate_hz=50.0),
-        open_board(tmp_path / "b0", "pans", capture=path) as events,
-    ):
+    boards = TextBoards(links=tmp_path / "b", rate_hz=50.0)
+    with boards, open_board(tmp_path / "b0", "pans", capture=path) as events:
         measured = events.wait_for(RangeMeasurement, 40)
     replayed = [r.measurement.range_m for r in lines.open_capture(path, value_of())]
     assert replayed[:40] == [m.range_m for m in measured]
@@ -313,9 +298,8 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     with TextBoards(boards=2, links=tmp_path / "b") as boards:
         began = time.time()
-        node = ros.start(
-            "driver", "source:=pans", f"port:={tmp_path}/b0,{tmp_path}/b1", f"capture:={tmp_path}/c.txt"
-        )
+        ports = f"port:={tmp_path}/b0,{tmp_path}/b1"
+        node = ros.start("driver", "source:=pans", ports, f"capture:={tmp_path}/c.txt")
         ros.spin_until(lambda: {message.tag_id for message in raw} == {1, 2} and len(raw) > 40)
         message = next(message for message in raw if message.anchor_id == 0x9280)
         assert message.range == pytest.approx(boards.true_ranges_m[1], abs=0.15)
@@ -330,20 +314,10 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
 
 
 def test_field_report_of_a_board_without_cirs(tmp_path: Path):
-    command = [
-        "field-report",
-        "--source",
-        "pans",
-        "--port",
-        str(tmp_path / "b0"),
-        "--distance",
-        "3",
-        "--seconds",
-        "3",
-    ]
-    files = ["--no-unplug", "-o", str(tmp_path / "out.zip"), "--json", str(tmp_path / "out.json")]
+    command = f"field-report --source pans --port {tmp_path}/b0 --distance 3 --seconds 3 --no-unplug"
+    files = f"-o {tmp_path}/out.zip --json {tmp_path}/out.json"
     with TextBoards(links=tmp_path / "b", distance_m=3.0):
-        result = CliRunner().invoke(cli.app, [*command, *files])
+        result = CliRunner().invoke(cli.app, f"{command} {files}".split())
     checks = {check["name"]: check for check in json.loads((tmp_path / "out.json").read_text())["checks"]}
     assert [name for name, check in checks.items() if check["verdict"] == "fail"] == [], result.output
     assert "share of ranges with CIR" not in checks

@@ -43,12 +43,8 @@ class JitteryLink:
     def exchange(self, clock: DeviceClock, true_s: float) -> None:
         received_s = self.delivered_s(true_s)
         replied_s = received_s + 50e-6
-        clock.exchange(
-            self.ns(true_s),
-            self.ticks(received_s),
-            self.ticks(replied_s),
-            self.ns(self.delivered_s(replied_s)),
-        )
+        ticks = self.ticks(received_s), self.ticks(replied_s)
+        clock.exchange(self.ns(true_s), *ticks, self.ns(self.delivered_s(replied_s)))
 
     def stamp_error_s(self, clock: DeviceClock, true_s: float) -> float:
         """Return the stamp error of a measurement that the board reads out for 4 ms before sending it."""
@@ -73,8 +69,6 @@ def test_99th_percentile_of_the_stamp_error_is_under_1_ms_with_bursts_of_10_ms()
 
     errors = np.abs(list(run(link, clock, 1, 300)))
 
-    print(f"error in us: p50 {1e6 * np.median(errors):.0f}, p99 {1e6 * np.quantile(errors, 0.99):.0f}, "
-          f"max {1e6 * errors.max():.0f}")  # fmt: skip
     assert np.quantile(errors, 0.99) < 1e-3
 
 
@@ -85,7 +79,6 @@ def test_after_a_gap_of_30_s_the_first_stamps_are_still_within_1_ms():
 
     errors = [abs(link.stamp_error_s(clock, 90 + i / 100)) for i in range(20)]
 
-    print(f"error in us after the gap: max {1e6 * max(errors):.0f}")
     assert max(errors) < 1e-3
 
 
@@ -102,19 +95,6 @@ def test_without_round_trips_the_fastest_arrivals_give_the_offset(drift):
 
     assert not clock.synchronised
     assert np.quantile(np.abs(errors[1000:]), 0.99) < 1.5e-3
-
-
-def test_jitter_cannot_move_stamps_backwards():
-    link = JitteryLink(np.random.default_rng(5))
-    clock = DeviceClock()
-    stamps = []
-    for step in range(3000):
-        true_s = step / 1000
-        if step % 10 == 0:
-            link.exchange(clock, true_s)
-        stamps.append(clock.stamp(link.ticks(true_s), link.ns(link.delivered_s(true_s))))
-
-    assert min(np.diff(stamps)) > 0
 
 
 def test_stamps_do_not_go_back_with_the_estimate():

@@ -1,11 +1,16 @@
-"""Frames in a byte stream: intact ones are delivered, damaged ones are counted, memory is bounded."""
+"""Frames in a byte stream: intact ones are delivered, damaged ones are counted, memory is bounded.
+
+The fuzz targets of the link run briefly with bytes from Hypothesis.
+"""
 
 from __future__ import annotations
 
+import itertools
 import tracemalloc
 
 import pytest
-from hypothesis import given
+from fuzz import link_targets
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.decoder import loopback
@@ -17,14 +22,8 @@ from uwb_mitigation.radios.wire.layout import MAX_PAYLOAD_BYTES, MessageType
 A = WireFrame(MessageType.LOG, 0, 7, 123_456, b"first\0\0")
 B = WireFrame(MessageType.RANGE_CIR, 1, 8, 2**63, bytes(range(256)) * 3)
 
-frames = st.builds(
-    WireFrame,
-    st.integers(0, 255),
-    st.integers(0, 2**16 - 1),
-    st.integers(0, 2**32 - 1),
-    st.integers(0, 2**64 - 1),
-    st.binary(max_size=600),
-)
+NUMBERS = [st.integers(0, 2**bits - 1) for bits in (8, 16, 32, 64)]
+frames = st.builds(WireFrame, *NUMBERS, st.binary(max_size=600))
 
 
 def decode(data: bytes) -> list[WireFrame]:
@@ -54,13 +53,12 @@ def test_encoder_numbers_its_frames_and_wraps_at_32_bits():
 def test_splitting_of_the_stream_does_not_matter(sent, noise, sizes):
     stream = noise + b"".join(map(encode_frame, sent)) + noise + b"\0"
     uncut, cut = FrameDecoder(), FrameDecoder()
-    received, position, turn = [], 0, 0
-    while position < len(stream):
-        size = sizes[turn % len(sizes)]
+    received, position = [], 0
+    for size in itertools.cycle(sizes):
         received += cut.feed(stream[position : position + size])
         position += size
-        turn += 1
-
+        if position >= len(stream):
+            break
     assert received == uncut.feed(stream)
     assert cut.counts == uncut.counts
 
@@ -94,16 +92,6 @@ def test_reset_discards_a_partial_frame():
     assert decoder.feed(wire[10:] + encode_frame(B)) == [B]
 
 
-@given(st.binary(max_size=5000))
-def test_arbitrary_bytes_do_not_break_the_decoder(data):
-    decoder = FrameDecoder()
-    decoder.feed(data)
-    decoder.feed(b"\0")
-
-    assert decoder.counts["bytes_received"] == len(data) + 1
-    assert decoder.feed(encode_frame(A)) == [A]
-
-
 @pytest.mark.parametrize("flood", [b"\0", b"\1", b"\xff", b"\1\1\0"], ids=["zeros", "ones", "ff", "short"])
 def test_flood_does_not_grow_memory(flood):
     data = flood * (1_000_000 // len(flood))
@@ -119,14 +107,7 @@ def test_flood_does_not_grow_memory(flood):
 
 @pytest.mark.parametrize(
     "faults",
-    [
-        Faults(),
-        Faults(flip=1e-3),
-        Faults(drop=1e-3),
-        Faults(insert=1e-3),
-        Faults(1e-4, 1e-4, 1e-4),
-        Faults(0.05, 0.05, 0.05),
-    ],
+    [Faults(*rates) for rates in ((), (1e-3,), (0, 1e-3), (0, 0, 1e-3), (1e-4,) * 3, (0.05,) * 3)],
     ids=["clean", "flips", "drops", "insertions", "all", "storm"],
 )
 def test_damaging_channel_delivers_exactly_the_intact_frames(faults):
@@ -136,3 +117,18 @@ def test_damaging_channel_delivers_exactly_the_intact_frames(faults):
     assert result.corrupt_delivered == 0
     assert result.delivered >= result.intact
     assert result.intact == 6000 or faults != Faults()
+
+
+@pytest.mark.parametrize("name", link_targets.TARGETS)
+def test_arbitrary_bytes_do_not_break_the_target(name):
+    settings(max_examples=300)(given(st.binary(max_size=400))(link_targets.TARGETS[name]))()
+
+
+def test_session_target_reaches_a_connection():
+    # kind 1, no pause, then model, boot and request of a HELLO, and its sequence.
+    script = link_targets.Script(bytes([1, 0, 0, 7, 7, 0, 0]))
+    kind = script.number(1)
+    script.number(2)
+    host = link_targets.BoardSession()
+    host.receive(link_targets._made_up(kind, script), 0, 0)
+    assert host.state is link_targets.LinkState.READY

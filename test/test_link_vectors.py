@@ -14,8 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwb_mitigation.radios import settings as radio_settings
-from uwb_mitigation.radios.settings import RadioSettings, RadioState, Role
+from uwb_mitigation.radios.settings import (
+    AGE_UNKNOWN_MS,
+    AnchorStatus,
+    RadioSettings,
+    RadioState,
+    RadioStatus,
+    Role,
+)
 from uwb_mitigation.radios.wire import layout, messages
 from uwb_mitigation.radios.wire.framing import FrameDecoder, WireFrame, encode_frame
 from uwb_mitigation.radios.wire.layout import Flag, LogLevel, MessageType, Mode
@@ -40,147 +46,56 @@ PREAMBLE = """\
 # Numbers are decimal and unsigned, bytes are hexadecimal, - is no bytes.
 """
 
-MEASUREMENT = RangeMeasurement(
-    stamp_ns=0,
-    tag_id=0x0123456789ABCDEF,
-    anchor_id=0xFEDCBA9876543210,
-    sequence=0xFFFFFFFE,
-    device_time=0xFF00FF00FF,
-    range_m=7.3125,
-    cir=Cir(
-        samples=np.array([0, 0, 256, -256, 32767, -32768, 1, -1], np.int16),
-        start_index=-3,
-        first_path_index=745.671875,
-        scale=0.1,
-        preamble_count=1021,
-        noise_threshold=1800,
-        rx_power_dbm=-81.5,
-        first_path_power_dbm=math.nan,
-        channel=2,
-        prf_mhz=64,
-    ),
-)
-FULL = RangeMeasurement(
-    stamp_ns=0,
-    tag_id=1,
-    anchor_id=2,
-    sequence=3,
-    device_time=4,
-    range_m=math.nan,
-    cir=Cir(samples=np.zeros(layout.MAX_SAMPLES, np.int16), preamble_count=1),
-)
-MAGNITUDES = RangeMeasurement(
-    stamp_ns=0,
-    tag_id=1,
-    anchor_id=2,
-    sequence=3,
-    device_time=4,
-    range_m=-0.25,
-    cir=Cir(samples=np.arange(1, 158, dtype=np.int16), encoding=Encoding.MAGNITUDE),
-)
+
+def measured(range_m: float, cir: Cir) -> RangeMeasurement:
+    return RangeMeasurement(0, 1, 2, 3, 4, range_m, cir)
+
+
+def correction(values: CorrectedRange, compute_us: int = 0) -> messages.Correction:
+    return messages.Correction(0, 1, 2, 3, 4, values, compute_us)
+
+
+IDS = {"tag_id": 0x0123456789ABCDEF, "anchor_id": 0xFEDCBA9876543210, "sequence": 0xFFFFFFFE}
+SAMPLES = np.array([0, 0, 256, -256, 32767, -32768, 1, -1], np.int16)
+LEVELS = {"noise_threshold": 1800, "rx_power_dbm": -81.5, "first_path_power_dbm": math.nan, "scale": 0.1}
+RADIO = {"preamble_count": 1021, "channel": 2, "prf_mhz": 64}
+CIR = Cir(SAMPLES, start_index=-3, first_path_index=745.671875, **LEVELS, **RADIO)
+MEASUREMENT = RangeMeasurement(0, **IDS, device_time=0xFF00FF00FF, cir=CIR, range_m=7.3125)
+MAGNITUDES = Cir(np.arange(1, 158, dtype=np.int16), Encoding.MAGNITUDE)
+FULL = Cir(np.zeros(layout.MAX_SAMPLES, np.int16), preamble_count=1)
+CORRECTED = CorrectedRange(6.75, 7.3125, 0.5625, 0.0625, Status.OK, CorrectedBy.DEVICE, 0xDEADBEEF)
+INVALID = CorrectedRange(math.nan, math.nan, 0.0, math.inf, Status.BAD_CIR, CorrectedBy.DEVICE, 0)
+HELLO = messages.Hello(0x1122334455667788, 0xDEADBEEF, 157, Mode.DEVICE, 42, 1, 4224, 1, 2, 3, "nano33")
+OFFSETS = Offsets(0.125, {2: 0.25}, {2**63 + 1: -0.5}, {(7, 3): 10.0})
+NETWORK = {"role": Role.ANCHOR, "address": 0x0102030405060708, "pan": 0x1234, "anchors": (1, 2**63 + 1)}
+CHANNEL = {"channel": 2, "prf_mhz": 16, "preamble": 1024, "preamble_code": 4, "rate_kbps": 110}
+FRAMES = {"decawave_sfd": True, "tx_power": 0x15355575, "antenna_delay": 32872, "window": 1016}
+DELAYS = {"reply_us": 15_000, "timeout_us": 60_000, "interval_us": 100_000}
+SETTINGS = RadioSettings(**NETWORK, **CHANNEL, **FRAMES, **DELAYS, report=True, bias_correction=True)
+REFUSED = messages.RadioConfigured(RadioSettings(), 3, False, "more anchors than 32")
+ANCHORS = AnchorStatus(1, 20, 7, -80.5, 12), AnchorStatus(2**64 - 2, 8, 0, math.nan, AGE_UNKNOWN_MS)
+STATUS = RadioStatus(28, 7, 6, 5, 4, 3, 2, 1, 9, 10, 31.5, 3.25, RadioState.BUS, ANCHORS)
 SENT = {
     "get_info": (MessageType.GET_INFO, 0, 0, 0),
     "set_mode": (messages.SetMode(Mode.DEVICE), 0, 1, 0),
     "time_sync": (MessageType.TIME_SYNC, 0, 0xFFFFFFFF, 0),
-    "hello": (
-        messages.Hello(0x1122334455667788, 0xDEADBEEF, 157, Mode.DEVICE, 42, 1, 4224, 1, 2, 3, "nano33"),
-        Flag.ANSWER,
-        0,
-        1_000_000,
-    ),
+    "hello": (HELLO, Flag.ANSWER, 0, 1_000_000),
     "time_sync_reply": (messages.TimeSyncReply(0xFFFFFFFF, 2**40 + 17), Flag.ANSWER, 1, 2**40 + 20),
     "log": (messages.Log(LogLevel.WARNING, "first path outside the window"), 0, 2, 3_000_000),
     "log_empty": (messages.Log(LogLevel.DEBUG, ""), 0, 3, 3_000_000),
     "status": (messages.BoardStatus(1, 2, 3, 4, Mode.DEVICE, 41.5), 0, 4, 4_000_000),
     "range_cir": (MEASUREMENT, 0, 5, 2**63 + 1),
-    "range_cir_magnitude": (MAGNITUDES, 0, 6, 5_000_000),
-    "range_cir_full": (FULL, 0, 7, 6_000_000),
-    "range_corrected": (
-        messages.Correction(
-            0,
-            1,
-            2,
-            3,
-            4,
-            CorrectedRange(6.75, 7.3125, 0.5625, 0.0625, Status.OK, CorrectedBy.DEVICE, 0xDEADBEEF),
-            7040,
-        ),
-        0,
-        8,
-        7_000_000,
-    ),
-    "range_corrected_invalid": (
-        messages.Correction(
-            0,
-            1,
-            2,
-            3,
-            4,
-            CorrectedRange(math.nan, math.nan, 0.0, math.inf, Status.BAD_CIR, CorrectedBy.DEVICE, 0),
-        ),
-        Flag.ANSWER,
-        9,
-        0,
-    ),
-}
-
-
-SETTINGS = RadioSettings(
-    role=Role.ANCHOR,
-    address=0x0102030405060708,
-    pan=0x1234,
-    channel=2,
-    prf_mhz=16,
-    preamble=1024,
-    preamble_code=4,
-    rate_kbps=110,
-    decawave_sfd=True,
-    tx_power=0x15355575,
-    antenna_delay=32872,
-    window=1016,
-    anchors=(1, 2**63 + 1),
-    reply_us=15_000,
-    timeout_us=60_000,
-    interval_us=100_000,
-    report=True,
-    bias_correction=True,
-)
-SENT |= {
-    "set_offsets": (SetOffsets(Offsets(0.125, {2: 0.25}, {2**63 + 1: -0.5}, {(7, 3): 10.0})), 0, 4, 0),
+    "range_cir_magnitude": (measured(-0.25, MAGNITUDES), 0, 6, 5_000_000),
+    "range_cir_full": (measured(math.nan, FULL), 0, 7, 6_000_000),
+    "range_corrected": (correction(CORRECTED, 7040), 0, 8, 7_000_000),
+    "range_corrected_invalid": (correction(INVALID), Flag.ANSWER, 9, 0),
+    "set_offsets": (SetOffsets(OFFSETS), 0, 4, 0),
     "offsets": (OffsetsAnswer(4, 64, True), Flag.ANSWER, 13, 9_000_000),
     "get_radio": (MessageType.GET_RADIO, 0, 2, 0),
     "set_radio": (messages.SetRadio(SETTINGS), 0, 3, 0),
     "radio": (messages.RadioConfigured(SETTINGS, 3), Flag.ANSWER, 10, 8_000_000),
-    "radio_refused": (
-        messages.RadioConfigured(RadioSettings(), 3, False, "more anchors than 32"),
-        Flag.ANSWER,
-        11,
-        8_000_000,
-    ),
-    "radio_status": (
-        radio_settings.RadioStatus(
-            28,
-            7,
-            6,
-            5,
-            4,
-            3,
-            2,
-            1,
-            9,
-            10,
-            31.5,
-            3.25,
-            RadioState.BUS,
-            (
-                radio_settings.AnchorStatus(1, 20, 7, -80.5, 12),
-                radio_settings.AnchorStatus(2**64 - 2, 8, 0, math.nan, radio_settings.AGE_UNKNOWN_MS),
-            ),
-        ),
-        0,
-        12,
-        9_000_000,
-    ),
+    "radio_refused": (REFUSED, Flag.ANSWER, 11, 8_000_000),
+    "radio_status": (STATUS, 0, 12, 9_000_000),
 }
 
 

@@ -7,11 +7,8 @@ import errno
 import itertools
 import os
 import re
-import select
 import sys
-import threading
 import time
-import tty
 import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,7 +17,7 @@ import pytest
 import serial
 from compilers import NEEDS_CC
 from conftest import REPOSITORY
-from port_events import PortEvents, wait_until
+from port_events import PortEvents, terminal, wait_until
 
 from benchmarks.equipment.dw1000_model.air import Air, Chip
 from benchmarks.equipment.dw1000_model.evb1000 import ROUND_TRIP_S, EmulatedEvb1000s
@@ -118,8 +115,6 @@ def test_modem_manager_ignores_the_boards():
 @pytest.mark.parametrize("damage", [b"\x55", b"\x02", b"\x55" * 9])
 @pytest.mark.parametrize("position", [0, 3, 100])
 def test_stray_octets_in_an_answer_repeat_the_request(damage: bytes, position: int):
-    controller, port = os.openpty()
-    tty.setraw(port)
     answers = {b"deca?": b"yEVB1000 USB2SPI 2.0\0"}
     remaining = [2]
 
@@ -130,17 +125,21 @@ def test_stray_octets_in_an_answer_repeat_the_request(damage: bytes, position: i
         remaining[0] -= 1
         return good[:position] + damage + good[position:]
 
-    with answering(controller, answer):
-        board = bus(os.ttyname(port))()
+    with terminal(answer) as name, contextlib.closing(bus(name)()) as board:
         assert board.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade")
         assert board.repeated == 2
         assert board.transfer(b"\x00", None, 4) == bytes.fromhex("3001cade")
         remaining[0] = 3
         with pytest.raises(LinkError, match=r"the board answered|received"):
             board.transfer(b"\x00", None, 4)
-        board.close()
-    os.close(controller)
-    os.close(port)
+
+
+def test_an_old_answer_is_not_taken_for_the_version():
+    def answer(request: bytes) -> bytes:
+        return b"ynew\0\3" if b"deca?" in request else b""
+
+    with terminal(answer, b"yold\0") as name, contextlib.closing(bus(name)()) as board:
+        assert board.version == "new"
 
 
 def test_board_in_standalone_mode_is_reported_with_the_switch_to_change():
@@ -157,37 +156,9 @@ def test_other_usb_device_is_reported(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LinkError, match="cannot be opened"):
         bus(tmp_path / "file")()
-    controller, port = os.openpty()
-    try:
-        with pytest.raises(LinkError, match="does not answer deca"):
-            bus(os.ttyname(port))()
-        with (
-            answering(controller, lambda _: b"\x02\x05\0"),
-            pytest.raises(LinkError, match=r"answers .* to deca"),
-        ):
-            bus(os.ttyname(port))()
-    finally:
-        os.close(controller)
-        os.close(port)
-
-
-@contextlib.contextmanager
-def answering(controller: int, answer: Callable[[bytes], bytes]) -> Iterator[None]:
-    """A terminal that answers each request."""
-    stop = threading.Event()
-
-    def run() -> None:
-        while not stop.is_set():
-            if select.select([controller], [], [], 0.05)[0]:
-                os.write(controller, answer(os.read(controller, 100)))
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    for answer, problem in ((None, "does not answer deca"), (lambda _: b"\x02\x05\0", "answers .* to deca")):
+        with terminal(answer) as name, pytest.raises(LinkError, match=problem):
+            bus(name)()
 
 
 class FakeSpi:

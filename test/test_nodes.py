@@ -1,4 +1,4 @@
-"""Driver and mitigator as real processes over real DDS."""
+"""Driver and mitigator as real processes over real DDS, and in one process without a CIR on a topic."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import DamagedRecordingError
 from uwb_mitigation.mitigation.correction import Mitigation
-from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
+from uwb_mitigation.nodes import mitigator as mitigator_node
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -64,9 +65,8 @@ def replay_through_both(ros: Ros, count: int, *driver: str) -> tuple[list[RangeC
 def test_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Path):
     raw, corrected = replay_through_both(ros, 300, "source:=mcap", f"path:={bag}", "rate:=10.0")
     assert len(corrected) == 300
-    assert [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range_raw) for m in corrected] == [
-        (m.header, m.sequence, m.anchor_id, m.tag_id, m.range) for m in raw
-    ]
+    sent = [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range) for m in raw]
+    assert [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range_raw) for m in corrected] == sent
 
 
 def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
@@ -74,9 +74,8 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     mitigation = Mitigation(load_bundle(default_model_path()), median_at_rest=True)
     with open_decaranging(log) as source:
         expected = mitigation.correct([record.measurement for record in source])
-    _, corrected = replay_through_both(
-        ros, len(expected), "source:=decaranging", f"path:={log}", "rate:=200.0"
-    )
+    given = ("source:=decaranging", f"path:={log}", "rate:=200.0")
+    _, corrected = replay_through_both(ros, len(expected), *given)
     assert [m.range for m in corrected] == [np.float32(item.range_m) for item in expected]
     assert [m.variance for m in corrected] == [np.float32(item.variance_m2) for item in expected]
     assert [m.status for m in corrected] == [int(item.status) for item in expected]
@@ -100,11 +99,7 @@ def test_stamps_are_on_the_nodes_clock_and_spaced_as_recorded(ros: Ros, bag: Pat
 
 @pytest.mark.parametrize(
     ("parameters", "named"),
-    [
-        (("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"),
-        (("source:=mcap",), "path"),
-        (("rate:=.nan",), "rate"),
-    ],
+    [(("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"), (("rate:=.nan",), "rate")],
 )
 def test_driver_without_a_source_exits_with_an_error(ros: Ros, parameters: tuple[str, ...], named: str):
     driver = ros.start("driver", *parameters)
@@ -198,3 +193,57 @@ def test_duplicate_node_names_are_reported_except_for_a_killed_node(
     ros.diagnosis("mitigator", lambda status: "another node has the name" in status.message)
     for process in (first, second):
         process.wait_for_output("another node has the name /mitigator")
+
+
+# Driver and mitigator in one process ------------------------------------------------------------------------------
+
+PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", *PAUSED)
+
+
+def test_ranges_of_a_pipeline_are_those_of_the_library_to_the_bit(ros: Ros):
+    mitigation = Mitigation(load_bundle(default_model_path()))
+    source = SimulatedSource(seed=1, count=200, rate_hz=400.0)
+    expected = [mitigation.correct([record.measurement])[0] for record in source]
+    received = ros.collect(RangeCorrected, CORRECTED)
+    pipeline = ros.start("pipeline", *PLAY)
+    ros.play()
+    assert pipeline.wait() == 0, pipeline.output
+    ros.spin_until(lambda: len(received) == 200)
+    assert [m.sequence for m in received] == list(range(200))
+    assert [m.range for m in received] == [np.float32(e.range_m) for e in expected]
+    assert [m.variance for m in received] == [np.float32(e.variance_m2) for e in expected]
+    assert "unknown" not in pipeline.output
+
+
+def test_a_pipeline_publishes_raw_ranges_for_subscribers(ros: Ros):
+    raw = ros.collect(RangeCir, RAW)
+    corrected = ros.collect(RangeCorrected, CORRECTED)
+    ros.start("pipeline", *PLAY)
+    ros.play()
+    ros.spin_until(lambda: len(raw) == 200 and len(corrected) == 200)
+    assert [m.header for m in raw] == [m.header for m in corrected]
+    assert [m.range for m in raw] == [m.range_raw for m in corrected]
+    assert all(len(m.cir.samples) for m in raw)
+
+
+def test_several_pipelines_do_not_interfere(ros: Ros):
+    received = {name: ros.collect(RangeCorrected, f"/{name}{CORRECTED}") for name in ("left", "right")}
+    pipelines = [ros.start("pipeline", *PLAY, arguments=("-r", f"__ns:=/{name}")) for name in received]
+    for name in received:
+        ros.play(f"{name}/driver")
+    for pipeline in pipelines:
+        assert pipeline.wait() == 0, pipeline.output
+    ros.spin_until(lambda: all(len(messages) == 200 for messages in received.values()))
+    for messages in received.values():
+        assert [m.sequence for m in messages] == list(range(200))
+
+
+@pytest.mark.parametrize("model", ["universal", "universal_amplitude", "evk1000_apartment", "dw3000_sts"])
+def test_network_runs_before_the_mitigator_is_active(model: str, monkeypatch: pytest.MonkeyPatch):
+    batches: list[int] = []
+    predict_m = Session.predict_m
+    monkeypatch.setattr(
+        Session, "predict_m", lambda self, windows: batches.append(len(windows)) or predict_m(self, windows)
+    )
+    mitigator_node.load_corrector(model)
+    assert {1, mitigator_node.BATCH} <= set(batches)

@@ -14,7 +14,7 @@ from bag_material import write_records
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from ros_harness import PAUSED, Ros, domain
+from ros_harness import PAUSED, Ros, diagnostic_values, domain
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER, TABLES, Parameter
@@ -36,10 +36,10 @@ def replaying(tmp_path_factory: pytest.TempPathFactory):
 @pytest.mark.parametrize(
     ("name", "value", "excerpt"),
     [
-        ("rate", -1.0, ("rate", "-1.0", "0.001", "10000")),
-        ("rate", 20_000, ("rate", "20000", "0.001", "10000")),
-        ("rate", math.nan, ("rate", "nan", "0.001", "10000")),
-        ("rate", "fast", ("rate", "fast", "0.001", "10000")),
+        *(
+            ("rate", value, ("rate", str(value), "0.001", "10000"))
+            for value in (-1.0, 20_000, math.nan, "fast")
+        ),
         ("paused", 1, ("paused", "1", "true or false")),
         ("mode", "cloud", ("mode", "cloud", "host, device")),
         ("seek_to", -5.0, ("seek_to", "-5.0", "1000000000")),
@@ -88,10 +88,7 @@ def test_live_parameters_survive_a_respawn(ros: Ros, tmp_path: Path, monkeypatch
     respawned = ros.start("mitigator", "offsets:=0.1")
     respawned.wait_for_output("correcting with model evk1000_apartment")
     assert "restored parameters after a respawn" in respawned.output
-    status = ros.diagnosis(
-        "mitigator", lambda one: any(v.key == "offsets" and "0.22" in v.value for v in one.values)
-    )
-    assert status
+    ros.diagnosis("mitigator", lambda status: "0.22" in diagnostic_values(status).get("offsets", ""))
 
 
 def test_state_of_a_crashed_node_is_loaded_once_and_only_if_it_is_new_and_valid(tmp_path: Path):
@@ -129,18 +126,11 @@ def test_invalid_qos_override_is_refused(ros: Ros, value: str):
 
 def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):
     bag = tmp_path / "no_frames.mcap"
-    write_records(
-        bag, (Record(replace(record.measurement, frame_id="")) for record in SimulatedSource(seed=1, count=5))
-    )
+    source = SimulatedSource(seed=1, count=5)
+    write_records(bag, (Record(replace(record.measurement, frame_id="")) for record in source))
     received = ros.collect(RangeCir, "/elsewhere")
-    ros.start(
-        "driver",
-        "source:=mcap",
-        f"path:={bag}",
-        "frame_id:=mast",
-        *PAUSED,
-        arguments=("-r", "uwb/range_raw:=/elsewhere"),
-    )
+    given = ("source:=mcap", f"path:={bag}", "frame_id:=mast", *PAUSED)
+    ros.start("driver", *given, arguments=("-r", "uwb/range_raw:=/elsewhere"))
     ros.play()
     ros.spin_until(lambda: len(received) == 5)
     assert {message.header.frame_id for message in received} == {"mast"}

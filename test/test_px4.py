@@ -5,10 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import signal
+import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +19,9 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from builtin_interfaces.msg import Time
+from conftest import REPOSITORY
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, PoseWithCovarianceStamped
-from message_package import build
-from ros_harness import Ros
+from ros_harness import Process, Ros
 from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCorrected
 
@@ -28,78 +31,38 @@ from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 
 pytestmark = pytest.mark.ros
 
-MESSAGE = """
-uint64 timestamp
-uint64 timestamp_sample
-uint8 POSE_FRAME_UNKNOWN = 0
-uint8 POSE_FRAME_NED = 1
-uint8 POSE_FRAME_FRD = 2
-uint8 pose_frame
-float32[3] position
-float32[4] q
-uint8 VELOCITY_FRAME_UNKNOWN = 0
-uint8 velocity_frame
-float32[3] velocity
-float32[3] angular_velocity
-float32[3] position_variance
-float32[3] orientation_variance
-float32[3] velocity_variance
-uint8 reset_counter
-int8 quality
-"""
-"""Fields of VehicleOdometry in px4_msgs, release/1.15."""
+MESSAGES = {
+    # Fields of px4_msgs, release/1.15.
+    "VehicleOdometry": "uint64 timestamp timestamp_sample; uint8 POSE_FRAME_UNKNOWN=0 POSE_FRAME_NED=1 POSE_FRAME_FRD=2 pose_frame;"
+    "float32[3] position; float32[4] q; uint8 VELOCITY_FRAME_UNKNOWN=0 velocity_frame; float32[3] velocity angular_velocity;"
+    "float32[3] position_variance orientation_variance velocity_variance; uint8 reset_counter; int8 quality",
+    # Fields of px4_msgs, main.
+    "RangingBeacon": "uint64 timestamp timestamp_sample; uint8 beacon_id; float32 range; float64 lat lon; float32 alt;"
+    "uint8 alt_type ALT_TYPE_WGS84=0 ALT_TYPE_MSL=1; float32 hacc vacc; uint8 sequence_nr status; uint16 carrier_freq;"
+    "float32 range_accuracy",
+    # The used fields of px4_msgs, main.
+    "VehicleLocalPosition": "uint32 MESSAGE_VERSION=1; bool xy_global z_global; float64 ref_lat ref_lon; float32 ref_alt",
+}
+"""{message: fields, with several of a type in one place}."""
 
-BEACON = """
-uint64 timestamp
-uint64 timestamp_sample
-uint8 beacon_id
-float32 range
-float64 lat
-float64 lon
-float32 alt
-uint8 alt_type
-uint8 ALT_TYPE_WGS84 = 0
-uint8 ALT_TYPE_MSL = 1
-float32 hacc
-float32 vacc
-uint8 sequence_nr
-uint8 status
-uint16 carrier_freq
-float32 range_accuracy
-"""
-"""Fields of RangingBeacon in px4_msgs, main."""
-
-LOCAL_POSITION = """
-uint32 MESSAGE_VERSION = 1
-bool xy_global
-bool z_global
-float64 ref_lat
-float64 ref_lon
-float32 ref_alt
-"""
-"""The used fields of VehicleLocalPosition in px4_msgs, main."""
-
-RECEIVER = """
-import json, rclpy
-from px4_msgs.msg import VehicleOdometry, RangingBeacon
+CLIENT = """
+import json, time, rclpy
+from px4_msgs.msg import *
+from rclpy.qos import qos_profile_sensor_data
 rclpy.init()
-node = rclpy.create_node("receiver")
+node = rclpy.create_node("fmu")
+"""
+
+RECEIVER = f"""{CLIENT}
 def show(message):
-    names = message.get_fields_and_field_types()
-    values = {name: getattr(message, name) for name in names}
-    print(json.dumps({name: v if isinstance(v, (int, float)) else [float(x) for x in v] for name, v in values.items()}))
+    values = {{name: getattr(message, name) for name in message.get_fields_and_field_types()}}
+    print(json.dumps({{name: v if isinstance(v, (int, float)) else [float(x) for x in v] for name, v in values.items()}}))
 node.create_subscription(RangingBeacon, "/fmu/in/ranging_beacon", show, 10)
 node.create_subscription(VehicleOdometry, "/fmu/in/vehicle_visual_odometry", show, 10)
 rclpy.spin(node)
 """
 
-
-LOCAL_PUBLISHER = """
-import time, rclpy
-from px4_msgs.msg import VehicleLocalPosition
-from rclpy.qos import qos_profile_sensor_data
-rclpy.init()
-node = rclpy.create_node("fmu")
+LOCAL_PUBLISHER = f"""{CLIENT}
 publisher = node.create_publisher(VehicleLocalPosition, "/fmu/out/vehicle_local_position_v1", qos_profile_sensor_data)
 while True:
     publisher.publish(VehicleLocalPosition(xy_global=True, z_global=True, ref_lat=47.397742, ref_lon=8.545594, ref_alt=488.0))
@@ -107,14 +70,58 @@ while True:
 """
 
 
-@pytest.fixture(scope="module")
-def px4_msgs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return the environment with a message package that has the name and the fields of px4_msgs."""
-    return build(
-        "px4_msgs",
-        {"VehicleOdometry": MESSAGE, "RangingBeacon": BEACON, "VehicleLocalPosition": LOCAL_POSITION},
-        tmp_path_factory.mktemp("px4"),
+def build_messages(folder: Path) -> dict[str, str]:
+    """Generate and compile px4_msgs as in a user's workspace; return the environment of a process that uses it."""
+    source, build = folder / "source", folder / "build"
+    (source / "msg").mkdir(parents=True)
+    for message, text in MESSAGES.items():
+        kinds = (field.split() for field in text.split(";"))
+        lines = [f"{kind} {name}\n" for kind, *names in kinds for name in names]
+        (source / "msg" / f"{message}.msg").write_text("".join(lines))
+    files = " ".join(f'"msg/{message}.msg"' for message in MESSAGES)
+    (source / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nproject(px4_msgs)\nfind_package(ament_cmake REQUIRED)\n"
+        "find_package(rosidl_default_generators REQUIRED)\n"
+        f"rosidl_generate_interfaces(${{PROJECT_NAME}} {files})\nament_package()\n"
     )
+    (source / "package.xml").write_text(
+        '<package format="3"><name>px4_msgs</name><version>0.0.0</version><description>test</description>'
+        '<maintainer email="a@example.com">a</maintainer><license>none</license>'
+        "<buildtool_depend>rosidl_default_generators</buildtool_depend>"
+        "<member_of_group>rosidl_interface_packages</member_of_group></package>"
+    )
+    environment = os.environ | {
+        "AMENT_PREFIX_PATH": os.environ.get("AMENT_PREFIX_PATH", sys.prefix),
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+    }
+    include = f"-DCMAKE_PROJECT_INCLUDE={REPOSITORY / 'cmake' / 'ros_wheels.cmake'}"
+    options = [f"-DPython3_EXECUTABLE={sys.executable}", include, "-DBUILD_TESTING=OFF"]
+    # What Python needs; of the rest, only what these depend on.
+    targets = ["px4_msgs_s__rosidl_typesupport_c", "px4_msgs__rosidl_typesupport_fastrtps_c"]
+    for command in (
+        ["cmake", "-S", str(source), "-B", str(build), *options],
+        ["cmake", "--build", str(build), "--parallel", "2", "--target", *targets],
+    ):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    found = {"PYTHONPATH": build / "rosidl_generator_py", "LD_LIBRARY_PATH": build}
+    return {name: f"{path}:{os.environ.get(name, '')}".rstrip(":") for name, path in found.items()}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    return build_messages(tmp_path_factory.mktemp("px4"))
+
+
+@pytest.fixture
+def px4_msgs(built: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Use a message package that has the name and the fields of px4_msgs."""
+    for name, value in built.items():
+        monkeypatch.setenv(name, value)
+
+
+def messages_of(receiver: Process) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in receiver.output.splitlines() if line.startswith("{")]
 
 
 def pose(seconds: float, x: float, variance: float = 0.04) -> PoseWithCovarianceStamped:
@@ -129,11 +136,7 @@ def pose(seconds: float, x: float, variance: float = 0.04) -> PoseWithCovariance
 
 
 @pytest.mark.slow
-def test_positions_are_sent_in_ned_without_orientation_and_velocity(
-    ros: Ros, px4_msgs: dict[str, str], monkeypatch: pytest.MonkeyPatch
-):
-    for name, value in px4_msgs.items():
-        monkeypatch.setenv(name, value)
+def test_positions_are_sent_in_ned_without_orientation_and_velocity(ros: Ros, px4_msgs: None):
     node, receiver = ros.start("px4"), ros.run([sys.executable, "-c", RECEIVER])
     publisher = ros.node.create_publisher(PoseWithCovarianceStamped, "/uwb/pose", 10)
     ros.wait_for_subscribers("/uwb/pose", 1)
@@ -166,8 +169,7 @@ def test_positions_are_sent_in_ned_without_orientation_and_velocity(
     ):
         publisher.publish(pose(start + seconds, x, variance))
     ros.spin_until(lambda: arrived(start - 9.0))
-    lines = [line for line in receiver.output.splitlines() if line.startswith("{")]
-    first, second, third, again = map(json.loads, lines[-4:])
+    first, second, third, again = messages_of(receiver)[-4:]
     assert first["timestamp_sample"] == start * 1e6
     assert first["timestamp"] > 1_700_000_000_000_000
     assert (first["pose_frame"], first["position"]) == (1, [2.0, 1.0, -0.5])
@@ -214,12 +216,9 @@ def ecef(latitude: float, longitude: float, height: float) -> np.ndarray:
 def test_positions_of_anchors_keep_their_distances_on_the_ellipsoid(origin: tuple[float, float, float]):
     local = np.random.default_rng(1).uniform(-1000, 1000, (50, 3))
     placed = np.array([ecef(*row) for row in to_geodetic(local, origin)])
-    assert np.linalg.norm(placed - ecef(*origin), axis=1) == pytest.approx(
-        np.linalg.norm(local, axis=1), abs=1e-5
-    )
-    assert np.linalg.norm(placed - placed[0], axis=1) == pytest.approx(
-        np.linalg.norm(local - local[0], axis=1), abs=1e-5
-    )
+    for place, reference in ((ecef(*origin), np.zeros(3)), (placed[0], local[0])):
+        distances_m = np.linalg.norm(local - reference, axis=1)
+        assert np.linalg.norm(placed - place, axis=1) == pytest.approx(distances_m, abs=1e-5)
     (north, east, up) = to_geodetic([[0, 10, 0], [10, 0, 0], [0, 0, 10]], origin) - np.array(origin)
     assert north[0] > 8e-5
     assert abs(north[1]) < 1e-9
@@ -235,11 +234,7 @@ def test_invalid_origins_are_refused(text: str):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("has_origin", [True, False])
-def test_ranges_are_sent_as_ekf2_accepts_them(
-    ros: Ros, px4_msgs: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, has_origin: bool
-):
-    for name, value in px4_msgs.items():
-        monkeypatch.setenv(name, value)
+def test_ranges_are_sent_as_ekf2_accepts_them(ros: Ros, px4_msgs: None, tmp_path: Path, has_origin: bool):
     path = tmp_path / "anchors.yaml"
     path.write_text(dump_anchors(AnchorMap([Anchor(key, place, 0.03) for key, place in ANCHORS.items()])))
     # Best-effort messages can be lost under load.
@@ -259,30 +254,19 @@ def test_ranges_are_sent_as_ekf2_accepts_them(
         """Publish ranges of four anchors with the same stamp, as a DWM1001 with PANS, and invalid ones."""
         number, before = next(rounds), len(received())
         for anchor, place in [*ANCHORS.items(), (7, (0, 0, 0))]:
-            for range_m, variance in [
-                (math.nan, 0.01),
-                (-1.0, 0.01),
-                (1.0, math.inf),
-                (math.dist(tag, place), 0.01),
-            ]:
+            true_m = math.dist(tag, place)
+            for range_m, variance in ((math.nan, 0.01), (-1.0, 0.01), (1.0, math.inf), (true_m, 0.01)):
                 stamp = Time(sec=number // 10, nanosec=number % 10 * 10**8)
-                header = Header(frame_id="uwb", stamp=stamp)
-                fields = {
-                    "tag_id": 1,
-                    "anchor_id": anchor,
-                    "sequence": number,
-                    "range": range_m,
-                    "variance": variance,
-                }
-                publisher.publish(RangeCorrected(header=header, **fields))
+                fields = {"header": Header(frame_id="uwb", stamp=stamp), "tag_id": 1, "anchor_id": anchor}
+                fields |= {"sequence": number, "range": range_m, "variance": variance}
+                publisher.publish(RangeCorrected(**fields))
         # Rounds that wait for a busy node would change the variances.
         if before:
             ros.spin_until(lambda: len(received()) > before)
         ros.spin_for(0.1)
 
     def received() -> list[dict[str, float]]:
-        lines = [line for line in receiver.output.splitlines() if line.startswith("{")]
-        return [message for message in map(json.loads, lines) if "beacon_id" in message]
+        return [message for message in messages_of(receiver) if "beacon_id" in message]
 
     ros.spin_until(lambda: send_round() or len(received()) > 40)
     messages = received()
@@ -309,10 +293,6 @@ def test_ranges_are_sent_as_ekf2_accepts_them(
     assert node.signal(signal.SIGINT) == 0, node.output
 
 
-def test_invalid_settings_of_ranges_are_named(
-    ros: Ros, px4_msgs: dict[str, str], monkeypatch: pytest.MonkeyPatch
-):
-    for name, value in px4_msgs.items():
-        monkeypatch.setenv(name, value)
+def test_invalid_settings_of_ranges_are_named(ros: Ros, px4_msgs: None):
     ros.start("px4", "mode:=ranges").wait_for_output("parameter anchors is empty")
     ros.start("px4", "mode:=range").wait_for_output("mode = 'range'")

@@ -38,15 +38,15 @@ class Host:
         return [event for event in self.events if isinstance(event, kind)]
 
 
-def test_ranges_reach_the_host_with_stamps_of_their_reception():
+def test_ranges_settings_and_status_of_the_radio_reach_the_host():
     with ModelledAir() as air:
         tag = air.add(RadioSettings(), serial_link=SerialLink())
         anchor = air.add(RadioSettings(role=Role.ANCHOR))
-        air.set_pair(tag, anchor, Pair(6))
+        air.set_pair(tag, anchor, Pair(6, loss=0.05))
         host = Host(air, tag)
-        host.run(2)
-        ranges = host.received(RangeMeasurement)
+        host.run(3)
         addresses = air.address(tag), air.address(anchor)
+    ranges = host.received(RangeMeasurement)
     assert len(ranges) > 100
     assert host.session.counts["lost"] == 0
     last = ranges[-1]
@@ -54,20 +54,9 @@ def test_ranges_reach_the_host_with_stamps_of_their_reception():
     assert abs(last.range_m - 6) < 0.02
     assert (len(last.cir), last.cir.channel, last.cir.prf_mhz) == (157, 5, 64)
     assert all(later.stamp_ns > earlier.stamp_ns for earlier, later in itertools.pairwise(ranges))
-    assert 2e9 - last.stamp_ns < 0.06e9
+    assert 3e9 - last.stamp_ns < 0.06e9
 
-
-def test_board_reports_settings_and_status_of_its_radio():
-    with ModelledAir() as air:
-        tag = air.add(RadioSettings(window=16), serial_link=SerialLink())
-        anchor = air.add(RadioSettings(role=Role.ANCHOR))
-        air.set_pair(tag, anchor, Pair(6, loss=0.05))
-        host = Host(air, tag)
-        host.run(3)
-        addresses = air.address(tag), air.address(anchor)
-    radio = host.session.radio
-    assert radio is not None
-    settings = radio.settings
+    settings = host.session.radio.settings
     assert (settings.address, settings.antenna_delay, settings.preamble_code) == (addresses[0], 2 * 16436, 9)
     assert settings.tx_power not in (0, 0xFFFFFFFF)
     status = host.received(RadioStatus)[-1]
@@ -79,7 +68,6 @@ def test_board_reports_settings_and_status_of_its_radio():
     (in_reach,) = status.anchors
     assert in_reach.address == addresses[1]
     assert -100 < in_reach.rx_power_dbm < -60
-    assert in_reach.age_ms is not None
     assert in_reach.age_ms < 500
 
 
@@ -96,7 +84,6 @@ def test_host_configures_the_radio_while_it_ranges():
         host.run(1)
         ranges = host.received(RangeMeasurement)
     assert not host.received(Refused)
-    assert host.session.radio is not None
     assert host.session.radio.settings.channel == 2
     assert len(ranges) > 50
     assert (len(ranges[-1].cir), ranges[-1].cir.prf_mhz) == (40, 16)
@@ -107,11 +94,10 @@ def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
         board = air.add(RadioSettings(), serial_link=SerialLink())
         host = Host(air, board)
         host.run(0.5)
-        _, payload = messages.encode(SetRadio(RadioSettings(channel=6)))
-        assert messages.decode(messages.MessageType.SET_RADIO, payload) == SetRadio(RadioSettings(channel=6))
-        host.session._radio_request.begin(SetRadio(RadioSettings(channel=6)))
+        request = SetRadio(RadioSettings(channel=6))
+        assert messages.decode(*messages.encode(request)) == request
+        host.session._radio_request.begin(request)
         host.run(1)
         (refusal,) = host.received(Refused)
         assert "channel" in refusal.text
-        assert host.session.radio is not None
         assert host.session.radio.settings.channel == 5

@@ -46,15 +46,15 @@ def level_of(status: DiagnosticStatus) -> int:
     return status.level[0] if isinstance(status.level, bytes) else status.level
 
 
-def test_tag_ranges_with_two_anchors(ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path):
+def test_tag_ranges_with_two_anchors_and_settings_are_applied_live(
+    ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path
+):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
     ros.start("mitigator")
     ports = ",".join(str(tmp_path / f"radio{number}") for number in range(3))
     ros.start("driver", "source:=evb1000", f"port:={ports}")
-    ros.spin_until(
-        lambda: len({message.anchor_id for message in corrected}) == 2 and len(corrected) >= 6 and bool(raw)
-    )
+    ros.spin_until(lambda: len({m.anchor_id for m in corrected}) == 2 and len(corrected) >= 6 and bool(raw))
     message = raw[0]
     assert len(message.cir.samples) == 2 * 157
     assert message.cir.preamble_count > 0
@@ -64,11 +64,6 @@ def test_tag_ranges_with_two_anchors(ros: ros_harness.Ros, boards: EmulatedEvb10
     assert int(values["radio 0: ranged"]) > 0
     assert sum("anchor 0x" in key and "dBm" in value for key, value in values.items()) == 2
 
-
-def test_settings_are_applied_live(ros: ros_harness.Ros, boards: EmulatedEvb1000s, tmp_path: Path):
-    raw = ros.collect(RangeCir, "/uwb/range_raw")
-    ros.start("driver", "source:=evb1000", f"port:={tmp_path / 'radio0'},{tmp_path / 'radio1'}")
-    ros.spin_until(lambda: bool(raw))
     refused = ros.set_parameter("driver", "radio.channel", 6)
     assert not refused.successful
     assert "channel" in refused.reason
@@ -84,9 +79,7 @@ def test_settings_are_applied_live(ros: ros_harness.Ros, boards: EmulatedEvb1000
         ("radio.preamble", 100, "preamble"),
         ("radio.data_rate", 111, "rate"),
         ("radio.anchors", "12,xyz", "radio.anchors"),
-        ("radio.address", "0", "radio.address"),
-        ("radio.address", "12e4", "radio.address"),
-        ("radio.address", "1122334455667788", "radio.address"),
+        *(("radio.address", text, "radio.address") for text in ("0", "12e4", "1122334455667788")),
         ("radio.preamble_code", 3, "preamble_code"),
     ],
 )
@@ -105,10 +98,8 @@ def test_address_is_read_as_it_is_printed(address: int):
 
 
 def test_anchor_that_never_answered_has_no_last_seen_time():
-    status = RadioStatus(
-        anchors=(AnchorStatus(7, 9, 0, np.nan, AGE_UNKNOWN_MS), AnchorStatus(8, 9, 9, -80.0, 1500))
-    )
-    never, recent = [*radio_values(None, status).values()][-2:]
+    anchors = AnchorStatus(7, 9, 0, np.nan, AGE_UNKNOWN_MS), AnchorStatus(8, 9, 9, -80.0, 1500)
+    never, recent = [*radio_values(None, RadioStatus(anchors=anchors)).values()][-2:]
     assert never == "0 of 9 ranged, nan dBm, last seen never"
     assert recent == "9 of 9 ranged, -80.0 dBm, last seen 1.5 s ago"
 
@@ -156,9 +147,7 @@ def test_radio_of_a_serial_board_is_configured_and_reports_its_status(ros: ros_h
         driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.window:=40")
         ros.spin_until(lambda: bool(raw) and len(raw[-1].cir.samples) == 80)
         assert abs(raw[-1].range - 5) < 0.1
-        status = ros.diagnosis(
-            "driver", lambda status: int(diagnostic_values(status).get("radio: ranged", 0)) > 0
-        )
+        status = ros.diagnosis("driver", lambda s: int(diagnostic_values(s).get("radio: ranged", 0)) > 0)
         values = diagnostic_values(status)
         assert level_of(status) == 0
         assert (values["radio: role"], values["radio: antenna delay"]) == ("tag", str(2 * 16436))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -38,6 +39,14 @@ def pair(
     return tag, anchor
 
 
+def ranges_of(channel: Pair, seconds: float, **settings: object) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ranges of a pair, and their samples."""
+    with ModelledAir() as air:
+        pair(air, channel, **settings)
+        air.run(seconds)
+        return air.ranges()
+
+
 def test_row_of_results_is_that_of_the_compiler():
     assert modelled._library().radio_air_result_bytes() == modelled.RANGE.itemsize
 
@@ -45,10 +54,7 @@ def test_row_of_results_is_that_of_the_compiler():
 @pytest.mark.parametrize("ppm", [(-20, 20), (0, 0), (20, -20)])
 @pytest.mark.parametrize("distance_m", [0.3, 5.01, 100.0])
 def test_ranges_are_exact_for_any_clock_error_and_across_the_wrap(ppm, distance_m: float):
-    with ModelledAir() as air:
-        pair(air, Pair(distance_m), ppm)
-        air.run(0.5)
-        rows, _ = air.ranges()
+    rows, _ = ranges_of(Pair(distance_m), 0.5, ppm=ppm)
     assert len(rows) > 100
     assert rows["device_time"].min() < 1e9 < WRAP - 4e9 < rows["device_time"].max(), "the counter has wrapped"
     errors_m = rows["range_m"] - distance_m
@@ -59,10 +65,8 @@ def test_ranges_are_exact_for_any_clock_error_and_across_the_wrap(ppm, distance_
 @pytest.mark.parametrize("window", [0, 157, 1016])
 def test_cir_equals_that_of_the_channel_bit_by_bit(window: int):
     iq = accumulator()
-    with ModelledAir() as air:
-        pair(air, Pair(7, samples=iq, first_path_index=745.25, preamble_count=100), window=window)
-        air.run(0.05)
-        rows, store = air.ranges()
+    channel = Pair(7, samples=iq, first_path_index=745.25, preamble_count=100)
+    rows, store = ranges_of(channel, 0.05, window=window)
     assert len(rows) > 2
     for row in rows:
         assert row["values"] == 2 * window
@@ -76,10 +80,8 @@ def test_cir_equals_that_of_the_channel_bit_by_bit(window: int):
 @pytest.mark.parametrize(("prf", "reference_db", "samples"), [(64, 121.74, 1016), (16, 113.77, 992)])
 def test_powers_are_the_manuals_formulas_of_the_registers(prf: int, reference_db: float, samples: int):
     iq = accumulator(samples)
-    with ModelledAir() as air:
-        pair(air, Pair(7, samples=iq, first_path_index=745.0, preamble_count=100), prf_mhz=prf, window=0)
-        air.run(0.05)
-        rows, _ = air.ranges()
+    channel = Pair(7, samples=iq, first_path_index=745.0, preamble_count=100)
+    rows, _ = ranges_of(channel, 0.05, prf_mhz=prf, window=0)
     magnitude = np.hypot(*iq.reshape(-1, 2).T.astype(float))
     first = np.sqrt((magnitude[746:749] ** 2).sum())
     expected = 20 * math.log10(first / 100) - reference_db
@@ -153,11 +155,9 @@ def test_tags_share_the_channel_without_mixing_ranges():
         air.set_pair(*anchors, Pair(4))
         air.run(10)
         rows, _ = air.ranges()
-        truth = {
-            (air.address(tag), air.address(anchor)): 3.0 + 10 * i + 5 * j
-            for i, tag in enumerate(tags)
-            for j, anchor in enumerate(anchors)
-        }
+        tag_ids, anchor_ids = ([air.address(board) for board in boards] for boards in (tags, anchors))
+    ids = itertools.product(enumerate(tag_ids), enumerate(anchor_ids))
+    truth = {(tag, anchor): 3.0 + 10 * i + 5 * j for (i, tag), (j, anchor) in ids}
     assert {(row["tag"], row["anchor"]) for row in rows} == set(truth)
     for row in rows:
         assert abs(row["range_m"] - truth[row["tag"], row["anchor"]]) < 0.05
@@ -193,10 +193,7 @@ def test_missing_antenna_delay_appears_in_the_range():
 
 
 def test_power_dependent_bias_is_corrected_if_enabled():
-    with ModelledAir() as air:
-        pair(air, Pair(5, samples=accumulator()), bias_correction=True)
-        air.run(0.1)
-        rows, _ = air.ranges()
+    rows, _ = ranges_of(Pair(5, samples=accumulator()), 0.1, bias_correction=True)
     power_dbm = rows["rx_power_dbm"][0]
     true_dbm = power_dbm + max(0.0, power_dbm + 88) * 1.1667
     table = [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86]

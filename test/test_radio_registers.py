@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 from compilers import NEEDS_CC
@@ -59,18 +59,12 @@ class Run:
             prepare(chip)
             for neighbour in self.chips[:number]:
                 air.set_pair(chip, neighbour, Pair(6.0))
-            radio_settings = tag if number else anchor
-            air.program(
-                chip, ranging(radio_settings, self.ranges, seconds, bus=self._bus(bus), at_end=self._at_end)
-            )
+            options = {
+                "bus": lambda host: self.buses.append(bus(host)) or self.buses[-1],
+                "at_end": self._at_end,
+            }
+            air.program(chip, ranging(tag if number else anchor, self.ranges, seconds, **options))
         air.run(2 * seconds)
-
-    def _bus(self, bus: Callable[[Host], ModelBus]) -> Callable[[Host], ModelBus]:
-        def opened(host: Host) -> ModelBus:
-            self.buses.append(bus(host))
-            return self.buses[-1]
-
-        return opened
 
     def _at_end(self, radio: NativeRadio) -> None:
         self.radios.append(radio.settings)
@@ -84,26 +78,17 @@ class Run:
         return writes[: next(row for row in range(end + 1, len(writes)) if writes[row][0] == 0x0E)]
 
 
-@dataclass(frozen=True)
-class Configuration:
-    """Registers of a configuration: name, register file, sub-address, octets and value of each.
-
-    The values are those of Decawave's tables and of the register log of its driver. The TX power words in the
-    OTP memory of the modelled chip are in smart-power format.
-    """
-
-    settings: RadioSettings
-    registers: str
-
-
 COMMON = """
 PANADR 03 0 4 5542A55A          AGC_TUNE2 23 0C 4 2502A907      AGC_TUNE3 23 12 2 0035
 DRX_TUNE4H 27 26 2 0028         LDE_CFG1 2E 0806 1 6D           ACK_RESP_T 1A 0 3 000000
 TX_ANTD 18 0 2 4034             LDE_RXANTD 2E 1804 2 4034       FS_XTALT 2B 0E 1 70
 EC_CTRL 24 0 1 04               OTP_SF 2D 12 1 02               AON_CFG1 2C 0A 2 0000
 """
+# {name: (settings, registers)}, each register with its name, file, sub-address, octets and value. The values are those of
+# Decawave's tables and of the register log of its driver. The TX power words in the OTP memory of the modelled chip are in
+# smart-power format.
 CONFIGURATIONS = {
-    "channel 5, 64 MHz, 6.8 Mbit/s": Configuration(
+    "channel 5, 64 MHz, 6.8 Mbit/s": (
         RadioSettings(),
         """
 SYS_CFG 04 0 4 00001200         TX_POWER 1E 0 4 25456585        CHAN_CTRL 1F 0 4 4A480055
@@ -114,7 +99,7 @@ DRX_TUNE2 27 08 4 313B006B      DRX_SFDTOC 27 20 2 0081         LDE_CFG2 2E 1806
 LDE_REPC 2E 2804 2 28F4         USR_SFD 21 0 1 08
 """,
     ),
-    "channel 2, 16 MHz, 110 kbit/s": Configuration(
+    "channel 2, 16 MHz, 110 kbit/s": (
         RadioSettings(channel=2, prf_mhz=16, rate_kbps=110, preamble=1024),
         """
 SYS_CFG 04 0 4 00441200         TX_POWER 1E 0 4 75757575        CHAN_CTRL 1F 0 4 18C40022
@@ -125,7 +110,7 @@ DRX_TUNE2 27 08 4 351A009A      DRX_SFDTOC 27 20 2 0421         LDE_CFG2 2E 1806
 LDE_REPC 2E 2804 2 0A3D         USR_SFD 21 0 1 40
 """,
     ),
-    "channel 7, 64 MHz, 6.8 Mbit/s, long preamble": Configuration(
+    "channel 7, 64 MHz, 6.8 Mbit/s, long preamble": (
         RadioSettings(channel=7, preamble=1024),
         """
 SYS_CFG 04 0 4 00001200         TX_POWER 1E 0 4 5171B1D1        CHAN_CTRL 1F 0 4 8C480077
@@ -141,35 +126,24 @@ LDE_REPC 2E 2804 2 3332         USR_SFD 21 0 1 08
 
 def expected(registers: str) -> dict[tuple[int, int], bytes]:
     """Return {(register file, sub-address): octets} of a table."""
-    words = registers.split()
-    rows = [words[row : row + 5] for row in range(0, len(words), 5)]
-    return {
-        (int(file, 16), int(sub, 16)): int(value, 16).to_bytes(int(octets), "little")
-        for _, file, sub, octets, value in rows
-    }
+    found = {}
+    for _, file, sub, octets, value in zip(*[iter(registers.split())] * 5, strict=True):
+        found[int(file, 16), int(sub, 16)] = int(value, 16).to_bytes(int(octets), "little")
+    return found
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_every_register_write_at_the_start_is_that_of_the_table(air: Air, name: str):
-    configuration = CONFIGURATIONS[name]
-    writes = Run(air, configuration.settings).start_up()
-    commands = {0x0D, 0x0E, SYS_STATUS, 0x36}
-    configured = {
-        (file, sub): data
-        for file, sub, data in writes
-        if file not in commands and (file, sub) not in {(0x2D, 0x04), (0x2D, 0x06)}
-    }
-    assert configured == expected(COMMON + configuration.registers)
+    settings, registers = CONFIGURATIONS[name]
+    writes = Run(air, settings).start_up()
+    commands, otp = {0x0D, 0x0E, SYS_STATUS, 0x36}, {(0x2D, 0x04), (0x2D, 0x06)}
+    configured = {(file, sub): data for file, sub, data in writes if file not in commands}
+    assert {key: data for key, data in configured.items() if key not in otp} == expected(COMMON + registers)
     # The clocks change octet by octet, and CPLOCK is cleared before the PLL starts.
-    clocks = [(file, sub, data) for file, sub, data in writes if file == 0x36 or data == b"\x02\0\0\0"]
-    assert clocks == [
-        (0x36, 0, b"\x01"),
-        (0x36, 0, b"\x01"),
-        (0x36, 1, b"\x03"),
-        (SYS_STATUS, 0, b"\x02\0\0\0"),
-        (0x36, 0, b"\x00"),
-        (0x36, 1, b"\x02"),
-    ]
+    cleared = (SYS_STATUS, 0, b"\x02\0\0\0")
+    clocks = [(file, sub, data) for file, sub, data in writes if file == 0x36 or data == cleared[2]]
+    before, after = ((0, b"\x01"), (0, b"\x01"), (1, b"\x03")), ((0, b"\x00"), (1, b"\x02"))
+    assert clocks == [*((0x36, *each) for each in before), cleared, *((0x36, *each) for each in after)]
     # TXSTRT with TRXOFF initialises the SFD logic and sends nothing.
     assert [data for file, _, data in writes if file == SYS_CTRL][-1] == b"\x42\0\0\0"
 
@@ -230,26 +204,15 @@ def test_smart_power_sends_one_frame_per_millisecond(air: Air):
 def test_antenna_delay_of_a_trek1000_is_from_otp(
     air: Air, settings: RadioSettings, tag: int, anchor: int, revision: int
 ):
-    assert antenna_delays(air, settings, revision) == (anchor, tag)
-
-
-def antenna_delays(air: Air, settings: RadioSettings, revision: int) -> tuple[int, int]:
-    """Return the antenna delays, TX + RX, of (anchor, tag) with this OTP memory."""
+    words = {0x0D: 0x4111_4011, 0x0E: 0x4122_4022, 0x0F: 0x4133_4033, 0x1D: 0x4144_4044, 0x1C: 0x8050_8060}
 
     def prepare(chip: Chip) -> None:
-        chip.program_otp(0x1E, revision << 8 | 0x10)
-        chip.program_otp(0x1C, 0x8050_8060)
-        for address, word in (
-            (0x0D, 0x4111_4011),
-            (0x0E, 0x4122_4022),
-            (0x0F, 0x4133_4033),
-            (0x1D, 0x4144_4044),
-        ):
+        for address, word in (words | {0x1E: revision << 8 | 0x10}).items():
             chip.program_otp(address, word)
 
     run = Run(air, settings, seconds=0.03, prepare=prepare)
-    of = {radio.role: radio.antenna_delay for radio in run.radios}
-    return of[Role.ANCHOR], of[Role.TAG]
+    delays = {radio.role: radio.antenna_delay for radio in run.radios}
+    assert (delays[Role.ANCHOR], delays[Role.TAG]) == (anchor, tag)
 
 
 @pytest.mark.parametrize(("rate_kbps", "refused"), [(6800, True), (850, False)])
@@ -265,9 +228,7 @@ def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refuse
 class StickyStatusBus(ModelBus):
     """The chip does not clear status bits when receiver or transmitter start: only a write clears them."""
 
-    def __init__(self, host: Host) -> None:
-        super().__init__(host)
-        self._status = 0
+    _status = 0
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
         answer = super().transfer(header, out, count)
@@ -300,11 +261,9 @@ class NoClockBus(NoLockBus):
     """The PLL of the chip does not lock: it ignores SPI at full speed."""
 
     def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
-        return (
-            super().transfer(header, out, count)
-            if self._hz < 3e6
-            else bytes(count if out is None else len(out))
-        )
+        if self._hz < 3e6:
+            return super().transfer(header, out, count)
+        return bytes(count if out is None else len(out))
 
 
 def test_unreported_pll_lock_is_a_warning(air: Air):

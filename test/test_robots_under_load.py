@@ -2,7 +2,7 @@
 
 Other cases are tested elsewhere: all transitions of the driver, a paused clock, a model that is swapped while driving, and
 publishers with another QoS (`test_reliability`), two tags and a best-effort height (`test_locator`), Ctrl-C with a board in
-each of its states (`test_serial_driver`), during imports and at the start (`test_entry`), several pipelines (`test_pipeline`).
+each of its states (`test_serial_driver`), during imports and at the start (`test_entry`), several pipelines (`test_nodes`).
 """
 
 from __future__ import annotations
@@ -56,10 +56,8 @@ def raw_range(tag: int, sequence: int, range_m: float, time_ns: int = 0) -> Rang
 
 def test_a_manager_takes_all_nodes_of_one_process_up_and_down_twice(ros: Ros, anchors: Path):
     nodes = ("driver", "mitigator", "locator")
-    raw, corrected = (
-        ros.collect(RangeCir, "/uwb/range_raw"),
-        ros.collect(RangeCorrected, "/uwb/range_corrected"),
-    )
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
 
     def wait_for_corrected() -> None:
         since_ns = time.time_ns()
@@ -104,16 +102,13 @@ def test_a_simulated_clock_that_jumps_neither_stops_positions_nor_mixes_their_ti
         def played(start_s: int = start_s, rounds: itertools.count = rounds) -> bool:
             """Publish a fifth of a second."""
             begin = next(rounds) * 0.2
-            for row in np.flatnonzero(
-                (ranges.stamp_ns / NS % 10 >= begin) & (ranges.stamp_ns / NS % 10 < begin + 0.2)
-            ):
+            times_s = ranges.stamp_ns / NS % 10
+            for row in np.flatnonzero((times_s >= begin) & (times_s < begin + 0.2)):
                 time_ns = start_s * NS + int(ranges.stamp_ns[row])
                 clock.publish(Clock(clock=stamp(time_ns)))
                 fields = {"tag_id": 7, "anchor_id": HALL.anchors[ranges.anchor[row]].id, "variance": 0.01}
-                range_m = float(ranges.range_m[row])
-                publisher.publish(
-                    RangeCorrected(header=Header(stamp=stamp(time_ns)), range=range_m, **fields)
-                )
+                fields |= {"header": Header(stamp=stamp(time_ns)), "range": float(ranges.range_m[row])}
+                publisher.publish(RangeCorrected(**fields))
             ros.spin_for(0.05)
             last_ns = start_s * NS + int(ranges.stamp_ns[-1])
             return begin > 9.0 and any(to_ns(pose.header.stamp) == last_ns for pose in poses)
@@ -146,24 +141,16 @@ def test_offsets_that_change_while_two_tags_drive_lose_and_mix_no_range(ros: Ros
         # Some are still in a queue when the offset changes.
         ros.spin_until(lambda: bool(corrected) and corrected[-1].sequence > number - 2 * count)
 
-    for offset, is_valid in [
-        (0.25, True),
-        ("absent.yaml", False),
-        (0.5, True),
-        ("nan", False),
-        (0.125, True),
-    ]:
+    for offset in (0.25, "absent.yaml", 0.5, "nan", 0.125):
         drive_on(50)
-        assert ros.set_parameter("mitigator", "offsets", offset).successful == is_valid
+        assert ros.set_parameter("mitigator", "offsets", offset).successful == isinstance(offset, float)
     drive_on(50)
     ros.spin_until(lambda: len(corrected) >= sum(map(len, sent.values())))
     for tag, numbers in sent.items():
         messages = [message for message in corrected if message.tag_id == tag]
         assert [message.sequence for message in messages] == numbers, "no range must be lost or repeated"
         assert {message.range_raw for message in messages} == {5.0 + tag}, "tags must not be mixed"
-        assert {message.correction for message in messages} == {0.125, 0.25, 0.5}, (
-            "only offsets that were set"
-        )
+        assert {message.correction for message in messages} == {0.125, 0.25, 0.5}, "only what was set"
     assert node.signal(signal.SIGINT) == 0, node.output
 
 

@@ -6,7 +6,7 @@ import math
 import sys
 from collections import Counter
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,16 +14,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Point, Pose, PoseArray, PoseWithCovarianceStamped
-from message_package import build
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseWithCovarianceStamped, Vector3
 from rclpy.qos import QoSProfile
 from ros_harness import Ros, diagnostic_values
 from sensor_msgs.msg import Range
 from std_msgs.msg import String
-from test_mapping import FRAME2, NODE2
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from uwb_mitigation.errors import MissingDependencyError, ParameterError
 from uwb_mitigation.nodes.feeds.topic import TopicFeed
@@ -37,85 +34,73 @@ CORNERS = {0: (0.0, 0.0, 2.0), 1: (8.0, 0.0, 2.0), 2: (8.0, 6.0, 2.0), 3: (0.0, 
 TAG = (3.0, 2.0, 0.4)
 LEVEL = ("level:=true", f"height:={TAG[2]}")
 
-PUBLISHER = f"""
-import math, time
-import rclpy
-from nlink_parser.msg import LinktrackNode2, LinktrackNodeframe2
-rclpy.init()
-node = rclpy.create_node("linktrack")
-publisher = node.create_publisher(LinktrackNodeframe2, "/nlink_linktrack_nodeframe2", 10)
-corners = {CORNERS}
-while True:
-    nodes = [LinktrackNode2(role=1, id=n, dis=math.dist({TAG}, corner), fp_rssi=-85.0, rx_rssi=-80.5) for n, corner in corners.items()]
-    nodes.append(LinktrackNode2(role=1, id=7, dis=0.0))
-    publisher.publish(LinktrackNodeframe2(role=2, id=9, nodes=nodes))
-    time.sleep(0.05)
+MAPPING = """
+name: markers of a site
+type: visualization_msgs/msg/MarkerArray
+topics: [/site/ranges]
+fields:
+  tag: {constant: 9}
+  anchor: markers[].id
+  range: markers[].scale.x
+  rx_power: markers[].scale.y
+  first_path_power: markers[].scale.z
+drop:
+  - {column: "markers[].scale.x", equals: 0}
 """
 
 
-@pytest.fixture(scope="module")
-def nlink(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    messages = {"LinktrackNode2": NODE2, "LinktrackNodeframe2": FRAME2}
-    return build("nlink_parser", messages, tmp_path_factory.mktemp("nlink"))
-
-
 @pytest.fixture
-def publisher(nlink: dict[str, str], monkeypatch: pytest.MonkeyPatch, ros: Ros) -> Ros:
-    for name, value in nlink.items():
-        monkeypatch.setenv(name, value)
-    ros.run([sys.executable, "-c", PUBLISHER])
-    return ros
-
-
-@pytest.fixture
-def anchors(tmp_path: Path) -> Path:
-    path = tmp_path / "anchors.yaml"
-    path.write_text(dump_anchors(AnchorMap([Anchor(key, place) for key, place in CORNERS.items()])))
+def markers(tmp_path: Path) -> Path:
+    """Return the file of a user's mapping for messages that contain an array of messages."""
+    path = tmp_path / "markers.yaml"
+    path.write_text(MAPPING)
     return path
 
 
-def wait_for_position(ros: Ros, poses: list[PoseWithCovarianceStamped]) -> None:
-    def arrived() -> bool:
-        point = poses[-1].pose.pose.position if poses else Point(x=math.nan)
-        return math.dist((point.x, point.y), TAG[:2]) < 0.1
+def send_ranges(ros: Ros) -> None:
+    """Publish ranges 20 times a second while the client spins."""
+    publisher = ros.node.create_publisher(MarkerArray, "/site/ranges", 10)
+    ranges_m = {number: math.dist(TAG, corner) for number, corner in CORNERS.items()} | {7: 0.0}
+    shown = [Marker(id=n, scale=Vector3(x=range_m, y=-80.5, z=-85.0)) for n, range_m in ranges_m.items()]
+    ros.node.create_timer(0.05, lambda: publisher.publish(MarkerArray(markers=shown)))
 
-    ros.spin_until(arrived)
+
+def has_position(poses: list[PoseWithCovarianceStamped]) -> bool:
+    point = poses[-1].pose.pose.position if poses else Point(x=math.nan)
+    return math.dist((point.x, point.y), TAG[:2]) < 0.1
 
 
 @pytest.mark.ros
-def test_ranges_of_linktrack_give_poses_and_pass_the_mitigator(publisher: Ros, anchors: Path):
-    ros = publisher
+def test_ranges_of_a_users_message_give_poses_and_pass_the_mitigator(ros: Ros, markers: Path, tmp_path: Path):
+    anchors = tmp_path / "anchors.yaml"
+    anchors.write_text(dump_anchors(AnchorMap([Anchor(key, place) for key, place in CORNERS.items()])))
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
-    raw, corrected = (
-        ros.collect(RangeCir, "/uwb/range_raw"),
-        ros.collect(RangeCorrected, "/uwb/range_corrected"),
-    )
-    ros.start("driver", "source:=topic", "map:=nlink_nodeframe2")
+    raw = ros.collect(RangeCir, "/uwb/range_raw")
+    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
+    ros.start("driver", "source:=topic", f"map:={markers}")
     ros.start("mitigator", "offsets:=0.25")
     ros.start("locator", "ranges:=uwb/range_raw", f"anchors:={anchors}", *LEVEL)
-    wait_for_position(ros, poses)
-    ros.spin_until(lambda: len(raw) > 40 and len(corrected) > 0)
+    send_ranges(ros)
+    ros.spin_until(lambda: has_position(poses) and len(raw) > 40 and len(corrected) > 0)
     assert {(message.tag_id, message.anchor_id) for message in raw} == {(9, corner) for corner in CORNERS}
-    (measured,) = [message for message in raw if message.anchor_id == 2][:1]
+    measured = next(message for message in raw if message.anchor_id == 2)
     assert measured.range == pytest.approx(math.dist(TAG, CORNERS[2]), abs=1e-4)
     assert (measured.cir.rx_power, measured.cir.first_path_power) == pytest.approx((-80.5, -85.0))
     assert corrected[0].status == RangeCorrected.NO_CIR
-    assert corrected[0].range == pytest.approx(
-        math.dist(TAG, CORNERS[corrected[0].anchor_id]) - 0.25, abs=1e-4
-    )
+    true_m = math.dist(TAG, CORNERS[corrected[0].anchor_id])
+    assert corrected[0].range == pytest.approx(true_m - 0.25, abs=1e-4)
 
 
 PLACES = [Pose(position=Point(x=x, y=y, z=z)) for x, y, z in CORNERS.values()]
 
 
 @pytest.mark.ros
-def test_locator_takes_a_mapping_and_anchors_from_a_topic(publisher: Ros):
-    ros = publisher
+def test_locator_takes_a_mapping_and_anchors_from_a_topic(ros: Ros, markers: Path):
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
-    ros.start("locator", "ranges:=nlink_nodeframe2", "anchors:=poses:/site/anchors", *LEVEL)
-    sender = ros.node.create_publisher(PoseArray, "/site/anchors", LATCHED)
-    sender.publish(PoseArray(poses=PLACES))
-    wait_for_position(ros, poses)
+    ros.start("locator", f"ranges:={markers}", "anchors:=poses:/site/anchors", *LEVEL)
+    ros.node.create_publisher(PoseArray, "/site/anchors", LATCHED).publish(PoseArray(poses=PLACES))
+    send_ranges(ros)
+    ros.spin_until(lambda: has_position(poses))
 
 
 def test_anchors_are_markers_or_poses():
@@ -133,10 +118,7 @@ def test_driver_reports_a_type_that_is_not_installed(ros: Ros):
 
 @pytest.mark.ros
 def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
-    received, diagnostics = (
-        ros.collect(RangeCir, "/uwb/range_raw"),
-        ros.collect(DiagnosticArray, "/diagnostics"),
-    )
+    received = ros.collect(RangeCir, "/uwb/range_raw")
     ros.start("driver", "source:=topic", "map:=string_json")
     sender = ros.node.create_publisher(String, "/uwb/json", QoSProfile(depth=100))
     texts = ["{", '{"tag": 7}', '{"tag": -1, "ranges": [{"anchor": 1, "range_m": 4.5}]}']
@@ -150,12 +132,8 @@ def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
     ros.spin_until(sent)
     assert {(message.tag_id, message.anchor_id, message.range) for message in received} == {(7, 1, 4.5)}
 
-    def counted() -> dict[str, str]:
-        statuses = [status for message in diagnostics for status in message.status if "driver" in status.name]
-        return diagnostic_values(statuses[-1]) if statuses else {}
-
     for reason in ("range is not a number", "message that cannot be used"):
-        ros.spin_until(lambda reason=reason: int(counted().get(reason, 0)) > 2)
+        ros.diagnosis("driver", lambda s, reason=reason: int(diagnostic_values(s).get(reason, 0)) > 2)
 
 
 # The mappings ----------------------------------------------------------------------------------------------------
@@ -172,9 +150,7 @@ class Convert:
 
     def take(self, message: Any, topic: str = "/x") -> list[tuple[int, int, float]]:
         self.ranges.take(message, topic)
-        return [
-            (measured.tag_id, measured.anchor_id, round(measured.range_m, 4)) for measured in self.published
-        ]
+        return [(m.tag_id, m.anchor_id, round(m.range_m, 4)) for m in self.published]
 
 
 @pytest.fixture
@@ -183,10 +159,8 @@ def types(monkeypatch: pytest.MonkeyPatch) -> None:
         "gtec_msgs": ("Ranging", "UWBRanging", "PozyxRangingWithCir"),
         "nlink_parser": ("LinktrackNodeframe3", "LinktrackTagframe0"),
     }.items():
-        module = ModuleType(f"{package}.msg")
-        for name in names:
-            setattr(module, name, SimpleNamespace)
-        monkeypatch.setitem(sys.modules, package, ModuleType(package))
+        module = SimpleNamespace(**dict.fromkeys(names, SimpleNamespace))
+        monkeypatch.setitem(sys.modules, package, module)
         monkeypatch.setitem(sys.modules, f"{package}.msg", module)
 
 
@@ -207,17 +181,15 @@ def test_gtec_messages(types: None):
     assert (convert.published[0].sequence, convert.published[0].cir.rx_power_dbm) == (12, -81.5)
     convert = Convert("gtec_uwbranging")
     registers = {"firstPathAmp1": 4889, "firstPathAmp2": 13876, "firstPathAmp3": 10464, "maxGrowthCIR": 9048}
-    message = SimpleNamespace(
-        anchorId=2, tagId=7, range=4310, seq=1, firstPath=749 * 64 + 32, rxPreamCount=1024, channel=5.0, prf=64, **registers
-    )  # fmt: skip
+    registers |= {"firstPath": 749 * 64 + 32, "rxPreamCount": 1024, "channel": 5.0, "prf": 64}
+    message = SimpleNamespace(anchorId=2, tagId=7, range=4310, seq=1, **registers)
     assert convert.take(message) == [(7, 2, 4.31)]
     cir = convert.published[0].cir
     assert (cir.first_path_index, cir.preamble_count, cir.channel) == (749.5, 1024, 5)
     assert cir.rx_power_dbm == pytest.approx(-91.2, abs=0.1)
     convert = Convert("gtec_pozyx_cir")
-    message = SimpleNamespace(
-        originId=0x6A40, destinationId=0x6A41, range=2500, seq=1, rxPower=-79.0, channel=5.0, cir=np.array([1, -2, 3, 4], np.int16)
-    )  # fmt: skip
+    fields = {"rxPower": -79.0, "channel": 5.0, "cir": np.array([1, -2, 3, 4], np.int16)}
+    message = SimpleNamespace(originId=0x6A40, destinationId=0x6A41, range=2500, seq=1, **fields)
     assert convert.take(message) == [(0x6A40, 0x6A41, 2.5)]
     assert convert.published[0].cir.samples.tolist() == [1, -2, 3, 4]
 
@@ -234,16 +206,13 @@ def test_standard_messages():
     convert = Convert("string_at")
     assert convert.take(String(data=line)) == [(4, 0, 0.72), (4, 2, 1.31)]
     assert [measured.cir.rx_power_dbm for measured in convert.published] == [-77.6, -75.13]
-    assert Convert("string_json").take(
-        String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
-    ) == [(1, 2, 3.0)]
+    message = String(data='{"tag": 1, "ranges": [{"anchor": 2, "range_m": 3}]}')
+    assert Convert("string_json").take(message) == [(1, 2, 3.0)]
 
 
 def test_lines_of_text_are_read_with_a_pattern():
-    fields = {
-        "anchor": {"column": "a", "hex": True},
-        "range": {"column": "r", "unit": "cm", "units": {30: "m"}},
-    }
+    distance = {"column": "r", "unit": "cm", "units": {30: "m"}}
+    fields = {"anchor": {"column": "a", "hex": True}, "range": distance}
     document = {"name": "lines", "type": "std_msgs/msg/String", "topics": ["/log"], "fields": fields}
     convert = Convert(Mapping.model_validate(document | {"pattern": r"from (?P<a>\w+): (?P<r>[\d.]+)"}))
     assert convert.take(String(data="from 1D: 250; from 1E: 3.5")) == [(1, 29, 2.5), (1, 30, 3.5)]
@@ -260,14 +229,15 @@ def test_ranges_without_an_id_are_counted():
 
 def test_hostile_texts_are_counted():
     convert = Convert("string_json")
-    for text in (
+    texts = [
         "[" * 100_000,
         '{"ranges": 5, "tag": 1}',
         '{"tag": 1, "ranges": "abc"}',
         "9" * 5000,
         "null",
         "[]",
-    ):
+    ]
+    for text in texts:
         convert.take(String(data=text))
     many = '{"tag": 1, "ranges": [' + ",".join(['{"anchor": 1, "range_m": 2}'] * 5000) + "]}"
     assert convert.take(String(data=many)) == []

@@ -6,6 +6,7 @@ import contextlib
 import os
 import struct
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,10 +22,10 @@ from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.radios.capture import CaptureWriter, first_line
 from uwb_mitigation.radios.fira import codes, messages
 from uwb_mitigation.radios.fira.calibration import OriginalsFile
-from uwb_mitigation.radios.fira.cir import PositionUnit, read_cir
+from uwb_mitigation.radios.fira.cir import CirReport, PositionUnit, read_cir
 from uwb_mitigation.radios.fira.codes import PacketType
 from uwb_mitigation.radios.fira.joining import DiagnosticsMatcher
-from uwb_mitigation.radios.fira.messages import Diagnostics
+from uwb_mitigation.radios.fira.messages import CirBlock, Diagnostics, SegmentMetrics
 from uwb_mitigation.radios.fira.packets import MAX_GAP_NS, PacketDecoder, encode_packets
 from uwb_mitigation.radios.fira.session import UciSession, UciSettings
 from uwb_mitigation.radios.port import PortAddress
@@ -33,6 +34,7 @@ from uwb_mitigation.radios.uci import UciPort, UciPortSettings, open_capture
 from uwb_mitigation.types.measurement import RadioType, RangeMeasurement, Segment
 
 FIRST_LINE = first_line("UCI")
+TAG_LINES = f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [2]}}\n'
 MS = 10**6
 RANGE = bytes.fromhex(
     # seq 7, handle 1, rfu, 200 ms, two-way, rfu, short, primary session, rfu, 1 record
@@ -40,11 +42,13 @@ RANGE = bytes.fromhex(
     # peer 2, ok, NLOS unknown, 210 cm, AoA, slot, RSSI 78 dBm, rfu
     "0200 00 ff d200 000000000000000000000000 00 9c 0000000000000000000000"
 )
+RANGE_PACKET = bytes.fromhex("62000038") + RANGE
 WORKING_CONFIG = bytes.fromhex(
     "2103006a 01000000 1b 000101 110101 030100 010102 06020000 040109 220101 020100 120103 2e010b"
     "27020807 2806010203040506 0d0101 2b080000000000000000 14010a 150102 08026009 0904c8000000 1b0119"
     "32020000 2c0100 130100 2d0100 050101 07020100 240100 350101"
 )
+ANCHOR = {"role": Role.ANCHOR, "address": 2, "peers": (1,)}
 
 
 class Bench:
@@ -60,6 +64,11 @@ class Bench:
         self.sent = b""
         self.session.opened(0)
 
+    @property
+    def handle(self) -> int:
+        (handle,) = self.board.sessions
+        return handle
+
     def step(self, data: bytes = b"", ms: float = 5.0) -> None:
         self.now_ns += round(ms * MS)
         self.measured_ranges += self.session.receive(data, self.now_ns, self.now_ns)
@@ -69,126 +78,232 @@ class Bench:
         if answer:
             self.measured_ranges += self.session.receive(answer, self.now_ns, self.now_ns)
 
-    def start(self, steps: int = 2000) -> Bench:
-        for _ in range(steps):
+    def wait(self, seconds: float) -> Bench:
+        for _ in range(round(seconds / 0.005)):
+            self.step()
+        return self
+
+    def wait_for(self, state: str, seconds: float = 20.0) -> str:
+        """Wait until the state contains a text; return it."""
+        for _ in range(round(seconds / 0.005)):
+            self.step()
+            if state in self.session.state:
+                break
+        return self.session.state
+
+    def start(self, seconds: float = 10.0) -> Bench:
+        for _ in range(round(seconds / 0.005)):
             self.step()
             if not self.session.state:
                 return self
         raise AssertionError(self.session.state)
 
-    def exchange(self, sequence: int, distance_m: float = 3.0) -> None:
-        (handle,) = self.board.sessions
-        self.step(self.board.exchange(handle, sequence, distance_m), 18.0)
+    def start_again(self) -> Bench:
+        """Open the port once more."""
+        self.session.closed(0)
+        self.session.opened(self.now_ns)
+        return self.start()
+
+    def stop(self) -> dict[str, int]:
+        """Stop the session; return the calibration of its board."""
+        self.session.stop(self.now_ns)
+        while not self.session.stopped:
+            self.step()
+        return self.board._calibration
+
+    def range(self, sequence: int, distance_m: float = 3.0) -> bytes:
+        return self.board.range_packet(self.handle, sequence, distance_m)
+
+    def diagnostics(self, sequence: int) -> bytes:
+        return self.board.diagnostics_packet(self.handle, sequence)
+
+    def exchange(self, *sequences: int, handle: int = 0, distance_m: float = 3.0) -> Bench:
+        for sequence in sequences:
+            self.step(self.board.exchange(handle or self.handle, sequence, distance_m), 18.0)
+        return self
 
 
 def bench(**faults: object) -> Bench:
     return Bench(UciBoardModel(faults=UciFaults(**faults)))
 
 
+def taps_in(measured: RangeMeasurement) -> int:
+    """Return the number of taps in a range; those of another exchange are a failure."""
+    count = len(measured.cir)
+    expected = taps_of(measured.sequence, count, 5)
+    assert np.array_equal(measured.cir.samples.reshape(-1, 2), expected) or not count
+    return count
+
+
+class Answering(UciBoardModel):
+    """Gives other answers to some commands.
+
+    Args:
+        answers: {name of the command: payload of the answer, or a function of the payload of the command}; None: the usual one.
+    """
+
+    def __init__(self, answers: dict[tuple[int, int], bytes | Callable[[bytes], bytes | None]]) -> None:
+        self.answers = answers
+        super().__init__()
+
+    def _command(self, name, payload, now_s):
+        answer = self.answers.get(name)
+        if callable(answer):
+            answer = answer(payload)
+        return super()._command(name, payload, now_s) if answer is None else self._respond(name, answer)
+
+
+# Messages --------------------------------------------------------------------------------------------------------
+
+
 def test_a_range_notification_of_a_real_board_is_parsed():
-    (message,) = PacketDecoder().feed(bytes.fromhex("62000038") + RANGE, 0)
+    (message,) = PacketDecoder().feed(RANGE_PACKET, 0)
     (record,) = message.content.records
     assert (message.content.handle, message.content.sequence) == (1, 7)
     assert (record.peer, record.status, record.range_m, record.rssi_dbm) == (2, 0, 2.10, -78.0)
 
 
-@pytest.mark.parametrize(("position", "value"), [(27, 0x21), (29, 0xFFFF)])
-def test_a_failed_or_invalid_range_has_no_distance(position: int, value: int):
-    data = bytearray(RANGE)
-    data[position : position + 2] = struct.pack("<H", value) if position == 29 else bytes([value, 0xFF])
-    assert np.isnan(messages.parse_ranges(bytes(data)).records[0].range_m)
+@pytest.mark.parametrize(("position", "value"), [(27, b"\x21\xff"), (29, b"\xff\xff")])
+def test_a_failed_or_invalid_range_has_no_distance(position: int, value: bytes):
+    data = RANGE[:position] + value + RANGE[position + 2 :]
+    assert np.isnan(messages.parse_ranges(data).records[0].range_m)
 
 
 def test_the_settings_of_a_session_are_those_that_worked_on_a_real_board():
     commands = Bench(address=0x1111, peers=(1,), interval_ms=200).start().sent
     packet = commands[commands.index(bytes.fromhex("21030070")) :][: 4 + 0x70]
-    expected = WORKING_CONFIG.replace(b"\x06\x02\x00\x00", b"\x06\x02\x11\x11").replace(
-        b"\x1b\x01\x19", b"\x1b\x01\x06"
-    )
+    expected = WORKING_CONFIG.replace(b"\x06\x02\x00\x00", b"\x06\x02\x11\x11")
+    expected = expected.replace(b"\x1b\x01\x19", b"\x1b\x01\x06")
     assert packet[:3] + b"\x6a" + packet[4:8] + b"\x1b" + packet[9:-6] == expected
     assert packet[8] == 0x1D
     assert packet[-6:] == bytes.fromhex("e80101e90178")
 
 
+def test_a_damaged_length_hides_packets_only_until_a_timeout():
+    decoder = PacketDecoder()
+    assert decoder.feed(RANGE_PACKET[:3] + b"\xff" + RANGE_PACKET[4:] + RANGE_PACKET, 0) == []
+    assert [message.content.sequence for message in decoder.feed(b"", MAX_GAP_NS + 1)] == [7]
+
+
+def test_a_long_command_is_sent_in_fragments():
+    sent = encode_packets(1, 3, bytes(600))
+    assert [sent[0], sent[254], sent[508]] == [0x31, 0x31, 0x21]
+    assert len(sent) == 600 + 3 * 4
+
+
+@pytest.mark.parametrize(
+    ("reason", "text"), [(0x42, "initiation time"), (0x9F, "manufacturer"), (0x77, "unknown")]
+)
+def test_reasons_are_shown_in_words(reason: int, text: str):
+    assert text in codes.reason_text(reason)
+    assert f"0x{reason:02x}" in codes.reason_text(reason)
+
+
+# CIRs ------------------------------------------------------------------------------------------------------------
+
+
+def block(taps: np.ndarray, offset: int = -5, segment: int = 1) -> CirBlock:
+    return CirBlock(0, segment, True, offset, taps)
+
+
+def levels(index: int = 362, first_path: float = 362.5, peak: int = 363, segment: int = 1) -> SegmentMetrics:
+    return SegmentMetrics(0, segment, True, -80.0 - segment, -84.0, index, first_path, peak)
+
+
+def reading(
+    blocks: tuple[CirBlock, ...], metrics: tuple[SegmentMetrics, ...] = (), unit: PositionUnit | None = None
+) -> CirReport:
+    frame = messages.FrameReport(2, True, None, 0.0, metrics, blocks, False)
+    return read_cir(Diagnostics(1, 1, (frame,)), 9, -70.0, unit)
+
+
 def test_the_cir_has_the_taps_of_the_exchange():
-    run = Bench(window=157).start()
-    for sequence in range(1, 4):
-        run.exchange(sequence)
+    run = Bench(window=157).start().exchange(1, 2, 3)
     assert run.session.window == (157, 5)
     measured = run.measured_ranges[1]
     cir = measured.cir
     assert (measured.tag_id, measured.anchor_id, measured.sequence, measured.range_m) == (1, 2, 2, 3.0)
-    assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 157, 5))
+    assert taps_in(measured) == 157
     assert (cir.start_index, cir.first_path_index) == (FIRST_PATH - 5, FIRST_PATH + 2 / 64)
-    assert (cir.radio, cir.segment, cir.rx_power_dbm, cir.channel) == (
-        RadioType.DW3000,
-        Segment.STS,
-        -80.5,
-        9,
-    )
+    assert (cir.radio, cir.segment, cir.channel) == (RadioType.DW3000, Segment.STS, 9)
+    assert cir.rx_power_dbm == -80.5
 
 
 @pytest.mark.parametrize("tap_bytes", [4, 6, 8])
 @pytest.mark.parametrize("max_taps", [16, 64])
 def test_a_smaller_window_and_other_taps_are_used_as_delivered(tap_bytes: int, max_taps: int):
-    run = Bench(UciBoardModel(max_taps=max_taps, tap_bytes=tap_bytes), window=157).start()
-    run.exchange(1)
+    run = Bench(UciBoardModel(max_taps=max_taps, tap_bytes=tap_bytes), window=157).start().exchange(1)
     assert run.session.window == (max_taps, 5)
-    assert np.array_equal(run.measured_ranges[0].cir.samples.reshape(-1, 2), taps_of(1, max_taps, 5))
-
-
-def test_firmware_that_refuses_the_number_of_taps_gets_the_lead():
-    class Refusing(UciBoardModel):
-        def _set_calibration(self, payload):
-            return b"\2\x9d\0" not in payload and super()._set_calibration(payload)
-
-    assert Bench(Refusing(), window=157).start().session.window == (16, 5)
-
-
-def test_a_board_that_was_not_opened_has_all_counts():
-    assert UciSession(UciSettings()).totals().keys() == Bench().start().session.totals().keys()
+    assert taps_in(run.measured_ranges[0]) == max_taps
 
 
 def test_taps_of_18_bits_are_scaled_to_16_bits():
     taps = np.array([[0, 0], [131071, -131072], [-2, 2]], np.int32)
-    block = messages.CirBlock(0, 1, True, -1, taps)
-    frame = messages.FrameReport(1, True, None, 0.0, (), (block,), False)
-    cir = read_cir(Diagnostics(1, 1, (frame,)), 9, -70.0).cir
+    cir = reading((block(taps, -1),)).cir
     assert np.all(np.abs(cir.samples.astype(int)) < 32767)
     assert np.abs(cir.samples.reshape(-1, 2) * cir.scale - taps).max() < cir.scale
     assert (cir.first_path_index, cir.rx_power_dbm) == (1.0, -70.0)
 
 
-@pytest.mark.parametrize("has_position", [True, False])
+@pytest.mark.parametrize("metrics", [(), (levels(),)], ids=["without levels", "with levels"])
 @pytest.mark.parametrize(
     ("offset", "consistent"), [(-5, True), (-3, False), (-8, False), (-9, False), (-40, False), (120, False)]
 )
-def test_the_first_path_is_checked_against_the_leading_edge(
-    offset: int, consistent: bool, has_position: bool
-):
-    block = messages.CirBlock(0, 1, True, offset, taps_of(1, 64, 5))
-    metrics = (messages.SegmentMetrics(0, 1, True, -80.0, -84.0, 362, 362.5, 363),) * has_position
-    frame = messages.FrameReport(2, True, None, 0.0, metrics, (block,), False)
-    reading = read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan)
-    assert reading.consistent is consistent
-    assert np.isfinite(reading.cir.first_path_index) == consistent
+def test_the_first_path_is_checked_against_the_leading_edge(offset: int, consistent: bool, metrics: tuple):
+    report = reading((block(taps_of(1, 64, 5), offset),), metrics)
+    assert report.consistent is consistent
+    assert np.isfinite(report.cir.first_path_index) == consistent
 
 
 @pytest.mark.parametrize(("peak", "consistent"), [(3, True), (-3, False)])
 def test_the_reported_peak_is_searched_after_the_first_path(peak: int, consistent: bool):
     taps = np.full((16, 2), (5, 0), np.int32)
     taps[[5, 8]] = (300, 0), (1000, 0)
-    metrics = messages.SegmentMetrics(0, 1, True, -80.0, -84.0, 362, 362.5, 362 + peak)
-    block = messages.CirBlock(0, 1, True, -5, taps)
-    frame = messages.FrameReport(2, True, None, 0.0, (metrics,), (block,), False)
-    assert read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan).consistent is consistent
+    assert reading((block(taps),), (levels(peak=362 + peak),)).consistent is consistent
+
+
+def test_of_two_primary_segments_the_sts_is_used():
+    blocks = tuple(block(taps_of(segment + 1, 16, 5), segment=segment) for segment in (0, 1))
+    cir = reading(blocks, (levels(739, 739.5, 740, 0), levels())).cir
+    assert (cir.segment, cir.start_index, cir.rx_power_dbm) == (Segment.STS, 357, -81.0)
+    assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 16, 5))
+    # The levels of another segment are not those of its taps.
+    assert reading(blocks[1:], (levels(739, 739.5, 740, 0),)).cir.start_index == 0
+
+
+@pytest.mark.parametrize(
+    ("index", "scale", "unit"),
+    [
+        *((index, 1.0, "taps") for index in (362, 739)),
+        *((index, 1.0016, "nanoseconds") for index in (362, 739)),
+        (362, 1.02, "contradictory"),
+    ],
+)
+def test_first_path_positions_are_in_taps_or_nanoseconds(index: int, scale: float, unit: str):
+    position_unit, errors = PositionUnit(), []
+    for number in range(64):
+        first_path = index + number * 37 % 64 / 64
+        reported = levels(index, round(64 * first_path * scale) / 64, index + 1)
+        report = reading((block(taps_of(number, 16, 5)),), (reported,), position_unit)
+        errors.append(report.cir.first_path_index - first_path)
+    assert position_unit.name == unit
+    assert np.abs(errors[8:]).max() < (0.02 if unit != "contradictory" else 1.0)
+
+
+def test_a_cir_of_an_unknown_layout_is_skipped_but_its_levels_are_used():
+    run = Bench(UciBoardModel(tap_bytes=10)).start().exchange(1)
+    (measured,) = run.measured_ranges
+    assert len(measured.cir) == 0
+    assert measured.cir.rx_power_dbm == -80.5
+    assert run.session.totals()["damaged"] == 0
 
 
 def test_an_anchor_uses_the_final_frame_and_ranges_with_its_tag():
-    run = Bench(role=Role.ANCHOR, address=2, peers=(1,)).start()
-    run.exchange(1)
-    assert (run.measured_ranges[0].tag_id, run.measured_ranges[0].anchor_id) == (1, 2)
-    assert len(run.measured_ranges[0].cir) == 16
+    (measured,) = Bench(**ANCHOR).start().exchange(1).measured_ranges
+    assert (measured.tag_id, measured.anchor_id, len(measured.cir)) == (1, 2, 16)
+
+
+# Joins -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -197,76 +312,179 @@ def test_an_anchor_uses_the_final_frame_and_ranges_with_its_tag():
 def test_every_range_arrives_with_its_own_cir_or_without(faults: dict):
     run = bench(**faults).start()
     for sequence in range(1, 400):
-        run.exchange(sequence, 1.0 + sequence / 100)
+        run.exchange(sequence, distance_m=1.0 + sequence / 100)
     run.step(ms=500)
     assert len({m.sequence for m in run.measured_ranges}) > 370
-    assert sum(len(m.cir) > 0 for m in run.measured_ranges) > 250
-    for measured in run.measured_ranges:
-        assert measured.range_m == pytest.approx(1.0 + measured.sequence / 100)
-        if len(measured.cir):
-            assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 16, 5))
+    assert sum(taps_in(m) > 0 for m in run.measured_ranges) > 250
+    assert all(m.range_m == pytest.approx(1.0 + m.sequence / 100) for m in run.measured_ranges)
 
 
 def test_diagnostics_after_the_next_range_are_joined_on_a_good_link():
-    run = bench(late=1.0).start()
-    for sequence in range(1, 50):
-        run.exchange(sequence)
+    run = bench(late=1.0).start().exchange(*range(1, 50))
     assert all(len(m.cir) == 16 for m in run.measured_ranges)
     assert len(run.measured_ranges) >= 47
 
 
-def test_a_damaged_sequence_number_is_not_joined():
-    run = Bench().start()
-    (handle,) = run.board.sessions
-    for sequence in range(1, 101):
-        run.exchange(sequence)
+@pytest.mark.parametrize("is_swapped", [False, True], ids=["range first", "diagnostics first"])
+def test_a_damaged_sequence_number_is_not_joined(is_swapped: bool):
+    run = bench(swap=float(is_swapped)).start().exchange(*range(1, 101))
     count = len(run.measured_ranges)
     # The range of exchange 101 claims to be 102, whose own range and the diagnostics of 101 are lost.
-    run.step(run.board.range_packet(handle, 102, 9.0), 18)
-    run.step(run.board.diagnostics_packet(handle, 102), 18)
+    packets = [run.range(102, 9.0), run.diagnostics(102)]
+    for packet in packets[::-1] if is_swapped else packets:
+        run.step(packet, 18)
     run.step(ms=500)
     assert [(m.range_m, len(m.cir)) for m in run.measured_ranges[count:]] == [(9.0, 0)]
 
 
 def test_halves_of_two_notifications_are_not_assembled():
-    run = Bench(window=64).start()
-    (handle,) = run.board.sessions
-    for sequence in range(1, 20):
-        run.exchange(sequence)
-    first, second = (run.board.diagnostics_packet(handle, number) for number in (20, 21))
+    run = Bench(window=64).start().exchange(*range(1, 20))
+    first, second = run.diagnostics(20), run.diagnostics(21)
     assert len(first) > 2 * 259 - 100
-    run.step(run.board.range_packet(handle, 20, 3.0), 18)
+    run.step(run.range(20), 18)
     run.step(first[:259], 0.1)
-    run.step(run.board.range_packet(handle, 21, 3.0) + second[259:], 20)
+    run.step(run.range(21) + second[259:], 20)
     run.step(ms=500)
     assert [len(m.cir) for m in run.measured_ranges[-2:]] == [0, 0]
 
 
 def test_a_range_of_another_session_or_peer_is_ignored():
     run = Bench().start()
-    (handle,) = run.board.sessions
-    swapped = UciFaults(swapped_ids=True)
-    for number in (handle, handle + 7):
-        run.board.sessions[number] = run.board.sessions[handle]
-        run.board.faults = swapped if number == handle else UciFaults()
-        run.step(run.board.range_packet(number, 1, 3.0) + run.board.diagnostics_packet(number, 1), 18)
+    handle, board = run.handle, run.board
+    for number, is_swapped in ((handle, True), (handle + 7, False)):
+        board.sessions[number] = board.sessions[handle]
+        board.faults = UciFaults(swapped_ids=is_swapped)
+        run.step(board.range_packet(number, 1, 3.0) + board.diagnostics_packet(number, 1), 18)
     run.step(ms=500)
     assert not run.measured_ranges
     assert run.session.counts["unknown_session"] >= 2
 
 
-def test_error_answers_are_repeated_until_the_board_ranges():
-    run = bench(errors=0.15).start(20_000)
-    assert run.session.counts["error_answers"] > 0
+def test_ranges_are_published_in_order_and_soon_after_a_lost_cir():
+    run = Bench().start().exchange(*range(1, 41))
+    run.step(run.range(41), 18)
+    run.step(run.board.exchange(run.handle, 42, 3.0), 2.0)
+    arrived_ns = run.now_ns
+    while run.measured_ranges[-1].sequence < 42:
+        run.step(ms=1.0)
+    assert run.now_ns - arrived_ns <= 6 * MS
+    assert [m.sequence for m in run.measured_ranges] == sorted(m.sequence for m in run.measured_ranges)
+    assert [len(m.cir) for m in run.measured_ranges[-2:]] == [0, 16]
 
 
-def test_a_board_that_restarts_by_itself_ranges_again():
+def test_repeated_notifications_are_published_once():
     run = Bench().start()
-    run.step(run.board.boot())
-    run.start()
-    run.exchange(1)
+    for sequence in range(1, 101):
+        run.step(2 * run.range(sequence) + 2 * run.diagnostics(sequence), 18)
+    assert [m.sequence for m in run.measured_ranges] == list(range(1, 101))
+    assert all(len(m.cir) == 16 for m in run.measured_ranges)
+    assert run.session.counts["duplicates"] == 200
+
+
+def test_ranges_without_diagnostics_are_published_without_delay():
+    run = Bench().start()
+    for sequence in range(100):
+        run.step(run.range(sequence), 18)
+    assert len(run.measured_ranges) == 100
+    assert run.measured_ranges[-1].stamp_ns == run.now_ns
+    assert str(CirKind.of(run.measured_ranges[-1].cir)) == "DW3000 without CIR"
+
+
+@pytest.mark.parametrize("masks", [(0x38, 0x40), (0x18, 0x20, 0x40)])
+@pytest.mark.parametrize("position", [0, 1, 2])
+def test_diagnostics_in_several_notifications_are_joined(masks: tuple[int, ...], position: int):
+    run = Bench().start()
+    config = run.board.sessions[run.handle].config
+    for sequence in range(1, 60):
+        parts = []
+        for mask in masks:
+            config[0xE9] = bytes([mask])
+            parts.append(run.diagnostics(sequence))
+        parts.insert(position, run.range(sequence))
+        for part in parts:
+            run.step(part, 18 / len(parts))
+    assert len(run.measured_ranges) >= 58
+    for measured in run.measured_ranges[6:]:
+        assert taps_in(measured) == 16
+        assert measured.cir.start_index == FIRST_PATH - 5
+    # A board that reports them in one notification again, after other firmware was loaded.
+    config[0xE9] = b"\x78"
+    count = len(run.measured_ranges)
+    run.exchange(*range(60, 120))
+    assert run.measured_ranges[-1].sequence == 119
+    assert all(len(m.cir) == 16 for m in run.measured_ranges[count + 8 :])
+
+
+def test_sessions_that_share_a_counter_get_their_cirs():
+    run = Bench(peers=(2, 3)).start()
+    for sequence in range(1, 201):
+        run.exchange(sequence, handle=1 + sequence % 2)
+    assert {m.anchor_id for m in run.measured_ranges[-2:]} == {2, 3}
+    assert all(len(m.cir) == 16 for m in run.measured_ranges[-60:])
+    # A lost range is still a gap in the sequence.
+    gaps = run.session.totals()["gaps"]
+    run.exchange(205, handle=1 + 205 % 2)
+    assert run.session.totals()["gaps"] > gaps
+
+
+def test_the_benchmark_finds_no_wrong_join_but_would_find_one(monkeypatch: pytest.MonkeyPatch):
+    result = uci.joins(1000, 16, 0.05, 0.01, 1, lambda _: None)
+    assert (result.wrong, result.exchanges) == (0, 1000)
+    assert result.with_cir > 300
+    packet = UciBoardModel.diagnostics_packet
+
+    def previous_cir(self, handle: int, sequence: int) -> bytes:
+        built = packet(self, handle, sequence - 1)
+        return built[:8] + struct.pack("<I", sequence) + built[12:]
+
+    monkeypatch.setattr(DiagnosticsMatcher, "_accept", lambda *_, **__: True)
+    monkeypatch.setattr(UciBoardModel, "diagnostics_packet", previous_cir)
+    assert uci.joins(200, 16, 0.0, 0.0, 1, lambda _: None).wrong > 100
+
+
+@pytest.mark.parametrize(
+    ("keep", "warning"),
+    [
+        (lambda packet: packet[:60] + packet[61:], "bytes or notifications are lost between board and host"),
+        (lambda packet: packet[:-100], "bytes or notifications are lost between board and host"),
+        (lambda packet: b"", "most ranges have no CIR: the firmware may not support it"),
+    ],
+    ids=["lost byte", "lost fragment", "never sent"],
+)
+def test_ranges_without_cir_are_explained_by_damaged_notifications_first(keep, warning: str):
+    run = Bench(window=157).start()
+    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), (0, None, print, lambda: 0))
+    port.session = run.session
+    for sequence in range(1, 60):
+        port.monitor.add_range(time.monotonic())
+        run.step(run.range(sequence), 5.0)
+        run.step(keep(run.diagnostics(sequence)), 95.0)
+    assert port.report().warning.startswith(warning)
+
+
+# Sessions --------------------------------------------------------------------------------------------------------
+
+
+def test_error_answers_are_repeated_until_the_board_ranges():
+    assert bench(errors=0.15).start(100.0).session.counts["error_answers"] > 0
+
+
+def test_responses_have_no_effect_before_their_command():
+    run = Bench()
+    run.step(encode_packets(*codes.RANGE_START, b"\0", PacketType.RESPONSE) * 10)
+    assert run.session.state
+
+
+@pytest.mark.parametrize("is_reset", [True, False], ids=["the board", "the session"])
+def test_a_board_or_session_that_restarts_ranges_again_and_keeps_its_counts(is_reset: bool):
+    run = Bench().start().exchange(1, 2, 3)
+    before = run.session.totals()
+    run.board.sessions[run.handle].active = False
+    run.step(run.board.boot() if is_reset else run.board._state(run.handle, 3))
+    run.start().exchange(1, 2)
     assert run.session.starts == 2
-    assert run.measured_ranges
+    assert [m.sequence for m in run.measured_ranges] == [1, 2, 3, 1, 2]
+    assert all(run.session.totals()[name] >= count for name, count in before.items())
 
 
 class Ending(UciBoardModel):
@@ -274,6 +492,7 @@ class Ending(UciBoardModel):
 
     reason = 0x02
     set_calibrations = 0
+    ending = None
 
     def _command(self, name, payload, now_s):
         self.set_calibrations += name == codes.SET_CALIBRATION
@@ -284,7 +503,7 @@ class Ending(UciBoardModel):
 
     def receive(self, data, now_s):
         ended = b""
-        if getattr(self, "ending", None) in self.sessions and now_s >= self.end_s:
+        if self.ending in self.sessions and now_s >= self.end_s:
             self.sessions[self.ending].active = False
             status = struct.pack("<IBB", self.ending, 3, self.reason)
             self.ending, ended = None, self._notify(codes.SESSION_STATUS, status)
@@ -311,27 +530,15 @@ def test_a_session_that_ends_without_having_been_active_shows_its_reason():
         def _state(self, handle, state):
             return b"" if state == 2 else super()._state(handle, state)
 
-    run = Bench(Silent()).start()
-    for _ in range(100):
-        run.step()
-    assert "maximum number of measurements" in run.session.state
+    assert "maximum number of measurements" in Bench(Silent()).start().wait(0.5).session.state
 
 
 def test_a_refused_start_is_repeated_with_growing_pauses():
-    class Refusing(UciBoardModel):
-        starts = 0
-
-        def _command(self, name, payload, now_s):
-            if name == codes.SESSION_INIT:
-                self.starts += 1
-                return self._respond(name, b"\x14")
-            return super()._command(name, payload, now_s)
-
-    run = Bench(Refusing())
-    for _ in range(int(20 / 0.005)):
-        run.step()
-    assert run.board.starts <= 2 * 6
-    assert "the board refuses SESSION_INIT: too many sessions (status 0x14)" in run.session.state
+    starts = []
+    refusing = Answering({codes.SESSION_INIT: lambda _: starts.append(1) or b"\x14"})
+    state = Bench(refusing).wait(20.0).session.state
+    assert len(starts) <= 2 * 6
+    assert "the board refuses SESSION_INIT: too many sessions (status 0x14)" in state
 
 
 def test_one_session_that_ends_does_not_stop_the_others():
@@ -341,157 +548,75 @@ def test_one_session_that_ends_does_not_stop_the_others():
     run.step(run.board._state(first, 3))
     assert run.session.state
     for sequence in range(1, 60):
-        run.step(run.board.exchange(second, sequence, 3.0), 18.0)
+        run.exchange(sequence, handle=second)
         assert second in run.board.sessions
     assert run.session.state == ""
     assert len(run.measured_ranges) >= 58
 
 
-@pytest.mark.parametrize(
-    ("reason", "text"), [(0x42, "initiation time"), (0x9F, "manufacturer"), (0x77, "unknown")]
-)
-def test_reasons_are_shown_in_words(reason: int, text: str):
-    assert text in codes.reason_text(reason)
-    assert f"0x{reason:02x}" in codes.reason_text(reason)
-
-
-def test_calibration_is_written_only_if_it_differs_and_restored_at_the_end():
-    run = Bench(window=157).start()
-    assert run.session.counts["calibration_writes"] == 2
-    run.session.closed(0)
-    run.session.opened(run.now_ns)
-    run.start()
-    assert run.session.counts["calibration_writes"] == 2
-    run.session.stop(run.now_ns)
-    while not run.session.stopped:
+def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges():
+    refusals = [b"\x12"] * 3
+    busy = Answering({})
+    busy.answers[codes.SESSION_INIT] = lambda _: refusals.pop() if busy.sessions and refusals else None
+    run = Bench(busy, peers=(2, 3))
+    for number in range(400):
         run.step()
-    assert run.board._calibration == UciBoardModel()._calibration
-    assert not run.board.sessions
-    # A board that has the values already, as after another driver was killed, is not written to.
-    ready = UciBoardModel()
-    ready._calibration = dict(zip(ready._calibration, (157, 5), strict=True))
-    assert Bench(ready, window=157).start().session.counts["calibration_writes"] == 0
-    # Neither is a board that cannot report a key.
-    unreadable = UciBoardModel()
-    unreadable._get_calibration = lambda payload: b"\x01"
-    assert Bench(unreadable, window=157).start().session.counts["calibration_writes"] == 0
-
-
-def test_a_window_that_the_board_does_not_accept_is_not_written_again():
-    run = Bench(UciBoardModel(max_taps=64), window=157).start()
-    for _ in range(3):
-        run.session.closed(0)
-        run.session.opened(run.now_ns)
-        run.start()
-    assert run.session.counts["calibration_writes"] == 2
-    assert run.session.window == (64, 5)
-
-
-def test_a_mandatory_parameter_that_is_refused_is_named():
-    class Strict(UciBoardModel):
-        def _command(self, name, payload, now_s):
-            if name == codes.SET_APP_CONFIG:
-                return self._respond(name, bytes([0x04, 1, 0x06, 0x05]))
-            return super()._command(name, payload, now_s)
-
-    run = Bench(Strict())
-    for _ in range(200):
-        run.step()
-    assert "DEVICE_MAC_ADDRESS (0x06): value out of range (status 0x05)" in run.session.state
-
-
-def test_ranges_are_published_in_order_and_soon_after_a_lost_cir():
-    run = Bench().start()
-    (handle,) = run.board.sessions
-    for sequence in range(1, 41):
-        run.exchange(sequence)
-    run.step(run.board.range_packet(handle, 41, 3.0), 18)
-    run.step(run.board.exchange(handle, 42, 3.0), 2.0)
-    arrived_ns = run.now_ns
-    while run.measured_ranges[-1].sequence < 42:
-        run.step(ms=1.0)
-    assert run.now_ns - arrived_ns <= 6 * MS
-    assert [m.sequence for m in run.measured_ranges] == sorted(m.sequence for m in run.measured_ranges)
-    assert [len(m.cir) for m in run.measured_ranges[-2:]] == [0, 16]
-
-
-def test_repeated_notifications_are_published_once():
-    run = Bench().start()
-    (handle,) = run.board.sessions
-    for sequence in range(1, 101):
-        packets = (
-            run.board.range_packet(handle, sequence, 3.0),
-            run.board.diagnostics_packet(handle, sequence),
-        )
-        run.step(2 * packets[0] + 2 * packets[1], 18)
-    assert [m.sequence for m in run.measured_ranges] == list(range(1, 101))
-    assert all(len(m.cir) == 16 for m in run.measured_ranges)
-    assert run.session.counts["duplicates"] == 200
-
-
-def test_of_two_primary_segments_the_sts_is_used():
-    blocks = [messages.CirBlock(0, segment, True, -5, taps_of(segment + 1, 16, 5)) for segment in (0, 1)]
-    metrics = [
-        messages.SegmentMetrics(0, segment, True, -80.0 - segment, -84.0, index, index + 0.5, index + 1)
-        for segment, index in ((0, 739), (1, 362))
-    ]
-    frame = messages.FrameReport(1, True, None, 0.0, tuple(metrics), tuple(blocks), False)
-    cir = read_cir(Diagnostics(1, 1, (frame,)), 9, np.nan).cir
-    assert (cir.segment, cir.start_index, cir.rx_power_dbm) == (Segment.STS, 357, -81.0)
-    assert np.array_equal(cir.samples.reshape(-1, 2), taps_of(2, 16, 5))
-
-
-@pytest.mark.parametrize(
-    ("index", "scale", "unit"),
-    [
-        (362, 1.0, "taps"),
-        (362, 1.0016, "nanoseconds"),
-        (739, 1.0016, "nanoseconds"),
-        (739, 1.0, "taps"),
-        (362, 1.02, "contradictory"),
-    ],
-)
-def test_first_path_positions_are_in_taps_or_nanoseconds(index: int, scale: float, unit: str):
-    position_unit, errors = PositionUnit(), []
-    for number in range(64):
-        first_path = index + number * 37 % 64 / 64
-        reported = round(64 * first_path * scale) / 64
-        block = messages.CirBlock(0, 1, True, -5, taps_of(number, 16, 5))
-        metrics = messages.SegmentMetrics(0, 1, True, -80.0, -84.0, index, reported, index + 1)
-        frame = messages.FrameReport(1, True, None, 0.0, (metrics,), (block,), False)
-        report = read_cir(Diagnostics(1, number, (frame,)), 9, np.nan, position_unit)
-        errors.append(report.cir.first_path_index - first_path)
-    assert position_unit.name == unit
-    assert np.abs(errors[8:]).max() < (0.02 if unit != "contradictory" else 1.0)
+        for handle, session in list(busy.sessions.items()):
+            if session.active and handle in busy.sessions:
+                run.step(busy.range_packet(handle, number, 3.0))
+    assert run.session.state == ""
+    assert {measured.anchor_id for measured in run.measured_ranges} == {2, 3}
 
 
 def test_a_silent_board_is_started_again_but_a_waiting_anchor_is_not():
-    run = Bench(role=Role.ANCHOR, address=2, peers=(1,)).start()
-    for _ in range(2000):
-        run.step()
+    run = Bench(**ANCHOR).start().wait(10.0)
     assert run.session.starts == 1
     run.board.receive = lambda data, now_s: b""
-    for _ in range(2000):
-        run.step()
-    assert run.session.state
+    assert run.wait(10.0).session.state
 
 
-def test_ranges_without_diagnostics_are_published_without_delay():
-    run = Bench().start()
-    (handle,) = run.board.sessions
-    for sequence in range(100):
-        run.step(run.board.range_packet(handle, sequence, 3.0), 18)
-    assert len(run.measured_ranges) == 100
-    assert run.measured_ranges[-1].stamp_ns == run.now_ns
-    assert str(CirKind.of(run.measured_ranges[-1].cir)) == "DW3000 without CIR"
+def test_an_anchor_without_its_tag_waits_if_the_board_cannot_report_its_state():
+    run = Bench(Answering({codes.GET_SESSION_STATE: b"\x08"}), **ANCHOR).start().wait(10.0)
+    assert run.session.starts == 1
+    assert run.exchange(1).wait(10.0).session.starts == 2
+
+
+@pytest.mark.parametrize("is_missing", [False, True], ids=["out of range", "missing at the start"])
+def test_a_parameter_that_is_refused_is_named(is_missing: bool):
+    answers = {codes.SET_APP_CONFIG: b"\x04\x01\x06\x05"}
+    texts = ("DEVICE_MAC_ADDRESS (0x06): value out of range (status 0x05)",)
+    if is_missing:
+        # It rejects the slots per round, without which it does not range.
+        answers[codes.SET_APP_CONFIG] = lambda data: b"\x04\x01\x1b\x04" if b"\x1b\1" in data else None
+        answers[codes.RANGE_START] = b"\x15"
+        rejected = "it rejects SLOTS_PER_RR (0x1b): invalid parameter (status 0x04)"
+        texts = "a parameter is missing (status 0x15)", rejected
+    state = Bench(Answering(answers)).wait_for(texts[0])
+    assert all(text in state for text in texts)
+
+
+@pytest.mark.parametrize("line", [b"error\r\n", b"error \r\n\r\nerror\r\n", b"\r\n> unknown command\r\n"])
+def test_a_board_that_answers_with_text_is_not_called_mute(line: bytes):
+    run = Bench()
+    run.board.receive = lambda data, now_s: line if data else b""
+    state = run.wait_for("CLI image")
+    assert "answers with text" in state
+    assert line.decode().split()[0].strip(">") in state
+    assert "flash the UCI image" in state
+
+
+def test_random_bytes_are_no_text():
+    run = Bench()
+    run.board.receive = lambda data, now_s: b"\x81\x00\xff\x13" * 4 if data else b""
+    state = run.wait_for("CLI image")
+    assert state == "no answer to the reset: is this a board with UCI firmware?"
 
 
 @given(st.binary(max_size=600), st.integers(1, 40))
 @settings(max_examples=300)
 def test_no_bytes_make_a_session_fail(data: bytes, piece: int):
     run = Bench().start()
-    (handle,) = run.board.sessions
-    good = run.board.range_packet(handle, 1, 3.0)
+    good = run.range(1)
     for position in range(0, len(data), piece):
         run.step(data[position : position + piece])
     # A damaged length may hide up to 255 bytes; after a timeout the decoder searches inside of them.
@@ -516,162 +641,43 @@ def test_no_payload_makes_a_parser_fail(data: bytes):
 @given(st.data())
 @settings(max_examples=200)
 def test_damaged_diagnostics_are_parsed_or_refused(data: st.DataObject):
-    board = UciBoardModel()
-    run = Bench(board, window=16).start()
-    (handle,) = board.sessions
-    damaged_payload = bytearray(board.diagnostics_packet(handle, 1)[4:])
+    damaged_payload = bytearray(DIAGNOSTICS_PAYLOAD)
     for _ in range(data.draw(st.integers(1, 4))):
         damaged_payload[data.draw(st.integers(0, len(damaged_payload) - 1))] = data.draw(st.integers(0, 255))
-    try:
+    with contextlib.suppress(LinkError):
         content = messages.parse_diagnostics(bytes(damaged_payload))
-    except LinkError:
-        return
-    reading = read_cir(content, 9, np.nan)
-    assert len(reading.cir.samples) % 2 == 0
-    assert run.session.state == ""
+        assert len(read_cir(content, 9, np.nan).cir.samples) % 2 == 0
 
 
-def test_intact_packets_between_damaged_ones_are_found():
-    good = bytes.fromhex("62000038") + RANGE
-    random = np.random.default_rng(3)
-    decoder, count = PacketDecoder(), 0
-    for _ in range(200):
-        damaged = bytearray(good)
-        damaged[3] = int(random.integers(0, 256))
-        count += len(decoder.feed(random.bytes(20) + good + bytes(damaged) + good, 0))
-    # A header among the random bytes can hide the packet after it.
-    assert count > 300
+DIAGNOSTICS_PAYLOAD = Bench().start().diagnostics(1)[4:]
 
 
-def test_a_long_command_is_sent_in_fragments():
-    sent = encode_packets(1, 3, bytes(600))
-    assert [sent[0], sent[254], sent[508]] == [0x31, 0x31, 0x21]
-    assert len(sent) == 600 + 3 * 4
-
-
-def test_a_capture_replays_the_same_measurements(tmp_path):
-    run = Bench()
-    writer = CaptureWriter(tmp_path / "session.txt")
-    writer.add_board(0, asdict(run.session.settings) | {"role": "TAG"})
-    receive = run.session.receive
-
-    def recorded(data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
-        writer.add(0, data, sent=False)
-        return receive(data, now_ns, stamp_ns)
-
-    run.session.receive = recorded
-    run.start()
-    for sequence in range(1, 30):
-        run.exchange(sequence)
-    writer.close()
-    capture = open_capture(tmp_path / "session.txt")
-    for _ in range(2):
-        replayed = [record.measurement for record in capture]
-        assert [m.sequence for m in replayed] == [m.sequence for m in run.measured_ranges]
-        assert all(
-            np.array_equal(a.cir.samples, b.cir.samples)
-            for a, b in zip(replayed, run.measured_ranges, strict=True)
-        )
-
-
-@pytest.mark.parametrize(
-    ("text", "error"),
-    [
-        ("", RecordingError),
-        ("0.1 0 < 00", RecordingError),
-        (f"{first_line('UCI')}\n0.1 0 < 00", DamagedRecordingError),
-        (f"{first_line('UCI')}\nboard 0 {{", DamagedRecordingError),
-        (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [1]}}', DamagedRecordingError),
-        (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [2]}}\ninf 0 < 00', DamagedRecordingError),
-        (f'{FIRST_LINE}\nboard 0 {{"role": "TAG", "peers": [2]}}\n1 0 < 0g', DamagedRecordingError),
-        (f"{first_line('UCI')}\n" + "9" * 400_000, DamagedRecordingError),
-    ],
-)
-def test_a_capture_that_is_damaged_is_refused(tmp_path, text: str, error: type):
-    path = tmp_path / "session.txt"
-    path.write_text(text)
-    with pytest.raises(error):
-        list(open_capture(path))
-
-
-def test_a_capture_ends_at_its_limit_and_ignores_what_comes_after_its_end(tmp_path):
-    writer = CaptureWriter(tmp_path / "session.txt", limit_bytes=200)
-    for _ in range(2):
-        for _ in range(20):
-            writer.add(0, bytes(20), sent=False)
-        writer.close()
-    assert 100 < (tmp_path / "session.txt").stat().st_size <= 200
-
-
-def test_responses_have_no_effect_before_their_command():
-    run = Bench()
-    run.step(encode_packets(*codes.RANGE_START, b"\0", PacketType.RESPONSE) * 10)
-    assert run.session.state
-
-
-def test_the_benchmark_finds_no_wrong_join_but_would_find_one(monkeypatch: pytest.MonkeyPatch):
-    result = uci.joins(1000, 16, 0.05, 0.01, 1, lambda _: None)
-    assert (result.wrong, result.exchanges) == (0, 1000)
-    assert result.with_cir > 300
-    monkeypatch.setattr(DiagnosticsMatcher, "_accept", lambda *_, **__: True)
-    monkeypatch.setattr(UciBoardModel, "diagnostics_packet", _previous_cir(UciBoardModel.diagnostics_packet))
-    assert uci.joins(200, 16, 0.0, 0.0, 1, lambda _: None).wrong > 100
-
-
-def _previous_cir(packet):
-    def build(self, handle: int, sequence: int) -> bytes:
-        built = bytearray(packet(self, handle, sequence - 1))
-        built[8:12] = struct.pack("<I", sequence)
-        return bytes(built)
-
-    return build
-
-
-def test_a_second_session_that_is_refused_is_tried_again_while_the_first_ranges():
-    class Busy(UciBoardModel):
-        refusals = 3
-
-        def _command(self, name, payload, now_s):
-            if name == codes.SESSION_INIT and self.sessions and self.refusals:
-                self.refusals -= 1
-                return self._respond(name, b"\x12")
-            return super()._command(name, payload, now_s)
-
-    run = Bench(Busy(), peers=(2, 3))
-    for number in range(400):
-        run.step()
-        for handle, session in list(run.board.sessions.items()):
-            if session.active and handle in run.board.sessions:
-                run.step(run.board.range_packet(handle, number, 3.0))
-    assert run.session.state == ""
-    assert {measured.anchor_id for measured in run.measured_ranges} == {2, 3}
+# Unusual boards --------------------------------------------------------------------------------------------------
 
 
 class OneKey(UciBoardModel):
     """Sets one calibration key per command."""
 
+    def __init__(self) -> None:
+        super().__init__(count_bytes=1)
+
     def _set_calibration(self, payload):
         return payload[0] == 1 and super()._set_calibration(payload)
 
 
-class Unnamed(UciBoardModel):
+def unnamed() -> UciBoardModel:
     """Refuses a whole packet of parameters without naming the one that it does not know."""
-
-    def _command(self, name, payload, now_s):
-        if name == codes.SET_APP_CONFIG and (payload[4] > 1 or payload[5] == 0x35):
-            return self._respond(name, b"\x04")
-        return super()._command(name, payload, now_s)
+    return Answering({codes.SET_APP_CONFIG: lambda data: b"\x04" if data[4] > 1 or data[5] == 0x35 else None})
 
 
-class OneByOne(UciBoardModel):
+def one_by_one() -> UciBoardModel:
     """Names only the first of several unknown parameters."""
 
-    def _command(self, name, payload, now_s):
-        if name == codes.SET_APP_CONFIG:
-            for tag in (0x2C, 0x32, 0x35):
-                if bytes([tag, 2 if tag == 0x32 else 1]) in payload:
-                    return self._respond(name, bytes([0x04, 1, tag, 0x04]))
-        return super()._command(name, payload, now_s)
+    def answer(payload: bytes) -> bytes | None:
+        known = ((tag, bytes([tag, 2 if tag == 0x32 else 1])) for tag in (0x2C, 0x32, 0x35))
+        return next((bytes([0x04, 1, tag, 0x04]) for tag, entry in known if entry in payload), None)
+
+    return Answering({codes.SET_APP_CONFIG: answer})
 
 
 class NoReset(UciBoardModel):
@@ -781,131 +787,55 @@ class Slow(UciBoardModel):
 
 
 @pytest.mark.parametrize(
-    "board",
-    [NoHandle, Slow, OneKey, Unnamed, OneByOne, NoReset, OnlyReady, Numbers, Late, Chatty, Active, Extended],
+    ("board", "rejected"),
+    [
+        *((board, set()) for board in (NoHandle, Slow, OneKey, NoReset, OnlyReady, Numbers, Late, Chatty)),
+        *((Active, set()), (Extended, set()), (unnamed, {0x35}), (one_by_one, {0x2C, 0x32, 0x35})),
+    ],
 )
-def test_boards_that_the_facts_allow_range_with_their_cir(board: type[UciBoardModel]):
-    model = board(count_bytes=1) if board is OneKey else board()
+def test_boards_that_the_facts_allow_range_with_their_cir(
+    board: Callable[[], UciBoardModel], rejected: set[int]
+):
+    model = board()
     model.sessions[7] = _Session(1 << 16 | 2, {})
     run = Bench(model, window=157).start()
     assert run.session.window == (157, 5)
     assert run.session.starts == 1
-    handle = max(model.sessions)
-    for sequence in range(1, 20):
-        run.step(model.exchange(handle, sequence, 3.0), 18)
+    run.exchange(*range(1, 20), handle=max(model.sessions))
     assert [m.range_m for m in run.measured_ranges] == [3.0] * 19
-    for measured in run.measured_ranges:
-        assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 157, 5))
-    rejected = {Unnamed: {0x35}, OneByOne: {0x2C, 0x32, 0x35}}.get(board, set())
+    assert {taps_in(m) for m in run.measured_ranges} == {157}
     assert run.session.ranging.rejected.keys() == rejected
 
 
-@pytest.mark.parametrize("masks", [(0x38, 0x40), (0x18, 0x20, 0x40)])
-@pytest.mark.parametrize("position", [0, 1, 2])
-def test_diagnostics_in_several_notifications_are_joined(masks: tuple[int, ...], position: int):
-    run = Bench().start()
-    (handle,) = run.board.sessions
-    for sequence in range(1, 60):
-        parts = []
-        for mask in masks:
-            run.board.sessions[handle].config[0xE9] = bytes([mask])
-            parts.append(run.board.diagnostics_packet(handle, sequence))
-        parts.insert(position, run.board.range_packet(handle, sequence, 3.0))
-        for part in parts:
-            run.step(part, 18 / len(parts))
-    assert len(run.measured_ranges) >= 58
-    for measured in run.measured_ranges[6:]:
-        assert np.array_equal(measured.cir.samples.reshape(-1, 2), taps_of(measured.sequence, 16, 5))
-        assert measured.cir.start_index == FIRST_PATH - 5
-    # A board that reports them in one notification again, after other firmware was loaded.
-    run.board.sessions[handle].config[0xE9] = b"\x78"
-    count = len(run.measured_ranges)
-    for sequence in range(60, 120):
-        run.exchange(sequence)
-    assert run.measured_ranges[-1].sequence == 119
-    assert all(len(m.cir) == 16 for m in run.measured_ranges[count + 8 :])
+# Calibration -----------------------------------------------------------------------------------------------------
 
 
-def test_a_cir_of_an_unknown_layout_is_skipped_but_its_levels_are_used():
-    run = Bench(UciBoardModel(tap_bytes=10)).start()
-    run.exchange(1)
-    (measured,) = run.measured_ranges
-    assert len(measured.cir) == 0
-    assert measured.cir.rx_power_dbm == -80.5
-    assert run.session.totals()["damaged"] == 0
+def test_firmware_that_refuses_the_number_of_taps_gets_the_lead():
+    refusing = Answering({codes.SET_CALIBRATION: lambda data: b"\x04" if b"\2\x9d\0" in data else None})
+    assert Bench(refusing, window=157).start().session.window == (16, 5)
 
 
-def test_an_anchor_without_its_tag_waits_if_the_board_cannot_report_its_state():
-    class Old(UciBoardModel):
-        def _command(self, name, payload, now_s):
-            if name == codes.GET_SESSION_STATE:
-                return self._respond(name, b"\x08")
-            return super()._command(name, payload, now_s)
-
-    run = Bench(Old(), role=Role.ANCHOR, address=2, peers=(1,)).start()
-    for _ in range(2000):
-        run.step()
-    assert run.session.starts == 1
-    run.exchange(1)
-    for _ in range(2000):
-        run.step()
-    assert run.session.starts == 2
+def test_calibration_is_written_only_if_it_differs_and_restored_at_the_end():
+    run = Bench(window=157).start()
+    assert run.session.counts["calibration_writes"] == 2
+    assert run.start_again().session.counts["calibration_writes"] == 2
+    assert run.stop() == UciBoardModel()._calibration
+    assert not run.board.sessions
+    # A board that has the values already, as after another driver was killed, is not written to.
+    ready = UciBoardModel()
+    ready._calibration = dict(zip(ready._calibration, (157, 5), strict=True))
+    # Neither is a board that cannot report a key.
+    unreadable = Answering({codes.GET_CALIBRATION: b"\x01"})
+    for board in (ready, unreadable):
+        assert Bench(board, window=157).start().session.counts["calibration_writes"] == 0
 
 
-def test_sessions_that_share_a_counter_get_their_cirs():
-    run = Bench(peers=(2, 3)).start()
-    for sequence in range(1, 201):
-        handle = 1 + sequence % 2
-        run.step(run.board.exchange(handle, sequence, 3.0), 18)
-    assert {m.anchor_id for m in run.measured_ranges[-2:]} == {2, 3}
-    assert all(len(m.cir) == 16 for m in run.measured_ranges[-60:])
-    # A lost range is still a gap in the sequence.
-    gaps = run.session.totals()["gaps"]
-    run.step(run.board.exchange(1 + 205 % 2, 205, 3.0), 18)
-    assert run.session.totals()["gaps"] > gaps
-
-
-def run_until(run: Bench, state: str) -> str:
-    for _ in range(4000):
-        run.step()
-        if state in run.session.state:
-            break
-    return run.session.state
-
-
-def test_a_rejected_parameter_is_named_when_the_start_is_refused():
-    class Incomplete(UciBoardModel):
-        """Rejects the slots per round, without which it does not range."""
-
-        def _command(self, name, payload, now_s):
-            if name == codes.SET_APP_CONFIG and b"\x1b\1" in payload:
-                return self._respond(name, bytes([0x04, 1, 0x1B, 0x04]))
-            return (
-                self._respond(name, b"\x15")
-                if name == codes.RANGE_START
-                else super()._command(name, payload, now_s)
-            )
-
-    state = run_until(Bench(Incomplete()), "RANGE_START")
-    assert "a parameter is missing (status 0x15)" in state
-    assert "it rejects SLOTS_PER_RR (0x1b): invalid parameter (status 0x04)" in state
-
-
-@pytest.mark.parametrize("line", [b"error\r\n", b"error \r\n\r\nerror\r\n", b"\r\n> unknown command\r\n"])
-def test_a_board_that_answers_with_text_is_not_called_mute(line: bytes):
-    run = Bench()
-    run.board.receive = lambda data, now_s: line if data else b""
-    state = run_until(run, "CLI image")
-    assert "answers with text" in state
-    assert line.decode().split()[0].strip(">") in state
-    assert "flash the UCI image" in state
-
-
-def test_random_bytes_are_no_text():
-    run = Bench()
-    run.board.receive = lambda data, now_s: b"\x81\x00\xff\x13" * 4 if data else b""
-    run_until(run, "CLI image")
-    assert run.session.state == "no answer to the reset: is this a board with UCI firmware?"
+def test_a_window_that_the_board_does_not_accept_is_not_written_again():
+    run = Bench(UciBoardModel(max_taps=64), window=157).start()
+    for _ in range(3):
+        run.start_again()
+    assert run.session.counts["calibration_writes"] == 2
+    assert run.session.window == (64, 5)
 
 
 class Originals(OriginalsFile):
@@ -926,26 +856,27 @@ def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UciBoardModel:
     return run.board
 
 
-def stopped(run: Bench) -> dict[str, int]:
-    """Stop a session; return the calibration of its board."""
-    run.session.stop(run.now_ns)
-    while not run.session.stopped:
-        run.step()
-    return run.board._calibration
-
-
 @pytest.mark.parametrize("port", ["/dev/ttyACM0", "/dev/ttyACM1"])
 def test_calibration_is_restored_after_the_driver_was_killed(
     killed: UciBoardModel, tmp_path: Path, port: str
 ):
-    run = Bench(killed, originals=Originals(port), window=157).start()
-    assert stopped(run) == UciBoardModel()._calibration
+    assert Bench(killed, Originals(port), window=157).start().stop() == UciBoardModel()._calibration
     assert not list(tmp_path.rglob("*.json"))
+
+
+@pytest.mark.parametrize("silent", [codes.GET_CALIBRATION, codes.SET_CALIBRATION], ids=["read", "write"])
+def test_original_calibration_is_kept_until_it_was_restored(killed: UciBoardModel, silent: tuple[int, int]):
+    run, usual = Bench(killed, Originals("/dev/ttyACM0"), window=157).start(), killed._command
+    killed._command = lambda name, *rest: b"" if name == silent else usual(name, *rest)
+    assert run.stop()[TAPS] == 157
+    killed._command = usual
+    restored = Bench(killed, Originals("/dev/ttyACM0"), window=157).start().stop()
+    assert restored == UciBoardModel()._calibration
 
 
 def test_calibration_that_another_program_has_changed_is_kept(killed: UciBoardModel):
     killed._calibration[TAPS] = 64
-    assert stopped(Bench(killed, originals=Originals("/dev/ttyACM0"), window=157).start())[TAPS] == 64
+    assert Bench(killed, Originals("/dev/ttyACM0"), window=157).start().stop()[TAPS] == 64
 
 
 @pytest.mark.parametrize(
@@ -954,25 +885,56 @@ def test_calibration_that_another_program_has_changed_is_kept(killed: UciBoardMo
 def test_damaged_files_of_the_calibration_are_ignored(killed: UciBoardModel, tmp_path: Path, text: str):
     (path,) = tmp_path.rglob("*.json")
     path.write_text(text)
-    assert Bench(killed, originals=Originals("/dev/ttyACM0"), window=157).start().session.window == (157, 5)
+    assert Bench(killed, Originals("/dev/ttyACM0"), window=157).start().session.window == (157, 5)
+
+
+# Captures --------------------------------------------------------------------------------------------------------
+
+
+def test_a_capture_replays_the_same_measurements(tmp_path):
+    run = Bench()
+    writer = CaptureWriter(tmp_path / "session.txt")
+    writer.add_board(0, asdict(run.session.settings) | {"role": "TAG"})
+    receive = run.session.receive
+
+    def recorded(data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]:
+        writer.add(0, data, sent=False)
+        return receive(data, now_ns, stamp_ns)
+
+    run.session.receive = recorded
+    run.start().exchange(*range(1, 30))
+    writer.close()
+    capture = open_capture(tmp_path / "session.txt")
+    for _ in range(2):
+        replayed = [record.measurement for record in capture]
+        assert [m.sequence for m in replayed] == [m.sequence for m in run.measured_ranges]
+        assert all(taps_in(measured) == 16 for measured in replayed)
 
 
 @pytest.mark.parametrize(
-    ("keep", "warning"),
+    ("text", "error"),
     [
-        (lambda packet: packet[:60] + packet[61:], "bytes or notifications are lost between board and host"),
-        (lambda packet: packet[:-100], "bytes or notifications are lost between board and host"),
-        (lambda packet: b"", "most ranges have no CIR: the firmware may not support it"),
+        ("", RecordingError),
+        ("0.1 0 < 00", RecordingError),
+        (f"{FIRST_LINE}\n0.1 0 < 00", DamagedRecordingError),
+        (f"{FIRST_LINE}\nboard 0 {{", DamagedRecordingError),
+        (TAG_LINES.replace("2", "1"), DamagedRecordingError),
+        (f"{TAG_LINES}inf 0 < 00", DamagedRecordingError),
+        (f"{TAG_LINES}1 0 < 0g", DamagedRecordingError),
+        (f"{FIRST_LINE}\n" + "9" * 400_000, DamagedRecordingError),
     ],
-    ids=["lost byte", "lost fragment", "never sent"],
 )
-def test_ranges_without_cir_are_explained_by_damaged_notifications_first(keep, warning: str):
-    run = Bench(window=157).start()
-    (handle,) = run.board.sessions
-    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), (0, None, print, lambda: 0))
-    port.session = run.session
-    for sequence in range(1, 60):
-        port.monitor.add_range(time.monotonic())
-        run.step(run.board.range_packet(handle, sequence, 3.0), 5.0)
-        run.step(keep(run.board.diagnostics_packet(handle, sequence)), 95.0)
-    assert port.report().warning.startswith(warning)
+def test_a_capture_that_is_damaged_is_refused(tmp_path, text: str, error: type):
+    path = tmp_path / "session.txt"
+    path.write_text(text)
+    with pytest.raises(error):
+        list(open_capture(path))
+
+
+def test_a_capture_ends_at_its_limit_and_ignores_what_comes_after_its_end(tmp_path):
+    writer = CaptureWriter(tmp_path / "session.txt", limit_bytes=200)
+    for _ in range(2):
+        for _ in range(20):
+            writer.add(0, bytes(20), sent=False)
+        writer.close()
+    assert 100 < (tmp_path / "session.txt").stat().st_size <= 200

@@ -46,26 +46,30 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     capture = tmp_path / "capture.txt"
     options = ("radio.window:=16", "radio.anchors:=[2, 3]", f"capture:={capture}")
     node = ros.start("driver", "source:=uci", f"port:={ports}", *options)
-    ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in raw} and len(raw) > 20)
-    assert {len(message.cir.samples) for message in raw} == {32}
+
+    # On a busy computer, diagnostics may be too late for their range; `test_uci` counts them in virtual time.
+    def with_cirs() -> list[RangeCir]:
+        return [message for message in raw if message.cir.samples]
+
+    ros.spin_until(lambda: {2, 3} == {message.anchor_id for message in with_cirs()} and len(with_cirs()) > 20)
+    assert {len(message.cir.samples) for message in with_cirs()} == {32}
     assert all(abs(message.range - 3.0) < 0.2 for message in raw)
 
     status = ros.diagnosis("driver", lambda status: "ranging" in status.message)
     assert diagnostic_values(status)["radio 0: CIR taps"] == "16"
 
-    assert {(m.cir.radio, m.cir.segment) for m in raw} == {(Cir.DW3000, Cir.STS)}
-    ros.spin_until(lambda: len(corrected) > 20)
+    assert {(m.cir.radio, m.cir.segment) for m in with_cirs()} == {(Cir.DW3000, Cir.STS)}
+    ros.spin_until(lambda: sum(m.status != RangeCorrected.NO_CIR for m in corrected) > 20)
     experimental = load_bundle(shipped_model_path("dw3000_sts")).model_id
-    assert {(m.model_id, m.status) for m in corrected} == {(experimental, RangeCorrected.OK)}
-    assert all(0 < abs(m.range - (m.range_raw - 0.5)) < 0.1 for m in corrected)
+    used = [m for m in corrected if m.status != RangeCorrected.NO_CIR]
+    assert {(m.model_id, m.status) for m in used} == {(experimental, RangeCorrected.OK)}
+    assert all(0 < abs(m.range - (m.range_raw - 0.5)) < 0.1 for m in used)
     reason = "model dw3000_sts (experimental), id "
     mitigator.wait_for_output(reason)
     assert mitigator.output.count(reason) == 1
     status = ros.diagnosis("mitigator", lambda status: any(reason in v.value for v in status.values))
-    assert re.fullmatch(
-        r"DW3000 STS .*: model dw3000_sts .* \(tag-anchor 1-2, 1-3\)",
-        diagnostic_values(status)["models by radio"],
-    )
+    models = r"DW3000 STS .*: model dw3000_sts .* \(tag-anchor 1-2, 1-3\)"
+    assert re.search(models, diagnostic_values(status)["models by radio"])
 
     assert ros.set_parameter("mitigator", "model", "universal").successful
     status = ros.diagnosis("mitigator", lambda status: "DW3000 STS" in status.message)
@@ -89,41 +93,28 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
 
 
-def open_pair(links: Path) -> list[PortEvents]:
-    boards = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
-    return [
-        PortEvents(uci, UciPortSettings(PortAddress(f"{links}{number}"), board))
-        for number, board in enumerate(boards)
-    ]
-
-
-def test_a_tag_without_ranges_in_the_last_seconds_is_a_warning(
+def test_a_tag_without_ranges_is_a_warning_and_closing_restores_the_calibration(
     boards: EmulatedUciBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("uwb_mitigation.radios.port.PERIOD_S", 1.0)
-    tag, anchor = open_pair(tmp_path / "uci")
+    before = [dict(model._calibration) for model in boards._models]
+    settings = UciSettings(), UciSettings(Role.ANCHOR, 2, (1,))
+    tag, anchor = (
+        PortEvents(uci, UciPortSettings(PortAddress(f"{tmp_path}/uci{number}"), board))
+        for number, board in enumerate(settings)
+    )
     with tag:
         with anchor:
             tag.wait_for(RangeMeasurement, 5)
+            assert boards._models[0]._calibration != before[0]
             wait_until(lambda: tag.port.report().warning == "")
             boards.set_faults(UciFaults(offset_m=-3.0))
-            wait_until(
-                lambda: re.search("negative distance.*antenna delay", tag.port.report().warning, re.DOTALL)
-            )
+            negative = "negative distance.*antenna delay"
+            wait_until(lambda: re.search(negative, tag.port.report().warning, re.DOTALL))
             boards.set_faults(UciFaults())
             wait_until(lambda: tag.port.report().warning == "")
         silent = r"no range for \d.*reception timeout: are the other boards on"
         wait_until(lambda: re.match(silent, tag.port.report().warning, re.DOTALL))
-
-
-def test_the_calibration_of_a_board_is_restored_when_its_port_is_closed(
-    boards: EmulatedUciBoards, tmp_path: Path
-):
-    before = [dict(model._calibration) for model in boards._models]
-    tag, anchor = open_pair(tmp_path / "uci")
-    with tag, anchor:
-        tag.wait_for(RangeMeasurement, 3)
-        assert boards._models[0]._calibration != before[0]
     assert [model._calibration for model in boards._models] == before
     assert not boards._models[0].sessions
 
