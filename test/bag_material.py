@@ -100,18 +100,10 @@ class Foreign:
         self._writer.start("ros2", "another recorder")
         self._channels: dict[str, int] = {}
 
-    def channel(
-        self,
-        topic: str,
-        type_name: str,
-        schema: str | None,
-        *,
-        encoding: str = "cdr",
-        language: str = "ros2msg",
-    ) -> None:
+    def channel(self, topic: str, type_name: str, schema: str | None, *, encoding: str = "cdr") -> None:
         number = 0
         if schema is not None:
-            number = self._writer.register_schema(type_name, language, schema.encode())
+            number = self._writer.register_schema(type_name, "ros2msg", schema.encode())
         self._channels[topic] = self._writer.register_channel(topic, encoding, number, {})
 
     def ours(self) -> Foreign:
@@ -122,14 +114,15 @@ class Foreign:
     def add(self, topic: str, log_time_ns: int, data: bytes) -> None:
         self._writer.add_message(self._channels[topic], log_time_ns, data, log_time_ns)
 
-    def range(self, number: int, samples: int = 20) -> None:
-        measurement = record(number, samples).measurement
-        self.add(RANGE_RAW, measurement.stamp_ns, codec.encode_range(measurement))
+    def range(self, number: int, log_time_ns: int | None = None) -> None:
+        measurement = record(number).measurement
+        self.add(RANGE_RAW, log_time_ns or measurement.stamp_ns, codec.encode_range(measurement))
 
-    def truth(self, number: int) -> None:
+    def truth(self, number: int, log_time_ns: int | None = None) -> None:
         known = record(number)
         assert known.truth is not None
-        self.add(RANGE_TRUTH, known.measurement.stamp_ns, codec.encode_truth(known.measurement, known.truth))
+        data = codec.encode_truth(known.measurement, known.truth)
+        self.add(RANGE_TRUTH, log_time_ns or known.measurement.stamp_ns, data)
 
     def flush(self) -> None:
         self._writer.flush()
@@ -166,3 +159,10 @@ def chunk_offsets(path: Path) -> list[tuple[int, int]]:
     with path.open("rb") as stream:
         indexes = make_reader(stream).get_summary().chunk_indexes
     return [(one.chunk_start_offset, one.chunk_start_offset + one.chunk_length) for one in indexes]
+
+
+def damage_after_first_chunk(path: Path) -> int:
+    """Cut a bag after its first chunk, and add a record that ends beyond the file; return the position."""
+    end = chunk_offsets(path)[0][1]
+    path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
+    return end

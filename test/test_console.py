@@ -22,11 +22,6 @@ from uwb_mitigation.commands.support import console
 from uwb_mitigation.types.measurement import Status
 
 
-def test_result_is_written_as_json(tmp_path: Path):
-    console.write_json(tmp_path / "out.json", {"n": 1})
-    assert json.loads((tmp_path / "out.json").read_text()) == {"n": 1}
-
-
 @dataclass(frozen=True)
 class Pair:
     anchor_id: int

@@ -146,20 +146,6 @@ def test_scripts_and_modules_in_python_commands_exist():
     assert [module for module in sorted(modules) if importlib.util.find_spec(module) is None] == []
 
 
-def test_scripts_that_import_benchmarks_are_called_with_a_python_path():
-    scripts = [
-        path.name
-        for path in (REPOSITORY / "docs" / "experiments").glob("*.py")
-        if re.search(r"^from benchmarks", path.read_text(), re.M)
-    ]
-    assert len(scripts) > 1
-    calls = rf"(.*)\bpython docs/experiments/(?:{'|'.join(scripts)})"
-    for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        if "PYTHONPATH=$PWD" not in text:
-            assert [call for call in re.findall(calls, text) if "PYTHONPATH=. " not in call] == []
-
-
 def check_parameters(node: str, values: dict[str, object]) -> None:
     rows = {row.name: row for name in NODES[node] for row in ALL_TABLES[name]}
     for name, value in values.items():

@@ -23,7 +23,6 @@ from uwb_mitigation.types.ros.topics import (
     ODOMETRY_TYPE,
     RANGE_CIR_TYPE,
     RANGE_RAW,
-    RANGE_TRUTH,
 )
 from uwb_mitigation.types.tracks import Estimate
 
@@ -59,16 +58,11 @@ def test_every_compression_is_read(tmp_path: Path, compression: CompressionType,
 def test_truth_is_joined_with_an_earlier_or_later_range(tmp_path: Path, lag: int) -> None:
     bag = Foreign(tmp_path / "bag.mcap").ours()
     for number in range(-5, 25):
-        for write, which in ((bag.range, number), (bag.truth, number - lag)):
-            if 0 <= which < 20:
-                # All messages have the same log time, so that the order in the file is used.
-                known = record(which)
-                data = (
-                    codec.encode_range(known.measurement)
-                    if write == bag.range
-                    else codec.encode_truth(known.measurement, known.truth)
-                )
-                bag.add(RANGE_RAW if write == bag.range else RANGE_TRUTH, START_NS, data)
+        # All messages have the same log time, so that the order in the file is used.
+        if 0 <= number < 20:
+            bag.range(number, log_time_ns=START_NS)
+        if 0 <= number - lag < 20:
+            bag.truth(number - lag, log_time_ns=START_NS)
     items = list(McapRecording(bag.finish()))
     assert [item.truth.configuration for item in items if item.truth] == [f"place {i}" for i in range(20)]
 
@@ -131,12 +125,18 @@ def test_files_of_a_folder_follow_each_other_by_number(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "excerpt"),
-    [(b"", "empty"), (b"\x89MCAP", "not an MCAP file"), (b"hello, this is text", "not an MCAP file")],
+    [
+        (b"", "empty"),
+        (b"\x89MCAP", "not an MCAP file"),
+        (b"hello, this is text", "not an MCAP file"),
+        (b"SQLite format 3\0", "ros2 bag convert"),
+    ],
 )
 def test_other_file_is_refused(tmp_path: Path, content: bytes, excerpt: str) -> None:
-    (tmp_path / "bag.mcap").write_bytes(content)
+    path = tmp_path / ("bag.db3" if content.startswith(b"SQL") else "bag.mcap")
+    path.write_bytes(content)
     with pytest.raises(RecordingError, match=excerpt):
-        McapRecording(tmp_path / "bag.mcap")
+        open_recording(path)
 
 
 def test_missing_topic_is_reported_with_the_existing_topics(tmp_path: Path) -> None:
@@ -176,16 +176,10 @@ def test_close_ends_an_iteration(tmp_path: Path) -> None:
     assert len(read) == 1
 
 
-@pytest.mark.parametrize("name", ["old.db3", "folder"])
-def test_sqlite_bag_is_refused_with_the_command_that_converts_it(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    if name == "folder":
-        path.mkdir()
-        (path / "folder_0.db3").write_bytes(b"SQLite format 3\0")
-    else:
-        path.write_bytes(b"SQLite format 3\0")
+def test_folder_of_sqlite_files_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    (tmp_path / "folder_0.db3").write_bytes(b"SQLite format 3\0")
     with pytest.raises(RecordingError, match="ros2 bag convert"):
-        open_recording(path)
+        open_recording(tmp_path)
 
 
 @pytest.mark.parametrize(

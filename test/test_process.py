@@ -9,17 +9,17 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import Foreign, chunk_offsets, write_records
+from bag_material import Foreign, chunk_offsets, damage_after_first_chunk, write_records
 from command_line import ENVIRONMENT, command, run, start, succeed
 from firmware_models import random_measurement
 from model_material import cir
+from port_events import wait_until
 
 from uwb_mitigation.commands.offline.parallel import plan, run_on_dask
 from uwb_mitigation.commands.offline.process import Job, process_bag
@@ -38,23 +38,14 @@ START_NS = 1_700_000_000_000_000_000
 
 
 def exchange(number: int) -> RangeMeasurement:
-    return RangeMeasurement(
-        START_NS + number * 10_000_000,
-        7,
-        1 + number % 3,
-        number,
-        number,
-        3.0 + number * 0.125,
-        cir(number, sample_period_s=float(np.float32(1.0016e-9))),
-        "antenna",
-    )
+    stamp_ns, range_m = START_NS + number * 10_000_000, 3.0 + number * 0.125
+    received = cir(number, sample_period_s=float(np.float32(1.0016e-9)))
+    return RangeMeasurement(stamp_ns, 7, 1 + number % 3, number, number, range_m, received, "antenna")
 
 
 def write_bag(path: Path, measurements: list[RangeMeasurement]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    return write_records(
-        path, (Record(measurement, Truth(2.5, "LOS", "here")) for measurement in measurements)
-    )
+    return write_records(path, (Record(measured, Truth(2.5, "LOS", "here")) for measured in measurements))
 
 
 def exchanges(count: int) -> list[RangeMeasurement]:
@@ -134,16 +125,9 @@ def test_corrected_ranges_of_the_input_are_replaced_and_counted(tmp_path: Path) 
     ]
 
 
-def cut(path: Path) -> int:
-    """Damage a bag after its first chunk; return the position."""
-    end = chunk_offsets(path)[0][1]
-    path.write_bytes(path.read_bytes()[:end] + b"\x06\xff\xff\xff")
-    return end
-
-
 def test_damaged_bag_is_processed_up_to_the_damage(tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(400))
-    end = cut(source)
+    end = damage_after_first_chunk(source)
     outcome = process_bag(job(source, tmp_path / "out.mcap"))
     assert outcome.written
     assert f"in.mcap, byte {end}" in str(outcome.error)
@@ -153,9 +137,8 @@ def test_damaged_bag_is_processed_up_to_the_damage(tmp_path: Path) -> None:
 
 def test_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
     write_bag(tmp_path / "in.mcap", exchanges(40))
-    done = start(
-        "process in.mcap -o out.mcap --model evk1000_apartment --json out.json",
-        folder=tmp_path)  # fmt: skip
+    words = "process in.mcap -o out.mcap --model evk1000_apartment --json out.json"
+    done = start(words, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "40 ranges" in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
@@ -198,7 +181,6 @@ def test_existing_output_is_kept_without_force(tmp_path: Path) -> None:
     refused = run("process", source, "-o", output, folder=tmp_path)
     assert refused.returncode == 2
     assert "--force" in refused.stderr
-    assert len(refused.stderr.splitlines()) == 1
     assert corrected_of(output) == []
     succeed("process", source, "-o", output, "--force", folder=tmp_path)
     assert len(corrected_of(output)) == 4
@@ -208,14 +190,12 @@ def test_invalid_bag_is_reported_and_does_not_stop_the_others(tmp_path: Path) ->
     folder = tmp_path / "monday"
     write_bag(folder / "a.mcap", exchanges(9))
     write_bag(folder / "later" / "b", exchanges(8))
-    write_bag(folder / "cut.mcap", exchanges(400))
-    cut(folder / "cut.mcap")
+    damage_after_first_chunk(write_bag(folder / "cut.mcap", exchanges(400)))
     (folder / "bad.mcap").write_bytes(b"nothing")
     done = start("process", "monday", "-o", "out", "--json", "out.json", folder=tmp_path)
     assert done.returncode == 1
-    assert "bad.mcap: not an MCAP file" in done.stderr
-    assert "cut.mcap, byte" in done.stderr
-    assert "2 of 4 bags failed" in done.stderr
+    for text in ("bad.mcap: not an MCAP file", "cut.mcap, byte", "2 of 4 bags failed"):
+        assert text in done.stderr
     files = sorted(str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*") if p.is_file())
     assert files == ["a.mcap", "cut.mcap", "later/b/b_0.mcap", "later/b/metadata.yaml"]
     result = json.loads((tmp_path / "out.json").read_text())
@@ -250,41 +230,35 @@ def test_invalid_arguments_are_reported_in_one_line(tmp_path: Path, given: list[
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_names_of_sources_are_kept_and_earlier_outputs_skipped(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("sources", "output", "written"),
+    [
+        (["one", "two"], "one/out", ["one/out/one/a.mcap", "one/out/one/sub/b.mcap", "one/out/two/a.mcap"]),
+        (["two"], "x", ["x/a.mcap"]),
+    ],
+)
+def test_folders_of_sources_are_kept_and_earlier_outputs_skipped(
+    sources: list[str], output: str, written: list[str], tmp_path: Path
+) -> None:
     for name in ("one/a.mcap", "one/sub/b.mcap", "two/a.mcap", "one/out/c.mcap"):
         write_bag(tmp_path / name, [])
-    several = plan([tmp_path / "one", tmp_path / "two"], tmp_path / "one" / "out")
-    assert [str(p.output.relative_to(tmp_path / "one" / "out")) for p in several] == [
-        "one/a.mcap",
-        "one/sub/b.mcap",
-        "two/a.mcap",
-    ]
-    assert [str(p.output.relative_to(tmp_path)) for p in plan([tmp_path / "two"], tmp_path / "x")] == [
-        "x/a.mcap"
-    ]
+    planned = plan([tmp_path / name for name in sources], tmp_path / output)
+    assert [str(each.output.relative_to(tmp_path)) for each in planned] == written
 
 
-def test_ctrl_c_leaves_no_partial_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_leaves_no_partial_file(number: signal.Signals, tmp_path: Path) -> None:
     source = write_bag(tmp_path / "in.mcap", exchanges(200))
     data, ((first, end), *_) = source.read_bytes(), chunk_offsets(source)
     # The same chunk two hundred times: more than is processed before the signal.
     source.write_bytes(data[:end] + data[first:end] * 200)
-    process = subprocess.Popen(
-        command("process", source, "-o", "out.mcap"),
-        cwd=tmp_path,
-        env=ENVIRONMENT,
-        stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 240
-    while not (tmp_path / "out.mcap.part").exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=240)
-    assert process.returncode == 130, stderr
+    words = command("process", source, "-o", "out.mcap")
+    output = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    with subprocess.Popen(words, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True, **output) as process:
+        wait_until((tmp_path / "out.mcap.part").exists)
+        os.killpg(process.pid, number)
+        _, stderr = process.communicate(timeout=240)
+    assert process.returncode == 128 + number, stderr
     assert b"Traceback" not in stderr
     assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
 
@@ -332,14 +306,8 @@ def test_dask_cluster_gives_the_same_result_and_continues_after_an_invalid_bag(t
     sources = [write_bag(tmp_path / f"in{n}.mcap", exchanges(50)) for n in range(3)]
     sources[1].write_bytes(b"nothing of the kind")
     jobs = [job(source, tmp_path / f"{source.stem}_out.mcap") for source in sources]
-    with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        host="127.0.0.1",
-        env={"PYTHONPATH": str(REPOSITORY)},
-    ) as cluster:
+    local = {"dashboard_address": None, "host": "127.0.0.1", "env": {"PYTHONPATH": str(REPOSITORY)}}
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=True, **local) as cluster:
         outcomes = {outcome.job: outcome for outcome in run_on_dask(jobs, cluster.scheduler_address)}
     assert "not an MCAP file" in str(outcomes[jobs[1]].error)
     for number in (0, 2):
