@@ -167,7 +167,7 @@ def test_silent_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch
     [
         (("--source", "radio"), "radio"),
         (("--port", ""), "port"),
-        (("--port", "/dev/a,/dev/b,/dev/c"), "port"),
+        (("--port", "a,b,c"), "3 ports"),
         (("--distance", "nan"), "distance"),
         (("-o", "report.txt"), "report.txt"),
         (("-o", "earlier.zip"), "exists already"),
@@ -176,7 +176,8 @@ def test_silent_board_gives_a_report(report: Report, tmp_path: Path, monkeypatch
 )
 def test_invalid_options_are_refused(options: tuple[str, ...], message: str, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("earlier.zip").touch()
+    for name in ("a", "b", "c", "earlier.zip"):
+        Path(name).touch()
     command = ["field-report", "--source", "uci", "--port", "/dev/a", "--distance", "3", *options]
     result = CliRunner().invoke(cli.app, command)
     assert result.exit_code

@@ -10,18 +10,16 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-import ros_harness
-from bag_material import imported
+from bag_material import write_records
 from command_line import succeed
 from compilers import NEEDS_CC
-from model_material import Recorded, bundle, measurement
-from ros_harness import diagnostic_values
+from model_material import bundle, measurement
+from ros_harness import PAUSED, Process, Ros, diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from benchmarks.paper.simulated import SimulatedDeepUwb
@@ -33,11 +31,11 @@ from uwb_mitigation.mitigation.model.choice import CirKind, choose_model
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.recordings.bag.reader import BagReader
-from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status, Truth
 from uwb_mitigation.types.ros.codec import decode_corrected
 from uwb_mitigation.types.ros.topics import RANGE_CORRECTED
+from uwb_mitigation.types.stamps import to_ns
 
 AUTO = load_model()
 NAMES = {bundle.model_id: bundle.name for bundle in AUTO}
@@ -86,10 +84,8 @@ def sts(each: RangeMeasurement) -> RangeMeasurement:
 
 def mixed(count: int) -> list[RangeMeasurement]:
     """Return ranges of a DW1000, in turn with those of a DW3000."""
-    source = SimulatedSource(count=count, rate_hz=40.0)
-    return [
-        sts(record.measurement) if number % 2 else record.measurement for number, record in enumerate(source)
-    ]
+    measured = [record.measurement for record in SimulatedSource(count=count, rate_hz=40.0)]
+    return [sts(each) if number % 2 else each for number, each in enumerate(measured)]
 
 
 def without(each: RangeMeasurement, **changes: object) -> RangeMeasurement:
@@ -108,28 +104,24 @@ def test_a_mixed_batch_is_corrected_like_single_ranges_by_the_named_models(backe
     named = {each.model_id: Mitigation(each, 0.22) for each in AUTO}
     auto = backend(AUTO, 0.22)
     results = auto.correct(ranges)
-    assert {NAMES[result.model_id] for result in results} == {
-        "universal",
-        "universal_amplitude",
-        "dw3000_sts",
-    }
+    used = [result.model_id for result in results]
+    assert {NAMES[model_id] for model_id in used} == {"universal", "universal_amplitude", "dw3000_sts"}
     assert results == [auto.correct(each) for each in ranges]
-    assert results == [
-        named[result.model_id].correct(each) for each, result in zip(ranges, results, strict=True)
-    ]
+    assert results == [named[model_id].correct(each) for each, model_id in zip(ranges, used, strict=True)]
     assert sum(auto.used.values()) == 2 * len(ranges)
 
 
 def test_arrays_with_and_without_levels_use_two_models() -> None:
-    (each,) = (record.measurement for record in islice(SimulatedSource(count=1), 1))
+    (each,) = mixed(1)
     cir = each.cir.samples.reshape(-1, 2).astype(float) @ [1, 1j]
-    levels = {
-        "preamble_count": each.cir.preamble_count,
-        "first_path_power_dbm": each.cir.first_path_power_dbm,
-    }
-    fields = levels | {"rx_power_dbm": [each.cir.rx_power_dbm, NAN]}
-    first_path = each.cir.first_path_index - each.cir.start_index
-    result = Mitigation(AUTO).correct_arrays(each.range_m, np.stack([cir, cir]), first_path, **fields)
+    result = Mitigation(AUTO).correct_arrays(
+        each.range_m,
+        np.stack([cir, cir]),
+        each.cir.first_path_index - each.cir.start_index,
+        preamble_count=each.cir.preamble_count,
+        rx_power_dbm=[each.cir.rx_power_dbm, NAN],
+        first_path_power_dbm=each.cir.first_path_power_dbm,
+    )
     assert [NAMES[model_id] for model_id in result.model_id] == ["universal", "universal_amplitude"]
     assert result.status.tolist() == [Status.OK, Status.OK]
 
@@ -139,20 +131,21 @@ def test_calibrate_starts_from_one_model() -> None:
         calibrate([], SimulatedSource().anchors, AUTO)
 
 
-def corrected_in(path: Path) -> dict[tuple[int, int], tuple[float, float, int, int]]:
-    messages = BagReader(path).messages((RANGE_CORRECTED,))
-    found = [decode_corrected(message.data) for message in messages]
-    return {
-        (key.stamp_ns, key.anchor_id): (each.range_m, each.variance_m2, each.status, each.model_id)
-        for key, each in found
-    }
+def bag_of(path: Path, ranges: list[RangeMeasurement]) -> Path:
+    """Write simulated ranges to a bag that is not marked as simulated."""
+    return write_records(path, (Record(each, Truth(each.range_m, "LOS", "here")) for each in ranges), "false")
+
+
+def corrected_in(path: Path) -> list[tuple[float, float, int, int]]:
+    """Return range, variance, status and model of the corrected ranges of a bag, by stamp and anchor."""
+    found = [decode_corrected(message.data) for message in BagReader(path).messages((RANGE_CORRECTED,))]
+    found.sort(key=lambda pair: (pair[0].stamp_ns, pair[0].anchor_id))
+    return [(each.range_m, each.variance_m2, each.status, each.model_id) for _, each in found]
 
 
 @pytest.fixture
 def mixed_bag(tmp_path: Path) -> Path:
-    recording = Recorded(Record(each, Truth(each.range_m, "LOS", "here")) for each in mixed(160))
-    recording.name = "two radios"
-    return imported(recording, tmp_path / "mixed.mcap")
+    return bag_of(tmp_path / "mixed.mcap", mixed(160))
 
 
 def test_process_and_evaluate_use_two_models_for_a_mixed_recording(mixed_bag: Path, tmp_path: Path) -> None:
@@ -167,7 +160,7 @@ def test_process_and_evaluate_use_two_models_for_a_mixed_recording(mixed_bag: Pa
     done = succeed("evaluate --data mixed.mcap --json evaluated.json", folder=tmp_path)
     assert done.stdout.count("ranges of ") == 2
     assert json.loads((tmp_path / "evaluated.json").read_text())["statuses"]["OK"] == row["ok"]
-    ok = Counter(NAMES[model_id] for *_, status, model_id in results.values() if status == Status.OK)
+    ok = Counter(NAMES[model_id] for *_, status, model_id in results if status == Status.OK)
     assert ok.keys() == {"universal", "dw3000_sts"}
     assert ok.total() > 0.95 * len(results)
 
@@ -196,7 +189,6 @@ def deepuwb(tmp_path: Path) -> Path:
             "0000000000" if record.truth.label == "LOS" else "1000000000",
         )
         for number, record in enumerate(records)
-        if record.truth
     ]
     with pd.option_context("mode.string_storage", "python"):
         frame = pd.DataFrame(rows, columns=["CIR", "Error", "Room", "Obstacles"])
@@ -205,13 +197,11 @@ def deepuwb(tmp_path: Path) -> Path:
     return tmp_path / "deepuwb.mcap"
 
 
-def replayed(
-    ros: ros_harness.Ros, bag: Path, count: int, node: str = "mitigator"
-) -> tuple[dict, ros_harness.Process]:
-    """Replay a bag through driver and mitigator, or through the pipeline, without an option; return the corrected ranges."""
+def replayed(ros: Ros, bag: Path, count: int, node: str = "mitigator") -> tuple[list[tuple], Process]:
+    """Replay a bag through driver and mitigator, or through the pipeline, without an option; see `corrected_in`."""
     received = ros.collect(RangeCorrected, "/uwb/range_corrected")
     source = ("source:=mcap", f"path:={bag}", "rate:=20.0")
-    mitigator = ros.start(node, *((*source, *ros_harness.PAUSED) if node == "pipeline" else ()))
+    mitigator = ros.start(node, *((*source, *PAUSED) if node == "pipeline" else ()))
     mitigator.wait_for_output("correcting with model")
     if node == "pipeline":
         ros.play()
@@ -220,29 +210,19 @@ def replayed(
         ros.spin_until(lambda: ros.state_of(node) == "active")
         ros.start("driver", *source, "wait_for_subscribers:=1")
     ros.spin_until(lambda: len(received) == count)
-    stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in received]
-    results = [(each.range, each.variance, each.status, each.model_id) for each in received]
-    keys = [(stamp, each.anchor_id) for stamp, each in zip(stamps, received, strict=True)]
-    return dict(zip(keys, results, strict=True)), mitigator
-
-
-def values(results: dict) -> list[tuple]:
-    """Return results without stamps, which a replay changes."""
-    return [results[key] for key in sorted(results)]
+    received.sort(key=lambda each: (to_ns(each.header.stamp), each.anchor_id))
+    return [(each.range, each.variance, each.status, each.model_id) for each in received], mitigator
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("node", ["mitigator", "pipeline"])
-def test_deepuwb_is_corrected_live_and_offline_without_an_option(
-    ros: ros_harness.Ros, deepuwb: Path, node: str
-):
+def test_deepuwb_is_corrected_live_and_offline_without_an_option(ros: Ros, deepuwb: Path):
     done = succeed("process deepuwb.mcap -o out.mcap", folder=deepuwb.parent)
     assert "without preamble count and levels: model universal_amplitude" in done.stdout
-    offline = values(corrected_in(deepuwb.parent / "out.mcap"))
+    offline = corrected_in(deepuwb.parent / "out.mcap")
     assert sum(status == Status.OK for *_, status, _ in offline) >= 0.95 * len(offline) > 280
-    live, mitigator = replayed(ros, deepuwb, len(offline), node)
-    assert values(live) == offline
-    assert mitigator.output.count("DW1000 IPATOV (assumed) without preamble count and levels: model") == 1
+    live, pipeline = replayed(ros, deepuwb, len(offline), "pipeline")
+    assert live == offline
+    assert pipeline.output.count("DW1000 IPATOV (assumed) without preamble count and levels: model") == 1
 
 
 @pytest.mark.ros
@@ -256,7 +236,7 @@ def test_demo_corrects_deepuwb(deepuwb: Path):
 
 
 @pytest.mark.ros
-def test_view_states_the_models_of_raw_ranges(ros: ros_harness.Ros, mixed_bag: Path):
+def test_view_states_the_models_of_raw_ranges(ros: Ros, mixed_bag: Path):
     program = "from uwb_mitigation.commands.entry import command_line; command_line()"
     shown = ros.run([sys.executable, "-c", program, "view", str(mixed_bag), "--port", "0"])
     for model in ("universal,", "dw3000_sts (experimental),"):
@@ -265,11 +245,11 @@ def test_view_states_the_models_of_raw_ranges(ros: ros_harness.Ros, mixed_bag: P
 
 
 @pytest.mark.ros
-def test_a_mixed_recording_uses_two_models_at_the_same_time(ros: ros_harness.Ros, mixed_bag: Path):
+def test_a_mixed_recording_uses_two_models_at_the_same_time(ros: Ros, mixed_bag: Path):
     succeed("process mixed.mcap -o out.mcap", folder=mixed_bag.parent)
-    offline = values(corrected_in(mixed_bag.parent / "out.mcap"))
+    offline = corrected_in(mixed_bag.parent / "out.mcap")
     live, mitigator = replayed(ros, mixed_bag, len(offline))
-    assert values(live) == offline
+    assert live == offline
     for text in ("levels: model universal, id", "DW3000 STS without levels: model dw3000_sts (experimental)"):
         mitigator.wait_for_output(text)
     status = ros.diagnosis("mitigator", lambda status: "models by radio" in diagnostic_values(status))
@@ -279,13 +259,10 @@ def test_a_mixed_recording_uses_two_models_at_the_same_time(ros: ros_harness.Ros
 
 
 @pytest.mark.ros
-def test_ranges_without_a_model_are_reported_once(ros: ros_harness.Ros, tmp_path: Path):
+def test_ranges_without_a_model_are_reported_once(ros: Ros, tmp_path: Path):
     other = [without(each, radio=RadioType.QM35, segment=Segment.STS) for each in mixed(60)]
-    recording = Recorded(map(Record, other))
-    recording.name = "another radio"
-    bag = imported(recording, tmp_path / "other.mcap")
-    live, mitigator = replayed(ros, bag, len(list(McapRecording(bag))))
-    assert {status for *_, status, _ in live.values()} == {Status.OUT_OF_DISTRIBUTION}
+    live, mitigator = replayed(ros, bag_of(tmp_path / "other.mcap", other), len(other))
+    assert {status for *_, status, _ in live} == {Status.OUT_OF_DISTRIBUTION}
     mitigator.wait_for_output("no model in use fits")
     status = ros.diagnosis("mitigator", lambda status: "no model in use fits" in status.message)
     assert "QM35 STS" in status.message
@@ -293,7 +270,7 @@ def test_ranges_without_a_model_are_reported_once(ros: ros_harness.Ros, tmp_path
 
 
 @pytest.mark.ros
-def test_a_named_model_that_rejects_every_range_names_the_one_that_fits(ros: ros_harness.Ros, deepuwb: Path):
+def test_a_named_model_that_rejects_every_range_names_the_one_that_fits(ros: Ros, deepuwb: Path):
     mitigator = ros.start("mitigator", "model:=universal")
     ros.start("driver", "source:=mcap", f"path:={deepuwb}", "rate:=0.2")
     mitigator.wait_for_output("with model:=auto: DW1000 IPATOV (assumed) without preamble count and levels")
