@@ -46,18 +46,9 @@ settings.load_profile("suite")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 LONGEST = (
-    *(
-        "site_page",
-        "self_calibration",
-        "tracking",
-        "viewer_page",
-        "viewer_node",
-        "calibrate_command",
-        "tutorial",
-    ),
-    *("viewer_recordings", "robot_estimator", "firmware_emulator", "paper_experiment", "firmware_parity"),
-    *("firmware_arduino_build", "topic_source", "robot_localization", "positioning", "locator_odometry"),
-    *("viewer_playback", "serial_driver", "survey_anchors", "universal", "px4", "process"),
+    "site_page self_calibration tracking viewer_page viewer_node calibrate_command tutorial viewer_recordings "
+    "robot_estimator firmware_emulator paper_experiment firmware_parity firmware_arduino_build topic_source "
+    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors universal px4 process"
 )
 """Files that start first, so that none of them runs alone at the end."""
 
@@ -75,7 +66,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    order = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    order = {f"test_{name}": place for place, name in enumerate(LONGEST.split())}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
     if not config.getoption("--fast"):
         return

@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors, parse_anchors
+from uwb_mitigation.types.anchors import MAX_ANCHORS, MAX_TEXT, Anchor, AnchorMap, dump_anchors, parse_anchors
 
 GOOD = """
 anchors:
   - {id: 1, x: 0, y: 0.5, z: 2.1}
   - {id: 0x1f, x: 7.6, y: 0, z: 2.1, sd: 0.02, name: door}
 """
+
+
+def listed(*positions: tuple[int, float]) -> str:
+    """Return a file with an anchor for each id and x."""
+    return f"anchors: [{', '.join(f'{{id: {number}, x: {x}, y: 0, z: 0}}' for number, x in positions)}]"
 
 
 def test_ids_positions_standard_deviations_and_names_are_read():
@@ -32,11 +37,20 @@ def test_written_file_is_read_back():
     assert parse_anchors(text, "x").anchors == anchors.anchors
 
 
+def test_large_sites_are_accepted():
+    # Positions in millimetres are whole numbers.
+    assert len(parse_anchors(listed(*((n, n + 0.25) for n in range(MAX_ANCHORS))), "x")) == MAX_ANCHORS
+
+
 @pytest.mark.parametrize(
     ("text", "excerpt"),
     [
         ("", "not a list of anchors"),
         ("anchors: []", "0 anchors"),
+        (listed(*((n, n / 2) for n in range(MAX_ANCHORS + 1))), "257 anchors"),
+        (f"{listed((1, 0))}\nrooms: []", "not a list of anchors"),
+        ("[" * 5000, "not YAML"),
+        ("#" * (MAX_TEXT + 1), "characters"),
         ("anchors: [3]", "entry 1: 3 is no anchor"),
         ("anchors: [{id: 1, x: 0, y: 0}]", "entry 1: the field z is missing"),
         ("anchors: [{id: 1, x: 0, y: 0, z: 0, colour: red}]", "unknown field 'colour'"),
@@ -44,7 +58,7 @@ def test_written_file_is_read_back():
         ("anchors: [{id: '1', x: 0, y: 0, z: 0}]", "id = '1'"),
         ("anchors: [{id: 1, x: .nan, y: 0, z: 0}]", "x = nan"),
         ("anchors: [{id: 1, x: 0, y: 0, z: 0, sd: -1}]", "sd = -1"),
-        ("anchors: [{id: 1, x: 0, y: 0, z: 0}, {id: 1, x: 1, y: 0, z: 0}]", "anchor 1 is there twice"),
+        (listed((3, 0), (1, 1), (1, 2)), "anchor 1 is there twice"),
         ("anchors: [{id: 1, x: 0, y: 0, z: 2100}, {id: 2, x: 7600, y: 0, z: 2100}]", "look like millimetres"),
         ("anchors: [{id: 1, x: 3000000, y: 0, z: 0}]", "millimetres?"),
     ],

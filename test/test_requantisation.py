@@ -26,14 +26,11 @@ def test_solved_requantisation_equals_the_float_formula_on_every_accumulator(see
     assert np.array_equal(found.apply(accumulators), requantisation.requantise(accumulators, moved))
 
 
-def test_ties_rounded_half_to_even_are_not_solved():
-    # Every second accumulator is a tie, and even and odd levels are rounded in opposite directions.
-    assert requantisation.solve_requantisation(np.float32(1 / 64), 0, 20_000) is None
-
-
-@pytest.mark.parametrize("scale", [np.float32(0.07), np.float32(0), np.float32(1e-12), np.float32(np.nan)])
-def test_scales_out_of_range_are_not_solved(scale: np.float32):
-    assert requantisation.solve_requantisation(scale, -100, 100) is None
+# Every second accumulator of 1 / 64 is a tie, and even and odd levels are rounded in opposite directions.
+@pytest.mark.parametrize("scale", [1 / 64, 0.07, 0, 1e-12, np.nan])
+def test_ties_and_scales_out_of_range_are_not_solved(scale: float):
+    low, high = (0, 20_000) if scale == 1 / 64 else (-100, 100)
+    assert requantisation.solve_requantisation(np.float32(scale), low, high) is None
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -61,10 +58,9 @@ def test_nudged_sum_is_equal_in_fused_separate_and_neon_arithmetic_on_every_pair
     ],
 )
 def test_neon_formula_differs_where_an_arm_processor_differed(ratios, pair):
-    first, second = np.float32(ratios[0]), np.float32(ratios[1])
+    first, second = np.float32(ratios)
     neon = requantisation.neon_sum_table(first, second)
-    differs = np.argwhere(neon != requantisation.sum_table(first, second))
-    assert differs.tolist() == [list(pair)]
+    assert np.argwhere(neon != requantisation.sum_table(first, second)).tolist() == [list(pair)]
     # The firmware export accepts such a network: only the nudge avoids it.
     assert requantisation.solve_sum(first, second)
 
@@ -73,12 +69,12 @@ def test_neon_formula_differs_where_an_arm_processor_differed(ratios, pair):
     "ratios", [(300.0, 0.5), (1e-5, 0.5), (0.0, 0.5), (np.nextafter(np.float32(1), np.float32(0)), 0.5)]
 )
 def test_ratios_outside_the_neon_kernel_have_no_table(ratios: tuple[float, float]):
-    assert requantisation.neon_sum_table(np.float32(ratios[0]), np.float32(ratios[1])) is None
+    assert requantisation.neon_sum_table(*np.float32(ratios)) is None
 
 
 @pytest.mark.parametrize("ratios", [(1.5, 0.75), (0.0, 0.5), (float("nan"), 0.5)])
 def test_sums_out_of_range_are_not_solved(ratios: tuple[float, float]):
-    assert requantisation.solve_sum(np.float32(ratios[0]), np.float32(ratios[1])) is None
+    assert requantisation.solve_sum(*np.float32(ratios)) is None
 
 
 def test_nudge_makes_a_network_exportable_and_moves_no_scale_by_more_than_64_ulps():

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
-from uwb_mitigation.simulation import buildings
-from uwb_mitigation.simulation.buildings import PLACEMENTS, WIDE_KINDS, block_of, draw_plan
+from uwb_mitigation.simulation.buildings import PLACEMENTS, block_of
 from uwb_mitigation.simulation.simulated import SimulatedBuildings
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.data.simulated import building_dataset
@@ -52,21 +51,6 @@ def test_error_contains_only_the_channel(dataset: Dataset) -> None:
     assert 0.1 < np.median(nlos) < 0.4 < np.median(ndp)
     # Noise before the path is sometimes detected as first path; nothing else is early.
     assert np.mean(dataset.error_m < -0.15) < 0.01
-
-
-@pytest.mark.parametrize("kind", WIDE_KINDS, ids=lambda kind: kind.name)
-def test_plans_match_their_kind(kind: buildings.BuildingType) -> None:
-    rng = np.random.default_rng(0)
-    plans = [draw_plan(kind, rng) for _ in range(30)]
-    low, high = np.transpose([kind.length_m, kind.width_m])
-    for plan in plans:
-        assert ((low <= plan.size) & (plan.size <= high)).all()
-        assert all(0.006 <= wall.thickness_m <= 0.5 for wall in plan.walls)
-        ends = np.array([(wall.start, wall.end) for wall in plan.walls]).reshape(-1, 2)
-        assert ((ends >= -1e-9) & (ends <= np.add(plan.size, 1e-9))).all()
-    if kind.name not in ("hall", "open"):
-        assert np.mean([len(plan.walls) for plan in plans]) > 3
-    assert any(plan.screens for plan in plans)
 
 
 def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:

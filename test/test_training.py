@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from itertools import combinations
 
 import numpy as np
@@ -46,11 +47,7 @@ def test_configurations_have_equal_weight():
         fit_linear_bias(part.configurations, part.rx_power_dbm, part.first_path_power_dbm, part.error_m)
         for part in (data, data.rows(rows))
     )
-    assert np.allclose(
-        [once.offset_m, once.per_rx_power, once.per_power_gap],
-        [long.offset_m, long.per_rx_power, long.per_power_gap],
-        rtol=1e-3,
-    )
+    assert np.allclose(astuple(once), astuple(long), rtol=1e-3)
 
 
 def test_without_levels_the_bias_is_the_median_over_configurations():
@@ -115,21 +112,24 @@ def test_options_out_of_range_are_refused(change):
         FitOptions(**change)
 
 
-def test_cross_validation_finds_the_line_on_held_out_configurations():
-    data = dataset(12, 20)
-    recipe = Recipe(SHAPE, FitOptions(epochs=1))
-    validation = train.cross_validate(data, recipe, folds=4, seed=0)
+RECIPE = Recipe(SHAPE, FitOptions(epochs=1))
+
+
+@pytest.fixture(scope="module")
+def validation() -> train.CrossValidation:
+    return train.cross_validate(dataset(12, 20), RECIPE, folds=4, seed=0)
+
+
+def test_cross_validation_finds_the_line_on_held_out_configurations(validation):
     statistics = validation.statistics()
     assert list(statistics) == ["raw", "overall_median", "l1_line", "float", "int8"]
     assert statistics["l1_line"]["mae"] < 0.25 * statistics["overall_median"]["mae"]
     assert abs(statistics["int8"]["mae"] - statistics["float"]["mae"]) < 0.01
 
 
-def test_card_contains_the_errors_on_held_out_configurations():
+def test_card_contains_the_errors_on_held_out_configurations(validation):
     data = dataset(12, 20)
-    recipe = Recipe(SHAPE, FitOptions(epochs=1))
-    validation = train.cross_validate(data, recipe, folds=4, seed=0)
-    card = train.site_card("name", recipe, LinearBiasModel(0.5), validation, "data")
+    card = train.site_card("name", RECIPE, LinearBiasModel(0.5), validation, "data")
     left = validation.errors["float"]
     deviation = np.interp(np.abs(data.error_m - left), *np.transpose(card.scale))
     # 0.68 x 13 of 12 configurations: the unseen one counts, too.
@@ -143,6 +143,6 @@ def test_card_contains_the_errors_on_held_out_configurations():
 def test_measurements_without_levels_do_not_harm_the_network():
     data = dataset(8, 20)
     data.rx_power_dbm[3] = np.nan
-    fitted = fit_new_model(data, Recipe(SHAPE, FitOptions(epochs=1)), 0)
+    fitted = fit_new_model(data, RECIPE, 0)
     assert fitted.linear_bias.needs_power
     assert np.isfinite(floating.predict_m(fitted.network, data.inputs)).all()

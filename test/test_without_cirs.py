@@ -18,7 +18,6 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.fit.candidates import fit_line
@@ -42,18 +41,10 @@ def ranges(environments: int = 10, seed: int = 0, levels: bool = True) -> list[R
                 level = -75.0 - 20.0 * np.log10(distance / 2.0) - 4.0 * nlos + rng.normal(0.0, 0.5)
                 error = -0.05 + shift + excess + rng.normal(0.0, 0.05)
                 powers = {"rx_power_dbm": level, "first_path_power_dbm": level - gap} if levels else {}
-                number = len(records)
-                measured = RangeMeasurement(
-                    10**18 + number * 10**8,
-                    7,
-                    1 + placement,
-                    number,
-                    0,
-                    distance + error,
-                    Cir(EMPTY, **powers),
-                )
-                label = "NLOS" if nlos else "LOS"
-                records.append(Record(measured, Truth(distance, label, f"environment {environment}")))
+                stamp_ns, number = 10**18 + len(records) * 10**8, len(records)
+                ids, cir = (7, 1 + placement, number, 0), Cir(EMPTY, **powers)
+                truth = Truth(distance, "NLOS" if nlos else "LOS", f"environment {environment}")
+                records.append(Record(RangeMeasurement(stamp_ns, *ids, distance + error, cir), truth))
     return records
 
 
@@ -125,9 +116,9 @@ def test_train_and_evaluate_without_cirs(tmp_path: Path):
 
 
 def test_ranges_without_first_path_level_are_passed_through(tmp_path: Path):
-    with BagWriter(tmp_path / "some.mcap", {"source": "test", "simulated": "true"}) as bag:
-        for number, record in enumerate(ranges()):
-            bag.write(changed(record, {"first_path_power_dbm": np.nan}) if number % 5 == 0 else record)
+    records = ranges()
+    records[::5] = [changed(record, {"first_path_power_dbm": np.nan}) for record in records[::5]]
+    write_records(tmp_path / "some.mcap", records)
     done = succeed("train", "--data", "some.mcap", "-o", "line.onnx", "--json", "t.json", folder=tmp_path)
     mae_m = {row["name"]: row["mae"] for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
     assert 0.2 * mae_m["raw"] < mae_m["l1_line"] < 0.8 * mae_m["raw"]
