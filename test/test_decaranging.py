@@ -123,6 +123,10 @@ def counts(*anomalies: Anomaly) -> dict[str, int]:
     return dict(Counter(anomaly.value for anomaly in anomalies))
 
 
+def contents(records: Iterable[Record]) -> list[tuple[float, list[int]]]:
+    return [(record.measurement.range_m, record.measurement.cir.samples.tolist()) for record in records]
+
+
 # ---- exchanges ----
 
 
@@ -241,30 +245,23 @@ def test_log_cut_at_any_byte_yields_the_exchanges_before_the_cut(write):
     path = write(header(), exchange(1.0), exchange(2.0, 1.0), exchange(3.0, 2.0))
     data = path.read_bytes()
     line_ends = [match.end() for match in re.finditer(rb"Anchor ToF.*\r\n", data)]
-    complete, _ = read(path)
+    complete = contents(read(path)[0])
     for size in range(0, len(data), 7):
         path.write_bytes(data[:size])
         records, error = read_until_damage(path)
-        expected = [record for record, end in zip(complete, line_ends, strict=True) if end <= size]
-        assert [r.measurement.range_m for r in records] == [r.measurement.range_m for r in expected]
-        for got, wanted in zip(records, expected, strict=True):
-            assert np.array_equal(got.measurement.cir.samples, wanted.measurement.cir.samples)
+        assert contents(records) == complete[: sum(end <= size for end in line_ends)]
         if size > 200 and data[size - 1 : size] != b"\n":
             assert isinstance(error, DamagedRecordingError)
 
 
-def _noisy(count: int) -> list[str]:
-    rng = np.random.default_rng(5)
-    noise = [[tuple(pair) for pair in rng.integers(-900, 900, (1016, 2)).tolist()] for _ in range(2 * count)]
-    return [
-        poll(i * SECOND, noise[2 * i]) + TRANSMIT + final(i * SECOND + 9, noise[2 * i + 1]) + ranged(float(i))
-        for i in range(count)
-    ]
-
-
 def test_truncated_or_corrupt_xz_stream_yields_everything_before(write):
-    path = write(header(), *_noisy(12), name="7.log.xz")
-    complete, _ = read(path)
+    noise = np.random.default_rng(5).integers(-900, 900, (12, 2, 1016, 2)).tolist()
+    parts = [
+        poll(i * SECOND, noise[i][0]) + TRANSMIT + final(i * SECOND + 9, noise[i][1]) + ranged(float(i))
+        for i in range(12)
+    ]
+    path = write(header(), *parts, name="7.log.xz")
+    complete = contents(read(path)[0])
     data = path.read_bytes()
     damaged = [(size, data[:size]) for size in range(100, len(data), len(data) // 8)]
     flipped = np.random.default_rng(6).integers(len(data) // 4, len(data), 8).tolist()
@@ -275,9 +272,7 @@ def test_truncated_or_corrupt_xz_stream_yields_everything_before(write):
         assert isinstance(error, RecordingError)
         assert str(path) in error.where
         assert len(records) >= 12 * at // len(data) - 2
-        for got, expected in zip(records, complete, strict=False):
-            assert got.measurement.range_m == expected.measurement.range_m
-            assert np.array_equal(got.measurement.cir.samples, expected.measurement.cir.samples)
+        assert contents(records) == complete[: len(records)]
 
 
 @pytest.mark.parametrize(
@@ -396,27 +391,19 @@ def naive(data: bytes) -> tuple[Counter[str], list[tuple[float, list[bytes] | No
     samples: list[bytes] | None = None
     lines = data.split(b"\r\n")
     for i, line in enumerate(lines):
-        if not line[:1].isalpha():
-            continue
         if line.startswith(b"RX DATA: "):
             kind = {b"21": "P", b"29": "F"}[line[9 + 42 : 9 + 44]]
             counts[Anomaly.NO_RANGE.value] += kind == "P" and "P" in seen
             seen += kind
             if kind == "F":
-                at = i + 4
-                assert lines[i + 3] == b"Accum Len 1016"
-                samples = lines[at : at + 1016]
+                samples = lines[i + 4 : i + 4 + 1016]
         elif line.startswith(b"RX E"):
             counts[Anomaly.RECEPTION_ERROR.value] += 1
         elif line.startswith(b"Anchor ToF"):
-            fields = dict(re.findall(rb"(\w+): (-?[\d.]+) m", line))
-            distance, raw, bias = (float(fields[name]) for name in (b"Dist", b"DistRaw", b"Bias"))
-            assert distance == pytest.approx(raw - bias, abs=1e-6)
             counts[Anomaly.NO_CIR.value] += not seen
-            exchanges.append((distance, samples))
+            exchanges.append((float(line.partition(b"Dist: ")[2].split()[0]), samples))
             seen, samples = "", None
-        if b"#INF" in line:
-            counts[Anomaly.NOT_A_NUMBER.value] += 1
+        counts[Anomaly.NOT_A_NUMBER.value] += b"#INF" in line
     counts[Anomaly.NO_RANGE.value] += bool(seen)
     return +counts, exchanges
 
@@ -427,9 +414,8 @@ def test_real_logs_equal_those_of_a_naive_parser(apartment):
     for path in (apartment / "logs" / f"{number}.log.xz" for number in (6, 11, 27, 29, 36, 37, 46, 19)):
         expected_counts, exchanges = naive(lzma.decompress(path.read_bytes()))
         log = open_decaranging(path)
-        measurements = [record.measurement for record in log]
+        measured = contents(log)
         assert log.skipped == expected_counts, path.name
-        assert [measurement.range_m for measurement in measurements] == [range_m for range_m, _ in exchanges]
-        for measurement, (_, lines) in list(zip(measurements, exchanges, strict=True))[::8]:
-            expected = [int(value) for line in lines or [] for value in line.split(b", ")]
-            assert measurement.cir.samples.tolist() == expected
+        assert [range_m for range_m, _ in measured] == [range_m for range_m, _ in exchanges]
+        for (_, samples), (_, lines) in list(zip(measured, exchanges, strict=True))[::8]:
+            assert samples == [int(value) for line in lines or [] for value in line.split(b", ")]

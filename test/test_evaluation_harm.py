@@ -48,13 +48,12 @@ def clipped(level: int) -> Callable[[Cir], Cir]:
 
 def louder(decibels: float) -> Callable[[Cir], Cir]:
     """Return the CIR of a radio with more (or less) power."""
-    gain = 10 ** (decibels / 20)
-    return lambda cir: replace(
-        cir,
-        scale=gain,
-        rx_power_dbm=cir.rx_power_dbm + decibels,
-        first_path_power_dbm=cir.first_path_power_dbm + decibels,
-    )
+
+    def change(cir: Cir) -> Cir:
+        levels = {name: getattr(cir, name) + decibels for name in ("rx_power_dbm", "first_path_power_dbm")}
+        return replace(cir, scale=10 ** (decibels / 20), **levels)
+
+    return change
 
 
 DAMAGED = {
@@ -64,21 +63,17 @@ DAMAGED = {
     **{f"clipped at {level}": clipped(level) for level in (100, 500, 2000)},
 }
 LATE = {f"shifted by {taps}": shifted(taps) for taps in (5, 10)}
-PERTURBED = {
-    **DAMAGED,
-    **LATE,
-    **{
-        f"{decibels} dB louder": louder(decibels) for decibels in (-25, -20, -16, -15, -10, -9, -5, 5, 10, 20)
-    },
+
+
+LOUDER = {
+    f"{decibels} dB louder": louder(decibels) for decibels in (-25, -20, -16, -15, -10, -9, -5, 5, 10, 20)
 }
+PERTURBED = DAMAGED | LATE | LOUDER
 
 
 def accuracy(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
     """Return the accuracy on records with changed CIRs."""
-    return evaluate_accuracy(
-        mitigation,
-        [changed(record, change(record.measurement.cir)) for record in records],
-    )
+    return evaluate_accuracy(mitigation, [changed(one, change(one.measurement.cir)) for one in records])
 
 
 @pytest.mark.parametrize("name", PERTURBED)
@@ -119,12 +114,12 @@ def universal() -> Mitigation:
 @pytest.fixture(scope="module")
 def calibrated(records) -> list[Record]:
     """Return the records minus the offset of the boards, which is the median error of the LOS placements."""
-    errors: dict[str, list[float]] = {}
-    for record in records:
-        if record.truth.label == "LOS":
-            error = record.measurement.range_m - record.truth.range_m
-            errors.setdefault(record.truth.configuration, []).append(error)
-    offset = float(np.median([np.mean(values) for values in errors.values()]))
+    data = build_dataset(records, load_bundle(default_model_path()).preprocessing)
+    los = data.labels == "LOS"
+    placements = data.configurations[los]
+    offset = float(
+        np.median([data.error_m[los][placements == name].mean() for name in np.unique(placements)])
+    )
     return [changed(record, range_m=record.measurement.range_m - offset) for record in records]
 
 

@@ -97,14 +97,8 @@ class Player:
         self.ends: list[UwbMitigationError | None] = []
         self.ended = threading.Event()
         self.on_record = on_record
-        self.feed = ReplayFeed(
-            source,
-            self.clock,
-            (DEFAULTS | options).__getitem__,
-            SILENT,
-            self,
-            self.end,
-        )
+        parameters = (DEFAULTS | options).__getitem__
+        self.feed = ReplayFeed(source, self.clock, parameters, SILENT, self, self.end)
 
     def publish_records(self, records: Sequence[tuple[Record, int]]) -> None:
         self.batches.append(len(records))
@@ -395,25 +389,24 @@ def test_odometry_imu_and_transforms_of_a_recording_are_replayed_with_the_same_s
     def header(stamp_ns: int, frame: str) -> Header:
         return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=frame)
 
+    def transforms_at(stamp_ns: int, *links: tuple[str, str]) -> TFMessage:
+        made = [TransformStamped(header=header(stamp_ns, one), child_frame_id=other) for one, other in links]
+        return TFMessage(transforms=made)
+
     with BagWriter(bag, {"source": "a test", "simulated": "true"}) as writer:
+
+        def write(topic: str, kind: str, message: object, stamp_ns: int) -> None:
+            writer.write_message(topic, kind, serialize_message(message), stamp_ns + 3 * MS)
+
         for record, stamp_ns in zip(records, stamps, strict=True):
             writer.write(replace(record, measurement=replace(record.measurement, stamp_ns=stamp_ns)))
             odometry = Odometry(header=header(stamp_ns + MS, "odom"), child_frame_id="base_link")
-            transforms = [
-                TransformStamped(header=header(stamp_ns + MS, parent), child_frame_id=child)
-                for parent, child in (("map", "odom"), ("odom", "base_link"))
-            ]
-            for topic, kind, message in (
-                ("/odom", ODOMETRY_TYPE, odometry),
-                ("/imu", IMU_TYPE, Imu(header=odometry.header)),
-                ("/tf", TF_TYPE, TFMessage(transforms=transforms)),
-            ):
-                writer.write_message(topic, kind, serialize_message(message), stamp_ns + 3 * MS)
-        mast = TransformStamped(header=header(stamps[0], "base_link"), child_frame_id="uwb_antenna")
-        writer.write_message(
-            "/tf_static", TF_TYPE, serialize_message(TFMessage(transforms=[mast])), stamps[9]
-        )
-        writer.write_message("/odom2", ODOMETRY_TYPE, serialize_message(Odometry()), stamps[9])
+            write("/odom", ODOMETRY_TYPE, odometry, stamp_ns)
+            write("/imu", IMU_TYPE, Imu(header=odometry.header), stamp_ns)
+            links = (("map", "odom"), ("odom", "base_link"))
+            write("/tf", TF_TYPE, transforms_at(stamp_ns + MS, *links), stamp_ns)
+        write("/tf_static", TF_TYPE, transforms_at(stamps[0], ("base_link", "uwb_antenna")), stamps[9])
+        write("/odom2", ODOMETRY_TYPE, Odometry(), stamps[9])
     ranges, odometry = ros.collect(RangeCir, "/uwb/range_raw"), ros.collect(Odometry, "/odom")
     imu, transforms = ros.collect(Imu, "/imu"), ros.collect(TFMessage, "/tf")
     static = ros.collect(TFMessage, "/tf_static")
