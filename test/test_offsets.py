@@ -20,7 +20,15 @@ from uwb_mitigation.radios.wire.layout import MAX_OFFSETS, MessageType, Mode
 from uwb_mitigation.radios.wire.messages import Correction, Hello
 from uwb_mitigation.radios.wire.session import MAX_TRIES, REQUEST_INTERVAL_NS, BoardSession
 from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, RangeMeasurement, Status
-from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets, dump_offsets, parse_offsets, read_offsets
+from uwb_mitigation.types.offsets import (
+    MAX_ENTRIES,
+    MAX_OFFSET_M,
+    NO_OFFSETS,
+    Offsets,
+    dump_offsets,
+    parse_offsets,
+    read_offsets,
+)
 
 TEXT = """\
 default: 0.5
@@ -89,6 +97,29 @@ def test_malformed_offsets_file_is_refused(text: str, excerpt: str):
     with pytest.raises(ParameterError, match=excerpt) as caught:
         parse_offsets(text, "site.yaml")
     assert "site.yaml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "excerpt"),
+    [
+        ({"anchors": dict.fromkeys(range(MAX_ENTRIES), 0.1)}, f"{MAX_ENTRIES + 1} offsets"),
+        ({"pair_sd": {(1, 2): 0.0}}, "sd = 0.0 m of anchor 2, tag 1"),
+        ({"pair_sd": {(1, 2): MAX_OFFSET_M + 1.0}}, "sd = "),
+    ],
+)
+def test_offsets_out_of_the_limits_are_refused(options: dict, excerpt: str):
+    with pytest.raises(ParameterError, match=excerpt):
+        Offsets(**{"pairs": {(1, 2): 0.1}} | options)
+
+
+def test_largest_offsets_and_standard_deviations_are_accepted_and_compared():
+    widest = {"pairs": {(1, 2): -MAX_OFFSET_M}, "pair_sd": {(1, 2): MAX_OFFSET_M}}
+    offsets = Offsets(MAX_OFFSET_M, dict.fromkeys(range(MAX_ENTRIES - 1), 0.1), **widest)
+    assert str(offsets) == f"{MAX_OFFSET_M:g} m, and {MAX_ENTRIES} of anchors, tags and pairs"
+    small, large = Offsets(0.1), Offsets(0.2)
+    assert small == Offsets(0.1)
+    assert small != large
+    assert large != small
 
 
 @pytest.fixture(scope="module")
