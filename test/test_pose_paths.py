@@ -29,24 +29,16 @@ def header(second: int, frame: str = "map") -> Any:
 
 def pose(second: int) -> Any:
     """Return poses that move along x at 1 m/s."""
-    return of(
-        "geometry_msgs/msg/Pose",
-        of("geometry_msgs/msg/Point", float(second), 2.0, 0.5),
-        of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-    )
+    return of("geometry_msgs/msg/Pose", of("geometry_msgs/msg/Point", float(second), 2.0, 0.5), identity())
+
+
+def identity() -> Any:
+    return of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
 
 
 def step(second: int, parent: str, child: str, x: float) -> Any:
-    return of(
-        "geometry_msgs/msg/TransformStamped",
-        header(second, parent),
-        child,
-        of(
-            "geometry_msgs/msg/Transform",
-            of("geometry_msgs/msg/Vector3", x, 1.0, 0.25),
-            of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-        ),
-    )
+    moved = of("geometry_msgs/msg/Transform", of("geometry_msgs/msg/Vector3", x, 1.0, 0.25), identity())
+    return of("geometry_msgs/msg/TransformStamped", header(second, parent), child, moved)
 
 
 def posed(second: int) -> Any:
