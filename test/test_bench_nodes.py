@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +13,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from ros_harness import Ros
 
-from benchmarks.nodes import RANGES, Subject, SubjectResult, count_missing, rate_ratio
+from benchmarks.nodes import RANGES, count_missing
 
 pytestmark = pytest.mark.ros
 
@@ -30,20 +29,6 @@ def test_missing_ranges_are_counted_across_a_loop_of_the_bag():
     assert count_missing([RANGES - 2, RANGES - 1, 0, 1]) == 0
     assert count_missing([RANGES - 2, 1]) == 2
     assert count_missing([]) == count_missing([3]) == 0
-
-
-def test_a_rate_that_is_never_sustained_is_zero_and_has_no_ratio(monkeypatch: pytest.MonkeyPatch):
-    tried: list[float] = []
-    subject = Subject.__new__(Subject)
-    subject.figures = SubjectResult()
-    monkeypatch.setattr(
-        subject, "trial", lambda rate_hz, _: tried.append(rate_hz) or SimpleNamespace(sustained=False)
-    )
-    subject.search_rate()
-    subject.search_rate()
-    assert subject.figures.rates_hz == [0.0, 0.0]
-    assert min(tried) > 0
-    assert rate_ratio(100.0, 0.0) is None
 
 
 def test_soak_reports_the_resources_of_the_processes(own_domain: None, tmp_path: Path):

@@ -9,8 +9,6 @@ import importlib.util
 import json
 import re
 import shlex
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -252,27 +250,6 @@ def test_templates_use_everything_that_can_be_generated():
     templates = "\n".join(page.read_text(encoding="utf-8") for page in generated.TEMPLATES.glob("*.md"))
     assert set(re.findall(r"^<!-- generated: (\w+) -->$", templates, re.M)) == set(generated.PARTS)
     assert not [path.name for path, text in GENERATED.items() if "<!-- generated" in text]
-
-
-# The language check.
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "lines"),
-    [
-        ("page.md", "Use `absurd`.\n\nIt is computed absurd.\n\n    absurd\n", [3]),
-        ("code.py", 'absurd = 1\n\nx = 1  # the same absurd\nraise ValueError("it is absurd now")\n', [3, 4]),
-        ("code.c", "int absurd;\n/* written\n   absurd */\n", [3]),
-        ("Message.msg", "# fine\nfloat32 range # m, absurd\n", [2]),
-    ],
-)
-def test_language_check_finds_expressions_in_text(tmp_path: Path, name: str, text: str, lines: list[int]):
-    (tmp_path / name).write_text(text, encoding="utf-8")
-    command = [sys.executable, generated.DOCS / "style" / "check_words.py", tmp_path / name]
-    checked = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert checked.returncode == 1
-    numbers = re.findall(rf"{re.escape(name)}:(\d+): ", checked.stdout)
-    assert sorted(map(int, numbers)) == lines
 
 
 # The built site.

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -40,6 +41,7 @@ def test_drawing_of_the_layers_agrees_with_the_contract_and_its_files_exist():
     assert [path for path in paths if not (REPOSITORY / path).exists()] == []
 
 
+@cache
 def imported_files(path: Path) -> set[Path]:
     """Return the files of the package that a file imports, also inside functions; not for type checks."""
     files, waiting = set[Path](), list[ast.AST](ast.parse(path.read_text(encoding="utf-8")).body)

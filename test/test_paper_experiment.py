@@ -16,17 +16,15 @@ pytest.importorskip("torch", reason="training is not set up: run make setup-trai
 import torch
 
 from benchmarks.paper import experiment, training
-from benchmarks.paper.data import Parts, shorten_windows, split_dataset
+from benchmarks.paper.data import Parts, shorten_windows
 from benchmarks.paper.results import RESULTS, ExperimentResults, read
 from benchmarks.paper.search import CHOICE, SPACE, search
-from benchmarks.paper.simulated import SimulatedDeepUwb
 from benchmarks.paper.training import NetworkStack
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
 from uwb_mitigation.mitigation.model import floating
 from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.data.dataset import build_dataset
 from uwb_mitigation.training.fit import fitting
 from uwb_mitigation.training.fit.options import FitOptions
 
@@ -202,14 +200,6 @@ def test_median_of_the_training_part_is_the_baseline(finished):
     train, test = parts().train, parts().test
     expected = np.abs(test.error_m - np.median(train.error_m)).mean()
     assert result.median.all.mae == pytest.approx(expected)
-
-
-def test_mlp_with_the_recipe_of_the_paper_is_at_least_as_good_as_raw_ranges():
-    simulated = build_dataset(SimulatedDeepUwb(ranges=4000, exchanges=4), Preprocessing(157, Scaling.MAX))
-    rooms = split_dataset("rooms", simulated)
-    stack = NetworkStack(Mlp(157), 2, experiment.PAPER.dropout)
-    stack.fit(rooms.train, replace(experiment.PAPER, epochs=3))
-    assert max(stack.maes_m(rooms.test)) <= np.abs(rooms.test.error_m).mean()
 
 
 def test_finished_tasks_are_not_repeated_unless_of_other_data(tmp_path):

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from compilers import NEEDS_CC
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
@@ -20,7 +19,6 @@ TIMEOUT_S = 240.0
 RUNS = {
     "bench": ["-m", "benchmarks", "nodes"],
     "demo": ["-m", "benchmarks", "demo"],
-    "radio demo": ["-m", "benchmarks", "radio-demo", "--seconds", "600"],
 }
 
 
@@ -37,11 +35,7 @@ def nodes_of(pid: int) -> list[psutil.Process]:
 @pytest.mark.ros
 @pytest.mark.parametrize(
     ("run", "number", "code"),
-    [
-        ("bench", signal.SIGKILL, -9),
-        ("demo", signal.SIGTERM, 143),
-        pytest.param("radio demo", signal.SIGINT, 130, marks=NEEDS_CC),
-    ],
+    [("bench", signal.SIGKILL, -9), ("demo", signal.SIGTERM, 143), ("demo", signal.SIGINT, 130)],
 )
 def test_nodes_end_with_their_parent_process(run: str, number: signal.Signals, code: int, tmp_path: Path):
     # Each process isolates itself.

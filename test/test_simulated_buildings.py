@@ -53,20 +53,6 @@ def test_error_contains_only_the_channel(dataset: Dataset) -> None:
     assert np.mean(dataset.error_m < -0.15) < 0.01
 
 
-def test_open_sites_are_in_line_of_sight_and_some_antennas_are_tilted() -> None:
-    blocks = [block_of(7, number)[0] for number in range(40)]
-    crossings = {
-        kind: np.concatenate([block.pairs.path.crossings for block in blocks if block.kind == kind])
-        for kind in ("open", "flat")
-    }
-    # A block contains a third of each condition, if the site has enough.
-    assert np.mean(crossings["open"] == 0) > 0.45 > 0.4 > np.mean(crossings["flat"] == 0)
-    # In LOS only a tilted antenna attenuates the direct path.
-    loss = [block.pairs.path.loss_db[block.pairs.path.crossings == 0] for block in blocks]
-    tilted = [values.max() > 0.0 for values in loss if len(values)]
-    assert 0.15 < np.mean(tilted) < 0.5
-
-
 @pytest.mark.parametrize("distance_m", [(0.0, 3.0), (3.0, 8.0), (12.0, 50.0)])
 def test_nlos_delay_grows_with_the_distance(distance_m: tuple[float, float]) -> None:
     blocks = [block_of(5, number)[0] for number in range(24)]

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import run, succeed
+from command_line import succeed
 from conftest import REPOSITORY
 
 
@@ -110,22 +110,6 @@ def test_quoted_output_is_printed(name: str, folder: Path, request: pytest.Fixtu
     assert [line for line in quote if line and line not in shown] == []
     if name == "process":
         assert [line for line in shown if line and line not in quote] == []
-
-
-@pytest.mark.parametrize("name", ["evaluate", "data info", "process", "doctor"])
-def test_narrow_terminals_show_whole_words(name: str, folder: Path, outputs: dict[str, str]):
-    line = next((line for line in COMMANDS if line.startswith(name)), name)
-    # `output_of` checks the tables at 80 columns; `doctor` is not in `outputs`.
-    wide = outputs[line] if line in outputs else run(*shlex.split(line), folder=folder, columns=80).stdout
-    words = [*shlex.split(line), *(["--force"] if name == "process" else [])]
-    narrow = run(*words, folder=folder, columns=60).stdout
-    tables = [text for text in narrow.splitlines() if text[:1] in ("┃", "│")]
-    assert max(map(len, tables)) <= 60
-    assert words_of("\n".join(tables)) <= words_of(wide)
-
-
-def words_of(text: str) -> set[str]:
-    return set(re.findall(r"[^\W\d_]+", text))
 
 
 def test_tables_on_pages_are_covered():
