@@ -111,15 +111,14 @@ def test_files_equal_those_of_the_mcap_library() -> None:
     file.add_metadata("origin", {"a": "b"})
     library.add_metadata("origin", {"a": "b"})
     for number in range(3):
-        assert file.add_schema(f"T{number}", "ros2msg", b"x" * 9) == library.register_schema(
-            f"T{number}", "ros2msg", b"x" * 9
-        )
-        channel = f"/t{number}", "cdr", number, {"k": "v"}
+        schema, channel = (f"T{number}", "ros2msg", b"x" * 9), (f"/t{number}", "cdr", number, {"k": "v"})
+        assert file.add_schema(*schema) == library.register_schema(*schema)
         assert file.add_channel(*channel) == library.register_channel(*channel)
         for time in (5, 3, 9):
             data = np.random.default_rng(number).bytes(400_000)
-            file.add_message(1 + time % (number + 1), time, data, time + 1, number)
-            library.add_message(1 + time % (number + 1), time, data, time + 1, number)
+            message = 1 + time % (number + 1), time, data, time + 1, number
+            file.add_message(*message)
+            library.add_message(*message)
     assert file.bounds_ns == (3, 9)
     assert file.counts.total() == 9
     file.finish()

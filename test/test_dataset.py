@@ -19,12 +19,12 @@ from uwb_mitigation.types.measurement import CirFault, RadioType, Segment, Truth
 
 
 def test_record_becomes_a_row():
-    records = [record(seed, f"c{seed}") for seed in range(3)]
+    records = [record(seed, f"c{seed}") for seed in range(2)] + [record(2, "c2", rx_power_dbm=-math.inf)]
     built = build_dataset(records, Preprocessing(157))
     _, expected = window_of(records[1].measurement.cir, Preprocessing(157))
     assert np.array_equal(built.inputs[1], expected)
     assert built.error_m.tolist() == [0.25] * 3
-    assert built.rx_power_dbm.tolist() == [-82.0] * 3
+    assert built.rx_power_dbm == pytest.approx([-82.0, -82.0, math.nan], nan_ok=True)
     assert built.first_path_power_dbm.tolist() == [-88.0] * 3
     assert built.configurations.tolist() == ["c0", "c1", "c2"]
     assert built.labels.tolist() == ["LOS"] * 3
@@ -45,11 +45,6 @@ def test_skipped_records_are_counted_by_reason():
         CirFault.NO_PREAMBLE_COUNT.text: 1,
         CirFault.EMPTY.text: 1,
     }
-
-
-def test_power_that_is_not_finite_is_unknown():
-    built = build_dataset([record(rx_power_dbm=-math.inf)], Preprocessing(157))
-    assert np.isnan(built.rx_power_dbm).all()
 
 
 def test_data_without_usable_records_is_refused_with_the_reason():

@@ -59,7 +59,6 @@ def test_module_without_a_node_names_the_nodes_in_one_line():
         ("driver", signal.SIGINT, "rclpy"),
         ("driver", signal.SIGTERM, "rclpy"),
         ("driver", signal.SIGINT, "serial"),
-        ("monitor", signal.SIGINT, "rclpy"),
         ("command_line", signal.SIGINT, "typer"),
         ("benchmarks", signal.SIGINT, "typer"),
     ],

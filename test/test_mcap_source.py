@@ -168,12 +168,8 @@ def test_topic_of_other_layout_is_refused(
 
 def test_close_ends_an_iteration(tmp_path: Path) -> None:
     with McapRecording(write_bag(tmp_path / "bag.mcap", 50)) as source:
-        read = []
-        for item in source:
-            read.append(item)
-            source.close()
-            source.close()
-    assert len(read) == 1
+        assert len([source.close() for _ in source]) == 1
+        source.close()
 
 
 def test_folder_of_sqlite_files_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:

@@ -56,21 +56,15 @@ def test_inputs_equal_the_specification_bit_by_bit(scaling, encoding, data):
     generator = np.random.default_rng(seed)
     low = -32766 if encoding == Encoding.COMPLEX_INT16 else 0
     samples = generator.integers(low, 32767, 128).astype(np.int16)
+    start_index = data.draw(st.integers(-2000, 2000))
+    first_path = start_index + data.draw(st.floats(5, 61.99))
     subject = Cir(
         samples,
         encoding,
-        start_index=data.draw(st.integers(-2000, 2000)),
+        start_index,
+        first_path,
         scale=data.draw(st.sampled_from([1.0, 0.37, 1e-3, 16.5])),
         preamble_count=data.draw(st.integers(1, 65535)),
-    )
-    first_path = subject.start_index + data.draw(st.floats(5, 61.99))
-    subject = Cir(
-        samples,
-        encoding,
-        subject.start_index,
-        first_path,
-        scale=subject.scale,
-        preamble_count=subject.preamble_count,
     )
     found, out = apply(subject, 8, scaling)
     if found == CirFault.TOO_SHORT:
