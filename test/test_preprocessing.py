@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import struct
 import warnings
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_material import cir, window_of
 
+from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.types.measurement import Cir, CirFault, Encoding
 
@@ -91,6 +93,7 @@ IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)
         ({"first_path_index": -math.inf}, CirFault.NO_FIRST_PATH),
         ({"first_path_index": 4.99}, CirFault.TOO_SHORT),
         ({"first_path_index": 865.0}, CirFault.TOO_SHORT),
+        ({"first_path_index": 1016.0}, CirFault.OUTSIDE),
         ({"first_path_index": 1e300}, CirFault.OUTSIDE),
         ({"first_path_index": -1e300}, CirFault.OUTSIDE),
         ({"start_index": 2**31 - 1}, CirFault.OUTSIDE),
@@ -99,6 +102,7 @@ IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)
         ({"samples": np.full(2032, 32767, np.int16)}, CirFault.SATURATED),
         ({"samples": np.full(1016, 32767, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.SATURATED),
         ({"samples": np.full(1016, -1, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.NEGATIVE),
+        ({"samples": np.int16(-np.eye(1, 1016, 750)[0]), "encoding": Encoding.MAGNITUDE}, CirFault.NEGATIVE),
         ({"samples": np.zeros(1016, np.int16), "encoding": Encoding.MAGNITUDE}, CirFault.ALL_ZERO),
         ({"samples": IN_DB, "encoding": Encoding.MAGNITUDE}, CirFault.DECIBELS),
         ({"preamble_count": 0}, CirFault.NO_PREAMBLE_COUNT),
@@ -116,3 +120,9 @@ def test_saturated_sample_outside_the_window_is_accepted():
 
 def test_scaling_by_maximum_needs_no_preamble_count():
     assert fault(cir(preamble_count=0), scaling=Scaling.MAX) == 0
+
+
+@pytest.mark.parametrize(("samples", "is_valid"), [(0, False), (1, True), (1016, True), (1017, False)])
+def test_window_has_1_to_1016_samples(samples, is_valid):
+    with contextlib.nullcontext() if is_valid else pytest.raises(UwbMitigationError):
+        Preprocessing(samples)
