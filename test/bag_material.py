@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
-from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +24,6 @@ from uwb_mitigation.types.measurement import (
 )
 from uwb_mitigation.types.ros import codec, schemas
 from uwb_mitigation.types.ros.topics import RANGE_CIR_TYPE, RANGE_RAW, RANGE_TRUTH, RANGE_TRUTH_TYPE
-from uwb_mitigation.types.source import Source
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -62,15 +59,6 @@ def write_corrected(bag: BagWriter, measurement: RangeMeasurement, corrected: Co
     bag.write_serialized(bag.corrected_channel(), data, stamp_ns, stamp_ns, measurement.sequence)
 
 
-def same(one: RangeMeasurement, other: RangeMeasurement) -> bool:
-    def flat(measurement: RangeMeasurement) -> list[object]:
-        cir = measurement.cir
-        fields = [*astuple(replace(measurement, cir=None)), *astuple(replace(cir, samples=None))]
-        return ["NaN" if isinstance(value, float) and math.isnan(value) else value for value in fields]
-
-    return flat(one) == flat(other) and np.array_equal(one.cir.samples, other.cir.samples)
-
-
 def write_records(
     path: Path, records: Iterable[Record], simulated: str = "true", source: str = "a test"
 ) -> Path:
@@ -83,11 +71,6 @@ def write_records(
 
 def write_bag(path: Path, count: int = 5, simulated: str = "false") -> Path:
     return write_records(path, map(record, range(count)), simulated)
-
-
-def imported(source: Source, path: Path) -> Path:
-    """Write the records of a source to a bag."""
-    return write_records(path, source, "false", source.name)
 
 
 class Foreign:
