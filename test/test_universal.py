@@ -28,6 +28,7 @@ def small() -> UniversalModel:
 
 def test_evaluation_by_condition_uses_other_buildings(small: UniversalModel) -> None:
     assert small.card.source == "DW1000 IPATOV"
+    assert small.card.channels == universal.CHANNELS
     assert small.card.early_path
     for row in ("raw", "float", "int8"):
         assert set(small.held_out[row]) == {"all", "LOS", "NLOS", "NDP NLOS"}

@@ -60,6 +60,7 @@ class ModelCard:
         interval95_sigmas: number of standard deviations that cover 95 % of the errors on unseen configurations.
         ood_bands: bands outside of which a measurement is out of distribution; None = unknown.
         radios, segments: sources of the CIRs that the network was trained for.
+        channels: UWB channels of the training data; empty = unknown.
         early_path: a missed direct path (`mitigation.early_path`) replaces the prediction of the network.
         needs_cir: False = the network predicts 0, so that the linear bias model also corrects ranges without a CIR.
     """
@@ -80,6 +81,7 @@ class ModelCard:
     early_path: bool = False
     radios: tuple[RadioType, ...] = (RadioType.DW1000,)
     segments: tuple[Segment, ...] = (Segment.IPATOV,)
+    channels: tuple[int, ...] = ()
 
     @property
     def scale_lines(self) -> NDArray[np.float32]:
@@ -377,6 +379,7 @@ def _card(metadata: dict[str, Any]) -> ModelCard:
         early_path=metadata["early_path"] is True,
         radios=tuple(RadioType[str(name)] for name in metadata["radios"]),
         segments=tuple(Segment[str(name)] for name in metadata["segments"]),
+        channels=tuple(map(_integer, metadata.get("channels", ()))),
     )
 
 
