@@ -140,7 +140,7 @@ def train(
 
 def quantise(
     model: Annotated[
-        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, written by `train` or `train-universal --float`.")
+        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, as `train` or `--float` writes it.")
     ],
     data: Annotated[
         Path,

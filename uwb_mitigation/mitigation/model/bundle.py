@@ -115,14 +115,11 @@ class ModelCard:
                 f"the preprocessing returns {self.preprocessing.samples}"
             )
         numbers = {
-            "linear_bias.offset_m": self.linear_bias.offset_m,
-            "linear_bias.per_rx_power": self.linear_bias.per_rx_power,
-            "linear_bias.per_power_gap": self.linear_bias.per_power_gap,
-            "correction_limits_m[0]": self.correction_limits_m[0],
-            "correction_limits_m[1]": self.correction_limits_m[1],
+            **{f"linear_bias.{name}": value for name, value in asdict(self.linear_bias).items()},
+            **{f"correction_limits_m[{n}]": value for n, value in enumerate(self.correction_limits_m)},
+            **{f"scale[{n}]": value for n, value in enumerate(chain.from_iterable(self.scale))},
             "variance_m2": self.variance_m2,
             "variance_uncorrected_m2": self.variance_uncorrected_m2,
-            **{f"scale[{n}]": value for n, value in enumerate(chain.from_iterable(self.scale))},
         }
         for name, value in numbers.items():
             if not math.isfinite(value):
