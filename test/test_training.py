@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from itertools import combinations
 
 import numpy as np
@@ -46,11 +47,7 @@ def test_configurations_have_equal_weight():
         fit_linear_bias(part.configurations, part.rx_power_dbm, part.first_path_power_dbm, part.error_m)
         for part in (data, data.rows(rows))
     )
-    assert np.allclose(
-        [once.offset_m, once.per_rx_power, once.per_power_gap],
-        [long.offset_m, long.per_rx_power, long.per_power_gap],
-        rtol=1e-3,
-    )
+    assert astuple(once) == pytest.approx(astuple(long), rel=1e-3)
 
 
 def test_without_levels_the_bias_is_the_median_over_configurations():
