@@ -138,7 +138,8 @@ def test_batch_equals_single_messages_or_is_refused(
     encoded = batch.encode_corrected(corrected)
     for row, message in enumerate(messages):
         decoded, ranges = codec.decode_range(message), batch.columns
-        assert (decoded.cir.encoding, decoded.cir.radio) == (ranges.encoding, ranges.radio)
+        for name in ("encoding", "radio", "channel"):
+            assert getattr(decoded.cir, name) == getattr(ranges, name)
         assert np.array_equal(decoded.cir.samples, ranges.samples[row])
         expected = [getattr(decoded.cir, name) for name in COLUMNS]
         assert repr(expected) == repr([getattr(ranges, name)[row].item() for name in COLUMNS])

@@ -71,9 +71,9 @@ def test_saved_bundle_is_loaded_unchanged(saved):
 
 def test_radios_of_a_card_read_back(tmp_path):
     radios, segments = (RadioType.DW3000, RadioType.QM35), (Segment.STS,)
-    written = bundle(tmp_path, SHAPE, radios=radios, segments=segments)
+    written = bundle(tmp_path, SHAPE, radios=radios, segments=segments, channels=(5, 9))
     read = load_bundle(written.path).card
-    assert (read.radios, read.segments) == (radios, segments)
+    assert (read.radios, read.segments, read.channels) == (radios, segments, (5, 9))
     for radio, segment, fits in (
         (RadioType.QM35, Segment.STS, True),
         (RadioType.DW3000, Segment.IPATOV, False),

@@ -82,10 +82,11 @@ def test_thinning_keeps_a_maximum_number_per_configuration():
     assert (np.diff(rows) > 0).all()
 
 
-def test_radios_and_segments_of_a_dataset_are_those_of_its_cirs():
-    records = [record(), record(radio=RadioType.DW3000, segment=Segment.STS)]
+def test_radios_segments_and_channels_of_a_dataset_are_those_of_its_cirs():
+    records = [record(), record(radio=RadioType.DW3000, segment=Segment.STS, channel=5)]
     dataset = build_dataset(records, Preprocessing(157))
-    assert (dataset.radios, dataset.segments) == (
+    assert (dataset.radios, dataset.segments, dataset.channels) == (
         (RadioType.DW1000, RadioType.DW3000),
         (Segment.IPATOV, Segment.STS),
+        (2, 5),
     )

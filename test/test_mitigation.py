@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from model_material import LINE, bundle, measurement, window_of
 
-from uwb_mitigation.mitigation.correction import UNRELIABLE_VARIANCE_M2, Mitigation
+from uwb_mitigation.mitigation.correction import OTHER_CHANNEL_FACTOR, UNRELIABLE_VARIANCE_M2, Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
@@ -115,6 +115,21 @@ def test_bundle_without_network_ignores_the_cir(tmp_path, changes):
     assert result.status is Status.OK
     if changes.get("first_path_power_dbm") is None and changes:
         assert result.correction_m == 0.25
+
+
+def test_standard_deviation_is_larger_on_other_channels(tmp_path):
+    for trained, channel, factor in (
+        ((2, 5), 5, 1),
+        ((2, 5), 4, OTHER_CHANNEL_FACTOR),
+        ((2, 5), 0, 1),
+        ((), 4, 1),
+    ):
+        subject = Mitigation(bundle(tmp_path, Remnet(samples=157), scale=((0.0, 0.375),), channels=trained))
+        invalid = measurement(samples=np.zeros(2032, np.int16), channel=channel)
+        result, passed_through = subject.correct([measurement(channel=channel), invalid])
+        assert result.variance_m2 == (0.375 * factor) ** 2
+        assert result.status is (Status.OK if factor == 1 else Status.UNRELIABLE)
+        assert passed_through.variance_m2 == 0.5
 
 
 def test_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):

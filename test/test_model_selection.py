@@ -99,16 +99,13 @@ def test_least_number_of_configurations_is_enough(configurations, folds):
 # --- candidates ---
 
 
-def test_cold_start_fits_an_offset_and_the_mean_a_line_too(tmp_path):
+def test_cold_start_fits_an_offset(tmp_path):
     data, source = dataset(20, 3, samples=32), bundle(tmp_path)
-    offered = candidates.with_cold_start(candidates.new_models(RECIPE), data, source)
-    found = {item.name: item.fit(data, 0).correction_m(data) for item in offered if not item.trains}
+    _, start, *_ = candidates.with_cold_start(candidates.new_models(RECIPE), data, source)
     network = network_m(float_network(source), data.inputs)
     shift = linear_fit.fit_constant(data.configurations, data.error_m - network).offset_m
     assert np.std(network) > 0.01
-    assert found[candidates.COLD_START] == pytest.approx(network + shift, abs=1e-5)
-    mean = (found[candidates.LINE] + found[candidates.COLD_START]) / 2
-    assert found[candidates.COLD_START_MEAN] == pytest.approx(mean, abs=1e-5)
+    assert start.fit(data, 0).correction_m(data) == pytest.approx(network + shift, abs=1e-5)
 
 
 def test_cold_start_is_preferred_with_few_configurations_only(tmp_path):
@@ -118,18 +115,8 @@ def test_cold_start_is_preferred_with_few_configurations_only(tmp_path):
         return [item.name for item in candidates.with_cold_start(own, data, source)]
 
     assert names(dataset(19, 2)) == [candidates.COLD_START, *candidates.NEW_MODELS]
-    many = dataset(20, 2)
-    assert names(many) == [
-        "constant",
-        candidates.COLD_START,
-        "line",
-        candidates.COLD_START_MEAN,
-        "line+network",
-        "network",
-    ]
+    assert names(dataset(20, 2)) == ["constant", candidates.COLD_START, "line", "line+network", "network"]
     assert names(dataset(20, 2, samples=8)) == list(candidates.NEW_MODELS)
-    many.rx_power_dbm[:2] = np.nan  # one configuration of the twenty without power levels
-    assert candidates.COLD_START_MEAN not in names(many)
 
 
 @pytest.mark.parametrize("name", [candidates.CONSTANT, candidates.LINE])

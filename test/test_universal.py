@@ -50,6 +50,7 @@ def test_command_writes_both_bundles_with_the_error_by_condition(tmp_path: Path)
 def test_model_of_the_dw1000_uses_early_paths() -> None:
     card = universal.train_universal_model(SMALL, "small", workers=1).card
     assert card.source == "DW1000 IPATOV"
+    assert card.channels == universal.CHANNELS
     assert card.early_path
 
 

@@ -140,7 +140,7 @@ def train(
 
 def quantise(
     model: Annotated[
-        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, written by `train` or `calibrate`.")
+        Path, typer.Argument(metavar="MODEL_FLOAT", help="Float bundle, as `train` or `--float` writes it.")
     ],
     data: Annotated[
         Path,
@@ -154,7 +154,7 @@ def quantise(
 ) -> None:
     """Quantise a float bundle to int8.
 
-    Its training or calibration data determine the scales of the activations.
+    Its training data determine the scales of the activations.
     """
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.training.data import recordings

@@ -19,6 +19,7 @@ from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.choice import Choice, CirKind, choose_model, kinds_of
 from uwb_mitigation.mitigation.model.ood import OodDetector, approximate_features, ood_features
 from uwb_mitigation.types.measurement import (
+    CORRECTED,
     CirFault,
     CorrectedBy,
     CorrectedColumns,
@@ -37,6 +38,10 @@ MAX_RANGE_M = 1e6
 UNRELIABLE_VARIANCE_M2 = 0.25
 """A corrected range with a larger variance is UNRELIABLE. At simulated sites these are 10 % of the ranges, and half of those
 with an error of more than 0.5 m."""
+
+OTHER_CHANNEL_FACTOR = 2.0
+"""Factor of the standard deviation on a known channel for which the model was not trained. Simulated, channels 4 and 7 need 1.4 to 2.6,
+depending on the width of the pulse (docs/experiments/other_channels.py)."""
 
 CLEARLY_IN_DISTRIBUTION = -0.01
 """OOD score below which rounding decides nothing: all scores below 0 have the same result."""
@@ -166,6 +171,9 @@ class Corrector:
             if not (choice.fits or kind.has_levels):
                 is_unlike = (corrected.status == _OUT_OF_DISTRIBUTION) & (corrected.fault == 0)
                 corrected.fault[is_unlike] = CirFault.NO_POWER
+            channels = self.bundles[choice.model].card.channels
+            if ranges.channel and channels and ranges.channel not in channels:
+                _widen(corrected)
             return corrected
         status = np.full(len(ranges), _OUT_OF_DISTRIBUTION if kind.samples else _NO_CIR, np.uint8)
         return pass_through(self.bundles[choice.model], ranges, offset_m, status)
@@ -413,6 +421,8 @@ class Mitigation(Corrector):
     trained for this radio or segment, the range minus offset or the corrected range is negative or not finite, the
     predicted error is outside the model's limits, or the OOD score is 1 or more. MODEL_ERROR: the network failed, or its output is not finite.
 
+    On a known UWB channel that is not in `ModelCard.channels`, the standard deviation is multiplied by `OTHER_CHANNEL_FACTOR`.
+
     The further a measurement is outside the model's training data (`Card.ood_bands`), the more its correction shrinks
     from the predicted error to the overall offset of the training data, and the larger its variance is.
 
@@ -450,6 +460,13 @@ class Mitigation(Corrector):
 
     def _backend(self, bundle: Bundle) -> Backend:
         return OnnxBackend(bundle, PairsAtRest() if self._median_at_rest else None)
+
+
+def _widen(ranges: CorrectedColumns) -> None:
+    """Multiply the standard deviations of corrected ranges by `OTHER_CHANNEL_FACTOR`."""
+    is_corrected = np.isin(ranges.status, CORRECTED)
+    ranges.variance_m2[is_corrected] *= np.float32(OTHER_CHANNEL_FACTOR**2)
+    ranges.status[is_corrected & (ranges.variance_m2 > UNRELIABLE_VARIANCE_M2)] = _UNRELIABLE
 
 
 def _subtract_offset(range_m: NDArray[np.floating], offset_m: NDArray[np.float32]) -> NDArray[np.floating]:

@@ -141,7 +141,7 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
             candidates = [item for item in candidates if not item.trains]
         selection = _select(job, candidates, seed)
         recipe_name = selection.chosen
-        if recipe_name in (models.COLD_START, models.COLD_START_MEAN):
+        if recipe_name == models.COLD_START:
             return _write_selected(job, selection, universal, recipe.fit, ("raw", models.CONSTANT))
     recipe = recipe.for_candidate(recipe_name)
     total = recipe.fit.epochs * (folds + 1)
@@ -180,7 +180,7 @@ def train_from_bundle(
         candidates = [item for item in candidates if item.name != models.NEW_OFFSET]
         candidates = models.with_cold_start(candidates, job.dataset, universal)
     selection = _select(job, candidates, options.seed)
-    start_bundle = universal if selection.chosen in (models.COLD_START, models.COLD_START_MEAN) else source
+    start_bundle = universal if selection.chosen == models.COLD_START else source
     return _write_selected(job, selection, start_bundle, options, ("raw", models.CONSTANT, models.AS_SHIPPED))
 
 

@@ -303,7 +303,7 @@ _CIR_NUMBERS = attrgetter(
 # Not frozen, because this takes 1 % of the time of a correction.
 @dataclass(slots=True, eq=False)
 class RangeColumns:
-    """Columns of n exchanges whose CIRs have the same encoding, length, radio and segment: inputs of the correction.
+    """Columns of n exchanges whose CIRs have the same encoding, length, radio, segment and channel: inputs of the correction.
 
     Attributes:
         tag_id, anchor_id: uint64 (n,).
@@ -312,7 +312,7 @@ class RangeColumns:
         samples: int16 (n, m).
         start_index, preamble_count: integer or float64 (n,).
         first_path_index, scale, rx_power_dbm, first_path_power_dbm: float (n,), of the type of `range_m`.
-        radio, segment: those of all CIRs.
+        radio, segment, channel: those of all CIRs.
     """
 
     tag_id: NDArray[np.uint64]
@@ -328,6 +328,7 @@ class RangeColumns:
     first_path_power_dbm: NDArray[Any]
     radio: RadioType = RadioType.UNKNOWN
     segment: Segment = Segment.UNKNOWN
+    channel: int = 0
 
     @staticmethod
     def grouped(measurements: Sequence[RangeMeasurement]) -> Iterator[tuple[list[int], RangeColumns]]:
@@ -335,7 +336,7 @@ class RangeColumns:
         groups: dict[tuple[int, ...], list[int]] = {}
         for index, measurement in enumerate(measurements):
             cir = measurement.cir
-            form = (cir.encoding, len(cir.samples), cir.radio, cir.segment)
+            form = (cir.encoding, len(cir.samples), cir.radio, cir.segment, cir.channel)
             groups.setdefault(form, []).append(index)
         for indices in groups.values():
             members = [measurements[index] for index in indices]
@@ -347,6 +348,7 @@ class RangeColumns:
             samples = np.array([cir.samples for cir in cirs]) if len(cirs) > 1 else cirs[0].samples[None]
             columns = RangeColumns(tag_id, anchor_id, range_m, cirs[0].encoding, samples, *others)
             columns.radio, columns.segment = cirs[0].radio, cirs[0].segment
+            columns.channel = cirs[0].channel
             yield indices, columns
 
     def take(self, rows: list[int]) -> RangeColumns:

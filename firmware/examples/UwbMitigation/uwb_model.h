@@ -1,4 +1,4 @@
-/* universal, model 853786ea, written by `uwb-mitigation board export-c`. */
+/* universal, model 86127184, written by `uwb-mitigation board export-c`. */
 #ifndef UWB_MODEL_H
 #define UWB_MODEL_H
 
@@ -429,7 +429,7 @@ static const uwb_scale_line uwb_model_scale[] = {
 };
 
 static const uwb_model uwb_model_data = {
-    0x853786eau, 157u, UWB_SCALE_PREAMBLE, 0.00991764199f, 3u, 3u, uwb_first_weights, uwb_first,
+    0x86127184u, 157u, UWB_SCALE_PREAMBLE, 0.00991764199f, 3u, 3u, uwb_first_weights, uwb_first,
     uwb_modules, 0u, NULL, uwb_head_weights, 384u, 1105, 2.45213469e-05f, 0.0f, 0.0f, 0.0f,
     -12.5251331f, 36.5019951f, 0.104561187f, uwb_model_scale, 12u, &uwb_model_ood_bands, 1,
 };

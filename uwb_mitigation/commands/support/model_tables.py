@@ -28,7 +28,6 @@ _CANDIDATES = {
     "as shipped": "the source model, unchanged",
     "new offset": "the source model with a new offset",
     "cold start": "network trained in simulation, with an offset of this data",
-    "mean of line and cold start": "average of both predictions",
     "fine-tuned": "the source network, trained further on this data",
     "constant": "one constant offset",
     "line": "linear bias model in the received powers",
@@ -46,7 +45,7 @@ def show_trained(trained: TrainedBundle) -> None:
         show_selection(trained.selection)
     if trained.prefers_cold_start:
         print_line(
-            f"With fewer than {candidates.MIN_CONFIGURATIONS_FOR_MEAN} configurations, cold start is selected unless another candidate is "
+            f"With fewer than {candidates.MIN_CONFIGURATIONS} configurations, cold start is selected unless another candidate is "
             f"{selection.COLD_START_MIN_GAIN:.0%} better."
         )
     if "int8" in trained.validation.errors:

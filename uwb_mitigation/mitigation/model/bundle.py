@@ -60,6 +60,7 @@ class ModelCard:
         interval95_sigmas: number of standard deviations that cover 95 % of the errors on unseen configurations.
         ood_bands: bands outside of which a measurement is out of distribution; None = unknown.
         radios, segments: sources of the CIRs that the network was trained for.
+        channels: UWB channels of the training data; empty = unknown.
         early_path: a missed direct path (`mitigation.early_path`) replaces the prediction of the network.
         needs_cir: False = the network predicts 0, so that the linear bias model also corrects ranges without a CIR.
     """
@@ -80,6 +81,7 @@ class ModelCard:
     early_path: bool = False
     radios: tuple[RadioType, ...] = (RadioType.DW1000,)
     segments: tuple[Segment, ...] = (Segment.IPATOV,)
+    channels: tuple[int, ...] = ()
 
     @property
     def scale_lines(self) -> NDArray[np.float32]:
@@ -113,14 +115,11 @@ class ModelCard:
                 f"the preprocessing returns {self.preprocessing.samples}"
             )
         numbers = {
-            "linear_bias.offset_m": self.linear_bias.offset_m,
-            "linear_bias.per_rx_power": self.linear_bias.per_rx_power,
-            "linear_bias.per_power_gap": self.linear_bias.per_power_gap,
-            "correction_limits_m[0]": self.correction_limits_m[0],
-            "correction_limits_m[1]": self.correction_limits_m[1],
+            **{f"linear_bias.{name}": value for name, value in asdict(self.linear_bias).items()},
+            **{f"correction_limits_m[{n}]": value for n, value in enumerate(self.correction_limits_m)},
+            **{f"scale[{n}]": value for n, value in enumerate(chain.from_iterable(self.scale))},
             "variance_m2": self.variance_m2,
             "variance_uncorrected_m2": self.variance_uncorrected_m2,
-            **{f"scale[{n}]": value for n, value in enumerate(chain.from_iterable(self.scale))},
         }
         for name, value in numbers.items():
             if not math.isfinite(value):
@@ -377,6 +376,7 @@ def _card(metadata: dict[str, Any]) -> ModelCard:
         early_path=metadata["early_path"] is True,
         radios=tuple(RadioType[str(name)] for name in metadata["radios"]),
         segments=tuple(Segment[str(name)] for name in metadata["segments"]),
+        channels=tuple(map(_integer, metadata.get("channels", ()))),
     )
 
 

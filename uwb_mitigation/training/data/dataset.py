@@ -50,7 +50,7 @@ class Dataset:
         skipped: {reason: number of measurements that were not used}.
         headers: float32 (n, 2), preamble count and noise threshold; None = not kept.
         tags, anchors: ids, int (n,), for splits by location; None = not kept.
-        radios, segments: known sources of the CIRs.
+        radios, segments: known sources of the CIRs. channels: known UWB channels.
         early_path_m: float32 (n,), errors that missed direct paths cause (`mitigation.early_path`), NaN: none; None = not
             computed.
     """
@@ -69,6 +69,7 @@ class Dataset:
     anchors: NDArray[np.uint64] | None = None
     radios: tuple[RadioType, ...] = (RadioType.DW1000,)
     segments: tuple[Segment, ...] = (Segment.IPATOV,)
+    channels: tuple[int, ...] = ()
     early_path_m: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
@@ -116,15 +117,17 @@ class Dataset:
 
 
 class CirSources:
-    """Collects the radios and segments of CIRs; unknown ones are those of earlier versions: DW1000, IPATOV."""
+    """Collects the radios, segments and channels of CIRs; unknown radios and segments are those of earlier versions: DW1000, IPATOV."""
 
     def __init__(self) -> None:
         self._radios: set[RadioType] = set()
         self._segments: set[Segment] = set()
+        self._channels: set[int] = set()
 
     def add(self, cir: Cir) -> None:
         """Add a CIR; without samples it has no segment."""
         self._radios.add(cir.radio or RadioType.DW1000)
+        self._channels.add(cir.channel)
         if len(cir):
             self._segments.add(cir.segment or Segment.IPATOV)
 
@@ -137,6 +140,11 @@ class CirSources:
     def segments(self) -> tuple[Segment, ...]:
         """All segments."""
         return tuple(sorted(self._segments)) or (Segment.IPATOV,)
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """All channels; empty if one is unknown."""
+        return () if 0 in self._channels else tuple(sorted(self._channels))
 
 
 class _Row(NamedTuple):
@@ -209,6 +217,7 @@ def _dataset_of(rows: Sequence[_Row], preprocessing: Preprocessing, skipped: Map
         anchors=np.array([measurement.anchor_id for measurement in measurements], np.uint64),
         radios=sources.radios,
         segments=sources.segments,
+        channels=sources.channels,
         early_path_m=np.array(early_paths, np.float32),
     )
 

@@ -81,12 +81,8 @@ def evaluate_accuracy(
     cards = {bundle.model_id: bundle.card for bundle in mitigation.bundles}
     model_id = max(cards, key=model_ids.count)
     # This part of the card is for people and may contain any JSON value.
-    training_configurations = cards[model_id].training.get("configurations")
-    trained_on = {
-        name
-        for name in set(configurations)
-        if isinstance(training_configurations, list) and name in training_configurations
-    }
+    known = cards[model_id].training.get("configurations")
+    trained_on = [name for name in set(configurations) if isinstance(known, list) and name in known]
     return Accuracy(
         n=len(raw),
         raw=ErrorStatistics.of(raw_m),

@@ -76,11 +76,10 @@ def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     corrections = correct_with_card(dataset, bundle.card, predicted)
     residual = dataset.error_m - corrections.correction_m
 
-    names, configuration_index = np.unique(dataset.configurations, return_inverse=True)
-    means = np.bincount(configuration_index, residual) / np.bincount(configuration_index)
-    is_los = np.array(
-        [(dataset.labels[configuration_index == k] == LOS).mean() > 0.5 for k in range(len(names))]
-    )
+    _, configuration_index = np.unique(dataset.configurations, return_inverse=True)
+    count = np.bincount(configuration_index)
+    means = np.bincount(configuration_index, residual) / count
+    is_los = np.bincount(configuration_index, dataset.labels == LOS) > 0.5 * count
     los_offset = float(np.median(means[is_los])) if is_los.any() else 0.0
     offset_of_others = np.array(
         [np.median(np.delete(means, k)) if len(means) > 1 else 0.0 for k in range(len(means))]

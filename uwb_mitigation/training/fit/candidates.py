@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.architecture import Architecture, Remnet
 from uwb_mitigation.mitigation.model.bundle import Bundle, session_options
-from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.mitigation.model.floating import float_network
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.data import splits
@@ -28,15 +28,15 @@ from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB
 NEW_MODELS = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+network", "network"
 """Models that are fitted to the data only."""
 
-COLD_START, COLD_START_MEAN = "cold start", "mean of line and cold start"
+COLD_START = "cold start"
 AS_SHIPPED, NEW_OFFSET, FINE_TUNED = "as shipped", "new offset", "fine-tuned"
 
 NETWORK_ONLY = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
 """Options of a network without a line: it needs more training than one that refines a line."""
 
 PER_CONFIGURATION = 20
-MIN_CONFIGURATIONS_FOR_MEAN = 20
-"""Number of configurations from which a line is averaged with the universal network."""
+MIN_CONFIGURATIONS = 20
+"""With fewer configurations, the universal network with an offset is preferred."""
 
 _BATCH = 1024
 
@@ -180,13 +180,9 @@ def fit_line(data: Dataset) -> LinearBiasModel:
         true_m = np.round(data.range_m - data.error_m, 1)
         assert data.tags is not None
         assert data.anchors is not None
-        cells = np.array(
-            [
-                "/".join(map(str, cell))
-                for cell in zip(data.configurations, true_m, data.tags, data.anchors, strict=True)
-            ]
-        )
-        rows = data.rows(splits.subsample(cells, PER_CONFIGURATION, 0))
+        cells = zip(data.configurations, true_m, data.tags, data.anchors, strict=True)
+        names = np.array(["/".join(map(str, cell)) for cell in cells])
+        rows = data.rows(splits.subsample(names, PER_CONFIGURATION, 0))
         gap = rows.rx_power_dbm - rows.first_path_power_dbm
         is_los = np.where(rows.labels == "", gap < LINE_OF_SIGHT_DB, rows.labels == "LOS")
         return linear_fit.fit_linear_bias_to_rows(
@@ -222,14 +218,6 @@ def _fine_tuned(
         linear_bias,
         _fit_residuals(data, linear_bias, PER_CONFIGURATION, options, architecture, start=network),
     )
-
-
-def _cold_start_mean(network: FloatWeights, data: Dataset, seed: int) -> FittedModel:
-    """Return the mean of line and cold start: it reduces both the scatter of the line and the network's errors at a site."""
-    line, offset = fit_line(data), _offset(data, network).offset_m
-    total = (line.offset_m + offset, line.per_rx_power, line.per_power_gap)
-    linear_bias = LinearBiasModel(*(float(np.float32(value / 2)) for value in total))
-    return FittedModel(linear_bias, scaled(network, 0.5))
 
 
 _WITHOUT_NETWORK = (
@@ -269,25 +257,19 @@ def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
 def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: Bundle) -> list[Candidate]:
     """Add the universal network with an offset of the data, if the data is preprocessed for it.
 
-    With few configurations it is the first candidate, so that it is preferred. With `MIN_CONFIGURATIONS_FOR_MEAN` or
-    more it follows the constant, and its mean with the line follows the line.
+    With few configurations it is the first candidate, so that it is preferred, otherwise it follows the constant.
     """
-    if data.preprocessing != universal.preprocessing:
-        return list(candidates)
-    network = float_network(universal)
-    start = Candidate(COLD_START, partial(_with_new_offset, LinearBiasModel(0.0), network))
-    if has_few_configurations(data):
-        return [start, *candidates]
-    has_powers = np.isfinite(data.rx_power_dbm - data.first_path_power_dbm)
-    has_line = len(data.rows(has_powers).names) >= MIN_CONFIGURATIONS_FOR_MEAN
-    mean = [Candidate(COLD_START_MEAN, partial(_cold_start_mean, network))] if has_line else []
-    inserted = {CONSTANT: [start], LINE: mean}
-    return [item for old in candidates for item in (old, *inserted.get(old.name, ()))]
+    added = list(candidates)
+    if data.preprocessing == universal.preprocessing:
+        start = partial(_with_new_offset, LinearBiasModel(0.0), float_network(universal))
+        place = 0 if has_few_configurations(data) else [item.name for item in added].index(CONSTANT) + 1
+        added.insert(place, Candidate(COLD_START, start))
+    return added
 
 
 def has_few_configurations(data: Dataset) -> bool:
     """Whether the cold start is preferred because there are few configurations."""
-    return len(data.names) < MIN_CONFIGURATIONS_FOR_MEAN
+    return len(data.names) < MIN_CONFIGURATIONS
 
 
 def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:

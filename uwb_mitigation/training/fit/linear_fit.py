@@ -67,7 +67,7 @@ def fit_linear_bias_to_rows(
     error_m: NDArray[np.floating],
     is_los: NDArray[np.bool_],
 ) -> LinearBiasModel:
-    """Fit the linear bias model to single ranges, for recordings without CIRs; all arrays have the shape (n,).
+    """Fit the linear bias model to single ranges, for recordings without CIRs; all arrays have the shape (n,), n > 0.
 
     In such recordings, a configuration is often a whole environment with LOS and NLOS ranges, so that its mean shows no
     line. LOS ranges get more weight until their error does not grow; if it still does, or without levels, the model is
@@ -78,12 +78,7 @@ def fit_linear_bias_to_rows(
         first_path_power_dbm: first-path power, dBm; NaN: unknown.
         error_m: measured - true range, m.
         is_los: whether a range is in line of sight.
-
-    Raises:
-        DatasetError: there are no measurements.
     """
-    if not len(error_m):
-        raise DatasetError("no measurements to fit a linear bias model to")
     of_los, offset_m = error_m[is_los], float(np.median(error_m))
     limit_m = float(np.abs(of_los).mean()) + MAX_LOS_INCREASE_M if len(of_los) else np.inf
     if len(of_los) and np.abs(of_los - offset_m).mean() > limit_m:

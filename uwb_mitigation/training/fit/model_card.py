@@ -64,6 +64,7 @@ def card_of(
         ood_bands=ood_bands,
         radios=dataset.radios,
         segments=dataset.segments,
+        channels=dataset.channels,
     )
 
 

@@ -207,7 +207,7 @@ class RangeBatch:
 
     Raises:
         RecordingError: the first message cannot be decoded, or another one has another form: length of the message or
-            frame_id, encoding, number of samples, radio, segment; or its fields are not valid.
+            frame_id, encoding, number of samples, channel, PRF, radio, segment; or its fields are not valid.
     """
 
     def __init__(self, messages: Sequence[bytes]) -> None:
@@ -218,9 +218,9 @@ class RangeBatch:
         if {len(message) for message in messages} != {size} or size < powers + _CIR_POWERS.size:
             raise RecordingError("messages of several lengths")
         table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), size)
-        # Encapsulation, length of frame_id, its terminator and padding; encoding, sample count, radio and segment.
+        # Encapsulation, length of frame_id, its terminator and padding; encoding, sample count, channel, PRF, radio and segment.
         fixed = np.r_[
-            0:4, 12:16, frame_end - 1 : start, start + 48, start + 56 : start + 60, powers + 10 : powers + 12
+            0:4, 12:16, frame_end - 1 : start, start + 48, start + 56 : start + 60, powers + 8 : powers + 12
         ]
         frame = table[:, _PREFIX.size : frame_end]
         if frame_end == _PREFIX.size or table[0, frame_end:start].any() or messages[0][2:4] != b"\0\0":
@@ -245,7 +245,7 @@ class RangeBatch:
         cirs = np.ascontiguousarray(table[:, end : end + samples.nbytes]).view("<i2")
         starts, counts = column(start + 40, "<i4"), column(end + samples.nbytes, "<u2")
         shape = first.cir.encoding, cirs, starts, first_path, scale
-        source = first.cir.radio, first.cir.segment
+        source = first.cir.radio, first.cir.segment, first.cir.channel
         self.columns = RangeColumns(tags, anchors, range_m, *shape, counts, rx_dbm, first_path_dbm, *source)
 
     @staticmethod
