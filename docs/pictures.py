@@ -200,7 +200,7 @@ def show_states(browser: Browser, folder: Path) -> None:
             browser.wait("the page", browser.ready)
             while player.position_s != state.seconds or player.is_behind:
                 time.sleep(0.1)
-            time.sleep(3.0)
+            time.sleep(5.0)
             if not state.is_connected:
                 server.close()
                 browser.wait("the message", lambda: "Connection lost" in browser.text())

@@ -293,6 +293,7 @@ def test_index_of_a_drive_has_tracks_errors_and_residuals(tmp_path: Path, monkey
     assert float(corrected.split()[0]) < 0.8 * float(re.search(r"raw \+ same filter: (\S+) m", references)[1])
     counted: list[str] = []
     monkeypatch.setattr(texts, "recorded_cards", lambda *_: counted.append(WHOLE) or [])
+    seek(player, 0.0)
     page = Drawn(View(scene, threading.Lock(), player=player))
     for position_s in (5.0, 8.0):
         page.send("seek", position_s)
