@@ -2,7 +2,7 @@
 
 `raw_and_corrected.png` contains maps of two simulated drives with calibrated offsets: positions by least squares on raw ranges,
 by the locator on raw ranges, and by the locator on corrected ranges. The others are screenshots in Chromium: `viewer.png` and
-`viewer_narrow.png` of live topics, `state_*.png` of the first screen for each state of the position.
+`viewer_narrow.png` of live topics, `state_*.png` of the first screen for each state of the page.
 
     python docs/pictures.py [map] [live] [states]
 """
@@ -57,7 +57,7 @@ SIMULATED_HZ = 40.0
 WATCHED_S = 40.0
 """Duration before the page is opened, for a trail and most of a strip chart."""
 FILLED_S = 7.0
-"""Duration before the screenshots are taken, for a waterfall plot."""
+"""Duration before the screenshots are taken, for the CIRs."""
 
 DRIVE_RANGES = 1400
 """Number of ranges of the drives of the states, at 20 Hz: 70 s."""
@@ -148,12 +148,15 @@ class State(NamedTuple):
     Attributes:
         building: see `FLATS`. anchors: changes the map. change: changes each record; None: it is not received.
         seconds: time in the recording.
+        is_indexed: whether its index is ready. is_connected: whether its viewer still runs.
     """
 
     building: str = "open"
     anchors: Callable[[AnchorMap], AnchorMap] = lambda anchors: anchors
     change: Callable[[Record], Record | None] = lambda record: record
     seconds: float = 40.0
+    is_indexed: bool = True
+    is_connected: bool = True
 
 
 STATES = {
@@ -163,6 +166,8 @@ STATES = {
     "not_determined": State(change=lambda record: record if record.measurement.anchor_id < 3 else None),
     "without_cirs": State(change=without_cir),
     "recording": State("brick"),
+    "indexing": State(is_indexed=False),
+    "lost_connection": State(is_connected=False),
 }  # fmt: skip
 
 
@@ -187,14 +192,18 @@ def show_states(browser: Browser, folder: Path) -> None:
         feed = SceneUpdater(Scene(), Lock())
         player = BagPlayer(bag, feed, lambda: mitigation(settings))
         feed.anchors(anchors)
-        player.index(settings.config(anchors), check=displaced_anchor).join()
+        if state.is_indexed:
+            player.index(settings.config(anchors), check=displaced_anchor).join()
         view = View(feed.scene, feed.lock, f"{name}.mcap", player=player, missing=player.missing)
         with ViewerServer(view, port=0) as server:
             browser.open(f"{server.url}#t={state.seconds}", *FIRST_SCREEN)
             browser.wait("the page", browser.ready)
             while player.position_s != state.seconds or player.is_behind:
                 time.sleep(0.1)
-            time.sleep(3.0)
+            time.sleep(5.0)
+            if not state.is_connected:
+                server.close()
+                browser.wait("the message", lambda: "Connection lost" in browser.text())
             save(browser, f"state_{name}", 64)
 
 

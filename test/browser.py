@@ -6,12 +6,10 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-SCREENS = Path(__file__).resolve().parents[1] / "build" / "screens"
 TIMEOUT_S = 120.0
 CALL_S = 10.0
 """Timeout of one call; a call that a reload of the page interrupts is repeated."""
@@ -26,8 +24,8 @@ INTERRUPTED = "aborted by navigation", "execution context", "stale element", "no
 """Errors of calls whose page was replaced meanwhile."""
 
 ROLES = {
-    "button": "button", "checkbox": "input", "combobox": "select", "searchbox": "input", "slider": "input",
-    "table": "table", "image": "[role=img]", "region": "section", "columnheader": "th", "heading": "h1, h2",
+    "button": "button", "checkbox": "input", "combobox": "select", "slider": "input",
+    "table": "table", "heading": "h1, h2",
 }  # fmt: skip
 """CSS selectors of the elements that can have a role."""
 
@@ -78,17 +76,6 @@ class Browser:
             yield
         finally:
             self.driver.execute_cdp_cmd(emulate, {"enabled": False})
-
-    @contextmanager
-    def dark_mode(self) -> Iterator[None]:
-        """Emulate a user who prefers dark pages."""
-        emulate = "Emulation.setEmulatedMedia"
-        dark = {"name": "prefers-color-scheme", "value": "dark"}
-        self.driver.execute_cdp_cmd(emulate, {"features": [dark]})
-        try:
-            yield
-        finally:
-            self.driver.execute_cdp_cmd(emulate, {"features": []})
 
     def scroll_to(self, name: str) -> float:
         """Scroll a named Bokeh figure into the middle; return the scroll position of the page."""
@@ -177,13 +164,6 @@ class Browser:
         """Return the visible text of the page."""
         return self.run("return document.body.innerText")
 
-    def export(self, name: str) -> str:
-        """Return an exported file of the page as text, such as `Map as CSV`."""
-        self.run("window.exported = {}")
-        self.click("button", f"Export {name}")
-        self.wait("the file", lambda: self.run("return Object.keys(window.exported).length") == 1)
-        return self.run("return Object.values(window.exported)[0].text()")
-
     def column(self, model: str, name: str) -> list[Any]:
         """Return a column of the source of a named table or figure; empty before the page is loaded."""
         return self.run(
@@ -208,18 +188,6 @@ class Browser:
             ".map((e) => e.outerHTML.slice(0, 100)).slice(0, 5).concat(['the page'])",
             width,
         )
-
-    def screenshot(self, name: str) -> Path:
-        SCREENS.mkdir(parents=True, exist_ok=True)
-        path = SCREENS / f"{name}.png"
-        self.driver.save_screenshot(str(path))
-        return path
-
-
-def drawn_column(document: Any, figure: str, column: str) -> Any:
-    """Return a column of the source of a named figure, without a browser."""
-    sources = [renderer.data_source for renderer in document.get_model_by_name(figure).renderers]
-    return next(source.data[column] for source in sources if column in source.data)
 
 
 @contextmanager

@@ -1,39 +1,36 @@
-"""Recordings whose stamps differ from their log times, and clients that are slow, in a real browser."""
+"""Recordings on the page: stamps that differ from log times, gaps, displaced anchors."""
 
 from __future__ import annotations
 
-import math
-import socket
 import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import START_NS, corrected, record
+from bag_material import START_NS, STEP_NS, corrected, record
 from browser import Browser
+from drawn import Drawn, corrected_bag
 from drives import HALL, drive
 
 from uwb_mitigation.commands.offline.track import displaced_anchor
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.recordings import recorded_ranges
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.anchors import AnchorMap
+from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.histories import Sample
+from uwb_mitigation.viewer.histories import RangeColumns
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Pose, Scene
+from uwb_mitigation.viewer.playback import BagPlayer, Check
+from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
+from uwb_mitigation.viewer.timeline import Timeline, add_residuals
 
 BAD = 700
 """Row of the range whose status is not OK and whose error is the largest."""
@@ -84,215 +81,134 @@ def write_drive(
     return path
 
 
-@contextmanager
-def serve(path: Path, anchors: AnchorMap = HALL) -> Iterator[tuple[BagPlayer, ViewerServer]]:
-    """Serve an indexed bag, paused at its begin."""
-    lock = threading.Lock()
-    feed = SceneUpdater(Scene(), lock)
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drive(tmp_path_factory.mktemp("drive") / "drive.mcap", {7: 0.0})
+
+
+def indexed(path: Path, anchors: AnchorMap = HALL, check: Check | None = None) -> View:
+    """Return the view of an indexed bag, paused at its begin."""
+    feed = SceneUpdater(Scene(), threading.Lock())
     player = BagPlayer(path, feed, lambda: pytest.fail("the bag contains corrected ranges"))
     feed.anchors(anchors)
-    player.index(EstimatorConfig(anchors), check=displaced_anchor).join()
-    with ViewerServer(View(feed.scene, lock, player=player), port=0) as server:
-        yield player, server
-
-
-def send(browser: Browser, name: str, *arguments: object) -> None:
-    """Send a command of the page."""
-    script = "Bokeh.documents[0].get_model_by_name('controls').command = [arguments[0], arguments[1], Math.random()]"
-    browser.run(script, name, list(arguments))
-
-
-def position_s(browser: Browser) -> float:
-    return float(browser.run("return document.getElementById('position').value"))
+    player.index(EstimatorConfig(anchors), check=check).join()
+    return View(feed.scene, feed.lock, player=player)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, -2.0])
-def test_marks_and_map_agree_with_the_log_time(browser: Browser, tmp_path: Path, delay_s: float):
-    with serve(write_drive(tmp_path / "drive.mcap", {7: delay_s})) as (player, server):
-        browser.open(server.url)
-        browser.wait("the figures", lambda: "Position RMSE, whole recording" in browser.cards())
-        assert ("Stamps differ from the log time" in browser.text()) == (delay_s != 0.0)
-        for button in ("Largest error", "Next bad range", "Previous bad range"):
-            if button != "Largest error":
-                send(browser, "seek", 0.0 if button == "Next bad range" else 40.0)
-                browser.wait("the other position", lambda: abs(position_s(browser) - BAD / 25.0) > 1.0)
-            browser.click("button", button)
-            browser.wait(button, lambda: position_s(browser) == pytest.approx(BAD / 25.0, abs=0.05))
-            browser.wait("its status", lambda: "BAD_CIR" in browser.column("pairs", "status"))
-        browser.wait(
-            "the track",
-            lambda: browser.column("map", "heading") == [None] and "tag 7" in browser.column("map", "name"),
-        )
-        assert player.timeline is not None
-        assert (
-            np.abs(player.timeline.tracks["tag_7", TrackKind.TRUE][:, 0] - np.arange(1000) / 25.0).max() < 0.1
-        )
-        assert float(browser.cards()["Position RMSE, whole recording"][0].split()[0]) < 0.5
-        assert browser.console_messages() == []
+def test_marks_and_map_agree_with_the_log_time(bag: Path, tmp_path: Path, delay_s: float):
+    view = indexed(write_drive(tmp_path / "late.mcap", {7: delay_s}) if delay_s else bag)
+    page, player, timeline = Drawn(view), view.player, view.timeline
+    assert ("Stamps differ from the log time" in " ".join(page.controls.notice)) == (delay_s != 0.0)
+    assert page.controls.marks["bad"] == [pytest.approx(BAD / 25.0 / player.seconds, abs=2e-3)]
+    (time_s, text), *_ = [event for event in page.controls.incidents if "largest" in event[1]]
+    assert time_s == pytest.approx(BAD / 25.0, abs=0.05)
+    assert text.startswith("largest error of a range, 3.")
+    assert "BAD_CIR" not in page.column("pairs", "status")
+    page.send("seek", time_s)
+    assert page.controls.player["position"] == pytest.approx(time_s, abs=1e-3)
+    assert "BAD_CIR" in page.column("pairs", "status")
+    assert page.column("map", "x1") != []
+    true_s = timeline.tracks["tag_7", TrackKind.TRUE][:, 0]
+    assert np.abs(true_s - np.arange(1000) / 25.0).max() < 0.1
+    assert float(page.cards()["Position RMSE, whole recording"][0].split()[0]) < 0.5
 
 
-def test_clocks_of_two_tags_may_differ_by_an_hour(browser: Browser, tmp_path: Path):
-    with serve(write_drive(tmp_path / "two.mcap", {7: 0.0, 8: 3600.0})) as (_, server):
-        browser.open(server.url + "#t=30&anchor=1&tag=8")
-        browser.wait("pairs of both tags", lambda: len(browser.column("pairs", "tag")) == 10)
-        browser.wait("a full strip", lambda: len(browser.column("strip", "raw")) > 140)
+def test_clocks_of_two_tags_may_differ_by_an_hour(tmp_path: Path):
+    page = Drawn(indexed(write_drive(tmp_path / "two.mcap", {7: 0.0, 8: 3600.0})))
+    page.send("seek", 30.0)
+    page.send("select", "1", "8")
+    assert len(page.column("pairs", "tag")) == 10
+    assert len(page.column("strip", "raw")) > 140
 
 
 def test_tag_that_never_has_a_position_is_named_and_the_player_runs(browser: Browser, tmp_path: Path):
-    anchor, bag = HALL.anchors[0].id, write_drive(tmp_path / "two.mcap", {7: 0.0, 9: 0.0}, lonely_tag=9)
-    with serve(bag) as (_, server):
+    def send(name: str, *arguments: object) -> None:
+        """Send a command of the page."""
+        script = "Bokeh.documents[0].get_model_by_name('controls').command = [arguments[0], arguments[1], Math.random()]"
+        browser.run(script, name, list(arguments))
+
+    anchor, two = HALL.anchors[0].id, write_drive(tmp_path / "two.mcap", {7: 0.0, 9: 0.0}, lonely_tag=9)
+    with ViewerServer(indexed(two), port=0) as server:
         browser.open(f"{server.url}#t=30&anchor={anchor}&tag=9")
-        browser.wait("its verdict", lambda: "Position not determined" in browser.text())
+        browser.wait("its verdict", lambda: "Position of tag 9 not determined" in browser.text())
         browser.wait("its row", lambda: "no position" in [row["age"] for row in browser.table("Tags")])
-        send(browser, "seek", 10.0)
-        browser.wait("the other position", lambda: position_s(browser) == 10.0)
-        send(browser, "select", anchor, 7)
+        browser.run("$('events').querySelector('li:last-child button').click()")
+        browser.wait("the event", lambda: abs(float(browser.run("return $('position').value")) - 30.0) > 1.0)
+        send("select", anchor, 7)
         browser.wait("the other tag", lambda: "Position RMSE, whole recording" in browser.cards())
         browser.wait("its errors", lambda: len(browser.column("positions", "error")) > 100)
         browser.wait("its residuals", lambda: any(browser.column("history", "residual")))
         assert browser.console_messages() == []
 
 
-def test_anchor_that_is_not_where_the_file_says_is_named_first(browser: Browser, tmp_path: Path):
+def test_anchor_that_is_not_where_the_file_says_is_named_first(bag: Path):
     anchors = [replace(one, position=(11.2, 0.0, 0.5)) if one.id == 2 else one for one in HALL.anchors]
-    with serve(write_drive(tmp_path / "drive.mcap", {7: 0.0}), AnchorMap(anchors)) as (_, server):
-        browser.open(server.url + "#t=30", 1280, 720)
-        browser.wait("the verdict", lambda: "Anchor 2 is not where the anchors file says" in browser.text())
-        browser.wait("the marker", lambda: "2 \u2297 not here" in browser.column("map", "text"))
-        assert [row["state"] for row in browser.table("Anchors")].count(health.BAD) == 1
+    page = Drawn(indexed(bag, AnchorMap(anchors), displaced_anchor))
+    page.send("seek", 30.0)
+    assert page.controls.verdict[:2] == ["degraded", "Anchor 2 is not where the anchors file says"]
+    assert "2 \u2297 not here" in page.column("map", "label")
+    states = {row[1]: row[0] for row in page.controls.health}
+    assert states.pop("2") == health.BAD
+    assert set(states.values()) == {health.UNKNOWN}, "their residuals are relative to a track that it bends"
 
 
-def test_same_url_shows_the_same_figures(browser: Browser, tmp_path: Path):
-    with serve(write_drive(tmp_path / "drive.mcap", {7: 0.0})) as (player, server):
-        browser.open(server.url + "#t=20")
-        browser.wait("the figures", lambda: browser.cards().get("Position error, now", "-")[0] != "-")
-        whole = browser.cards()
-        send(browser, "seek", 0.0)
-        send(browser, "speed", 50.0)
-        send(browser, "play", True)
-        browser.wait("the end", lambda: player.position_s == player.seconds)
-        browser.find("combobox", "figures of").send_keys("last")
-        browser.wait("the other figures", lambda: "Position RMSE, last 60 s" in browser.cards())
-        assert "window=last" in browser.driver.current_url
-        browser.open(server.url + "#t=20.0")
-        browser.wait(
-            "the figures", lambda: browser.cards().get("Position error, now") == whole["Position error, now"]
-        )
-        assert browser.cards() == whole
-        assert browser.find("heading", "Range errors, whole recording")
+def test_gaps_are_shown_as_gaps(tmp_path: Path):
+    page = Drawn(indexed(write_drive(tmp_path / "gap.mcap", {7: -2.0}, gap_s=(10.0, 30.0))))
+    page.send("seek", 25.0)
+    assert page.controls.tag_rows[0][3] == "no data for 15 s"
+    assert np.isnan(page.column("positions", "error")).sum() == 1
+    events = [(round(time_s, -1), text) for time_s, text in page.controls.incidents if "largest" not in text]
+    assert sorted(events) == [
+        (10.0, "position of tag 7: lost"),
+        (10.0, "tag 7: lost"),
+        (30.0, "position of tag 7: back after 20 s"),
+        (30.0, "tag 7: back after 20 s"),
+    ]
+    page.send("seek", 35.0)
+    assert np.isnan(page.column("strip", "raw")).sum() == 1
 
 
-def test_gaps_are_shown_as_gaps(browser: Browser, tmp_path: Path):
-    with serve(write_drive(tmp_path / "gap.mcap", {7: -2.0}, gap_s=(10.0, 30.0))) as (_, server):
-        browser.open(server.url + "#t=25")
-        browser.wait(
-            "an old tag", lambda: any("no data for 15 s" in name for name in browser.column("map", "name"))
-        )
-        assert browser.column("positions", "error").count(None) == 1
-        events = [event.split(": ", 1) for event in browser.run("return $('events').innerText").splitlines()]
-        assert sorted(text for _, text in events) == [
-            "position of tag 7: back after 20 s", "position of tag 7: lost", "tag 7: back after 20 s", "tag 7: lost",
-        ]  # fmt: skip
-        assert {round(float(time_s.removesuffix(" s")) / 10.0) for time_s, _ in events} == {1, 3}
-        browser.run("$('events').querySelector('li:last-child button').click()")
-        browser.wait("the last event", lambda: position_s(browser) == pytest.approx(30.0, abs=0.2))
-        send(browser, "seek", 35.0)
-        browser.wait("a gap in the strip", lambda: None in browser.column("strip", "raw"))
-
-
-def test_index_reads_all_ranges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_index_reads_all_ranges(bag: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorded_ranges, "CHUNK", 100)
-    with serve(write_drive(tmp_path / "drive.mcap", {7: 0.0})) as (player, _):
-        timeline = player.timeline
-        assert timeline is not None
-        assert (len(timeline.bad), timeline.bad.sum()) == (1000, 1)
-        assert timeline.largest_error() == BAD
-        assert np.isfinite(timeline.true_m).all()
-        assert timeline.losses[1, 7] == (0, 200)
+    timeline = indexed(bag).timeline
+    assert timeline.counts == (999, 1000, 1)
+    assert np.isfinite(timeline.columns.true_m).all()
+    assert len(timeline.rows[1, 7]) == 200
 
 
-class SlowLink:
-    """A TCP proxy that forwards at most a number of bytes per second to the client.
-
-    Attributes:
-        port: port of the proxy.
-        target: port of the server, set before a client connects.
-        rate: bytes per second.
-    """
-
-    def __init__(self) -> None:
-        self.target, self.rate = 0, 1e9
-        self._listener = socket.create_server(("localhost", 0))
-        self.port = self._listener.getsockname()[1]
-        self._thread = threading.Thread(target=self._accept)
-        self._thread.start()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                client, _ = self._listener.accept()
-            except OSError:
-                return
-            server = socket.socket()
-            # Small buffers: otherwise they contain data of many seconds.
-            server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
-            server.connect(("localhost", self.target))
-            for source, sink, is_slow in ((client, server, False), (server, client, True)):
-                threading.Thread(target=self._forward, args=(source, sink, is_slow), daemon=True).start()
-
-    def _forward(self, source: socket.socket, sink: socket.socket, is_slow: bool) -> None:
-        try:
-            while data := source.recv(2048):
-                sink.sendall(data)
-                time.sleep(len(data) / self.rate if is_slow else 0.0)
-        except OSError:
-            pass
-        finally:
-            source.close()
-            sink.close()
-
-    def close(self) -> None:
-        # Closing alone does not end an `accept` that waits in another thread.
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._thread.join()
-        self._listener.close()
+def test_residual_belongs_to_the_anchor_of_its_range():
+    anchors = AnchorMap([Anchor(9, (0.0, 0.0, 0.0)), Anchor(3, (10.0, 0.0, 0.0))])
+    anchor = np.array([9, 5, 3, 9, 11], np.uint64)
+    n, time_s = len(anchor), np.array([1.0, 1.1, 1.2, 6.0, 6.1])
+    nan = np.full(n, np.nan)
+    columns = RangeColumns(time_s, time_s, nan, np.full(n, 6.5), nan, nan.copy(), nan, nan, nan)
+    timeline = Timeline(time_s, anchor, np.full(n, 7, np.uint64), columns)
+    track = np.array([[0.0, 4.0, 0.0, np.nan, 0.1], [1.5, 4.0, 0.0, np.nan, 0.1]])
+    timeline.tracks["tag_7", TrackKind.CORRECTED] = track
+    add_residuals(timeline, anchors)
+    expected = [6.5 - 4.0, np.nan, 6.5 - 6.0, np.nan, np.nan]
+    assert columns.residual_m == pytest.approx(expected, nan_ok=True), "unknown anchors, old positions: none"
 
 
-def test_slow_client_shows_current_data_or_its_age(browser: Browser):
-    lock = threading.Lock()
-    view = View(Scene(), lock)
-    stop = threading.Event()
+def test_radio_without_cirs_has_no_bad_ranges(tmp_path: Path):
+    path = corrected_bag(tmp_path / "radio.mcap", range(60), status=Status.NO_CIR)
+    marks = Drawn(indexed(path)).controls.marks
+    assert (marks["bad"], marks["count"]) == ([], 0)
 
-    def feed() -> None:
-        while not stop.wait(0.02):
-            now_s = time.time()
-            with lock:
-                for anchor in range(8):
-                    view.scene.add_sample((anchor, 7), Sample(now_s, 5.0, now_s % 1000.0, 0.1, Status.OK))
-                view.scene.add_pose("tag", Pose(math.sin(now_s), math.cos(now_s), 0.0, stamp_s=now_s))
 
-    def age_s() -> float:
-        shown = max(browser.column("pairs", "corrected"))
-        return (time.time() % 1000.0 - shown) % 1000.0
-
-    link = SlowLink()
-    thread = threading.Thread(target=feed)
-    with ViewerServer(view, port=0, origins=(f"localhost:{link.port}",)) as server:
-        link.target = server.port
-        thread.start()
-        try:
-            browser.open(f"http://localhost:{link.port}/")
-            browser.wait("pairs", lambda: len(browser.column("pairs", "corrected")) == 8)
-            link.rate = 40_000.0
-            time.sleep(10.0)
-            # Nothing queues: without acknowledgements, the age has grown to 10 s and grows further.
-            browser.wait("current data", lambda: age_s() < 6.0)
-            assert "behind" in browser.text() or "LIVE" in browser.text()
-            link.rate = 500.0
-            browser.wait("a page that admits its age", lambda: "s behind" in browser.text())
-            link.rate = 1e9
-        finally:
-            stop.set()
-            thread.join()
-            link.close()
+def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
+    path = corrected_bag(tmp_path / "long.mcap", range(9000), range_m=5.0, range_raw_m=5.3)
+    feed = SceneUpdater(Scene(), threading.Lock())
+    player = BagPlayer(path, feed, lambda: None)
+    page = Drawn(View(feed.scene, feed.lock, player=player))
+    assert page.controls.cards == [["Reading the recording ...", "", ""]]
+    assert page.controls.verdict[:2] == ["no data yet", "the recording is being read"]
+    player.index(None).join()
+    player.seek(player.seconds)
+    while player.is_behind:
+        player.advance()
+    page.send("draw")
+    assert feed.scene.ranges <= 3001
+    assert np.nanmin(page.column("strip", "age")) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
+    assert np.ptp(page.column("history", "age")) == pytest.approx(player.seconds, abs=1.0)

@@ -4,45 +4,33 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bag_material import STEP_NS, corrected, record, write_corrected
-from bokeh.document import Document
-from browser import drawn_column
+from drawn import Clock, Drawn
 
-from uwb_mitigation.recordings.bag.writer import BagWriter
+from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.incidents import Incidents
-from uwb_mitigation.viewer.page import Page
-from uwb_mitigation.viewer.playback import BagPlayer
+from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.state import View
 from uwb_mitigation.viewer.verdict import DEGRADED, GOOD, HeldVerdict, Verdict
 
+CIRCLE = NodeStatus(1, "", math.nan, ("tag 7 determination: circle: R. Remedy: more anchors",))
 ANCHORS = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}
-
-
-class Clock:
-    now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 def driven(
     errors_m: dict[int, float] | None = None, status: Status = Status.OK, count: int = 30, sd_m: float = 0.1
 ) -> tuple[Scene, Clock]:
     """Return a scene with ranges of four anchors to a tag at (4, 3), with an error for each anchor."""
-    clock = Clock()
-    scene = Scene(clock)
+    scene = Scene(clock := Clock())
     scene.stamp_clock = lambda: clock.now_s + 900.0
     scene.set_anchors(
         [Anchor(id_, (x, y, 0.0), name="door" if id_ == 2 else "") for id_, (x, y) in ANCHORS.items()]
@@ -56,14 +44,12 @@ def driven(
     return scene, clock
 
 
-def shown(scene: Scene, player: BagPlayer | None = None) -> Document:
-    document = Document()
-    Page(document, View(scene, threading.Lock(), player=player))
-    return document
+def shown(scene: Scene) -> Drawn:
+    return Drawn(View(scene, threading.Lock()))
 
 
-def controls(scene: Scene, player: BagPlayer | None = None):
-    return shown(scene, player).get_model_by_name("controls")
+def controls(scene: Scene):
+    return shown(scene).controls
 
 
 def test_good_position_has_its_accuracy_age_and_share_of_corrected_ranges():
@@ -81,39 +67,32 @@ def test_anchor_that_reads_long_degrades_the_position_by_its_name():
     state, reason, action, _ = controls(scene).verdict
     assert (state, reason) == ("degraded", "Anchor door reads 0.60 m long")
     assert action == "Calibrate, or check its position."
-    document = shown(scene)
-    anchors = next(
-        r.data_source for r in document.get_model_by_name("map").renderers if "health" in r.data_source.data
-    )
-    assert anchors.data["label"] == ["1 \u2713", "door \u2297 +0.6 m", "3 \u2713", "4 \u2713"]
-    assert anchors.data["health"][1] == health.BAD
+    page = shown(scene)
+    assert page.column("map", "label") == ["1 \u2713", "door \u2297 +0.6 m", "3 \u2713", "4 \u2713"]
+    assert page.column("map", "health")[1] == health.BAD
+    assert page.column("pairs", "state").count(health.BAD) == 1
+
+
+@pytest.mark.parametrize(("error_m", "state"), [(0.2, health.CHECK), (0.4, health.BAD)])
+def test_verdict_and_table_agree_on_a_common_offset(error_m: float, state: str):
+    page = controls(driven(dict.fromkeys(ANCHORS, error_m))[0])
+    reason = f"All anchors read too long, {error_m:.2f} m in the median"
+    assert page.verdict[:2] == ["degraded", reason]
+    assert page.verdict[2].startswith("A common cause is likely. Calibrate the offset")
+    assert page.health[0][0] == state
+    assert page.health[0][-1].startswith(reason)
 
 
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (
-            lambda scene, clock: setattr(clock, "now_s", clock.now_s + 12.0),
-            ("lost", "no ranges of tag 7 for 12 s"),
-        ),
+        (lambda scene, clock: setattr(clock, "now_s", clock.now_s + 12.0), ("lost", "no ranges of tag 7 for 12 s")),
         (lambda scene, clock: scene.tags.clear(), ("not determined", "no position of tag 7")),
-        (
-            lambda scene, clock: scene.set_node_status(
-                "locator",
-                NodeStatus(1, "", math.nan, ("tag 7 determination: circle: R. Remedy: more anchors",)),
-            ),
-            ("degraded", "circle: R"),
-        ),
-        (
-            lambda scene, clock: scene.add_pose("tag_7", Pose(4, 3, 0, sd_m=0.9)),
-            ("degraded", "uncertain by 0.90 m"),
-        ),
-        (
-            lambda scene, clock: scene.add_pose("tag_7", Pose(4, 3, 0)),
-            ("degraded", "its standard deviation is unknown"),
-        ),
+        (lambda scene, clock: scene.set_node_status("locator", CIRCLE), ("degraded", "circle: R")),
+        (lambda scene, clock: scene.add_pose("tag_7", Pose(4, 3, 0, sd_m=0.9)), ("degraded", "uncertain by 0.90 m")),
+        (lambda scene, clock: scene.add_pose("tag_7", Pose(4, 3, 0)), ("degraded", "its standard deviation is unknown")),
     ],
-)
+)  # fmt: skip
 def test_verdict_names_the_reason(change, expected: tuple[str, str]):
     scene, clock = driven()
     change(scene, clock)
@@ -153,42 +132,123 @@ def test_state_of_an_anchor_needs_evidence_and_has_hysteresis(
     assert health.state(means | changes, before) == expected
 
 
-def test_radio_without_cirs_is_a_normal_state(tmp_path: Path):
-    scene, _ = driven(status=Status.NO_CIR)
-    page = controls(scene)
-    assert page.verdict[0] == "good"
-    assert page.verdict[3].endswith("no range corrected: no CIRs")
+def test_radio_without_cirs_is_a_normal_state():
+    page = shown(driven(status=Status.NO_CIR)[0])
+    state, *_, facts = page.controls.verdict
+    assert state == "good"
+    assert facts.endswith("no range corrected: no CIRs")
     assert controls(driven(status=Status.BAD_CIR)[0]).verdict[3].endswith("no range corrected")
-    assert {row[0] for row in page.health} == {health.GOOD}
-    cards = {title: (value, text) for title, value, text in page.cards}
-    assert cards["Ranges corrected, since the start"] == ("none", "0 of 120 ranges corrected: no CIRs")
-    assert "0 corrected ranges of 120" in page.summary
-    bag = tmp_path / "radio.mcap"
-    with BagWriter(bag, {}) as out:
-        for number in range(60):
-            write_corrected(out, record(number).measurement, replace(corrected(number), status=Status.NO_CIR))
-    player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: None)
-    player.index(None).join()
-    marks = controls(Scene(), player).marks
-    assert (marks["bad"], marks["count"]) == ([], 0)
+    assert {row[0] for row in page.controls.health} == {health.GOOD}
+    assert page.cards()["Ranges corrected, since the start"] == ("none", "0 of 120 ranges corrected: no CIRs")
+
+
+@pytest.mark.parametrize("status", [Status.OK, Status.NO_CIR])
+def test_correction_has_a_figure_only_if_ranges_were_corrected(status: Status):
+    scene, clock = driven({1: 0.3}, status)
+    for tenth in range(-30, 1):
+        place = clock.now_s + 900.0 + tenth / 10, 4.1, 3.0, 0.0, math.nan
+        scene.add_position("tag_7", TrackKind.TRUE, place)
+    assert ("Correction, last 60 s" in shown(scene).cards()) == (status is Status.OK)
+
+
+def test_pairs_tags_and_nodes_without_data_are_marked():
+    scene, clock = driven()
+    states = ((7, "circle: R"), (8, "unique: R"))
+    entries = [SimpleNamespace(key=f"tag {n} determination", value=state) for n, state in states]
+    diagnosis = SimpleNamespace(status=[SimpleNamespace(name="locator", level=1, message="", values=entries)])
+    SceneUpdater(scene, threading.Lock()).add("/diagnostics", diagnosis)
+    scene.set_node_status("driver", NodeStatus(0, "10.0 Hz", clock()))
+    scene.set_node_status("recording", NodeStatus(2, "damaged"))
+    page = shown(scene)
+    assert page.controls.notice == ["tag 7 determination: circle: R"]
+    assert page.column("pairs", "no_data") == [False] * 4
+    assert page.column("map", "x1") == [4.0] * 4
+    clock.now_s += 12.0
+    page.send("draw")
+    assert page.column("pairs", "status") == ["no data for 12 s"] * 4
+    assert page.column("pairs", "rate") == [0.0] * 4
+    assert page.column("map", "x1") == []
+    assert "tag 7: no data for 12 s" in page.columns("map", "name")
+    assert page.controls.nodes == [
+        ["driver", "STALE", "no diagnostics for 12 s; last: 10.0 Hz"],
+        ["locator", "STALE", "no diagnostics for 12 s; last: "],
+        ["recording", "ERROR", "damaged"],
+    ]
+    assert page.controls.notice == ["No ranges for 12 s."]
+    assert page.controls.health[0][-1].startswith("No anchor answers: check the tag")
+    scene.add_sample((1, 7), Sample(clock.now_s + 900.0, 5.0, 5.0, 0.1, Status.OK))
+    page.send("draw")
+    assert page.column("pairs", "status")[0] == "OK"
+    assert "No ranges for 12 s." not in page.controls.notice
+
+
+def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
+    scene, _ = driven()
+    scene.add_position("tag_7", TrackKind.TRUE, (1000.0, 4.0, 3.0, 0.0, math.nan))
+    page = shown(scene)
+
+    def legend() -> set[str]:
+        (found,) = page.document.get_model_by_name("map").legend
+        return {getattr(item.label, "value", "status") for item in found.items if item.visible}
+
+    assert legend() == {"raw", "corrected", "true", "status", "anchor", "selected anchor", "tag"}
+    scene.add_pose("tag_7", Pose(4, 3, 1, (0.4, 0.2, 0.3), 0.5, stamp_s=1003.0))
+    page.send("draw")
+    assert legend() >= {"95 % ellipse", "heading"}
+    assert (page.column("map", "heading"), page.column("map", "width")) == ([0.5], [0.8])
+
+
+def test_predicted_accuracy_is_shown_on_request():
+    page = shown(driven()[0])
+    assert page.column("map", "dw") == []
+    page.send("accuracy", True)
+    assert len(page.column("map", "dw")) == 1
+    anchors = np.array([[0.0, 0.0, 1.0], [8.0, 0.0, 1.0], [8.0, 8.0, 1.0], [0.0, 8.0, 1.0]])
+    image, low, size = health.predicted_accuracy(anchors, 1.0, 0.1)
+    centre = np.array([*(low + size * (20 + 0.5) / 40), 1.0])
+    assert image[20, 20] == pytest.approx(0.1 * dop(anchors, centre, level=True).hdop, rel=1e-5)
+    assert np.isinf(health.predicted_accuracy(anchors[:1], 1.0, 0.1)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("residuals_m", "nlos", "expected"),
+    [
+        ([0.0, 0.8, 0.0], [0.0, 94.0, 0.0], "Anchor 2 reads 0.80 m long, with 94 % NLOS: its line of sight"),
+        ([0.0, -0.4, 0.0], [0.0, 0.0, 0.0], "Anchor 2 reads 0.40 m short: calibrate"),
+        ([0.2, 0.8, 0.3], [0.0, 94.0, 0.0], "All anchors read too long, 0.30 m in the median: a common cause"),
+        ([0.2, -0.8, 0.3], [0.0, 0.0, 0.0], "The ranges of all anchors contradict the position: check ids"),
+        ([0.2, 0.8, 0.3], [90.0, 94.0, 60.0], "The ranges of all anchors contradict the position, and most are NLOS"),
+        ([math.nan] * 3, [math.nan] * 3, ""),
+    ],
+)  # fmt: skip
+def test_advice_names_the_probable_cause(residuals_m: list[float], nlos: list[float], expected: str) -> None:
+    others = dict.fromkeys(("rate", "lost", "not_ok", "stopped", "displaced"), 0.0)
+    anchors = {
+        number: others | {"nlos": share, "residual": residual_m}
+        for number, (residual_m, share) in enumerate(zip(residuals_m, nlos, strict=True), 1)
+    }
+    common, advice = health.advice(anchors)
+    texts = [text for text in (common, *advice.values()) if text]
+    assert len(texts) == (expected != "")
+    assert "".join(texts).startswith(expected)
 
 
 def test_clock_jump_dead_tag_and_old_stamps_are_reported():
     scene, clock = driven()
-    scene.add_sample((1, 9), Sample(clock.now_s + 888.3, 5.0, 5.0, 0.1, Status.OK))
+    for late_s in (11.8, 11.7):
+        scene.add_sample((1, 9), Sample(clock.now_s + 900.0 - late_s, 5.0, 5.0, 0.1, Status.OK))
     for _ in range(2):
         clock.now_s += 0.1
         for anchor in ANCHORS:
             scene.add_sample((anchor, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
     assert page.incidents == [(None, "0 s ago: clock of tag 7: jump by +3600 s")]
-    assert any("tag 7 are 3600.0 s in the future" in line for line in page.notice)
-    assert any("tag 9 are 11.7 s old" in line for line in page.notice)
+    assert [(row[0], row[-1]) for row in page.tag_rows] == [("tag 7", "-3600.0 s"), ("tag 9", "11.9 s")]
     clock.now_s += 5.0
     scene.add_sample((1, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
-    assert "No ranges of tag 9 for 5 s." in page.notice
-    assert [row[0] for row in page.tag_rows] == ["tag 7", "tag 9"]
+    assert (None, "5 s ago: tag 9: lost") in page.incidents
+    assert page.tag_rows[1][3:] == ["no position", "0.0", "16.9 s"]
 
 
 @pytest.mark.parametrize(
@@ -223,42 +283,20 @@ def test_badge_has_the_age_by_reception_and_by_stamp():
     assert controls(scene).update[2:] == pytest.approx([2.1, 11.7])
 
 
-def test_controls_without_effect_are_disabled():
-    available = controls(Scene()).available
-    assert not any(available.values())
-    assert controls(driven()[0]).available | {"accuracy": True} == available | {
-        "accuracy": True, "circles": True, "heat": True, "follow": True
-    }  # fmt: skip
+def test_control_without_effect_is_disabled():
+    assert controls(Scene()).available == {"accuracy": False}
+    assert controls(driven()[0]).available == {"accuracy": True}
 
 
 def test_labels_of_colour_bars_and_of_the_outermost_bins_are_distinct():
-    document = shown(driven()[0])
+    document = shown(driven()[0]).document
     bars = [bar for bar in document.get_model_by_name("map").right if hasattr(bar, "color_mapper")]
     steps = [f"\u2264 {limit}" for limit in ("0.1", "0.2", "0.5", "1", "10")]
-    assert list(bars[1].major_label_overrides.values()) == steps
+    assert list(bars[0].major_label_overrides.values()) == steps
     assert document.get_model_by_name("errors").xaxis[0].major_label_overrides == {
         -1: "-1 or less",
         2: "2 or more",
     }
-
-
-def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
-    bag = tmp_path / "long.mcap"
-    with BagWriter(bag, {}) as out:
-        for number in range(9000):
-            write_corrected(
-                out, record(number).measurement, replace(corrected(number), range_m=5.0, range_raw_m=5.3)
-            )
-    scene = Scene()
-    player = BagPlayer(bag, SceneUpdater(scene, threading.Lock()), lambda: None)
-    player.index(None).join()
-    player.seek(player.seconds)
-    while player.is_behind:
-        player.advance()
-    assert scene.ranges <= 3001
-    page = shown(scene, player)
-    assert np.nanmin(drawn_column(page, "strip", "age")) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
-    assert np.ptp(drawn_column(page, "history", "age")) == pytest.approx(player.seconds, abs=1.0)
 
 
 def test_late_positions_give_no_residuals():
@@ -277,7 +315,7 @@ def test_history_of_the_selected_anchor_and_errors_with_standard_deviations():
     for sample in scene.pairs[1, 7].samples:
         sample.true_m = 5.0
         scene.count_error(sample)
-    column = partial(drawn_column, shown(scene))
+    column = shown(scene).column
     assert column("history", "residual") == pytest.approx(0.6)
     assert (column("history", "rate")[-1], column("history", "NLOS")[-1]) == pytest.approx((10.0, 100.0))
     assert column("positions", "bound") == pytest.approx(0.2)

@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test"))
 
 from browser import Browser, chromium
 
+from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import (
     Cir,
     CorrectedBy,
@@ -28,8 +29,9 @@ from uwb_mitigation.types.measurement import (
     Status,
 )
 from uwb_mitigation.types.ros.codec import MeasurementKey
+from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.scene import AnchorPosition, Pose, Scene
+from uwb_mitigation.viewer.scene import Pose, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -54,7 +56,6 @@ def feed_ranges(feed: SceneUpdater, stop: threading.Event) -> None:
                         9 + 6 * np.sin(angle),
                         1.0,
                         (0.5, 0.3, 0.2),
-                        1.0,
                         stamp_s=time.time(),
                     ),
                 )
@@ -64,8 +65,9 @@ def feed_ranges(feed: SceneUpdater, stop: threading.Event) -> None:
             status = Status(rng.choice(len(Status), p=(0.9, 0.025, 0.025, 0.025, 0.025)))
             raw_m = 8.0 + rng.normal()
             cir = Cir(samples, Encoding.MAGNITUDE, 745, 750.4, rx_power_dbm=-85.0, first_path_power_dbm=-89.0)
-            feed.measurement(RangeMeasurement(key.stamp_ns, tag, anchor, sequence, 0, raw_m, cir))
-            feed.corrected(key, CorrectedRange(raw_m - 0.4, raw_m, 0.4, 0.01, status, CorrectedBy.HOST, 1))
+            feed.add(RANGE_RAW, RangeMeasurement(key.stamp_ns, tag, anchor, sequence, 0, raw_m, cir))
+            corrected = CorrectedRange(raw_m - 0.4, raw_m, 0.4, 0.01, status, CorrectedBy.HOST, 1)
+            feed.add(RANGE_CORRECTED, (key, corrected))
             sequence += 1
 
 
@@ -87,7 +89,7 @@ def load(browser: Browser, url: str) -> None:
 
 def main() -> None:
     scene = Scene()
-    scene.set_anchors({n: AnchorPosition(4.0 * (n % 6), 4.5 * (n // 6), 2.0) for n in range(1, ANCHORS + 1)})
+    scene.set_anchors([Anchor(n, (4.0 * (n % 6), 4.5 * (n // 6), 2.0)) for n in range(1, ANCHORS + 1)])
     view, stop = View(scene, threading.Lock()), threading.Event()
     feed = SceneUpdater(scene, view.lock)
     with ViewerServer(view, port=0) as server, chromium() as browser:

@@ -197,7 +197,7 @@ def _page(
         for check in sorted(checks, key=lambda check: severity.index(check.verdict.value))
     ]
     sections: dict[str, Any] = {"Checks": [("check", "result", "value", "limit", "what to do"), *rows]}
-    sections |= {FIGURES[name]: figures[name] for name in ("strip", "errors", "cir", "waterfall")}
+    sections |= {FIGURES[name]: figures[name] for name in ("strip", "errors", "cir")}
     for heading, name in (("System", "system"), ("Counters of the driver", "counters")):
         sections[heading] = [("name", "value"), *values[name].items()]
     return render_report(f"Field report: {title}", lines, sections)

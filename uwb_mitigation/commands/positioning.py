@@ -85,10 +85,10 @@ def track(
         uwb-mitigation track drive.mcap -o track.mcap --odometry /odom --imu /imu
     """
     from uwb_mitigation.commands.offline.track import (
-        displaced_anchor,
         held_out,
         mitigation,
         tum_file,
+        worst_displaced,
         write_tracks,
     )
     from uwb_mitigation.commands.offline.track import tum as tum_text
@@ -129,9 +129,8 @@ def track(
     if report is not None:
         from uwb_mitigation.viewer.report import write_report
 
-        write_report(
-            report, bag, config, lambda: mitigation(settings), settings.stamp_offset_s, displaced_anchor
-        )
+        displaced, offset_s = worst_displaced(residuals), settings.stamp_offset_s
+        write_report(report, bag, config, lambda: mitigation(settings), tracks, displaced, offset_s)
         print_line(f"Wrote {report}.")
     if png is not None:
         from uwb_mitigation.commands.offline.tracks import Tracks

@@ -29,16 +29,7 @@ def view(
         ),
     ],
     settings: TrackSettings,
-    second: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[SECOND]", help="A bag of the same drive with another correction, to compare."
-        ),
-    ] = None,
     anchors: options.AnchorsOption = None,
-    floor_plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Floor plan: the YAML file of a map of map_server.")
-    ] = None,
     namespace: Annotated[
         str | None,
         typer.Option(
@@ -61,8 +52,7 @@ def view(
 ) -> None:
     """Show a recording in the browser: map, ranges, CIRs.
 
-    It serves the page of the node `viewer` with a slider for the time, without ROS, until Ctrl-C. With two bags of one drive,
-    it compares their corrections.
+    It serves the page of the node `viewer` with a slider for the time, without ROS, until Ctrl-C.
 
         uwb-mitigation data simulate --like drive -o flat.mcap
 
@@ -74,43 +64,32 @@ def view(
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
     from uwb_mitigation.viewer.feed import SceneUpdater
-    from uwb_mitigation.viewer.floor_plan import load_floor_plan
     from uwb_mitigation.viewer.playback import BagPlayer
     from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.server import ViewerServer
     from uwb_mitigation.viewer.state import View
 
-    lock = Lock()
     anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
-    paths = [bag] if second is None else [bag, second]
-    players, threads = [], []
-    for path in paths:
-        feed = SceneUpdater(Scene(), lock)
-        player = BagPlayer(path, feed, partial(mitigation, settings), namespace)
-        if anchor_map is not None:
-            feed.anchors(anchor_map)
-        if player.corrects:
-            console.err.print(
-                f"{path} contains raw ranges only: they are corrected for display.", style="yellow"
-            )
-        config = None if anchor_map is None else read_config(path, anchor_map, settings, console.warn)
-        threads.append(player.index(config, settings.stamp_offset_s, displaced_anchor))
-        players.append(player)
-    first = players[0]
-    first.companion = None if second is None else players[1]
-    names = " and ".join(path.resolve().name for path in paths)
-    plan = None if floor_plan is None else load_floor_plan(floor_plan)
-    shown = View(first.scene, lock, title=names, player=first, plan=plan, missing=first.missing)
+    feed = SceneUpdater(Scene(), Lock())
+    player = BagPlayer(bag, feed, partial(mitigation, settings), namespace)
+    config = None
+    if anchor_map is not None:
+        feed.anchors(anchor_map)
+        config = read_config(bag, anchor_map, settings, console.warn)
+    if player.corrects:
+        console.err.print(f"{bag} contains raw ranges only: they are corrected for display.", style="yellow")
+    thread = player.index(config, settings.stamp_offset_s, displaced_anchor)
+    name = bag.resolve().name
+    shown = View(feed.scene, feed.lock, title=name, player=player, missing=player.missing)
     secret = secrets.token_urlsafe(16) if token else ""
     with ViewerServer(shown, host, port, tuple(origins or ()), secret) as server:
         if server.warning:
             console.err.print(f"warning: {server.warning} (--token).", style="yellow")
         console.out.print(f"{server.url} shows {bag}; Ctrl-C ends it.", markup=False, soft_wrap=True)
-        first.play(True)
+        player.play(True)
         if browser:
             webbrowser.open(server.url)
-        for player, thread in zip(players, threads, strict=True):
-            thread.join()
-            show_models(player.models)
+        thread.join()
+        show_models(player.models)
         while True:
             time.sleep(3600.0)

@@ -30,7 +30,6 @@ from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.topics import relative
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.floor_plan import load_floor_plan
 from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, MissingData, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
@@ -100,7 +99,6 @@ class Viewer(ManagedNode):
             self._lock,
             title=f"UWB ranges {self.get_namespace().strip('/')}".strip(),
             window=self.value("window"),
-            plan=load_floor_plan(Path(plan).expanduser()) if (plan := self.value("floor_plan")) else None,
         )
         origins = tuple(origin.strip() for origin in self.value("origins").split(",") if origin.strip())
         token = secrets.token_urlsafe(16) if self.value("token") == "generate" else self.value("token")
@@ -125,12 +123,8 @@ class Viewer(ManagedNode):
     def describe(self) -> diagnostics.Description:
         pages = 0 if self._view is None else self._view.pages
         url = "" if self._server is None else self._server.url
-        values: dict[str, object] = {
-            "url": url,
-            "pages": pages,
-            "malformed": self._feed.malformed,
-            "dropped": self._scene.dropped,
-        }
+        values: dict[str, object] = {"url": url, "pages": pages, "malformed": self._feed.malformed}
+        values["dropped"] = self._scene.dropped
         return url, diagnostics.OK, f"serving {pages} page{'' if pages == 1 else 's'}", values
 
     def _subscribe(

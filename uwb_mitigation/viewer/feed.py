@@ -15,7 +15,7 @@ import numpy as np
 
 from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.determination import UNIQUE
-from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, horizontal_ellipse
+from uwb_mitigation.positioning.geometry import horizontal_ellipse
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
@@ -47,7 +47,7 @@ MAX_HEADING_VARIANCE = 1.0
 
 
 class SceneUpdater:
-    """Adds messages to a scene, with the lock that its pages hold while they draw.
+    """Adds messages to a scene; `add`, with the lock that its pages hold while they draw.
 
     Attributes:
         malformed: number of messages that could not be decoded.
@@ -69,17 +69,19 @@ class SceneUpdater:
             topics.ANCHORS: lambda _, message: self.markers(message),
             topics.DIAGNOSTICS: lambda _, message: self._diagnostics(message),
         }
-        self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
-        self._gaps_db: BoundedDict[MeasurementKey, float] = BoundedDict(MAX_TRUTHS)
-        self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
+        self._forget()
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
-        self._truths.clear()
-        self._gaps_db.clear()
-        self._without_truth.clear()
+        self._forget()
         with self.lock:
             self.scene.clear()
+
+    def _forget(self) -> None:
+        """Remove what waits for another message of its range."""
+        self._truths: BoundedDict[MeasurementKey, Truth] = BoundedDict(MAX_TRUTHS)
+        self._gaps_db: BoundedDict[MeasurementKey, float] = BoundedDict(MAX_TRUTHS)
+        self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
     def report(self, name: str, report: NodeStatus) -> None:
         with self.lock:
@@ -97,32 +99,32 @@ class SceneUpdater:
         """Add a message of a topic without its namespace and tag; None: it could not be decoded."""
         if message is None:
             self.malformed += 1
-        else:
+            return
+        with self.lock:
             self._adders[topic](tag, message)
 
     def measurement(self, measurement: RangeMeasurement) -> None:
         trace = Trace.from_cir(measurement.cir)
         if trace is not None:
             self._gaps_db.add(measurement_key(measurement), measurement.cir.power_gap_db)
-            with self.lock:
-                self.scene.add_trace((measurement.anchor_id, measurement.tag_id), trace)
+            self.scene.add_trace((measurement.anchor_id, measurement.tag_id), trace)
 
     def truth(self, key: MeasurementKey, truth: Truth) -> None:
         if (sample := self._without_truth.pop(key, None)) is None:
             self._truths.add(key, truth)
-            return
-        with self.lock:
+        else:
             self.scene.set_truth(sample, truth)
 
     def corrected(self, key: MeasurementKey, corrected: CorrectedRange) -> None:
         truth = self._truths.pop(key, None)
-        sample = Sample.from_corrected(key.stamp_ns / 1e9, corrected, truth)
+        sd_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0.0 else math.nan
+        measured = corrected.range_raw_m, corrected.range_m, sd_m, corrected.status
+        sample = Sample(key.stamp_ns / 1e9, *measured, math.nan if truth is None else truth.range_m)
         sample.gap_db = self._gaps_db.pop(key, math.nan)
-        with self.lock:
-            pair = key.anchor_id, key.tag_id
-            self.scene.add_sample(pair, sample)
-            self.scene.pairs[pair].count_lost(key.sequence)
-            self.scene.count_error(sample)
+        pair = key.anchor_id, key.tag_id
+        self.scene.add_sample(pair, sample)
+        self.scene.pairs[pair].count_lost(key.sequence)
+        self.scene.count_error(sample)
         if truth is None:
             self._without_truth.add(key, sample)
 
@@ -136,31 +138,27 @@ class SceneUpdater:
         if 0.0 < covariance[5, 5] < MAX_HEADING_VARIANCE:
             heading_rad = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
         stamp_s = to_ns(message.header.stamp) / NS_PER_S
-        shape = (*_bounds(covariance), heading_rad, stamp_s, _horizontal_sd_m(covariance))
-        pose = Pose(position.x, position.y, position.z, *shape)
-        with self.lock:
-            self.scene.add_pose(tag, pose)
+        shape = horizontal_ellipse(covariance), heading_rad, stamp_s, _horizontal_sd_m(covariance)
+        self.scene.add_pose(tag, Pose(position.x, position.y, position.z, *shape))
 
     def estimate(self, tag: str, estimate: Estimate, received_s: float, stamp_offset_s: float) -> None:
         """Add a position that the viewer itself estimated from ranges to whose stamps an offset was added."""
         x, y, z = estimate.position.tolist()
         stamp_s, sd_m = estimate.stamp_ns / NS_PER_S - stamp_offset_s, _horizontal_sd_m(estimate.covariance)
         with self.lock:
-            pose = Pose(x, y, z, *_bounds(estimate.covariance), stamp_s=stamp_s, sd_m=sd_m)
+            pose = Pose(x, y, z, horizontal_ellipse(estimate.covariance), stamp_s=stamp_s, sd_m=sd_m)
             self.scene.add_pose(tag, pose, received_s)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position
         if math.isfinite(position.x + position.y):
             stamp_s, sd_m = to_ns(message.header.stamp) / NS_PER_S, _horizontal_sd_m(message.pose.covariance)
-            with self.lock:
-                self.scene.add_position(tag, kind, (stamp_s, position.x, position.y, position.z, sd_m))
+            self.scene.add_position(tag, kind, (stamp_s, position.x, position.y, position.z, sd_m))
 
     def markers(self, message: Any) -> None:
         """Add the anchors of a visualization_msgs/MarkerArray."""
         if anchors := parse_markers(message):
-            with self.lock:
-                self.scene.set_anchors(anchors)
+            self.scene.set_anchors(anchors)
 
     def anchors(self, anchors: AnchorMap) -> None:
         """Set the anchors of an anchors file."""
@@ -178,16 +176,10 @@ class SceneUpdater:
                 if entry.key.endswith(" determination") and not entry.value.startswith(UNIQUE)
             )
             report = NodeStatus(level, str(status.message), self.scene.clock(), determinations)
-            self.report(str(status.name), report)
+            self.scene.set_node_status(str(status.name), report)
 
 
 def _horizontal_sd_m(covariance: Any) -> float:
     """Return the root of the sum of the variances of x and y; NaN: unknown."""
     variance = float(np.trace(np.asarray(covariance, np.float64).reshape(6, 6)[:2, :2]))
     return math.sqrt(variance) if 0.0 < variance < math.inf else math.nan
-
-
-def _bounds(covariance: np.ndarray[Any, Any]) -> tuple[tuple[float, float, float], float]:
-    """Return half axes and angle of the 95 % ellipse, and the protection level; NaN if the covariance is invalid."""
-    ellipse = horizontal_ellipse(covariance)
-    return ellipse, PROTECTION / math.sqrt(CHI2_95) * ellipse[0]

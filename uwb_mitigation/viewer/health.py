@@ -66,12 +66,8 @@ def anchor_means(pairs: Mapping[Pair, Means]) -> dict[int, Means]:
         values = {name: [row[name] for row in rows if not math.isnan(row[name])] for name in rows[0]}
         means = {name: sum(column) / len(column) if column else math.nan for name, column in values.items()}
         # An anchor has stopped if all of its pairs have.
-        totals = {
-            "rate": sum(values["rate"]),
-            "evidence": sum(values["evidence"]),
-            "stopped": min(values["stopped"]),
-        }
-        result[anchor_id] = means | totals
+        totals = {name: sum(values[name]) for name in ("rate", "evidence")}
+        result[anchor_id] = means | totals | {"stopped": min(values["stopped"])}
     return result
 
 
@@ -82,12 +78,10 @@ def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple
     """
     is_common = len(anchors) > 1 and not any(means["displaced"] for means in anchors.values())
     common = _common_advice(list(anchors.values())) if is_common else ""
-    return common, {
-        anchor_id: ""
-        if common
-        else _anchor_advice(f"Anchor {names.get(anchor_id) or format_id(anchor_id)}", means)
-        for anchor_id, means in anchors.items()
-    }
+    if common:
+        return common, dict.fromkeys(anchors, "")
+    labels = {anchor_id: f"Anchor {names.get(anchor_id) or format_id(anchor_id)}" for anchor_id in anchors}
+    return "", {anchor_id: _anchor_advice(labels[anchor_id], means) for anchor_id, means in anchors.items()}
 
 
 def _common_advice(anchors: list[Means]) -> str:

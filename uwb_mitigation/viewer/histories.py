@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -13,9 +14,9 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, CorrectedRange, Encoding, Status, Truth
+from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, Encoding, Status
 
-MAX_SAMPLES, WATERFALL = 6000, 50
+MAX_SAMPLES, MAX_CIRS = 6000, 50
 """Ranges (100 per second for a minute) and CIRs of a pair that are kept."""
 MAX_VALUES = 2 * 1016
 """Of a CIR: the DW1000's complete accumulator, real and imaginary."""
@@ -51,7 +52,7 @@ class BoundedDict(OrderedDict[K, V]):
 
 
 class RangeColumns(NamedTuple):
-    """Ranges of one pair, each float64 (n,); NaN: unknown. See `Sample`; `time_s` is on the clock of the figures."""
+    """Ranges, each float64 (n,); NaN: unknown. See `Sample`; `time_s` is on the clock of the figures."""
 
     time_s: NDArray[np.float64]
     stamp_s: NDArray[np.float64]
@@ -62,6 +63,13 @@ class RangeColumns(NamedTuple):
     interval_s: NDArray[np.float64]
     gap_db: NDArray[np.float64]
     status: NDArray[np.float64]
+
+    def quality(self) -> NDArray[np.float64]:
+        """Return time (s), residual (m), rate (Hz) and NLOS share (%) of one pair, float64 (n, 4)."""
+        residual_m = np.where(np.abs(self.residual_m) < MAX_RANGE_M, self.residual_m, np.nan)
+        is_nlos = np.where(np.isfinite(self.gap_db), self.gap_db >= LINE_OF_SIGHT_DB, np.nan)
+        rate_hz, nlos = 1.0 / _rolling_mean(self.interval_s), 100.0 * _rolling_mean(is_nlos)
+        return np.column_stack([self.time_s, residual_m, rate_hz, nlos])
 
 
 @dataclass(slots=True)
@@ -87,14 +95,6 @@ class Sample:
     interval_s: float = math.nan
     gap_db: float = math.nan
 
-    @classmethod
-    def from_corrected(cls, time_s: float, corrected: CorrectedRange, truth: Truth | None) -> Sample:
-        sigma_m = math.sqrt(corrected.variance_m2) if corrected.variance_m2 >= 0 else math.nan
-        sample = cls(time_s, corrected.range_raw_m, corrected.range_m, sigma_m, corrected.status)
-        if truth is not None:
-            sample.true_m = truth.range_m
-        return sample
-
 
 _VALUES = attrgetter(
     "time_s", "time_s", "raw_m", "range_m", "true_m", "residual_m", "interval_s", "gap_db", "status"
@@ -114,9 +114,8 @@ class Trace:
         if odd or not 0 < len(cir.samples) <= MAX_VALUES:
             return None
         # The largest sample times the scale must fit a float32, and the index of the first path an int32.
-        if not abs(cir.scale) < 1e30 or (
-            math.isfinite(cir.first_path_index) and abs(cir.first_path_index) >= 2**31
-        ):
+        is_far = math.isfinite(cir.first_path_index) and abs(cir.first_path_index) >= 2**31
+        if is_far or not abs(cir.scale) < 1e30:
             return None
         # Copy the samples: they may be a view into a large message.
         return cls(replace(cir, samples=cir.samples.copy()))
@@ -153,7 +152,7 @@ class History:
     _is_interrupted: bool = False
     _steps: deque[int] = field(default_factory=lambda: deque(maxlen=20))
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
-    traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=WATERFALL))
+    traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=MAX_CIRS))
 
     def add(self, sample: Sample, now_s: float) -> None:
         """Add a range, and remove ranges that are older than a minute."""
@@ -188,17 +187,13 @@ class History:
         cirs = [trace.cir for trace in self.traces]
         gap_db = _plausible_values([cir.power_gap_db for cir in cirs])
         correction_m = _plausible_values([sample.raw_m - sample.range_m for sample in samples])
-        residual_m = _plausible_values([sample.residual_m for sample in samples])
         return {
             "lost": 100.0 * self.lost / max(self.lost + self.received, 1),
             "not_ok": _mean(np.array([100.0 * sample.status.is_fault for sample in samples])),
-            "evidence": float(len(residual_m)),
             "nlos": _mean(100.0 * (gap_db >= LINE_OF_SIGHT_DB)),
             "correction": _mean(correction_m),
-            "spread": float(correction_m.std()) if len(correction_m) else math.nan,
-            "residual": _mean(residual_m),
             "rx": _mean(_plausible_values([cir.rx_power_dbm for cir in cirs])),
-            "fp": _mean(_plausible_values([cir.first_path_power_dbm for cir in cirs])),
+            **residual_means([sample.residual_m for sample in samples]),
         }
 
     @property
@@ -227,7 +222,13 @@ class History:
         return max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0 else 0.0)
 
 
-def _plausible_values(values: list[float]) -> NDArray[np.float64]:
+def residual_means(residuals_m: Sequence[float]) -> dict[str, float]:
+    """Return mean and number of the known residuals of the last `STATISTICS` ranges."""
+    known_m = _plausible_values(residuals_m)
+    return {"residual": _mean(known_m), "evidence": float(len(known_m))}
+
+
+def _plausible_values(values: Sequence[float]) -> NDArray[np.float64]:
     """Return the finite values, float64 (n,)."""
     array = np.array(values, np.float64)
     return array[np.abs(array) < MAX_RANGE_M]
@@ -235,3 +236,14 @@ def _plausible_values(values: list[float]) -> NDArray[np.float64]:
 
 def _mean(values: NDArray[Any]) -> float:
     return float(values.mean()) if len(values) else math.nan
+
+
+def _rolling_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the means of the last `RATE_RANGES` known values, float64 (n,); NaN: there is none."""
+    is_known, window = np.isfinite(values), np.ones(RATE_RANGES)
+    if not len(values):
+        return values
+    sums = np.convolve(np.where(is_known, values, 0.0), window)[: len(values)]
+    counts = np.convolve(is_known.astype(np.float64), window)[: len(values)]
+    mean: NDArray[np.float64] = np.divide(sums, counts, out=np.full(len(values), np.nan), where=counts > 0.0)
+    return mean

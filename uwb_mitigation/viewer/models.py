@@ -1,11 +1,7 @@
-"""The Bokeh models of one page: its figures, the data sources that a page fills from a scene, and the state of its controls.
-
-Figures use the colours of the light page; on a dark page its script exchanges `NIGHT` and `PAPER`.
-"""
+"""The Bokeh models of one page: its figures, the data sources that a page fills from a scene, and the state of its controls."""
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from typing import Any
 
@@ -32,9 +28,8 @@ from bokeh.plotting import figure
 from bokeh.transform import factor_mark
 from numpy.typing import NDArray
 
-from uwb_mitigation.viewer.floor_plan import MapImage
 from uwb_mitigation.viewer.health import BAD, CHECK, GOOD, STATES, STEPS_M, UNKNOWN
-from uwb_mitigation.viewer.histories import HISTORY_S, RATE_RANGES, STATISTICS, WATERFALL
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_CIRS, RATE_RANGES, STATISTICS
 from uwb_mitigation.viewer.palette import (
     BLUE,
     GREEN,
@@ -47,22 +42,20 @@ from uwb_mitigation.viewer.palette import (
     VERMILLION,
     TrackKind,
 )
-from uwb_mitigation.viewer.scene import CELL_M, ERROR_EDGES_M
+from uwb_mitigation.viewer.scene import ERROR_EDGES_M
 
 TRACE_BEFORE, TRACE_AFTER = 20, 180
 """Number of samples shown before and after the first path."""
 
-_RANGES, _CIRS = f"last {STATISTICS} ranges", f"last {WATERFALL} CIRs"
+_RANGES, _CIRS = f"last {STATISTICS} ranges", f"last {MAX_CIRS} CIRs"
 
 COLUMNS = {
     "state": ("state", "", STATES),
     "status": ("status", "last range", "whether the network could correct the range"),
     "raw": ("raw, m", "last range", "measured range"),
     "corrected": ("corrected, m", "last range", "corrected range"),
-    "second": ("second, m", "last range", "corrected range of the second recording"),
     "sigma": ("\u03c3, m", "last range", "standard deviation of the corrected range"),
     "correction": ("correction, m", _RANGES, "mean of raw minus corrected range"),
-    "spread": ("spread, m", _RANGES, "standard deviation of raw minus corrected range"),
     "residual": ("residual, m", _RANGES, "mean of corrected range minus distance to the estimated position"),
     "not_ok": ("not OK, %", _RANGES, "share of ranges whose status is not OK"),
     "nlos": (
@@ -71,9 +64,8 @@ COLUMNS = {
         "no line of sight: share of CIRs with the first path 6 dB or more below the total",
     ),
     "rx": ("RX, dBm", _CIRS, "mean receive level"),
-    "fp": ("FP, dBm", _CIRS, "mean level of the first path"),
     "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
-    "lost": ("lost, %", "all ranges", "share of missing sequence numbers"),
+    "lost": ("lost, %", "all; in a recording: since the minute before", "share of missing sequence numbers"),
 }
 """Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
@@ -83,25 +75,23 @@ FIGURES = {
     "history": "Residual, rate and NLOS share",
     "positions": "Position error over time",
     "cir": "Last CIR",
-    "waterfall": f"Last {WATERFALL} CIRs",
-    "errors": "Error histogram",
-    "distribution": "Cumulative distribution of the errors",
+    "errors": "Range errors",
+    "distribution": "Cumulative distribution of the range errors",
 }
 """Names and headings of the figures."""
 
 _STROKES = {
     TrackKind.RAW: (1.0, "solid"),
-    TrackKind.SECOND: (3.0, "dotted"),
     TrackKind.CORRECTED: (3.0, "solid"),
     TrackKind.SMOOTHED: (2.0, "dotdash"),
     TrackKind.TRUE: (2.0, "dashed"),
 }
 """Width and dashes of the lines of each kind, in drawing order."""
 
-_SIZES = {"95 % ellipse": "width", "protection level": "protection", "heading": "heading"}
+_SIZES = {"95 % ellipse": "width", "heading": "heading"}
 """Columns that are NaN if a tag has none."""
 
-_LIVE = TrackKind.RAW, TrackKind.CORRECTED, TrackKind.SECOND
+_COMPARED = TrackKind.RAW, TrackKind.CORRECTED
 
 HEALTH_LOOKS = {
     GOOD: ("hex", GREEN),
@@ -110,9 +100,6 @@ HEALTH_LOOKS = {
     UNKNOWN: ("hex_dot", PAPER),
 }
 """Marker and colour of an anchor for each state; statuses of ranges have other markers."""
-
-FADING = (1.0, 0.5, 0.2)
-"""Opacity of the newest, the middle and the oldest third of a track."""
 
 MAP_HEIGHT = 380
 """So that the map is on the first screen, pixels."""
@@ -129,7 +116,7 @@ class Controls(DataModel):  # type: ignore[misc]
         update: set by the server after each update: its number, how long the previous one took, and the age of the
             latest range by its reception and by its stamp, s; the age is negative if there are no recent ranges.
         acknowledged: set by the script to the number of the last update that it has drawn.
-        verdict, summary, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
+        verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
         available: set by the server: whether a control has an effect, {id: bool}.
         empty: set by the server: messages of figures without data, {name: message}.
     """
@@ -144,7 +131,6 @@ class Controls(DataModel):  # type: ignore[misc]
     incidents = AnyValue(default=[])
     available = AnyValue(default={})
     empty = AnyValue(default={})
-    summary = AnyValue(default="")
     notice = AnyValue(default=[])
     nodes = AnyValue(default=[])
     player = AnyValue(default=None)
@@ -153,19 +139,16 @@ class Controls(DataModel):  # type: ignore[misc]
 
 
 class Models:
-    """All models of a page. Exports contain the sources that have a name.
+    """All models of a page.
 
     Args:
         seconds: duration of the recording; None: live.
-        plan: floor plan; None: unknown.
-        second: whether the page compares two recordings.
 
     Attributes:
-        layers: renderers of the map that are shown on request, {name: renderers}.
+        coverage: the map of the predicted accuracy and its legend, which are shown on request.
     """
 
-    def __init__(self, seconds: float | None, plan: MapImage | None = None, second: bool = False) -> None:
-        self._kinds = _LIVE if second else _LIVE[:2]
+    def __init__(self, seconds: float | None) -> None:
         names, looks = [status.name for status in STATUS_LOOKS], STATUS_LOOKS.values()
         colours = CategoricalColorMapper(
             factors=names, palette=[look.colour or NIGHT for look in looks], nan_color=GREY
@@ -174,46 +157,34 @@ class Models:
         marker = factor_mark("status", [look.marker for look in looks], names)
         self._symbols = {"marker": marker, "color": self._colour}
         self.controls = Controls(name="controls")
-        self.pairs = _source("pairs", "anchor", "tag", "no_data", *COLUMNS)
-        self.anchors = _source("anchors", "x", "y", "name", "id", "health", "label")
-        self.selected = _source("", "x", "y")
+        self.pairs = _source("anchor", "tag", "no_data", *COLUMNS)
+        self.pairs.name = "pairs"
+        self.anchors = _source("x", "y", "name", "id", "health", "label")
+        self.selected = _source("x", "y")
         # Glyphs with NaN are not drawn: without a heading, for example.
-        self.tags = _source(
-            "tags", "x", "y", "name", "status", "label_y", "width", "height", "angle", "heading", "protection"
-        )
+        self.tags = _source("x", "y", "name", "status", "label_y", "width", "height", "angle", "heading")
         # The script of the page fills it with the names that do not cover each other.
-        self.labels = _source("", "x", "y", "text", "offset", "shift")
-        self.tracks = {kind: [_source(kind.value, "x", "y") for _ in FADING] for kind in _STROKES}
-        self.accuracy = _source("predicted accuracy", "image", "x", "y", "dw", "dh")
-        self.heat = _source("heat map", "x", "y", "mean")
+        self.labels = _source("x", "y", "text", "offset", "shift")
+        self.tracks = {kind: _source("x", "y") for kind in _STROKES}
+        self.accuracy = _source("image", "x", "y", "dw", "dh")
         # The map shows these corners until the user changes the view; it must not follow the data.
-        self.extent = _source("", "x", "y")
-        self.rays = _source("ranges", "x", "y", "raw", "corrected", "x1", "y1", "status")
-        self.statuses = _source("", "x", "y", "status")
-        self.strip = _source("ranges", "age", "raw", "corrected", "second", "true")
-        self.bad = _source("not OK", "age", "corrected", "status")
-        self.trace = _source("CIR", "sample", "magnitude")
-        self.marks = _source("marks", "noise", "first", "from", "to")
-        self.waterfall = _source("", "image")
-        kinds = [kind.name.lower() for kind in _LIVE]
-        self.errors = _source("histogram", "left", "right", *kinds, *(f"{kind}_share" for kind in kinds))
-        self.history = _source("residuals", "age", "residual", "rate", "NLOS")
-        self.positions = _source("position errors", "time", "error", "bound")
-        self.compared_positions = {
-            kind: _source(f"position errors, {kind.value}", "time", kind.name.lower())
-            for kind in (TrackKind.RAW, TrackKind.SECOND)
-        }
-        self.position = _source("", "time")
+        self.extent = _source("x", "y")
+        self.rays = _source("x", "y", "x0", "y0", "x1", "y1", "status")
+        self.strip = _source("age", "raw", "corrected", "true")
+        self.bad = _source("age", "corrected", "status")
+        self.trace = _source("sample", "magnitude")
+        self.marks = _source("noise", "first", "from", "to")
+        self.errors = _source("left", "right", "raw", "corrected", "raw_share", "corrected_share")
+        self.history = _source("age", "residual", "rate", "NLOS")
+        self.positions = _source("time", "error", "bound")
+        self.raw_positions = _source("time", "raw")
+        self.position = _source("time")
         # A figure without data has no axis ranges: invisible corners define them until data arrives.
-        self.corners = {
-            name: _source("", "corner_x", "corner_y")
-            for name in ("cir", "strip", "history", "positions", "errors")
-        }
-        self.layers: dict[str, list[Any]] = {}
+        corners = "cir", "strip", "history", "positions", "errors"
+        self.corners = {name: _source("corner_x", "corner_y") for name in corners}
         self.figures = {
-            "map": self._map(plan), "strip": self._strip(), "history": self._history(seconds), "cir": self._cir(),
-            "waterfall": self._waterfall(), "errors": self._errors(), "distribution": self._distribution(),
-            "positions": self._positions(seconds),
+            "map": self._map(), "strip": self._strip(), "history": self._history(seconds), "cir": self._cir(),
+            "positions": self._positions(seconds), "errors": self._errors(), "distribution": self._distribution(),
         }  # fmt: skip
         if seconds is not None:
             for name in ("history", "positions"):
@@ -254,83 +225,50 @@ class Models:
             if item.visible != shown:
                 item.visible = shown
 
-    def _map(self, plan: MapImage | None) -> figure:
-        plot = new_figure(MAP_HEIGHT, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset")
+    def _map(self) -> figure:
+        plot = new_figure(MAP_HEIGHT, "x, m", "y, m", match_aspect=True, tools="pan,wheel_zoom,reset,save")
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self.extent, size=0, alpha=0)
         plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
-        if plan is not None:
-            plot.image_url(
-                url=[plan.url], x=plan.x, y=plan.y, w=plan.width, h=plan.height, angle=plan.yaw, anchor="bottom_left"
-            )  # fmt: skip
-        self.heat_levels = LinearColorMapper("Viridis256", low=0.0, high=1.0, nan_color="#00000000")
-        steps = range(len(STEPS_M))
-        accuracy = LinearColorMapper(
-            cividis(len(STEPS_M)), low=-0.5, high=len(STEPS_M) - 0.5, nan_color="#00000000"
-        )
-        labels = {step: f"\u2264 {limit_m:g}" for step, limit_m in zip(steps, STEPS_M, strict=True)}
-        bars = [
-            _colour_bar(self.heat_levels, title="mean correction, m", visible=False),
-            _colour_bar(
-                accuracy, title="predicted \u03c3, m", visible=False, ticker=FixedTicker(ticks=list(steps)),
-                major_label_overrides=labels,
-            ),
-        ]  # fmt: skip
-        for bar in bars:
-            plot.add_layout(bar, "right")
-        self.layers["accuracy"] = [
-            plot.image(
-                "image", "x", "y", "dw", "dh", source=self.accuracy, color_mapper=accuracy, alpha=0.6, visible=False
-            ), bars[1],
-        ]  # fmt: skip
+        clear, count = "#00000000", len(STEPS_M)
+        accuracy = LinearColorMapper(cividis(count), low=-0.5, high=count - 0.5, nan_color=clear)
+        labels = {step: f"\u2264 {limit_m:g}" for step, limit_m in enumerate(STEPS_M)}
+        bar = ColorBar(
+            color_mapper=accuracy, width=10, padding=4, title="predicted \u03c3, m", visible=False,
+            ticker=FixedTicker(ticks=list(labels)), major_label_overrides=labels,
+        )  # fmt: skip
+        plot.add_layout(bar, "right")
+        image = plot.image("image", source=self.accuracy, color_mapper=accuracy, alpha=0.6, visible=False)
+        self.coverage = image, bar
         items = defaultdict[str, list[Any]](list)
-        for name, glyph, source, style in self._map_layers(plan is not None):
-            items[name].append(getattr(plot, glyph)("x", style.pop("y", "y"), source=source, **style))
+        for name, glyph, source, style in self._map_layers():
+            items[name].append(getattr(plot, glyph)(source=source, **style))
         del items[""]
         named = items["anchor"] + items["tag"]
         plot.add_tools(HoverTool(tooltips=[("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")], renderers=named))
-        self.layers["circles"] = items["raw range"] + items["corrected range"]
-        self.layers["heat"] = [*items["mean correction"], bars[0]]
         legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
         self._legend = {name: LegendItem(label=legend[name], renderers=items[name]) for name in items}
         plot.add_layout(Legend(items=list(self._legend.values())), "below")
         return finished(plot)
 
-    def _map_layers(self, has_plan: bool) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
+    def _map_layers(self) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
         """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
-        walls = ColumnDataSource({name: [math.nan] * has_plan for name in "xy"})
         tag = CategoricalColorMapper(factors=["OK"], palette=[BLUE], nan_color=GREY)
         looks = HEALTH_LOOKS
         anchor = CategoricalColorMapper(factors=list(looks), palette=[colour for _, colour in looks.values()])
-        on_request: dict[str, Any] = {"fill_color": None, "visible": False}
         label = {
             "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
             "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset", "x_offset": "shift",
         }  # fmt: skip
         return [
-            ("wall", "scatter", walls, {"marker": "square", "size": 12, "color": GREY}),
-            ("mean correction", "rect", self.heat, on_request | {
-                "width": CELL_M, "height": CELL_M, "line_color": None, "fill_alpha": 0.8,
-                "fill_color": {"field": "mean", "transform": self.heat_levels},
-            }),
-            ("raw range", "circle", self.rays, on_request | {"radius": "raw", "line_color": VERMILLION, "line_dash": "dashed"}),
-            ("corrected range", "circle", self.rays, on_request | {
-                "radius": "corrected", "line_color": self._colour, "line_width": 2.5,
-            }),
-            ("", "segment", self.rays, {"x1": "x1", "y1": "y1", "line_color": self._colour, "line_alpha": 0.8}),
-            *(
-                (kind.value, "line", source, _stroke(kind) | {"line_alpha": alpha})
-                for kind, sources in self.tracks.items() for source, alpha in zip(sources, FADING, strict=True)
-            ),
+            ("", "segment", self.rays, {"line_color": self._colour, "line_alpha": 0.8}),
+            *((kind.value, "line", source, _stroke(kind)) for kind, source in self.tracks.items()),
             ("95 % ellipse", "ellipse", self.tags, {
                 "width": "width", "height": "height", "angle": "angle", "color": BLUE, "fill_alpha": 0.25,
             }),
-            ("protection level", "circle", self.tags, {
-                "radius": "protection", "fill_color": None, "line_color": NIGHT, "line_dash": "dotted",
-            }),
             ("heading", "ray", self.tags, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
-            ("status", "scatter", self.statuses, self._symbols | {"size": 10, "line_width": 2}),
+            ("status", "scatter", self.rays, self._symbols | {"size": 10, "line_width": 2}),
             ("anchor", "scatter", self.anchors, {
                 "marker": factor_mark("health", [marker for marker, _ in HEALTH_LOOKS.values()], list(HEALTH_LOOKS)),
                 "size": 15, "line_color": NIGHT, "fill_color": {"field": "health", "transform": anchor},
@@ -346,7 +284,7 @@ class Models:
 
     def _strip(self) -> figure:
         plot = new_figure(230, _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
-        names = self._lines(plot, self.strip, "age", *self._kinds, TrackKind.TRUE)
+        names = self._lines(plot, self.strip, "age", *_COMPARED, TrackKind.TRUE)
         plot.scatter("age", "corrected", source=self.bad, size=8, legend_field="status", **self._symbols)
         return finished(plot, "age", *names)
 
@@ -365,12 +303,9 @@ class Models:
         plot = _time_figure(seconds, "m")
         style = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
         plot.varea("time", 0, "bound", source=self.positions, **style)
-        plot.line(
-            "time", "error", source=self.positions, legend_label="corrected", **_stroke(TrackKind.CORRECTED)
-        )
-        for kind in self._kinds:
-            if kind in self.compared_positions:
-                self._lines(plot, self.compared_positions[kind], "time", kind)
+        corrected = _stroke(TrackKind.CORRECTED) | {"legend_label": "corrected"}
+        plot.line("time", "error", source=self.positions, **corrected)
+        self._lines(plot, self.raw_positions, "time", TrackKind.RAW)
         return finished(plot, "time", "error", "bound")
 
     def _lines(
@@ -383,7 +318,7 @@ class Models:
         return names
 
     def _cir(self) -> figure:
-        plot = new_figure(230, _SAMPLES, "magnitude", x_range=_trace_range())
+        plot = new_figure(230, _SAMPLES, "magnitude", x_range=Range1d(-TRACE_BEFORE, TRACE_AFTER))
         style = {"fill_color": GREEN, "fill_alpha": 0.15, "line_color": None, "legend_label": "network input"}
         plot.vstrip("from", "to", source=self.marks, **style)
         style = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
@@ -392,40 +327,23 @@ class Models:
         plot.hspan("noise", source=self.marks, line_color=GREY, line_dash="dashed", legend_label="noise")
         return finished(plot, "sample", "magnitude")
 
-    def _waterfall(self) -> figure:
-        plot = new_figure(
-            230, _SAMPLES, "exchanges ago", x_range=_trace_range(), y_range=Range1d(WATERFALL, 0)
-        )
-        levels = LinearColorMapper("Cividis256", low=0, high=255)
-        # Anchor the image at its first row, the newest, because the axis points down.
-        plot.image(
-            "image", x=-TRACE_BEFORE, y=0, dw=TRACE_BEFORE + TRACE_AFTER, dh=WATERFALL,
-            source=self.waterfall, color_mapper=levels,
-        )  # fmt: skip
-        scale = {0: "-40", 127.5: "-20", 255: "0"}
-        ticker = FixedTicker(ticks=list(scale))
-        plot.add_layout(
-            _colour_bar(levels, title="dB of peak", ticker=ticker, major_label_overrides=scale), "right"
-        )
-        return plot
-
     def _errors(self) -> figure:
         plot = new_figure(230, "range error, m", "ranges", y_range=DataRange1d(start=0.0, min_interval=1.0))
         low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
         plot.xaxis.ticker = FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
         plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
-        for kind, hatch in zip(self._kinds, ("/", None, "."), strict=False):
+        for kind, hatch in zip(_COMPARED, ("/", None), strict=True):
             colour = TRACK_COLOURS[kind]
             plot.quad(
                 left="left", right="right", bottom=0, top=kind.name.lower(), source=self.errors, color=colour, fill_alpha=0.35,
                 hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
             )  # fmt: skip
-        return finished(plot, "left", "right", *(kind.name.lower() for kind in self._kinds))
+        return finished(plot, "left", "right", "raw", "corrected")
 
     def _distribution(self) -> figure:
         plot = new_figure(230, "range error, m", "share of ranges, %", y_range=Range1d(0, 100))
         plot.x_range = Range1d(float(ERROR_EDGES_M[0]), float(ERROR_EDGES_M[-1]))
-        names = self._lines(plot, self.errors, "right", *self._kinds, suffix="_share")
+        names = self._lines(plot, self.errors, "right", *_COMPARED, suffix="_share")
         return finished(plot, "right", *names)
 
 
@@ -433,16 +351,12 @@ _SAMPLES, _AGE = "samples (1 ns) from the first path", "time before now, s"
 _TIME = "time in the recording, s"
 
 
-def _trace_range() -> Range1d:
-    return Range1d(-TRACE_BEFORE, TRACE_AFTER)
-
-
-def _source(title: str, *columns: str) -> ColumnDataSource:
-    return ColumnDataSource({column: [] for column in columns}, name=title or None)
+def _source(*columns: str) -> ColumnDataSource:
+    return ColumnDataSource({column: [] for column in columns})
 
 
 def new_figure(
-    height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset", **options: Any
+    height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset,save", **options: Any
 ) -> figure:
     """Return an empty figure with the style of the page."""
     plot = figure(
@@ -462,11 +376,6 @@ def _time_figure(seconds: float | None, y: str) -> figure:
 def _stroke(kind: TrackKind) -> dict[str, Any]:
     width, dash = _STROKES[kind]
     return {"line_color": TRACK_COLOURS[kind] or NIGHT, "line_width": width, "line_dash": dash}
-
-
-def _colour_bar(mapper: LinearColorMapper, **options: Any) -> ColorBar:
-    colours = {"title_text_color": NIGHT, "major_label_text_color": NIGHT}
-    return ColorBar(color_mapper=mapper, width=10, padding=4, **colours, **options)
 
 
 def finished(plot: figure, *columns: str) -> figure:

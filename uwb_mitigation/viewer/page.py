@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,12 @@ from bokeh.events import Reset
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.drawing import Figures
-from uwb_mitigation.viewer.headline import RECENT, WHOLE
 from uwb_mitigation.viewer.histories import Pair
 from uwb_mitigation.viewer.models import COLUMNS, FIGURES, Models
 from uwb_mitigation.viewer.palette import STATUS_LOOKS
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import PageState, View
-from uwb_mitigation.viewer.texts import Texts
+from uwb_mitigation.viewer.texts import TAG_TITLES, Texts
 
 REFRESH_S = 0.1
 FAST_PAGES = 3
@@ -33,9 +31,6 @@ TABLE_S = 0.5
 
 HEARTBEAT_S = 1.0
 """Maximum interval of updates: a page without an update shows old data."""
-
-TRAILS_S = (10.0, 60.0, math.inf)
-"""Durations of the tracks that a page can show."""
 
 TEMPLATES = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"))
 
@@ -53,8 +48,8 @@ class Page:
         self._sent, self._sent_s, self._took_s, self._redraw = 0, 0.0, 0.0, False
         self._due_s = self._table_due_s = 0.0
         self._paused = False
-        player, compares = view.player, view.second is not None
-        self._models = models = Models(None if player is None else player.seconds, view.plan, compares)
+        player = view.player
+        self._models = models = Models(None if player is None else player.seconds)
         self._state = PageState(view, models)
         self._figures, self._texts = Figures(self._state), Texts(self._state)
         # Register before the model is added to the document: later registrations have no effect.
@@ -64,25 +59,17 @@ class Page:
             for model in models.roots:
                 document.add_root(model)
         document.title = view.title
-        columns = {name: column for name, column in COLUMNS.items() if name != "second" or compares}
         document.template = TEMPLATES.get_template("page.html.j2")
         document.template_variables.update(
             page_title=view.title,
             recording=player is not None,
             nonce=nonce,
-            columns=columns,
-            intervals=[
-                (interval, len(list(names)))
-                for interval, names in groupby(columns, key=lambda name: columns[name][1])
-            ],
+            columns=COLUMNS,
             states=health.STATES,
+            tag_titles=TAG_TITLES,
             figures=FIGURES,
             looks=STATUS_LOOKS,
             speeds=player and player.SPEEDS,
-            trails={
-                f"{seconds:g}": "all" if math.isinf(seconds) else f"{seconds:g} s" for seconds in TRAILS_S
-            },
-            windows=(WHOLE, RECENT),
         )
         document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
         models.controls.on_change("command", self._on_command)
@@ -114,10 +101,7 @@ class Page:
         """Update every model from the scene, and number the update if anything has changed."""
         self._draw_player()
         player, scene = self._player, self._view.scene
-        position = None
-        if player is not None:
-            is_indexed = self._view.second is not None and self._view.second.timeline is not None
-            position = player.shown_s, player.is_behind, player.timeline is None, is_indexed
+        position = player and (player.shown_s, player.is_behind, player.timeline is None)
         with self._view.lock:
             # Ages change without data; drawing them once a second is enough.
             state = scene.revision, self._state.selected, math.floor(scene.clock()), position
@@ -145,17 +129,7 @@ class Page:
         else:
             state.forget("scene")
         self._figures.draw(scene)
-        marks, timeline = self._models.controls.marks or {}, self._view.timeline
-        state.set(
-            available={
-                "largest": marks.get("largest") is not None,
-                **dict.fromkeys(("previous_bad", "next_bad"), marks.get("count", 0) > 0),
-                **dict.fromkeys(("step", "window"), timeline is not None and len(timeline.status) > 1),
-                **dict.fromkeys(("circles", "heat"), bool(scene.anchors and scene.pairs)),
-                "accuracy": len(scene.anchors) > 1,
-                "follow": bool(scene.tags),
-            }
-        )
+        state.set(available={"accuracy": len(scene.anchors) > 1})
 
     def select(self, pair: Pair | None) -> None:
         """Show the CIR and the ranges of a pair, which may have no ranges yet."""
@@ -168,26 +142,15 @@ class Page:
             self._state.set(player={"playing": not self._paused})
             return
         position_s = round(player.shown_s, 3)
-        self._state.set(
-            player={
-                "playing": player.playing, "position": position_s, "seconds": player.seconds, "speed": player.speed,
-                "behind": player.is_behind,
-            }
-        )  # fmt: skip
+        shown = {"playing": player.playing, "speed": player.speed, "behind": player.is_behind}
+        self._state.set(player=shown | {"position": position_s, "seconds": player.seconds})
         if self._state.changed("position", position_s):
             models.position.data = {"time": [position_s]}
         if (timeline := player.timeline) is not None and self._state.changed("marks", timeline.is_complete):
             relative = timeline.log_s / max(player.seconds, 1e-9)
-            largest = timeline.largest_error()
-            self._state.set(
-                marks={
-                    "bad": np.unique(relative[timeline.bad].round(3)).tolist(),
-                    "incidents": [time_s / max(player.seconds, 1e-9) for time_s, _ in timeline.incidents],
-                    "count": int(timeline.bad.sum()),
-                    "largest": None if largest is None else float(relative[largest]),
-                    "truth": bool(np.isfinite(timeline.true_m).any()),
-                }
-            )
+            bad = np.unique(relative[timeline.bad].round(3)).tolist()
+            incidents = [time_s / max(player.seconds, 1e-9) for time_s, _ in timeline.incidents]
+            self._state.set(marks={"bad": bad, "count": timeline.counts[2], "incidents": incidents})
 
     # Events ---------------------------------------------------------------------------------------------------
 
@@ -195,19 +158,13 @@ class Page:
         """Execute a command of the page; a browser may send anything."""
         try:
             name, arguments = str(command[0]), list(command[1])
-            if name == "show":
-                for renderer in self._models.layers[arguments[0]]:
-                    renderer.visible = bool(arguments[1])
+            if name == "accuracy":
+                for renderer in self._models.coverage:
+                    renderer.visible = bool(arguments[0])
             elif name == "select":
                 self.select((int(str(arguments[0]), 0), int(str(arguments[1]), 0)))
-            elif name == "trail" and float(arguments[0]) in TRAILS_S:
-                self._state.trail_s = float(arguments[0])
-            elif name == "window" and arguments[0] in (WHOLE, RECENT):
-                self._state.window = arguments[0]
-            elif name == "select_anchor":
-                self._select_anchor(int(arguments[0]))
             elif self._player is not None:
-                self.select(self._player.command(name, *arguments))
+                self._player.command(name, *arguments)
             elif name == "play":
                 self._paused = not bool(arguments[0])
         except (LookupError, TypeError, ValueError, OverflowError):
@@ -223,12 +180,6 @@ class Page:
         self._took_s = time.monotonic() - self._sent_s
         if self._redraw and not self._is_waiting:
             self.draw()
-
-    def _select_anchor(self, anchor: int) -> None:
-        """Select the pair of an anchor with the selected tag, else its first pair."""
-        pairs = [pair for pair, _, _ in self._view.scene.latest() if pair[0] == anchor]
-        tag = self._state.tag_id
-        self.select(next((pair for pair in pairs if pair[1] == tag), pairs[0] if pairs else None))
 
     def _on_reset(self, _event: Reset) -> None:
         with self._view.lock:

@@ -1,7 +1,7 @@
 """Colours and symbols of statuses and tracks, the same on the page, in RViz, in Foxglove and in reports.
 
 The colours are those of Okabe and Ito, which colour-blind people can distinguish. Their contrast is at least 3 : 1 on `PAPER`
-and on `NIGHT`, as WCAG 2.1 level AA requires of graphics. Every status also has its own symbol.
+and on `NIGHT` (RViz), as WCAG 2.1 level AA requires of graphics. Every status also has its own symbol.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from uwb_mitigation.types.measurement import Status
 BLUE, VERMILLION, GREEN, PURPLE, ORANGE = "#0072b2", "#d55e00", "#14a46c", "#c080a2", "#b87f00"
 GREY = "#6c6c6c"
 PAPER, NIGHT = "#ffffff", "#111827"
-"""Backgrounds of the light and of the dark page; each is also the ink on the other one."""
+"""Backgrounds; each is also the ink on the other one."""
 
 
 class StatusStyle(NamedTuple):
@@ -67,15 +67,16 @@ class TrackKind(Enum):
     RAW = "raw"
     CORRECTED = "corrected"
     SMOOTHED = "smoothed"
-    SECOND = "second recording"
     TRUE = "true"
 
+
+ATTRIBUTES = {TrackKind.RAW: "raw_live", TrackKind.CORRECTED: "live", TrackKind.SMOOTHED: "smoothed"}
+"""Attributes of `TagTracks`."""
 
 TRACK_COLOURS = {
     TrackKind.RAW: VERMILLION,
     TrackKind.CORRECTED: BLUE,
     TrackKind.SMOOTHED: GREEN,
-    TrackKind.SECOND: PURPLE,
     TrackKind.TRUE: None,
 }
 """None: the ink of the page."""

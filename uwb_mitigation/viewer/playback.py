@@ -21,16 +21,14 @@ from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.mitigation.model.choice import Choice
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
-from uwb_mitigation.types.measurement import RangeMeasurement
-from uwb_mitigation.types.ros.codec import measurement_key
-from uwb_mitigation.types.ros.topics import ANCHORS, RANGE_RAW
+from uwb_mitigation.types.ros.topics import ANCHORS
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.histories import HISTORY_S, Pair
+from uwb_mitigation.viewer.histories import HISTORY_S
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording
+from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording, corrected_events
 from uwb_mitigation.viewer.scene import MissingData, NodeStatus
-from uwb_mitigation.viewer.timeline import BATCH, Timeline, index_recording
+from uwb_mitigation.viewer.timeline import Timeline, index_recording
 
 READ_S = 0.15
 """Maximum duration of one read, so that the page reacts to commands; playing continues at the position that was reached."""
@@ -43,9 +41,6 @@ MAX_MESSAGES = 3000
 
 MAX_CHECKED = 50_000
 """A check of the anchors tracks once without each of them: a minute for this number of ranges."""
-
-POSE_PERIOD_S = 0.1
-"""Recorded time between two positions of a tag."""
 
 Check = Callable[[Sequence[TagTracks], EstimatorConfig], dict[int, float]]
 
@@ -68,7 +63,6 @@ class BagPlayer:
         corrects: whether the bag contains raw ranges only.
         timeline: index of the recording; None: not ready.
         is_behind: whether the messages up to the position have not been read yet.
-        companion: player of another recording of the same drive, which follows this one.
         scene: scene of `feed`.
         missing: messages for the page on data that the bag does not contain.
         models: number of ranges that `index` corrected, by choice of the model.
@@ -86,23 +80,17 @@ class BagPlayer:
         self.position_s, self.speed, self.playing = 0.0, 1.0, False
         self.is_behind = False
         self.timeline: Timeline | None = None
-        self.companion: BagPlayer | None = None
         self.models: Mapping[Choice, int] = {}
-        no_positions = "No tag positions: they need anchors, and --height if all anchors have one height."
-        self.missing = MissingData(
-            "No ranges up to this time."
-            if recording.contents & RANGES
-            else "The recording contains tracks without ranges.",
-            "No anchor positions: set --anchors FILE.",
-            "" if recording.contents & POSITIONS else no_positions,
-        )
+        self.missing = MissingData("No ranges up to this time.", "No anchor positions: set --anchors FILE.")
+        if not recording.contents & RANGES:
+            self.missing.ranges = "The recording contains tracks without ranges."
+        if not recording.contents & POSITIONS:
+            needs = "they need anchors, and --height if all anchors have one height"
+            self.missing.positions = f"No tag positions: {needs}."
         self._stamp_offset_s = 0.0
         self._backend = backend() if self.corrects else None
-        self._uncorrected: list[tuple[float, RangeMeasurement]] = []
         self._next: Event | None = None
-        self._advanced_s = time.monotonic()
-        self._clock_s, self._posed_s = 0.0, -math.inf
-        self._posed: dict[str, int] = {}
+        self._advanced_s, self._clock_s = time.monotonic(), 0.0
         feed.scene.clock = lambda: self._clock_s
         feed.scene.stamp_clock = lambda: self._clock_s + recording.start_ns / NS_PER_S
         self._window_s = min(HISTORY_S, MAX_MESSAGES / max(recording.rate_hz, 1e-9))
@@ -117,14 +105,19 @@ class BagPlayer:
         return min(self._clock_s, self.position_s) if self.playing and self.is_behind else self.position_s
 
     def index(
-        self, config: EstimatorConfig | None, stamp_offset_s: float = 0.0, check: Check | None = None
+        self,
+        config: EstimatorConfig | None,
+        stamp_offset_s: float = 0.0,
+        check: Check | None = None,
+        estimated: Sequence[TagTracks] = (),
     ) -> threading.Thread:
         """Index the recording in a thread, which is returned.
 
         Args:
-            config: see `index_recording`.
-            stamp_offset_s: see `index_recording`.
+            config: of the estimators, see `index_recording`.
+            stamp_offset_s: added to the stamps of the ranges.
             check: returns `Timeline.displaced` for estimated tracks.
+            estimated: tracks that are known already.
         """
 
         def run() -> None:
@@ -134,10 +127,9 @@ class BagPlayer:
             def publish(timeline: Timeline) -> None:
                 self.timeline = timeline
 
-            timeline = index_recording(recording, config, backend, publish, stamp_offset_s)
+            timeline = index_recording(recording, config, backend, publish, stamp_offset_s, estimated)
             self.models = {} if backend is None else backend.used
             with self._feed.lock:
-                self._feed.scene.heat = timeline.heat
                 self._feed.scene.is_indexed = True
                 self._feed.scene.revision += 1
             if check is None or config is None or not timeline.estimates:
@@ -156,37 +148,14 @@ class BagPlayer:
         thread.start()
         return thread
 
-    def command(self, name: str, *arguments: Any) -> Pair | None:
-        """Execute a command of the page; return the pair to select, if any."""
+    def command(self, name: str, *arguments: Any) -> None:
+        """Execute a command of the page."""
         if name == "play":
             self.play(bool(arguments[0]))
         elif name == "seek" and math.isfinite(position_s := float(arguments[0])):
             self.seek(position_s)
         elif name == "speed" and float(arguments[0]) in self.SPEEDS:
             self.speed = float(arguments[0])
-        elif name == "step":
-            self.step()
-        elif name in ("next_bad", "previous_bad") and self.timeline is not None:
-            return self.jump(self.timeline.bad_row(self.position_s, is_next=name == "next_bad"))
-        elif name == "largest" and self.timeline is not None:
-            return self.jump(self.timeline.largest_error())
-        return None
-
-    def step(self) -> None:
-        """Advance to the next range."""
-        if self.timeline is not None:
-            row = int(np.searchsorted(self.timeline.log_s, self.position_s + 1e-6))
-            if row < len(self.timeline.log_s):
-                self.playing = False
-                self._move(float(self.timeline.log_s[row]))
-
-    def jump(self, row: int | None) -> Pair | None:
-        """Pause at a row of the timeline, and return its pair."""
-        if self.timeline is None or row is None:
-            return None
-        self.playing = False
-        self.seek(float(self.timeline.log_s[row]) + 1e-6)
-        return self.timeline.pair(row)
 
     def play(self, on: bool) -> None:
         """Play or pause; at the end, the recording starts again."""
@@ -199,34 +168,22 @@ class BagPlayer:
         """Show a position, with the minute before it."""
         self._feed.clear()
         self._shown: dict[tuple[str, TrackKind], int] = {}
-        self._posed = {}
-        position_s = min(max(position_s, 0.0), self.seconds)
-        start_ns = max(int((position_s - self._window_s) * NS_PER_S), 0)
+        self.position_s = min(max(position_s, 0.0), self.seconds)
+        start_ns = max(int((self.position_s - self._window_s) * NS_PER_S), 0)
         self._next = None
-        self._events: Iterator[Event] = self._recording.events(self._recording.contents, start_ns)
+        events = self._recording.events(self._recording.contents, start_ns)
+        self._events: Iterator[Event] = corrected_events(events, self._backend)
         self._advanced_s = time.monotonic()
-        self._move(position_s, seek=True)
+        self._read()
 
     def advance(self) -> None:
         """Advance by the time since the last call."""
         now_s = time.monotonic()
         passed_s, self._advanced_s = min(now_s - self._advanced_s, MAX_STEP_S), now_s
-        if self.is_behind:
-            self._read()
-        elif self.playing:
-            self.playing = self.position_s + self.speed * passed_s < self.seconds
-            self._move(self.position_s + self.speed * passed_s)
-        else:
-            self._read()
-
-    def _move(self, position_s: float, seek: bool = False) -> None:
-        self.position_s = min(max(position_s, 0.0), self.seconds)
+        if self.playing and not self.is_behind:
+            self.position_s = min(self.position_s + self.speed * passed_s, self.seconds)
+            self.playing = self.position_s < self.seconds
         self._read()
-        if (companion := self.companion) is not None:
-            position_s = (
-                self.position_s + (self._recording.start_ns - companion._recording.start_ns) / NS_PER_S
-            )
-            (companion.seek if seek else companion._move)(position_s)
 
     def _read(self) -> None:
         """Read up to the current position for at most `READ_S`; the next call continues."""
@@ -242,57 +199,25 @@ class BagPlayer:
                     self._next = event
                     break
                 self._clock_s = event.time_ns / NS_PER_S
-                self._show_poses()
                 self._feed.add(event.topic, event.message, event.tag)
-                if self.corrects and event.topic == RANGE_RAW and event.message is not None:
-                    self._uncorrected.append((self._clock_s, event.message))
-                    if len(self._uncorrected) == BATCH:
-                        self._correct()
                 self.is_behind = time.monotonic() >= end_s
         except RecordingError as error:
             self._events = iter(())
             self._feed.report("recording", NodeStatus(2, f"{error.what}: nothing beyond can be shown"))
-        self._correct()
         if not self.is_behind:
             self._clock_s = self.position_s
-        self._posed_s = -math.inf
-        self._show_poses()
         if self.timeline is not None and self.timeline.is_complete:
             self._show_tracks(self.timeline)
 
-    def _show_poses(self) -> None:
-        """Show the estimates of the index at the time of the message that is read."""
-        timeline = self.timeline
-        if (
-            timeline is None
-            or not timeline.is_complete
-            or 0.0 <= self._clock_s - self._posed_s < POSE_PERIOD_S
-        ):
-            return
-        self._posed_s = self._clock_s
-        for tag, estimated in timeline.estimates.items():
-            time_s = timeline.tracks[tag, TrackKind.CORRECTED][:, 0]
-            count = int(np.searchsorted(time_s, self._clock_s, side="right"))
-            # A tag without new ranges has no new position: its age increases.
-            if count and self._posed.get(tag) != count:
-                self._posed[tag] = count
-                estimate = next(iter(estimated.live.take(slice(count - 1, count))))
-                self._feed.estimate(tag, estimate, float(time_s[count - 1]), self._stamp_offset_s)
-
     def _show_tracks(self, timeline: Timeline) -> None:
-        """Show the tracks up to the current position."""
+        """Show tracks and estimated positions of the index up to the current time."""
         for key, track in timeline.tracks.items():
-            count = int(np.searchsorted(track[:, 0], self._clock_s, side="right"))
-            if self._shown.get(key) != count:
-                self._shown[key] = count
-                with self._feed.lock:
-                    self._feed.scene.set_track(*key, track[:count])
-
-    def _correct(self) -> None:
-        if self._backend is None:
-            return
-        batch, self._uncorrected = self._uncorrected, []
-        results = self._backend.correct([measurement for _, measurement in batch])
-        for (self._clock_s, measurement), corrected in zip(batch, results, strict=True):
-            self._show_poses()
-            self._feed.corrected(measurement_key(measurement), corrected)
+            (name, kind), count = key, int(np.searchsorted(track[:, 0], self._clock_s, side="right"))
+            if self._shown.get(key) == count:
+                continue
+            self._shown[key] = count
+            with self._feed.lock:
+                self.scene.set_track(*key, track[:count])
+            if count and kind is TrackKind.CORRECTED and name in timeline.estimates:
+                estimate = next(iter(timeline.estimates[name].live.take(slice(count - 1, count))))
+                self._feed.estimate(name, estimate, float(track[count - 1, 0]), self._stamp_offset_s)

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.types.ros import schemas, topics
+from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.viewer.feed import DECODERS
 from uwb_mitigation.viewer.scene import DEFAULT_TAG
 
+BATCH = 64
+"""Number of messages that are read ahead to correct their ranges in one call."""
 POSITIONS = frozenset({topics.POSE, topics.ODOMETRY, topics.POSE_SMOOTHED})
 RANGES = frozenset({topics.RANGE_RAW, topics.RANGE_CORRECTED})
 
@@ -65,9 +70,8 @@ class Recording:
             if match := _POSITION_TOPIC.fullmatch(topic):
                 plain, tag = f"/uwb/{match[3]}", match[2] or DEFAULT_TAG
             is_selected = match[1] == prefix if match else topic in (prefix + plain, topics.DIAGNOSTICS)
-            if is_selected and kind.replace("/msg/", "/") == topics.TYPES.get(plain, "").replace(
-                "/msg/", "/"
-            ):
+            expected = topics.TYPES.get(plain, "")
+            if is_selected and kind.replace("/msg/", "/") == expected.replace("/msg/", "/"):
                 self._topics[topic] = plain, tag
         if topics.POSE in self.contents:
             # Tracks (the output of `track`) are used only if there are no poses.
@@ -97,6 +101,35 @@ class Recording:
         for message in self._bag.messages(names, self.start_ns + start_ns):
             plain, tag = self._topics[message.channel.topic]
             yield Event(message.log_time_ns - self.start_ns, plain, _decode(plain, message.data), tag)
+
+
+def corrected_events(events: Iterator[Event], backend: Corrector | None) -> Iterator[Event]:
+    """Yield events, and with a backend a corrected range after each raw one.
+
+    Raises:
+        RecordingError: the bag is damaged; every event before the damage has been yielded.
+    """
+    if backend is None:
+        yield from events
+        return
+    is_end, damage = False, None
+    while not is_end:
+        batch = list[Event]()
+        try:
+            # After an error, `batch` contains the events before.
+            batch.extend(islice(events, BATCH))
+        except RecordingError as error:
+            damage = error
+        is_end = len(batch) < BATCH
+        raw = [event for event in batch if event.topic == topics.RANGE_RAW and event.message is not None]
+        results = dict(zip(map(id, raw), backend.correct([event.message for event in raw]), strict=True))
+        for event in batch:
+            yield event
+            if (result := results.get(id(event))) is not None:
+                corrected = measurement_key(event.message), result
+                yield event._replace(topic=topics.RANGE_CORRECTED, message=corrected)
+    if damage is not None:
+        raise damage
 
 
 def _decode(topic: str, data: bytes) -> Any:

@@ -10,22 +10,23 @@ from typing import Any
 
 import numpy as np
 from bokeh.embed import file_html
-from bokeh.models import ColumnDataSource, FactorRange, Line
+from bokeh.models import ColumnDataSource, FactorRange
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 
 from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.viewer.drawing import Figures
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.models import FIGURES, Models, finished, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
 from uwb_mitigation.viewer.palette import TRACK_COLOURS, TrackKind
-from uwb_mitigation.viewer.playback import BagPlayer, Check
+from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import PageState, View
-from uwb_mitigation.viewer.texts import Texts
+from uwb_mitigation.viewer.texts import TAG_TITLES, Texts
 
 SHOWN = "map", "positions", "errors", "distribution"
 """Figures of the report of a recording."""
@@ -63,8 +64,6 @@ def draw_scene(view: View) -> Models:
     labels += [(*row, -4, 0) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
     columns = zip(*labels, strict=True) if labels else ((),) * 5
     models.labels.data = dict(zip(models.labels.data, columns, strict=True))
-    for line in (r.glyph for r in models.figures["map"].renderers if isinstance(r.glyph, Line)):
-        line.line_alpha = 0.8
     return models
 
 
@@ -97,8 +96,9 @@ def write_report(
     bag: Path,
     config: EstimatorConfig,
     backend: Callable[[], Corrector],
+    tracks: Sequence[TagTracks],
+    displaced: dict[int, float],
     stamp_offset_s: float = 0.0,
-    check: Check | None = None,
 ) -> None:
     """Write the state of the page at the end of a recording.
 
@@ -107,8 +107,9 @@ def write_report(
         bag: the recording.
         config: of the estimators.
         backend: see `BagPlayer`.
+        tracks: the tracks of its tags.
+        displaced: see `Timeline`.
         stamp_offset_s: see `BagPlayer.index`.
-        check: see `BagPlayer.index`.
 
     Raises:
         RecordingError: the bag cannot be read.
@@ -116,7 +117,7 @@ def write_report(
     feed = SceneUpdater(Scene(), Lock())
     player = BagPlayer(bag, feed, backend)
     feed.anchors(config.anchors)
-    player.index(config, stamp_offset_s, check).join()
+    player.index(config, stamp_offset_s, lambda *_: displaced, tracks).join()
     player.seek(player.seconds)
     while player.is_behind:
         player.advance()
@@ -126,11 +127,7 @@ def write_report(
     lines = [f"Position {state}" + (f": {reason}. {action}" if reason else ""), facts, *controls.notice]
     sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
     sections |= {FIGURES[name]: models.figures[name] for name in SHOWN}
-    sections["Anchors at the end"] = [
-        ("state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"), *controls.health,
-    ]  # fmt: skip
-    sections["Tags at the end"] = [
-        ("tag", "x, y, z, m", "\u03c3, m", "age", "ranges, Hz"),
-        *controls.tag_rows,
-    ]
+    titles: tuple[str, ...] = "state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"
+    sections["Anchors at the end"] = [titles, *controls.health]
+    sections["Tags at the end"] = [TAG_TITLES, *controls.tag_rows]
     write_atomically(path, render_report(bag.name, lines, sections))

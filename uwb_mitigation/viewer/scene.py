@@ -38,7 +38,7 @@ from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 
 # Limits. Ids and texts come from the air or the network; above a limit, the oldest entries are removed.
-MAX_PAIRS, MAX_TAGS, MAX_NODES, MAX_CELLS = 256, 64, 64, 4000
+MAX_PAIRS, MAX_TAGS, MAX_NODES = 256, 64, 64
 MAX_TRACK = 3000  # points
 MAX_TEXT = 400  # characters of a name or a message
 MAX_COORDINATE_M = 2e7  # any position on Earth; a position further away is ignored
@@ -49,13 +49,16 @@ STALE_S, STALE = 5.0, 3
 """A node has this diagnostic level if its last diagnostics are older, as in rqt_robot_monitor."""
 ERROR_EDGES_M = np.linspace(-1.0, 2.0, 61)
 """Bins of the error histogram; larger errors count in the outermost bins."""
-STEP_M, STEP_S, CELL_M = 0.02, 0.09, 0.5
-"""Distance and time between points of a live track: closer points are skipped, unless a point is 0.5 s old; cell of the heat map."""
+STEP_M, STEP_S = 0.02, 0.09
+"""Distance and time between points of a live track: closer points are skipped, unless a point is 0.5 s old."""
 HEIGHT_VARIANCE_M2 = 0.01
 """Of the published height, for the positions from raw ranges."""
 
 DEFAULT_TAG = "tag"
 """Name of the tag whose topics have the plain names; the others are named as `tag_frame` does."""
+
+Counts = tuple[int, int, int]
+"""Numbers of corrected ranges, of all ranges, and of those with a status that needs attention."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +67,6 @@ class Pose:
 
     Attributes:
         ellipse: horizontal 95 % ellipse: half axes (m) and angle of the major axis (rad); NaN: unknown.
-        protection_m: horizontal protection level; NaN: unknown.
         heading_rad: NaN: unknown.
         stamp_s, sd_m: time of the estimate, s, and horizontal standard deviation; NaN: unknown.
     """
@@ -73,7 +75,6 @@ class Pose:
     y: float
     z: float = math.nan
     ellipse: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    protection_m: float = math.nan
     heading_rad: float = math.nan
     stamp_s: float = math.nan
     sd_m: float = math.nan
@@ -123,12 +124,8 @@ class NodeStatus:
         age_s = now_s - self.received_s
         if not age_s > STALE_S:
             return self
-        return replace(
-            self,
-            level=STALE,
-            message=f"no diagnostics for {age_s:.0f} s; last: {self.message}",
-            determinations=(),
-        )
+        message = f"no diagnostics for {age_s:.0f} s; last: {self.message}"
+        return replace(self, level=STALE, message=message, determinations=())
 
 
 @dataclass(slots=True)
@@ -154,31 +151,36 @@ class Scene:
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
         tracks: {(name, kind): positions}.
-        heat: {cell: [sum of the corrections of the ranges in this cell, m, and their number]}.
-        is_indexed: tracks and heat map are those of the index of a recording; data does not change them.
+        is_indexed: tracks are those of the index of a recording; data does not change them.
         revision: increases with every change, so that a page draws only changes.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock, self.stamp_clock = clock, time.time
+        self.anchors: dict[int, Anchor] = {}
+        self.is_indexed, self.received_s, self.revision = False, math.nan, 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove everything except the anchors."""
         self.incidents = Incidents()
         # {tag: (latest stamp, its time of reception)}: stamps of different tags may come from different clocks.
         self._latest: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
-        self.received_s = math.nan
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
         self.tags: BoundedDict[str, TagView] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
         self.tracks: BoundedDict[tuple[str, TrackKind], TrackView] = BoundedDict(4 * MAX_TAGS)
-        self.is_indexed = False
-        self.heat: BoundedDict[tuple[int, int], list[float]] = BoundedDict(MAX_CELLS)
-        self.anchors: dict[int, Anchor] = {}
         self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
-        self.error_sums_m = np.zeros(2)
-        self.errors = 0
-        self.revision = 0
+        self.error_sums_m, self.errors = np.zeros(2), 0
+        self.revision += 1
+
+    @property
+    def counts(self) -> Counts:
+        """Numbers of ranges."""
+        return self.corrected, self.ranges, self.faults
 
     def now_s(self, tag_id: int | None = None) -> float:
         """Return the latest stamp of a tag (None: of the latest range) plus the time since then; NaN before any."""
@@ -251,9 +253,8 @@ class Scene:
         if _is_plausible(pose.x, pose.y, pose.z):
             entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or TagView())
             if (before := entry.pose) is not None and pose.stamp_s > before.stamp_s:
-                entry.speed = math.dist((pose.x, pose.y), (before.x, before.y)) / (
-                    pose.stamp_s - before.stamp_s
-                )
+                moved_m = math.dist((pose.x, pose.y), (before.x, before.y))
+                entry.speed = moved_m / (pose.stamp_s - before.stamp_s)
             entry.pose, entry.received_s = pose, self.clock() if received_s is None else received_s
             self.incidents.add_position(tag_label(tag[:MAX_TEXT], None), entry.received_s, pose.x, pose.y)
             point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
@@ -283,14 +284,10 @@ class Scene:
         self.revision += 1
 
     def _compare_with_position(self, pair: Pair, sample: Sample) -> None:
-        """Compute what a range and the position of its tag yield together: residual, heat map, raw position."""
+        """Compute what a range and the position of its tag yield together: residual, raw position."""
         anchor, tag = self.anchors.get(pair[0]), self.tag_of(pair[1])
         pose = None if tag is None else tag.pose
-        if tag is None or pose is None or self.age_s(tag) > NO_DATA_S:
-            return
-        if not self.is_indexed and abs(correction_m := sample.raw_m - sample.range_m) < MAX_RANGE_M:
-            add_heat(self.heat, pose.x, pose.y, correction_m)
-        if anchor is None:
+        if tag is None or pose is None or anchor is None or self.age_s(tag) > NO_DATA_S:
             return
         # On a busy computer, positions arrive late.
         if not abs(pose.stamp_s - sample.time_s) * tag.speed > MAX_MOVED_M:
@@ -320,12 +317,9 @@ class Scene:
     def set_anchors(self, anchors: Iterable[Anchor]) -> None:
         """Set the anchors on Earth; the height of an anchor may be NaN."""
         plausible = (anchor for anchor in anchors if _is_plausible(*anchor.position))
-        anchors_before, self.anchors = (
-            self.anchors,
-            {anchor.id: anchor for anchor in islice(plausible, MAX_ANCHORS)},
-        )
+        before, self.anchors = self.anchors, {anchor.id: anchor for anchor in islice(plausible, MAX_ANCHORS)}
         self.revision += 1
-        if self.anchors and self.anchors != anchors_before:
+        if self.anchors and self.anchors != before:
             places = [
                 replace(anchor, position=(*anchor.position[:2], finite_or_zero(anchor.position[2])))
                 for anchor in self.anchors.values()
@@ -350,23 +344,6 @@ class Scene:
             if pair_tag == tag_id:
                 history.samples.clear()
                 history.traces.clear()
-
-    def clear(self) -> None:
-        """Remove everything except the anchors."""
-        self._latest.clear()
-        self._raw_locators.clear()
-        self.tags.clear()
-        self.tracks.clear()
-        if not self.is_indexed:
-            self.heat.clear()
-        self.pairs.clear()
-        self.ranges = self.corrected = self.faults = self.dropped = 0
-        self.incidents = Incidents()
-        self.node_statuses.clear()
-        self.error_counts[:] = 0
-        self.error_sums_m[:] = 0
-        self.errors = 0
-        self.revision += 1
 
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
         """Yield every pair with its last range, by anchor and tag; also pairs that have stopped."""
@@ -404,16 +381,6 @@ def count_errors(errors_m: NDArray[np.float64]) -> NDArray[np.int64]:
     bins = len(ERROR_EDGES_M) - 1
     rows = np.clip(np.searchsorted(ERROR_EDGES_M, errors_m, side="right") - 1, 0, bins - 1)
     return np.stack([np.bincount(row, minlength=bins) for row in rows])
-
-
-def add_heat(
-    heat: BoundedDict[tuple[int, int], list[float]], x: float, y: float, correction_m: float
-) -> None:
-    """Add the correction of a range to the cell of its tag."""
-    cell = math.floor(x / CELL_M), math.floor(y / CELL_M)
-    entry = heat.add(cell, heat.get(cell) or [0.0, 0.0])
-    entry[0] += correction_m
-    entry[1] += 1.0
 
 
 def with_gaps(columns: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:

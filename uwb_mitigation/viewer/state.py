@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bokeh.models import ColumnDataSource
 
-from uwb_mitigation.viewer.floor_plan import MapImage
-from uwb_mitigation.viewer.headline import RECENT, WHOLE
-from uwb_mitigation.viewer.histories import MAX_RANGE_M, History, Pair
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair
 from uwb_mitigation.viewer.models import Models
 from uwb_mitigation.viewer.scene import MissingData, Scene
 from uwb_mitigation.viewer.verdict import HeldVerdict
@@ -29,7 +27,6 @@ class View:
         lock: held while the scene is changed or drawn.
         window: number of samples that the network reads.
         player: player of a recording; None: live.
-        plan: floor plan; None: unknown.
         missing: the reasons for an empty page.
         pages: number of open pages.
     """
@@ -39,7 +36,6 @@ class View:
     title: str = "UWB ranges"
     window: int = 157
     player: BagPlayer | None = None
-    plan: MapImage | None = None
     missing: MissingData = field(default_factory=MissingData)
     pages: int = 0
 
@@ -49,9 +45,9 @@ class View:
         return None if self.player is None else self.player.timeline
 
     @property
-    def second(self) -> BagPlayer | None:
-        """The player of the second recording; None: there is only one."""
-        return None if self.player is None else self.player.companion
+    def complete(self) -> Timeline | None:
+        """The index of the recording with its tracks; None: live, or not ready."""
+        return self.timeline if self.timeline is not None and self.timeline.is_complete else None
 
 
 class PageState:
@@ -63,7 +59,7 @@ class PageState:
 
     Attributes:
         selected: the selected pair; None: there are no ranges.
-        window: interval of the figures. trail_s: duration of the tracks.
+        trail_s: duration of the tracks.
         health: state and mean residual (m) of each anchor. verdict: on the position of the selected tag.
         has_data: whether a pair has recent ranges.
     """
@@ -71,7 +67,7 @@ class PageState:
     def __init__(self, view: View, models: Models) -> None:
         self.view, self.models = view, models
         self.selected: Pair | None = None
-        self.window, self.trail_s = WHOLE if view.player else RECENT, 60.0
+        self.trail_s = HISTORY_S
         self.health: dict[int, tuple[str, float]] = {}
         self.verdict, self.has_data = HeldVerdict(), False
         self._drawn: dict[str, object] = {}

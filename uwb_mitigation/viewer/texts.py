@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,8 @@ import numpy as np
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.determination import UNKNOWN_POSITION
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.headline import RECENT, Card, interval_cards, live_cards, recorded_positions
-from uwb_mitigation.viewer.histories import NO_DATA_S, Pair
+from uwb_mitigation.viewer.headline import Card, live_cards, recorded_cards
+from uwb_mitigation.viewer.histories import HISTORY_S, NO_DATA_S, STATISTICS, Pair, residual_means
 from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
 from uwb_mitigation.viewer.state import PageState, no_data, set_rows
 from uwb_mitigation.viewer.verdict import UNDETERMINED, WAITING, Verdict, verdict
@@ -20,9 +19,9 @@ from uwb_mitigation.viewer.verdict import UNDETERMINED, WAITING, Verdict, verdic
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
 
+TAG_TITLES = "tag", "x, y, z, m", "\u03c3, m", "age", "ranges, Hz", "range age by stamp"
+"""Columns of the table of tags."""
 MAX_SHOWN_EVENTS = 8
-STAMP_DIFFERENCE_S = 1.0
-"""If the age of the latest range by its stamp and by its reception differ by more, the page says so."""
 
 
 class Texts:
@@ -31,12 +30,12 @@ class Texts:
     def __init__(self, state: PageState) -> None:
         self._state, self._view, self._models = state, state.view, state.models
         self._player = state.view.player
-        self._interval_cards: list[Card] = []
+        self._cards: list[Card] = []
         self._states: dict[Any, str] = {}
 
     def draw(self, scene: Scene) -> None:
         """Write the texts of a scene."""
-        cards = self._cards(scene)
+        self._update_cards(scene)
         rows, pairs = self._pairs(scene)
         self._state.has_data = any(not row["no_data"] for row in rows)
         set_rows(self._models.pairs, rows)
@@ -50,7 +49,7 @@ class Texts:
         self._state.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
-        tag_id, timeline = self._state.tag_id, self._view.timeline
+        tag_id = self._state.tag_id
         tag = f"tag {'' if tag_id is None else format_id(tag_id)}"
         remedies = [line.partition(separator)[2] for separator in (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
                     for line in notices if separator in line]  # fmt: skip
@@ -58,11 +57,7 @@ class Texts:
         current = verdict(
             scene, tag_id, of_tag, {key: states[key] for key in of_tag}, next(iter(remedies), "")
         )
-        if (
-            self._player is not None
-            and not (timeline and timeline.is_complete)
-            and current.state == UNDETERMINED
-        ):
+        if current.state == UNDETERMINED and self._player is not None and self._view.complete is None:
             current = Verdict(WAITING, "the recording is being read")
         shown = self._state.verdict.update(current, scene.clock())
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
@@ -71,10 +66,9 @@ class Texts:
             health=_anchor_rows(anchors, states, names),
             tag_rows=self._tags(scene, pairs),
             incidents=self._incidents(scene),
-            cards=cards,
+            cards=self._cards,
             nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports],
             notice=notices,
-            summary=self._summary(scene),
         )
 
     def _health(self, key: Any, means: health.Means) -> str:
@@ -82,7 +76,7 @@ class Texts:
         return self._states[key]
 
     def _pairs(self, scene: Scene) -> tuple[list[dict[str, Any]], dict[Pair, health.Means]]:
-        timeline, second = self._view.timeline, self._view.second
+        timeline, now_s = self._view.timeline, math.nan if self._player is None else self._player.shown_s
         rows, pairs = list[dict[str, Any]](), dict[Pair, health.Means]()
         for pair, history, sample in scene.latest():
             missing, age_s = no_data(scene, history), scene.age_s(history)
@@ -91,37 +85,36 @@ class Texts:
                 "stopped": age_s if missing else 0.0,
                 "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], 0.0),
             }
-            if timeline is not None and pair in timeline.losses:
-                lost, received = timeline.losses[pair]
-                means["lost"] = 100.0 * lost / max(lost + received, 1)
-            other = None if second is None else second.scene.pairs.get(pair)
-            compared = None if other is None else other.latest
+            if timeline is not None:
+                residuals_m = timeline.ranges(pair, now_s - HISTORY_S, now_s).residual_m
+                # A displaced anchor bends the track with which the others are compared.
+                is_judged = not timeline.displaced or pair[0] in timeline.displaced
+                means |= residual_means(residuals_m[-STATISTICS:].tolist() if is_judged else [])
             pairs[pair] = means
             rows.append(means | {
                 "anchor": format_id(pair[0]), "tag": format_id(pair[1]), "state": self._health(pair, means),
                 "status": missing or sample.status.name, "no_data": bool(missing), "raw": sample.raw_m,
-                "corrected": sample.range_m, "second": compared.range_m if compared else math.nan, "sigma": sample.sigma_m,
+                "corrected": sample.range_m, "sigma": sample.sigma_m,
             })  # fmt: skip
         return rows, pairs
 
     def _tags(self, scene: Scene, pairs: dict[Pair, health.Means]) -> list[list[str]]:
-        """Return label, position, standard deviation, age and rate of each tag."""
-        plain_id, ids = plain_tag_id(scene.tags, pairs), dict.fromkeys(sorted(tag for _, tag in pairs))
-        names = {name: tag_label(name, plain_id) for name in scene.tags}
-        rates = dict.fromkeys(names.values(), math.nan)
-        for tag_id in ids:
-            label = names.get(tag_name(tag_id, scene.tags, pairs), f"tag {format_id(tag_id)}")
-            rates[label] = sum(
-                np.nan_to_num(means["rate"]) for (_, tag), means in pairs.items() if tag == tag_id
-            )
-        views, rows = {label: scene.tags[name] for name, label in names.items()}, []
-        for label, rate_hz in rates.items():
-            place, sd_m, age = "-", math.nan, "no position"
-            if (view := views.get(label)) is not None and (pose := view.pose) is not None:
+        """Return label, position, standard deviation, age, rate and age of the last range by its stamp of each tag."""
+        plain_id, rows = plain_tag_id(scene.tags, pairs), dict[str, list[str]]()
+        for name, view in scene.tags.items():
+            label, place, sd_m, age = tag_label(name, plain_id), "-", math.nan, "no position"
+            if (pose := view.pose) is not None:
                 place, sd_m, age_s = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, scene.age_s(view)
                 age = f"no data for {age_s:.0f} s" if age_s > NO_DATA_S else f"{age_s:.1f} s"
-            rows.append([label, place, _number(sd_m, 2), age, _number(rate_hz, 1)])
-        return rows
+            rows[label] = [label, place, _number(sd_m, 2), age, "-", "-"]
+        for tag_id in sorted({tag_id for _, tag_id in pairs}):
+            label, name = f"tag {format_id(tag_id)}", tag_name(tag_id, scene.tags, pairs)
+            row = rows.setdefault(
+                tag_label(name, plain_id) if name else label, [label, "-", "-", "no position", "", ""]
+            )
+            rate_hz = sum(np.nan_to_num(means["rate"]) for (_, tag), means in pairs.items() if tag == tag_id)
+            row[4:] = _number(rate_hz, 1), f"{scene.stamp_clock() - scene.latest_stamp_s(tag_id):.1f} s"
+        return list(rows.values())
 
     def _facts(self, scene: Scene, accuracy: str) -> str:
         """Return accuracy, age and share of corrected ranges."""
@@ -129,49 +122,26 @@ class Texts:
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
-            corrected, count, faults = self._counts(scene)
+            corrected, count, faults = (self._view.timeline or scene).counts
             not_corrected = "no range corrected" + ("" if faults else ": no CIRs")
-            share = f"{100.0 * corrected / count:.0f} % of ranges corrected"
-            texts.append(share if corrected else not_corrected)
-            cards = [card for card in self._interval_cards if corrected and card[0].startswith("Correction")]
-            texts += [f"correction: {card[1]} ({card[2]})" for card in cards]
-        return " \u00b7 ".join(texts)
-
-    def _counts(self, scene: Scene) -> tuple[int, int, int]:
-        """Return the numbers of corrected ranges, of all ranges, and of those with a status that needs attention."""
-        timeline = self._view.timeline
-        if timeline is None:
-            return scene.corrected, scene.ranges, scene.faults
-        return int(timeline.is_corrected.sum()), len(timeline.status), int(timeline.bad.sum())
-
-    def _cards(self, scene: Scene) -> list[Card]:
-        """Return the large figures."""
-        state, player, timeline = self._state, self._player, self._view.timeline
-        if player is None:
-            self._interval_cards = live_cards(scene, state.tag_id)
-            return self._interval_cards
-        if timeline is None:
-            return [["Reading the recording ...", "", ""]]
-        second = None if self._view.second is None else self._view.second.timeline
-        position_s = player.shown_s if state.window == RECENT else 0.0
-        is_complete = timeline.is_complete, second is not None and second.is_complete
-        if state.changed("cards", (state.window, state.tag_id, position_s, second is None, *is_complete)):
-            self._interval_cards = interval_cards(timeline, second, state.tag_id, state.window, position_s)
-        if not timeline.is_complete:
-            return self._interval_cards
-        positions = recorded_positions(timeline, state.tag_id)
-        return positions.current_card(player.shown_s) + self._interval_cards
-
-    def _summary(self, scene: Scene) -> str:
-        """Return time and counts."""
-        count = sum(1 for _ in scene.latest())
-        corrected, ranges, _ = self._counts(scene)
-        texts = [f"{count} pair{'' if count == 1 else 's'}", f"{corrected} corrected ranges of {ranges}"]
+            texts.append(
+                f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else not_corrected
+            )
+            cards = [card for card in self._cards if card[0].startswith("Correction")]
+            texts += [f"correction: {value} ({text})" for _, value, text in cards]
         if scene.dropped:
-            texts.append(f"{scene.dropped} dropped by the viewer")
-        if math.isfinite(now_s := scene.now_s(self._state.tag_id)):
-            texts.insert(0, _utc(now_s))
+            texts.append(f"{scene.dropped} ranges dropped by the viewer")
         return " \u00b7 ".join(texts)
+
+    def _update_cards(self, scene: Scene) -> None:
+        """Set the large figures."""
+        tag_id, timeline = self._state.tag_id, self._view.timeline
+        if self._player is None:
+            self._cards = live_cards(scene, tag_id)
+        elif timeline is None:
+            self._cards = [["Reading the recording ...", "", ""]]
+        elif self._state.changed("cards", (tag_id, timeline.is_complete)):
+            self._cards = recorded_cards(timeline, tag_id)
 
     def _notices(self, scene: Scene) -> list[str]:
         """Return the reasons for an empty page, and what needs attention."""
@@ -181,36 +151,14 @@ class Texts:
             lines.append(missing.ranges)
         elif not self._state.has_data:
             lines.append(f"No ranges for {min(map(scene.age_s, histories)):.0f} s.")
-        else:
-            lines += self._ages(scene)
-        lines += [
-            "" if scene.anchors else missing.anchors,
-            "" if scene.tags or scene.tracks else missing.positions,
-        ]
+        lines.append("" if scene.anchors else missing.anchors)
+        lines.append("" if scene.tags or scene.tracks else missing.positions)
         if timeline is not None:
-            lines += [
-                *timeline.notices,
-                "" if timeline.is_complete else "Estimating the tracks of the recording ...",
-            ]
+            lines += timeline.notices
+            lines.append("" if timeline.is_complete else "Estimating the tracks of the recording ...")
         for status in scene.node_statuses.values():
             lines += status.aged(scene.clock()).determinations
         return [line for line in lines if line]
-
-    def _ages(self, scene: Scene) -> list[str]:
-        """Return notices on tags that have stopped, and on stamps that do not fit the clock."""
-        lines = []
-        for tag_id in dict.fromkeys(tag_id for (_, tag_id), _, _ in scene.latest()):
-            age_s = min(scene.age_s(history) for (_, tag), history in scene.pairs.items() if tag == tag_id)
-            latest_s = scene.latest_stamp_s(tag_id)
-            behind_s = scene.stamp_clock() - latest_s - age_s
-            if age_s > NO_DATA_S:
-                lines.append(f"No ranges of tag {format_id(tag_id)} for {age_s:.0f} s.")
-            elif self._player is None and abs(behind_s) > STAMP_DIFFERENCE_S:
-                lines.append(
-                    f"Stamps of tag {format_id(tag_id)} are {abs(behind_s):.1f} s {'old' if behind_s > 0 else 'in the future'} "
-                    "when they arrive: the clocks differ, or ranges are delayed."
-                )
-        return lines
 
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
@@ -238,10 +186,3 @@ def _anchor_rows(
 
 def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
-
-
-def _utc(time_s: float) -> str:
-    try:
-        return f"{datetime.fromtimestamp(time_s, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
-    except (OverflowError, ValueError, OSError):
-        return f"{time_s:.0f} s"

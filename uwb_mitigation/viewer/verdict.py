@@ -74,7 +74,9 @@ def verdict(
     sd_m = tag.pose.sd_m
     accuracy = "" if math.isnan(sd_m) else f"sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
     common, advice = health.advice(anchors, names)
-    bad = [anchor_id for anchor_id, state in states.items() if state == health.BAD]
+    # With a common cause, anchors that need attention are bad together.
+    wrong = {health.BAD, health.CHECK} if common else {health.BAD}
+    bad = [anchor_id for anchor_id, state in states.items() if state in wrong]
     received = sum(means["stopped"] == 0.0 for means in anchors.values())
     reason = action = ""
     if remedy:

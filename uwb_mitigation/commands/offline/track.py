@@ -129,11 +129,16 @@ def held_out(tracks: Sequence[TagTracks], config: EstimatorConfig) -> list[Holdo
 
 
 def displaced_anchor(tracks: Sequence[TagTracks], config: EstimatorConfig) -> dict[int, float]:
+    """Return `worst_displaced` of the held-out residuals of tracks."""
+    return worst_displaced(held_out(tracks, config))
+
+
+def worst_displaced(residuals: Sequence[HoldoutErrors]) -> dict[int, float]:
     """Return {anchor id: median held-out residual, m} of the anchor whose ranges fit another position; empty: none.
 
     Of several, it is the one with the largest residual: a displaced anchor also bends the tracks without the others.
     """
-    rows = [row for row in held_out(tracks, config) if row.is_displaced and row.anchor_id is not None]
+    rows = [row for row in residuals if row.is_displaced and row.anchor_id is not None]
     worst = max(rows, key=lambda row: row.raw_m, default=None)
     return {} if worst is None or worst.anchor_id is None else {worst.anchor_id: worst.raw_m}
 

@@ -253,7 +253,6 @@ VIEWER = (
               "with the URL. Empty: no protection."),
     Parameter("anchors", "", "Anchors file for a map without a locator; the anchors are also published as "
               "markers for RViz and Foxglove. Empty: markers of a locator."),
-    Parameter("floor_plan", "", "Floor plan of the page: YAML file of a map of map_server. Empty: none."),
     Parameter("map_frame", "map", "Frame of the anchors."),
     Parameter("window", 157, "Window of the network, which is marked in the CIR.", low=1, high=1016),
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),

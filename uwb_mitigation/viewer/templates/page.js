@@ -18,16 +18,6 @@ function start(doc) {
   const send = (name, ...args) => { controls.command = [name, args, ++commands]; };
   const on = (name, show) => { controls.properties[name].change.connect(show); show(); };
 
-  // The style sheet colours the frames of the figures; glyphs in the colours of the light page are inverted here.
-  const night = matchMedia("(prefers-color-scheme: dark)"), inks = ["#111827", "#ffffff"];
-  const invert = (colour) => inks[1 - inks.indexOf(colour)] ?? colour;
-  night.addEventListener("change", () => location.reload());
-  if (night.matches) for (const model of doc.all_models) for (const property of model) {
-    const value = property.is_unset ? undefined : property.get_value();
-    if (inks.includes(value?.value ?? value)) model.setv({[property.attr]: value.value ? {value: invert(value.value)} : invert(value)}, {sync: false});
-    else if (property.attr === "palette" && value.length < 10) model.setv({palette: value.map(invert)}, {sync: false});
-  }
-
   // The next update comes after this one has been drawn: a slow page skips updates instead of showing old ones.
   let received = performance.now();
   const showAge = () => {
@@ -51,8 +41,6 @@ function start(doc) {
     return made;
   };
   const texts = (id, name, make) => on(name, () => $(id).replaceChildren(...controls[name].map(make)));
-  for (const [id, name] of [["tags", "tag_rows"], ["health", "health"], ["nodes", "nodes"]])
-    texts(id, name, (cells) => element("tr", cells.map((text) => element("td", text))));
   texts("events", "incidents", ([time, text]) => {
     if (time === null) return element("li", text);
     const button = element("button", `${time.toFixed(1)} s: ${text}`);
@@ -61,86 +49,53 @@ function start(doc) {
   });
   texts("notice", "notice", (text) => element("div", text));
   texts("cards", "cards", (lines) => element("div", lines.map((text, i) => element(i === 1 ? "strong" : "span", text))));
-  on("verdict", () => {
+  for (const name of ["verdict", "selected", "tag_rows"]) on(name, () => {
     const [state, reason, action, facts] = controls.verdict, box = $("verdict");
     if (!state) return;
+    const tag = controls.tag_rows.length > 1 && controls.selected ? ` of tag ${controls.selected[1]}` : "";
     box.className = state;
-    [`Position ${state}${reason ? `: ${reason}` : ""}`, action, facts].forEach((text, i) => setText(box.children[i], text));
+    [`Position${tag} ${state}${reason ? `: ${reason}` : ""}`, action, facts].forEach((text, i) => setText(box.children[i], text));
   });
   on("available", () => { for (const [id, is] of Object.entries(controls.available)) if ($(id)) $(id).disabled = !is; });
-  on("summary", () => setText($("summary"), controls.summary));
 
-  // Pairs: rows are kept, so that a click or the focus survives an update.
-  const body = $("pairs").tBodies[0], rows = new Map();
-  const fields = [...$("pairs").querySelectorAll("[data-sort]")].map((button) => button.dataset.sort);
-  let sort = "pair", descending = false;
-  const makeRow = (pair) => {
-    const pick = element("button", pair.join(", ")), row = element("tr", fields.map(() => element("td", [])));
-    pick.type = "button";
-    pick.setAttribute("aria-label", `Select anchor ${pair[0]}, tag ${pair[1]}`);
-    row.addEventListener("click", () => send("select", ...pair));
-    fields.forEach((field, cell) => { row.cells[cell].className = {pair: "pair", state: "text state", status: "text"}[field] ?? ""; });
-    row.cells[0].append(pick);
-    return row;
-  };
-  const drawPairs = () => {
-    const data = source.data, count = data.anchor.length, keys = Array.from({length: count}, (_, i) => i);
-    const words = $("search").value.trim().toLowerCase(), filter = $("filter").value;
-    const shown = keys.filter((i) => `${data.anchor[i]}, ${data.tag[i]}`.toLowerCase().includes(words)
-      && {all: true, no_data: data.no_data[i], bad: data.status[i] !== "OK", not_good: !data.state[i].endsWith("good")}[filter]);
-    const value = (i) => sort === "pair" ? i : data[sort][i];
-    const compare = (a, b) => typeof a === "string" ? a.localeCompare(b) : Number.isNaN(a) - Number.isNaN(b) || a - b;
-    shown.sort((a, b) => (descending ? -1 : 1) * compare(value(a), value(b)) || a - b);
-    const drawn = shown.map((i) => {
-      const key = `${data.anchor[i]} ${data.tag[i]}`;
-      if (!rows.has(key)) rows.set(key, makeRow([data.anchor[i], data.tag[i]]));
-      const row = rows.get(key);
-      const selected = controls.selected?.join(" ") === key;
-      row.className = `${data.no_data[i] ? "no-data" : ""} ${selected ? "selected" : ""}`;
-      row.querySelector("button").setAttribute("aria-pressed", selected);
-      fields.forEach((field, cell) => {
-        if (field === "pair") return;
-        const value = data[field][i];
-        setText(row.cells[cell], typeof value === "string" ? value : number(value, DIGITS[field]));
-        if (field === "status") row.cells[cell].className = `text ${data.no_data[i] ? "" : value}`;
-      });
-      return row;
+  // Tables: rows are kept, so that a click or the focus survives an update.
+  const fill = (body, rows) => {
+    while (body.rows.length > rows.length) body.lastChild.remove();
+    rows.forEach((cells, i) => {
+      const row = body.rows[i] ?? body.insertRow();
+      cells.forEach((text, cell) => setText(row.cells[cell] ?? row.insertCell(), text));
     });
-    if (drawn.length !== body.rows.length || drawn.some((row, i) => row !== body.rows[i])) {
-      const focus = document.activeElement;
-      body.replaceChildren(...drawn);
-      if (body.contains(focus)) focus.focus();
-    }
-    const box = body.closest(".scroll"), hint = box.scrollWidth > box.clientWidth ? "; scroll the table sideways for more columns \u2192" : "";
-    setText($("pairs-count"), `${shown.length} of ${count} pairs${hint}`);
   };
-  let pressed = false;
-  const updatePairs = () => { if (!pressed) drawPairs(); };
-  body.addEventListener("pointerdown", () => { pressed = true; });
-  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, () => { pressed = false; setTimeout(drawPairs); });
-  source.properties.data.change.connect(updatePairs);
-  const titles = ["strip", "history", "cir", "waterfall"].map((name) => [$(`${name}-title`), $(`${name}-title`).textContent]);
+  for (const [id, name] of [["tags", "tag_rows"], ["health", "health"], ["nodes", "nodes"]]) on(name, () => fill($(id), controls[name]));
+  const body = $("pairs").tBodies[0];
+  const drawPairs = () => {
+    const {anchor, tag, no_data, ...columns} = source.data;
+    fill(body, anchor.map((id, i) => [`${id}, ${tag[i]}`, ...Object.entries(columns).map(([name, values]) =>
+      typeof values[i] === "string" ? values[i] : number(values[i], DIGITS[name]))]));
+    anchor.forEach((id, i) => {
+      const row = body.rows[i], selected = controls.selected?.join() === [id, tag[i]].join();
+      row.tabIndex = 0;
+      row.className = `${no_data[i] ? "no-data" : ""} ${selected ? "selected" : ""}`;
+      row.setAttribute("aria-current", selected);
+      row.cells[2].className = no_data[i] ? "" : columns.status[i];
+    });
+  };
+  const select = (event) => {
+    const i = event.target.closest("tr").sectionRowIndex;
+    if (event.type === "click" || event.key === "Enter") send("select", source.data.anchor[i], source.data.tag[i]);
+  };
+  for (const type of ["click", "keydown"]) body.addEventListener(type, select);
+  source.properties.data.change.connect(drawPairs);
+  const titles = ["strip", "history", "cir"].map((name) => [$(`${name}-title`), $(`${name}-title`).textContent]);
   on("selected", () => {
     drawPairs();
     const [anchor, tag] = controls.selected ?? [];
     for (const [element, title] of titles) setText(element, anchor == null ? title : `${title}: anchor ${anchor}, tag ${tag}`);
   });
-  on("empty", () => {
-    const {cir} = controls.empty;
-    for (const [name, message] of Object.entries({...controls.empty, waterfall: cir ?? ""})) $(name).dataset.empty = message;
-  });
-  for (const name of ["search", "filter"]) $(name).addEventListener("input", drawPairs);
-  for (const button of document.querySelectorAll("[data-sort]")) button.addEventListener("click", () => {
-    descending = sort === button.dataset.sort && !descending;
-    for (const th of document.querySelectorAll("#pairs th")) th.removeAttribute("aria-sort");
-    sort = button.dataset.sort;
-    button.closest("th").setAttribute("aria-sort", descending ? "descending" : "ascending");
-    drawPairs();
-  });
-
+  on("empty", () => { for (const [name, message] of Object.entries(controls.empty)) $(name).dataset.empty = message; });
   // Map.
   const map = model("map"), ranges = () => [map.x_range, map.y_range];
-  const fit = () => { $("follow").setAttribute("aria-pressed", "false"); Bokeh.index.find_one(map).reset(); };
+  const fit = () => Bokeh.index.find_one(map).reset();
   const pan = (x, y, zoom = 1) => {
     const view = Bokeh.index.find_one(map);
     const moved = ranges().map((range, axis) => {
@@ -150,16 +105,8 @@ function start(doc) {
     });
     view.update_range({xrs: new Map([moved[0]]), yrs: new Map([moved[1]])}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
-  const tags = map.renderers.map((r) => r.data_source).find((s) => s.name === "tags");
-  tags.properties.data.change.connect(() => {
-    if ($("follow").getAttribute("aria-pressed") !== "true") return;
-    const i = Math.max(tags.data.name.findIndex((name) => name.split(":")[0] === `tag ${controls.selected?.[1]}`), 0);
-    const [dx, dy] = ranges().map((range, axis) =>
-      ((axis ? tags.data.y : tags.data.x)[i] - (range.start + range.end) / 2) / (range.end - range.start));
-    if (Math.hypot(dx, dy) > 0.02) pan(dx, dy);
-  });
   // A name that would cover another one is hidden: tags come first, then the selected anchor.
-  const [anchors, labels] = ["id", "offset"].map((column) => map.renderers.map((r) => r.data_source).find((s) => column in s.data));
+  const [tags, anchors, labels] = ["label_y", "id", "offset"].map((column) => map.renderers.map((r) => r.data_source).find((s) => column in s.data));
   const placeLabels = () => {
     const {x_scale, y_scale, bbox} = Bokeh.index.find_one(map).frame, boxes = [], shown = {x: [], y: [], text: [], offset: [], shift: []};
     // Above the marker, or below it where it would leave the frame or cover another one.
@@ -188,10 +135,7 @@ function start(doc) {
   // The view and the size of the map change without a common event.
   setInterval(placeLabels, 200);
   $("fit").addEventListener("click", fit);
-  $("follow").addEventListener("click", (event) =>
-    event.target.setAttribute("aria-pressed", event.target.getAttribute("aria-pressed") !== "true"));
-  for (const name of ["circles", "heat", "accuracy"]) $(name).addEventListener("change", (event) => send("show", name, event.target.checked));
-  $("trail").addEventListener("change", (event) => send("trail", event.target.value));
+  $("accuracy").addEventListener("change", (event) => send("accuracy", event.target.checked));
   const keys = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1], "+": [0, 0, 0.8], "-": [0, 0, 1.25]};
   $("map").addEventListener("keydown", (event) => {
     if (event.key === "0") fit(); else if (keys[event.key]) pan(...keys[event.key]); else return;
@@ -210,17 +154,16 @@ function start(doc) {
   $("map").addEventListener("click", (event) => {
     const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = anchors.data;
     const i = id.findIndex((_, i) => Math.hypot(x_scale.compute(x[i]) - event.clientX + box.left, y_scale.compute(y[i]) - event.clientY + box.top) < 15);
-    if (i >= 0) send("select_anchor", id[i]);
+    const {anchor, tag} = source.data, own = [...anchor.keys()].filter((pair) => BigInt(anchor[pair]) == id[i]);
+    const pair = own.find((pair) => tag[pair] === controls.selected[1]) ?? own[0];
+    if (pair !== undefined) send("select", anchor[pair], tag[pair]);
   });
-
-  const titleErrors = () => setText($("errors-title"), `Range errors, ${$("window")?.value ?? "since the start"}`);
-  titleErrors();
 
   // Recording.
   let held = false, savedMs = 0;
   const saveUrl = (isPosition) => {
     const [anchor, tag] = controls.selected ?? [], at = controls.player?.position;
-    const parts = {anchor, tag, t: position && at != null ? at.toFixed(2) : undefined, window: $("window")?.selectedIndex ? $("window").value : undefined};
+    const parts = {anchor, tag, t: position && at != null ? at.toFixed(2) : undefined};
     const text = Object.entries(parts).filter(([, value]) => value !== undefined).map(([name, value]) => `${name}=${encodeURIComponent(value)}`);
     // Browsers limit how often a page changes its URL.
     if (isPosition && controls.player?.playing && performance.now() < savedMs + 500) return;
@@ -247,17 +190,13 @@ function start(doc) {
       position.value = Number(position.value) + steps[event.key];
       send("seek", Number(position.value));
     });
-    for (const name of ["step", "previous_bad", "next_bad", "largest"]) $(name).addEventListener("click", () => send(name));
-    $("window").addEventListener("change", (event) => { send("window", event.target.value); titleErrors(); saveUrl(false); });
-    if (wanted.has("window")) { $("window").value = wanted.get("window"); titleErrors(); send("window", wanted.get("window")); }
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
-      const {bad, count, incidents, largest, truth} = controls.marks;
+      const {bad, count, incidents} = controls.marks;
       const mark = (share, colour, text) => `<text x="${100 * share}%" y="11" fill="${colour}">${text}</text>`;
       $("bad-marks").innerHTML = bad.map((share) => mark(share, "#d55e00", "|")).join("")
-        + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("")
-        + (largest == null ? "" : mark(largest, "currentColor", `max ${truth ? "error" : "correction"}`));
+        + incidents.map((share) => mark(share, "currentColor", "\u25c6")).join("");
       $("marks-legend").textContent = `| ${count} bad ranges, \u25c6 ${incidents.length} events`;
     });
   }
@@ -277,29 +216,11 @@ function start(doc) {
   });
   controls.properties.selected.change.connect(() => saveUrl(false));
 
-  // Export.
-  const quote = (value) => /[",\n]/.test(value) ? `"${String(value).replaceAll('"', '""')}"` : String(value);
-  const csv = (name) => {
-    const shown = name === "pairs" ? [source] : new Set(model(name).renderers.filter((r) => r.visible && r.data_source.name).map((r) => r.data_source));
-    return [...shown].map(({name: title, data}) => {
-      const columns = Object.keys(data), rows = Array.from(data[columns[0]], (_, i) => columns.map((column) => quote(data[column][i])));
-      return rows.length ? [["data", ...columns], ...rows.map((row) => [title, ...row])].map((row) => row.join(",")).join("\n") + "\n" : "";
-    }).filter(Boolean).join("\n");
-  };
-  window.exported = {};
-  for (const button of document.querySelectorAll("[data-export]")) button.addEventListener("click", async () => {
-    const {export: name, format} = button.dataset;
-    const blob = format === "csv" ? new Blob([csv(name)], {type: "text/csv"}) : await Bokeh.index.find_one(model(name)).export(format).to_blob();
-    const link = document.createElement("a");
-    link.download = `uwb-${name}-${new Date().toISOString().replace(/[:.]/g, "-")}.${format}`;
-    link.href = URL.createObjectURL(blob);
-    link.click();
-    window.exported[`${name}.${format}`] = blob;
-  });
-
   // A session ends with the viewer: the page reloads when the viewer is back.
   doc.on_event("connection_lost", () => {
     $("lost").style.display = "block";
+    // What the page shows may be wrong by now.
+    $("verdict").style.display = "none";
     $("age").hidden = true;
     const wait = setInterval(async () => {
       try { if ((await fetch(location.href, {cache: "no-store"})).ok) { clearInterval(wait); location.reload(); } }
