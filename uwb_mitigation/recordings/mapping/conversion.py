@@ -1,4 +1,4 @@
-"""Values of a mapping in SI units, from columns of a file or message."""
+"""Rows as the readers of all formats return them, and their values in SI units."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import compress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, UNREADABLE, Chunk
 from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter
 from uwb_mitigation.types.measurement import (
     LINEAR_MAGNITUDES,
@@ -24,6 +25,12 @@ from uwb_mitigation.types.measurement import (
     is_logarithmic,
 )
 from uwb_mitigation.types.stamps import NS_PER_S
+
+LOG_TIME = "@stamp"
+"""Column with the time at which a message was recorded, ns."""
+
+UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError)
+"""Errors of values that do not have the expected form."""
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
@@ -62,6 +69,37 @@ Mask = NDArray[np.bool_]
 ColumnDict = dict[str, NDArray[Any]]
 """{name: array (n,)} in SI units. `stamp`: ns, int64; `tag`, `anchor`: uint64; `label`, `configuration`: texts; others, such
 as `range`, `true range` and `tag x`: float64, NaN: unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Rows of one file.
+
+    Attributes:
+        columns: {name: array or list}.
+        count: number of rows.
+        path: the file, or the topic.
+        rows: int64 (count,), numbers of the rows in the file, from 0.
+        before: number of rows in the files before.
+    """
+
+    columns: Mapping[str, Any]
+    count: int
+    path: Path | str
+    rows: NDArray[np.int64]
+    before: int = 0
+
+    def where(self, row: int) -> str:
+        """Return the location of a row for errors."""
+        return f"{self.path}: row {self.rows[row] + 1}"
+
+    def take(self, mask: NDArray[np.bool_]) -> Chunk:
+        """Return the chosen rows."""
+        if mask.all():
+            return self
+        items = self.columns.items()
+        columns = {n: v[mask] if isinstance(v, np.ndarray) else [*compress(v, mask)] for n, v in items}
+        return Chunk(columns, int(mask.sum()), self.path, self.rows[mask], self.before)
 
 
 def concat(tables: list[ColumnDict]) -> ColumnDict:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError, did_you_mean
 from uwb_mitigation.files import read_bounded
-from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
+from uwb_mitigation.recordings.mapping.conversion import LOG_TIME, Chunk
 from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
 from uwb_mitigation.recordings.text_blocks import OnWarning, TextBlocks
