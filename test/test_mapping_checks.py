@@ -321,11 +321,20 @@ def test_sigterm_removes_the_partial_file(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_magnitudes_in_db_are_refused_with_their_row(tmp_path: Path):
-    in_db = " ".join(str(round(40.0 + 30.0 / (1.0 + n), 2)) for n in range(200))
-    (tmp_path / "ranges.csv").write_text(f't,a,r,cir\n0,2,3.0,"{in_db}"\n')
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ([round(40.0 + 30.0 / (1.0 + n), 2) for n in range(200)], "a CIR in dB"),
+        ([(-1) ** n * 40 for n in range(200)], "negative magnitudes (cir.samples: interleaved, or complex)"),
+    ],
+)
+def test_cirs_that_are_no_magnitudes_are_refused_with_their_row(
+    tmp_path: Path, values: list[float], problem: str
+):
+    text = " ".join(map(str, values))
+    (tmp_path / "ranges.csv").write_text(f't,a,r,cir\n0,2,3.0,"{text}"\n')
     mapping = PLAIN | {"cir": {"column": "cir", "samples": "magnitude"}}
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping))
     done = run("data", "import", "ranges.csv", "--map", "map.yaml", "-o", "x.mcap", folder=tmp_path)
     assert done.returncode == 1
-    assert "row 1: a CIR in dB" in done.stderr
+    assert f"row 1: {problem}" in done.stderr

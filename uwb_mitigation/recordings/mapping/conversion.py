@@ -63,6 +63,9 @@ _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
 MAX_POSSIBLE = 10_000.0
 """Rows with a larger range (m), level (dBm) or first-path index are not used."""
 
+MAX_NEGATIVE = 0.2
+"""Largest share of negative magnitudes; of real and imaginary parts, about half are negative."""
+
 _LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 
 Mask = NDArray[np.bool_]
@@ -404,7 +407,7 @@ def read_cir(values: Any, form: str) -> Cir:
     """Return one CIR as int16 samples with the scale that restores the values; NaN: without samples.
 
     Raises:
-        RecordingError: the values are in dB.
+        RecordingError: the values are in dB, or real and imaginary parts instead of magnitudes.
         ValueError: the values are not numbers.
     """
     if isinstance(values, str):
@@ -432,6 +435,8 @@ def read_cir(values: Any, form: str) -> Cir:
     samples = np.rint(flat / scale).astype(np.int16)
     if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
         raise RecordingError("a CIR in dB", valid=LINEAR_MAGNITUDES)
+    if encoding is Encoding.MAGNITUDE and np.mean(samples < 0) > MAX_NEGATIVE:
+        raise RecordingError("negative magnitudes", valid="cir.samples: interleaved, or complex")
     return Cir(samples, encoding, scale=scale)
 
 
