@@ -70,25 +70,23 @@ class McapRecording(Source):
 
     def _join(self, bag: BagReader) -> Iterator[Record]:
         """Pair ranges with their truths, which may come before or after them; in the order of the ranges."""
-        pending: deque[RangeMeasurement] = deque()
+        pending: deque[tuple[MeasurementKey, RangeMeasurement]] = deque()
         truths: dict[MeasurementKey, Truth] = {}
         poses: dict[tuple[int, int], TruePose] = {}
         has_poses = bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE
 
         def oldest_is_complete() -> bool:
-            oldest = pending[0]
-            has_pose = not has_poses or (oldest.stamp_ns, oldest.tag_id) in poses
-            return measurement_key(oldest) in truths and has_pose
+            key, _ = pending[0]
+            return key in truths and (not has_poses or (key.stamp_ns, key.tag_id) in poses)
 
         def pop_oldest() -> Record:
-            oldest = pending.popleft()
-            pose = poses.get((oldest.stamp_ns, oldest.tag_id), (None, None))
-            return Record(oldest, truths.pop(measurement_key(oldest), None), *pose)
+            key, oldest = pending.popleft()
+            return Record(oldest, truths.pop(key, None), *poses.get((key.stamp_ns, key.tag_id), (None, None)))
 
         try:
             for item in self._decoded(bag):
                 if isinstance(item, RangeMeasurement):
-                    pending.append(item)
+                    pending.append((measurement_key(item), item))
                 elif len(item) == 2:
                     truths[item[0]] = item[1]
                     if len(truths) > 2 * JOIN_WINDOW:
