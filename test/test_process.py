@@ -21,8 +21,9 @@ from command_line import ENVIRONMENT, command, run, start, succeed
 from firmware_models import random_measurement
 from model_material import cir
 
-from uwb_mitigation.commands.offline.parallel import plan
+from uwb_mitigation.commands.offline.parallel import plan, run_on_dask
 from uwb_mitigation.commands.offline.process import Job, process_bag
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import shipped_model_path
@@ -294,16 +295,23 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
     jobs = [
         job(write_bag(tmp_path / f"in{n}.mcap", exchanges(9)), tmp_path / f"out{n}.mcap") for n in range(3)
     ]
-    # The system kills a process if memory runs out.
+    # The system kills a process if memory runs out, here after another one has written its output but not returned.
     (tmp_path / "sitecustomize.py").write_text(
-        "import os, signal\n"
+        "import os, pathlib, signal, time\n"
         "from uwb_mitigation.commands.offline import process as job\n"
-        "class Killed(job.BagWriter):\n"
-        "    def __enter__(self):\n"
-        "        if self.file.name == 'out1.mcap':\n"
-        "            os.kill(os.getpid(), signal.SIGKILL)\n"
-        "        return super().__enter__()\n"
-        "job.BagWriter = Killed\n"
+        f"written = pathlib.Path({str(tmp_path / 'written')!r})\n"
+        "process = job.process_bag\n"
+        "def killed(one, report):\n"
+        "    if one.source.name == 'in1.mcap':\n"
+        "        while not written.exists():\n"
+        "            time.sleep(0.01)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    outcome = process(one, report)\n"
+        "    if one.source.name == 'in0.mcap' and not written.exists():\n"
+        "        written.touch()\n"
+        "        time.sleep(600)\n"
+        "    return outcome\n"
+        "job.process_bag = killed\n"
     )
     code = (
         "import pickle, sys; from uwb_mitigation.commands.offline.parallel import run_locally\n"
@@ -319,3 +327,34 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
     )
     assert ast.literal_eval(done.stdout.decode()) == {"in0.mcap": True, "in1.mcap": False, "in2.mcap": True}
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_dask_cluster_gives_the_same_result_and_continues_after_an_invalid_bag(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
+    sources = [write_bag(tmp_path / f"in{n}.mcap", exchanges(50)) for n in range(3)]
+    sources[1].write_bytes(b"nothing of the kind")
+    jobs = [job(source, tmp_path / f"{source.stem}_out.mcap") for source in sources]
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        host="127.0.0.1",
+        env={"PYTHONPATH": str(REPOSITORY)},
+    ) as cluster:
+        outcomes = {outcome.job: outcome for outcome in run_on_dask(jobs, cluster.scheduler_address)}
+    assert "not an MCAP file" in str(outcomes[jobs[1]].error)
+    for number in (0, 2):
+        assert outcomes[jobs[number]].error is None
+        assert corrected_of(jobs[number].output) == one_by_one(exchanges(50))
+
+
+def test_unreachable_scheduler_is_named(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
+    import dask
+
+    with dask.config.set({"distributed.comm.timeouts.connect": "200ms"}):
+        for address in ("tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
+            with pytest.raises(ParameterError, match="no Dask scheduler"):
+                list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], address))
+    assert distributed

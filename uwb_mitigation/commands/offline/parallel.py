@@ -1,19 +1,18 @@
-"""Select bags and output paths; process bags in parallel."""
+"""Select bags and output paths; process bags in parallel on this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from multiprocessing.context import BaseContext
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from uwb_mitigation.commands.offline.process import Job, Outcome, try_process
-from uwb_mitigation.errors import ParameterError, RecordingError
+from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
 from uwb_mitigation.recordings.bag.rosbag2 import listed_files
 from uwb_mitigation.recordings.bag.writer import partial_file
 
@@ -111,33 +110,88 @@ def num_cores() -> int:
 
 
 def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
-    """Process at most `workers` bags at the same time; yield each outcome when it is ready.
+    """Process the bags in at most `workers` processes; yield each outcome when it is ready.
 
-    Each bag has its own process: if it crashes, for example because memory runs out, only this bag fails.
+    If a process crashes, for example because memory runs out, the remaining bags are processed one at a time, so that
+    only the bag that causes it fails.
     """
-    # Forking a process with threads (ONNX Runtime, rich) may deadlock. A fork server imports the libraries once.
+    is_new = {job: not job.output.exists() for job in jobs}
+    unfinished = []
+    with _processes(min(workers, len(jobs))) as executor:
+        for job, outcome in _run(executor, _in_worker, jobs):
+            if outcome is None:
+                unfinished.append(job)
+            else:
+                yield outcome
+    for job in unfinished:
+        # A process that was stopped may have written its output already.
+        again = replace(job, force=job.force or is_new[job])
+        reason = "the process crashed, perhaps because memory ran out"
+        crashed = Outcome(job, error=RecordingError(reason, where=str(job.source)))
+        with _processes(1) as executor:
+            for _, outcome in _run(executor, _in_worker, [again]):
+                yield replace(outcome or crashed, job=job)
+        partial_file(job.output).unlink(missing_ok=True)
+
+
+def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
+    """Process the bags on the Dask cluster with the scheduler at `address`; yield each outcome when it is ready.
+
+    The workers need this package and the same file paths. A bag that has started is finished even if the
+    iterator is closed, since Dask cannot interrupt it.
+
+    Raises:
+        MissingDependencyError: `distributed` is not installed.
+        ParameterError: no scheduler responds.
+    """
+    try:
+        from distributed import Client
+        from distributed.comm import get_address_host
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            "--scheduler needs Dask", valid="python -m pip install distributed"
+        ) from error
+    try:
+        # If the client itself tries an invalid address, closing it takes a minute.
+        get_address_host(address)
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise ParameterError(
+            f"no Dask scheduler: {str(error) or type(error).__name__}",
+            where=address,
+            valid="tcp://HOST:8786, as `dask scheduler` prints",
+        ) from error
+    with client, client.get_executor(pure=False) as executor:
+        for _, outcome in _run(executor, try_process, jobs):
+            assert outcome is not None
+            yield outcome
+
+
+def _processes(workers: int) -> ProcessPoolExecutor:
+    # Forking a process with threads (ONNX Runtime, rich) may deadlock.
     server = "forkserver" in multiprocessing.get_all_start_methods()
     context = multiprocessing.get_context("forkserver" if server else "spawn")
-    context.set_forkserver_preload([Job.__module__, "onnxruntime"])
-    with ThreadPoolExecutor(min(workers, len(jobs))) as threads:
-        futures = [threads.submit(_in_process, job, context) for job in jobs]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            for future in futures:
-                future.cancel()
+    return ProcessPoolExecutor(workers, context, initializer=_ignore_interrupts)
 
 
-def _in_process(job: Job, context: BaseContext) -> Outcome:
-    """Process a bag in a new process."""
-    with ProcessPoolExecutor(1, context, initializer=_ignore_interrupts) as executor:
-        try:
-            return executor.submit(_in_worker, job).result()
-        except BrokenProcessPool:
-            partial_file(job.output).unlink(missing_ok=True)
-            reason = "the process crashed, perhaps because memory ran out"
-            return Outcome(job, error=RecordingError(reason, where=str(job.source)))
+def _run(
+    executor: Executor, work: Callable[[Job], Outcome], jobs: Sequence[Job]
+) -> Iterator[tuple[Job, Outcome | None]]:
+    """Yield each job with its outcome when it is ready; None: a worker process crashed before."""
+    futures = {executor.submit(work, job): job for job in jobs}
+    try:
+        for future in as_completed(futures):
+            job = futures[future]
+            try:
+                yield job, future.result()
+            except BrokenProcessPool:
+                yield job, None
+            except Exception as error:  # Errors of the cluster or of pickling have no common type.
+                reason = f"cannot be processed: {type(error).__name__}: {error}"
+                yield job, Outcome(job, error=RecordingError(reason, where=str(job.source)))
+    finally:
+        for future in futures:
+            future.cancel()
 
 
 def _ignore_interrupts() -> None:
