@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -192,8 +193,17 @@ def test_chunks_without_rows_do_not_change_the_others(tmp_path: Path, monkeypatc
     assert (source.values["cir"] == -1).all()
 
 
-def test_magnitudes_in_db_are_refused_with_their_row(tmp_path: Path):
-    in_db = " ".join(str(round(40.0 + 30.0 / (1.0 + n), 2)) for n in range(200))
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ([round(40.0 + 30.0 / (1.0 + n), 2) for n in range(200)], "a CIR in dB"),
+        ([(-1) ** n * 40 for n in range(200)], "negative magnitudes (cir.samples: interleaved, or complex)"),
+    ],
+)
+def test_cirs_that_are_no_magnitudes_are_refused_with_their_row(
+    tmp_path: Path, values: list[float], problem: str
+):
+    text = " ".join(map(str, values))
     cir = {"column": "cir", "samples": "magnitude"}
-    with pytest.raises(RecordingError, match="row 1: a CIR in dB"):
-        list(of(f't,a,r,cir\n0,2,3.0,"{in_db}"\n', tmp_path / "x.csv", cir=cir))
+    with pytest.raises(RecordingError, match=re.escape(f"row 1: {problem}")):
+        list(of(f't,a,r,cir\n0,2,3.0,"{text}"\n', tmp_path / "x.csv", cir=cir))

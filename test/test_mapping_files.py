@@ -146,6 +146,12 @@ def test_unit_of_one_anchor_is_found_and_can_be_set(unit: str, factor: float, tr
     assert source.errors_m == pytest.approx(np.full(80, 0.1), abs=1e-4)
 
 
+def test_unit_of_all_anchors_is_suggested_if_most_ranges_are_long(tmp_path: Path):
+    text = HEADER + rows(factors={1: 40, 2: 40, 3: 40, 4: 100})
+    with pytest.raises(RecordingError, match=r"anchor 4 is .*set unit: mm or cm of range"):
+        of(text, tmp_path / "x.csv")
+
+
 @pytest.mark.parametrize(
     "pairs",
     [

@@ -151,12 +151,14 @@ def test_command_writes_a_bag_and_its_result(tmp_path: Path) -> None:
 def test_ranges_of_a_radio_without_model_are_counted_with_their_reason(tmp_path: Path) -> None:
     other = {"radio": RadioType.DW3000, "segment": Segment.STS}
     measured = [replace(each, cir=replace(each.cir, **other)) for each in exchanges(12)]
-    write_bag(tmp_path / "in.mcap", [*exchanges(3), *measured])
+    silent = replace(exchange(20), cir=replace(cir(20), samples=np.zeros_like(cir(20).samples)))
+    write_bag(tmp_path / "in.mcap", [*exchanges(3), *measured, silent])
     words = "process in.mcap -o out.mcap --model evk1000_apartment --json out.json"
     done = succeed(*words.split(), folder=tmp_path)
     text = " ".join(done.stderr.split())
     assert "12 ranges are not corrected: they are of DW3000 STS" in text
     assert "trained for DW1000 IPATOV" in text
+    assert "1 ranges are not corrected: the window contains only zeros" in text
     (counts,) = [bag["mismatches"] for bag in json.loads((tmp_path / "out.json").read_text())["bags"]]
     assert list(counts.values()) == [12]
 

@@ -17,8 +17,8 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.radio import TAPS, Receiver
-from uwb_mitigation.simulation.scene import ROUTE, Building, along_route
-from uwb_mitigation.simulation.simulated import FIRST_TAG_ID, NOT_RECEIVED, SimulatedSource, SimulatedSurvey
+from uwb_mitigation.simulation.scene import ROUTE, along_route
+from uwb_mitigation.simulation.simulated import FIRST_TAG_ID, NOT_RECEIVED, SimulatedSource
 from uwb_mitigation.types.measurement import Record
 
 
@@ -35,11 +35,6 @@ def drive() -> list[Record]:
     return list(SimulatedSource(seed=3, count=1500))
 
 
-@pytest.fixture(scope="module")
-def survey() -> list[Record]:
-    return list(SimulatedSurvey(seed=3, configurations=300, exchanges=5))
-
-
 def errors_of(records: list[Record], label: str) -> np.ndarray:
     return np.array(
         [r.measurement.range_m - r.truth.range_m for r in records if r.truth and r.truth.label == label]
@@ -52,12 +47,6 @@ def test_same_seed_gives_the_same_measurements() -> None:
     assert [values(r) for r in itertools.islice(endless, 90)] == first
     counted = [values(r) for r in SimulatedSource(seed=5, rate_hz=333.0, tags=2, count=70)]
     assert counted == first[: len(counted)]
-
-
-def test_survey_does_not_depend_on_the_number_of_placements() -> None:
-    few = [values(r) for r in SimulatedSurvey(seed=5, configurations=7, exchanges=5)]
-    many = [values(r) for r in SimulatedSurvey(seed=5, configurations=80, exchanges=5)]
-    assert many[: len(few)] == few
 
 
 def test_truth_is_the_distance_between_anchor_and_robot() -> None:
@@ -79,22 +68,21 @@ def test_exchanges_that_are_not_received_are_counted() -> None:
     assert source.skipped[NOT_RECEIVED] == 400 - received
 
 
-def test_line_of_sight_errors_centre_on_the_offset(survey: list[Record]) -> None:
-    error = errors_of(survey, "LOS")
+def test_line_of_sight_errors_centre_on_the_offset(drive: list[Record]) -> None:
+    error = errors_of(drive, "LOS")
     assert np.median(error) == pytest.approx(Receiver().range_offset_m, abs=0.02)
     assert np.percentile(error, 75) - np.percentile(error, 25) < 0.06
 
 
-def test_obstacles_and_lost_direct_paths_lengthen_ranges(drive: list[Record], survey: list[Record]) -> None:
-    for records in (drive, survey):
-        los, nlos, ndp = (errors_of(records, label) for label in ("LOS", "NLOS", "NDP NLOS"))
-        assert min(len(los), len(nlos), len(ndp)) >= 20
-        assert los.mean() + 0.1 < nlos.mean() < ndp.mean()
-        assert nlos.mean() - 0.22 == pytest.approx(0.35, abs=0.25)
+def test_obstacles_and_lost_direct_paths_lengthen_ranges(drive: list[Record]) -> None:
+    los, nlos, ndp = (errors_of(drive, label) for label in ("LOS", "NLOS", "NDP NLOS"))
+    assert min(len(los), len(nlos), len(ndp)) >= 20
+    assert los.mean() + 0.1 < nlos.mean() < ndp.mean()
+    assert nlos.mean() - 0.22 == pytest.approx(0.35, abs=0.25)
 
 
-def test_every_measurement_is_finite_and_a_valid_input(drive: list[Record], survey: list[Record]) -> None:
-    for m in (record.measurement for record in drive + survey):
+def test_every_measurement_is_finite_and_a_valid_input(drive: list[Record]) -> None:
+    for m in (record.measurement for record in drive):
         assert len(m.cir) == TAPS
         assert np.isfinite([m.range_m, m.cir.rx_power_dbm, m.cir.first_path_power_dbm]).all()
         fault, window = window_of(m.cir, Preprocessing())
@@ -102,10 +90,10 @@ def test_every_measurement_is_finite_and_a_valid_input(drive: list[Record], surv
         assert np.isfinite(window).all()
 
 
-def test_levels_are_of_the_order_of_real_logs(survey: list[Record]) -> None:
-    rx = np.array([r.measurement.cir.rx_power_dbm for r in survey])
-    gap = rx - [r.measurement.cir.first_path_power_dbm for r in survey]
-    peaks = [window_of(r.measurement.cir, Preprocessing())[1].max() for r in survey[::5]]
+def test_levels_are_of_the_order_of_real_logs(drive: list[Record]) -> None:
+    rx = np.array([r.measurement.cir.rx_power_dbm for r in drive])
+    gap = rx - [r.measurement.cir.first_path_power_dbm for r in drive]
+    peaks = [window_of(r.measurement.cir, Preprocessing())[1].max() for r in drive[::5]]
     assert -101.5 < rx.min() < rx.max() < -77.5
     assert -1.0 < np.percentile(gap, 1) < np.percentile(gap, 99) < 25.0
     assert 0.2 < np.min(peaks) < np.max(peaks) < 1.6
@@ -114,7 +102,7 @@ def test_levels_are_of_the_order_of_real_logs(survey: list[Record]) -> None:
 # --- the commands ---
 
 
-@pytest.mark.parametrize("like", ["buildings", "survey", "drive"])
+@pytest.mark.parametrize("like", ["buildings", "drive"])
 def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> None:
     ranges = 100
     words = ["data", "simulate", "--like", like, "--ranges", str(ranges), "-o", str(tmp_path / "sim.mcap")]
@@ -132,8 +120,8 @@ def test_command_writes_a_bag_marked_as_simulated(tmp_path: Path, like: str) -> 
     assert "--force" in str(again.exception)
 
 
-@pytest.mark.parametrize("words", ["--like survey --ranges 30", "--like survey --exchanges 0"])
-def test_survey_of_a_part_of_a_placement_is_refused(tmp_path: Path, words: str) -> None:
+@pytest.mark.parametrize("words", ["--like buildings --ranges 30", "--like buildings --exchanges 0"])
+def test_a_part_of_a_placement_is_refused(tmp_path: Path, words: str) -> None:
     done = CliRunner().invoke(app, ["data", "simulate", "-o", str(tmp_path / "sim.mcap"), *words.split()])
     assert isinstance(done.exception, ParameterError)
     assert "a multiple of" in str(done.exception)
@@ -144,22 +132,19 @@ def test_survey_of_a_part_of_a_placement_is_refused(tmp_path: Path, words: str) 
 
 
 @pytest.mark.parametrize(
-    ("source", "options", "excerpts"),
+    ("options", "excerpts"),
     [
-        (SimulatedSource, {"seed": -1}, ("seed", "-1", "0 to")),
-        (SimulatedSource, {"seed": 1.5}, ("seed", "1.5", "whole number")),
-        (SimulatedSource, {"count": -5}, ("count", "-5", "0 to")),
-        (SimulatedSource, {"rate_hz": math.nan}, ("rate_hz", "nan", "0.1 to 100000")),
-        (SimulatedSource, {"tags": 0}, ("tags", "0", "1 to 64")),
-        (SimulatedSource, {"anchors": ()}, ("anchors", "()", "pairs of finite")),
-        (SimulatedSource, {"anchors": ((math.nan, 0.0),)}, ("anchors", "nan", "pairs of finite")),
-        (SimulatedSource, {"route": ((0.0, 0.0), (1.0, 1.0))}, ("route", "2", "3 to 10000")),
-        (SimulatedSurvey, {"configurations": 0}, ("configurations", "0", "1 to")),
-        (SimulatedSurvey, {"exchanges": 1001}, ("exchanges", "1001", "1 to 1000")),
-        (SimulatedSurvey, {"plan": Building((1.0, 9.0))}, ("plan size in x", "1.0", "2 to 1000")),
+        ({"seed": -1}, ("seed", "-1", "0 to")),
+        ({"seed": 1.5}, ("seed", "1.5", "whole number")),
+        ({"count": -5}, ("count", "-5", "0 to")),
+        ({"rate_hz": math.nan}, ("rate_hz", "nan", "0.1 to 100000")),
+        ({"tags": 0}, ("tags", "0", "1 to 64")),
+        ({"anchors": ()}, ("anchors", "()", "pairs of finite")),
+        ({"anchors": ((math.nan, 0.0),)}, ("anchors", "nan", "pairs of finite")),
+        ({"route": ((0.0, 0.0), (1.0, 1.0))}, ("route", "2", "3 to 10000")),
     ],
 )
-def test_invalid_parameter_is_refused(source: type, options: dict, excerpts: tuple[str, ...]) -> None:
+def test_invalid_parameter_is_refused(options: dict, excerpts: tuple[str, ...]) -> None:
     with pytest.raises(ParameterError) as caught:
-        source(**options)
+        SimulatedSource(**options)
     assert [excerpt for excerpt in excerpts if excerpt not in str(caught.value)] == []

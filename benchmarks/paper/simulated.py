@@ -21,7 +21,7 @@ from uwb_mitigation.simulation.scene import DirectPath
 from uwb_mitigation.simulation.simulated import (
     BATCH,
     FIRST_TAG_ID,
-    SURVEY_RATE_HZ,
+    PLACEMENTS_RATE_HZ,
     Simulated,
     TwrBatch,
     check_seed,
@@ -63,7 +63,7 @@ class SimulatedDeepUwb(Simulated):
         check_range("simulated DeepUWB", "ranges", ranges, 100, 1_000_000, whole=True)
         check_range("simulated DeepUWB", "exchanges", exchanges, 1, 1000, whole=True)
         radio = Receiver(range_offset_m=RANGE_OFFSET_M)
-        super().__init__(f"simulated like DeepUWB, seed {seed}", SURVEY_RATE_HZ, radio, 0)
+        super().__init__(f"simulated like DeepUWB, seed {seed}", PLACEMENTS_RATE_HZ, radio, 0)
         self._seed = seed
         self._exchanges = exchanges
         row_ends = np.rint(np.cumsum(ROOM_ROWS) * (ranges / sum(ROOM_ROWS))).astype(int)
@@ -105,7 +105,7 @@ class SimulatedDeepUwb(Simulated):
             for k, between in enumerate(obstacles)
         ]
         # One day per room.
-        sequence = round(number * 86_400 * SURVEY_RATE_HZ) + batch * size + np.arange(size)
+        sequence = round(number * 86_400 * PLACEMENTS_RATE_HZ) + batch * size + np.arange(size)
         ids = np.ones(size, np.int64)
         return (
             TwrBatch(

@@ -12,16 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from uwb_mitigation.recordings.decaranging import DecaRangingFolder
-from uwb_mitigation.simulation.simulated import SimulatedSource, SimulatedSurvey
+from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
 
 count = int(sys.argv[2]) if len(sys.argv) > 2 else 6000
 line = None
-for source in (
-    DecaRangingFolder(Path(sys.argv[1])),
-    SimulatedSource(seed=1, count=count),
-    SimulatedSurvey(seed=1, configurations=count // 5, exchanges=5),
-):
+for source in (DecaRangingFolder(Path(sys.argv[1])), SimulatedSource(seed=1, count=count)):
     rows = []
     for record in source:
         m, truth = record.measurement, record.truth

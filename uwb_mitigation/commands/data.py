@@ -92,19 +92,17 @@ def import_recordings(
 def simulate(
     output: Annotated[Path, OUTPUT],
     like: Annotated[
-        Literal["drive", "survey", "buildings"],
+        Literal["drive", "buildings"],
         typer.Option(
-            help="drive: a robot that drives through a flat; survey: static placements in that flat; buildings: placements "
-            "in random buildings, with different boards."
+            help="drive: a robot that drives through a flat; buildings: static placements in random buildings, with "
+            "different boards."
         ),
     ] = "drive",
     seed: Annotated[int, typer.Option(help="Seed. Stamps start today at 0:00 UTC.")] = 1,
     ranges: Annotated[
         int, typer.Option(help="Number of ranges, including those that are too weak to be received.")
     ] = 20_000,
-    exchanges: Annotated[
-        int, typer.Option(help="Exchanges of each static placement (survey, buildings).")
-    ] = 20,
+    exchanges: Annotated[int, typer.Option(help="Exchanges of each static placement (buildings).")] = 20,
     anchors: Annotated[int, typer.Option(help="Number of anchors of a drive, 4 to 8.")] = 4,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -233,21 +231,17 @@ def simulated_source(like: str, seed: int, ranges: int, exchanges: int, anchors:
     Raises:
         ParameterError: a number is out of its range.
     """
-    from uwb_mitigation.simulation import simulated
-    from uwb_mitigation.simulation.simulated import SimulatedBuildings
+    from uwb_mitigation.simulation.simulated import SimulatedBuildings, SimulatedSource
 
-    if like in ("survey", "buildings"):
+    if like == "buildings":
         if exchanges < 1 or ranges % exchanges:
             raise ParameterError(
                 f"{ranges} ranges of {exchanges} exchanges a placement", valid="a multiple of the exchanges"
             )
-        placements = ranges // exchanges
-        if like == "buildings":
-            return SimulatedBuildings(seed=seed, placements=placements, exchanges=exchanges)
-        return simulated.SimulatedSurvey(seed=seed, configurations=placements, exchanges=exchanges)
+        return SimulatedBuildings(seed=seed, placements=ranges // exchanges, exchanges=exchanges)
     if ranges < 1:
         raise ParameterError(f"{ranges} ranges", valid="1 or more: a drive is endless")
-    return simulated.SimulatedSource.with_anchors(anchors, seed=seed, count=ranges)
+    return SimulatedSource.with_anchors(anchors, seed=seed, count=ranges)
 
 
 def _open(path: Path, cir: Literal["final", "poll"]) -> Source:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import io
 import json
 import math
 import platform
@@ -27,6 +28,7 @@ from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.checks import check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line
 from uwb_mitigation.errors import LinkError, ParameterError
+from uwb_mitigation.files import write_atomically
 
 if TYPE_CHECKING:
     from uwb_mitigation.commands.field.checks import Check, Observation
@@ -94,7 +96,7 @@ def field_report(
         observation.identity = {name: anonymise(text, ports) for name, text in observation.identity.items()}
         checks = run_checks(observation)
         _write(folder, source, observation, checks)
-        _pack(folder, output)
+        write_atomically(output, _packed(folder))
     rows = [(check.name, check.verdict.value, check.value, check.limit) for check in checks]
     console.show_table(
         "Field report", ("check", "result", "value", "limit"), rows, left=4, optional=["limit"]
@@ -203,18 +205,14 @@ def _page(
     return render_report(f"Field report: {title}", lines, sections)
 
 
-def _pack(folder: Path, output: Path) -> None:
-    """Write the zip file."""
-    with tempfile.NamedTemporaryFile(dir=output.absolute().parent, suffix=".part", delete=False) as file:
-        partial_file = Path(file.name)
-    try:
-        with zipfile.ZipFile(partial_file, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in sorted(folder.iterdir()):
-                # Without the times and owners of files.
-                archive.writestr(zipfile.ZipInfo(path.name), path.read_bytes(), zipfile.ZIP_DEFLATED)
-        partial_file.replace(output)
-    finally:
-        partial_file.unlink(missing_ok=True)
+def _packed(folder: Path) -> bytes:
+    """Return the zip file."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.iterdir()):
+            # Without the times and owners of files.
+            archive.writestr(zipfile.ZipInfo(path.name), path.read_bytes(), zipfile.ZIP_DEFLATED)
+    return content.getvalue()
 
 
 def anonymise(text: str, ports: Sequence[str] = ()) -> str:

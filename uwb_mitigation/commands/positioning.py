@@ -203,10 +203,8 @@ def _read(
         bar.add_task("reading", total=None)
         corrected = () if mitigation is None else mitigation.correct_records(open_recording(bag))
         recorded = read_ranges(bag, config.anchors, settings.stamp_offset_s, corrected)
-    for identity, count in recorded.unknown_anchors.items():
-        warn(f"{count} ranges of anchor {format_id(identity)} left out: it is not in the anchors file")
-    for why, count in recorded.skipped.items():
-        warn(f"left out: {count} x {why}")
+    for text in recorded.warnings:
+        warn(text)
     check_one_tag(config, recorded.tags)
     return config, recorded
 

@@ -131,7 +131,7 @@ def _result(outcomes: list[Outcome], seconds: float, model_id: int | None) -> di
 
 def _row(outcome: Outcome) -> dict[str, Any]:
     ok, unreliable, error = outcome.statuses["OK"], outcome.statuses["UNRELIABLE"], outcome.error
-    names = ("messages", "ranges", "replaced", "seconds", "statuses", "skipped", "error")
+    names = ("messages", "ranges", "replaced", "seconds", "statuses", "reasons", "skipped", "error")
     return {name: getattr(outcome, name) for name in names} | {
         "models": {str(choice): count for choice, count in outcome.models.items() if choice.fits},
         "mismatches": {str(choice): count for choice, count in outcome.models.items() if not choice.fits},
@@ -169,6 +169,9 @@ def _show(result: dict[str, Any]) -> None:
     console.print_line(
         f"{corrected} of {result['ranges']} ranges corrected, {result['ranges_per_s']:.0f} ranges/s"
     )
+    reasons: Counter[str] = sum((row["reasons"] for row in result["bags"]), Counter())
+    for reason, count in reasons.items():
+        console.warn(f"{count} ranges are not corrected: {reason}")
     for row in result["bags"]:
         for kind, count in row["skipped"].items():
             console.warn(f"{row['source']}: {count} x {kind}")

@@ -26,7 +26,7 @@ from uwb_mitigation.radios.port import (
 )
 from uwb_mitigation.radios.settings import PortMessage, ValueReader, read_baud, read_capture, read_ports
 from uwb_mitigation.recordings.live_ranges import LiveConverter
-from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
+from uwb_mitigation.recordings.mapping.conversion import UNREADABLE
 from uwb_mitigation.recordings.mapping.mapping import Mapping, StartDialogue, load_mapping
 from uwb_mitigation.types.measurement import RangeMeasurement
 

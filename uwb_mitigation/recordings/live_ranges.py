@@ -9,7 +9,6 @@ import numpy as np
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.recordings.mapping import conversion
-from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
 from uwb_mitigation.recordings.mapping.mapping import LIST_INDEX, TOPIC, Mapping
 from uwb_mitigation.recordings.mapping.messages import MessageRows
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement
@@ -54,9 +53,9 @@ class LiveConverter:
         """
         rows = self._rows.rows(message)
         count = len(rows[LIST_INDEX])
-        rows |= {LOG_TIME: [now_ns] * count, TOPIC: [where] * count}
+        rows |= {conversion.LOG_TIME: [now_ns] * count, TOPIC: [where] * count}
         columns = {column: _array(values) for column, values in rows.items()}
-        chunk = Chunk(columns, count, where, np.arange(count))
+        chunk = conversion.Chunk(columns, count, where, np.arange(count))
         rules = conversion.filter_rows(self._mapping.drop, chunk)
         chunk = chunk.take(conversion.count_kept(rules, count, self.counts))
         if not chunk.count:
@@ -69,7 +68,7 @@ class LiveConverter:
         first, self._rows_seen = self._rows_seen, self._rows_seen + chunk.count
         return [conversion.measurement(values, row, self._cir(chunk, row), first + row) for row in rows_used]
 
-    def _cir(self, chunk: Chunk, row: int) -> Cir:
+    def _cir(self, chunk: conversion.Chunk, row: int) -> Cir:
         if (source := self._mapping.cir) is None or source.files:
             return conversion.NO_CIR
         try:

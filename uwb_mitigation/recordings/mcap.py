@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from uwb_mitigation.errors import RecordingError, did_you_mean
@@ -71,46 +70,33 @@ class McapRecording(Source):
 
     def _join(self, bag: BagReader) -> Iterator[Record]:
         """Pair ranges with their truths, which may come before or after them; in the order of the ranges."""
-        pending: deque[_PendingRange] = deque()
-        by_key: dict[MeasurementKey, _PendingRange] = {}
-        early_truths: dict[MeasurementKey, Truth] = {}
+        pending: deque[tuple[MeasurementKey, RangeMeasurement]] = deque()
+        truths: dict[MeasurementKey, Truth] = {}
         poses: dict[tuple[int, int], TruePose] = {}
         has_poses = bag.topics.get(topics.ODOMETRY_TRUTH) == topics.ODOMETRY_TYPE
 
+        def oldest_is_complete() -> bool:
+            key, _ = pending[0]
+            return key in truths and (not has_poses or (key.stamp_ns, key.tag_id) in poses)
+
         def pop_oldest() -> Record:
-            entry = pending.popleft()
-            by_key.pop(measurement_key(entry.measurement), None)
-            return Record(entry.measurement, entry.truth, *(entry.pose or (None, None)))
+            key, oldest = pending.popleft()
+            return Record(oldest, truths.pop(key, None), *poses.get((key.stamp_ns, key.tag_id), (None, None)))
 
         try:
             for item in self._decoded(bag):
                 if isinstance(item, RangeMeasurement):
-                    key = measurement_key(item)
-                    pose = poses.get((item.stamp_ns, item.tag_id))
-                    entry = _PendingRange(item, early_truths.pop(key, None), pose)
-                    pending.append(entry)
-                    by_key[key] = entry
+                    pending.append((measurement_key(item), item))
                 elif len(item) == 2:
-                    key, truth = item
-                    if key in by_key:
-                        by_key[key].truth = truth
-                    else:
-                        early_truths[key] = truth
-                        if len(early_truths) > JOIN_WINDOW:
-                            del early_truths[next(iter(early_truths))]
-                            self.skipped["truth without its range"] += 1
+                    truths[item[0]] = item[1]
+                    if len(truths) > 2 * JOIN_WINDOW:
+                        del truths[next(iter(truths))]
+                        self.skipped["truth without its range"] += 1
                 else:
-                    stamped_tag, pose = item[:2], item[2:]
-                    for entry in pending:
-                        if (entry.measurement.stamp_ns, entry.measurement.tag_id) == stamped_tag:
-                            entry.pose = pose
-                    poses[stamped_tag] = pose
-                    if len(poses) > JOIN_WINDOW:
+                    poses[item[:2]] = item[2:]
+                    if len(poses) > 2 * JOIN_WINDOW:
                         del poses[next(iter(poses))]
-                while pending and (
-                    (pending[0].truth is not None and (pending[0].pose is not None or not has_poses))
-                    or len(pending) > JOIN_WINDOW
-                ):
+                while pending and (len(pending) > JOIN_WINDOW or oldest_is_complete()):
                     yield pop_oldest()
         except RecordingError:
             while pending:
@@ -118,8 +104,8 @@ class McapRecording(Source):
             raise
         while pending and not self._closed:
             yield pop_oldest()
-        if early_truths:
-            self.skipped["truth without its range"] += len(early_truths)
+        if truths:
+            self.skipped["truth without its range"] += len(truths)
 
     def _decoded(
         self, bag: BagReader
@@ -152,12 +138,3 @@ TruePosition = tuple[int, int, tuple[float, float, float], float | None]
 
 TruePose = tuple[tuple[float, float, float], float | None]
 """A true position and yaw."""
-
-
-@dataclass(slots=True)
-class _PendingRange:
-    """A range that waits for its truth."""
-
-    measurement: RangeMeasurement
-    truth: Truth | None
-    pose: TruePose | None

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import RecordingError, format_id
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
 from uwb_mitigation.types.anchors import AnchorMap
@@ -77,6 +77,16 @@ class RecordedRanges:
     tags: list[TagRecording]
     unknown_anchors: Counter[int]
     skipped: Counter[str]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was left out, for the user."""
+        reason = "it is not in the anchors file"
+        unknown = self.unknown_anchors.items()
+        lines = [
+            f"{count} ranges of anchor {format_id(anchor)} left out: {reason}" for anchor, count in unknown
+        ]
+        return [*lines, *(f"left out: {count} x {reason}" for reason, count in self.skipped.items())]
 
     def check(self, anchors: AnchorMap, where: str = "") -> None:
         """Raise RecordingError if no range is of an anchor in the map."""

@@ -47,11 +47,6 @@ SIDE_LOBE_SIGMAS = 5.0
 """Minimum of the detection threshold in standard deviations of the side lobes of the strongest tap. An assumption: with
 a threshold that only follows the noise, 0.3 % of simulated LOS frames are detected at a side lobe."""
 
-FALSE_PEAK_M, FALSE_PEAK_DB = (5.0, 12.0), (10.0, 16.0)
-"""False peaks: how long before the straight-line path, and their power above the mean noise. The upper limit is the detection
-threshold with the default multiplier; the strongest of 128 noise taps is 7 dB above the mean. Assumptions, see the logs of other
-buildings: 5 to 12 m."""
-
 _SPAN = 8
 _PHASES = 64
 _EDGE_STEPS = 32
@@ -164,7 +159,6 @@ class Receiver:
         pulses_per_symbol: pulses of a pseudo-random sequence, whose correlation has side lobes at multiples of
             `PULSE_SPACING_TAPS`; 0: a preamble, whose periodic correlation is perfect.
         kind, segment: source of the CIRs.
-        false_peak_share: share of frames with a peak before the direct path that is no path (`FALSE_PEAK_M`).
     """
 
     tx_power_dbm: float = -14.3
@@ -181,7 +175,6 @@ class Receiver:
     pulses_per_symbol: int = 0
     kind: RadioType = RadioType.DW1000
     segment: Segment = Segment.IPATOV
-    false_peak_share: float = 0.0
 
     def boards(self, n: int) -> Boards:
         """Return the properties of n pairs between identical boards."""
@@ -248,7 +241,7 @@ class Receiver:
         """
         boards = boards or self.boards(len(multipath.delay_ns))
         place = rng.uniform(*PLACE, len(multipath.delay_ns))
-        symbol = _place_paths(place[:, None] + multipath.delay_ns / TAP_NS, multipath.gain)
+        symbol = place_paths(place[:, None] + multipath.delay_ns / TAP_NS, multipath.gain)
         scale = 10.0 ** ((self.tx_power_dbm + boards.gain_db + POWER_CONSTANT_DB) / 20.0)
         symbol *= scale.astype(np.float32)[:, None]
 
@@ -272,13 +265,11 @@ class Receiver:
         accumulator = rng.standard_normal(components.shape, dtype=np.float32)
         accumulator *= np.sqrt(noise / 2.0).astype(np.float32)[:, None]
         accumulator += components * count.astype(np.float32)[:, None]
-        if self.false_peak_share:
-            accumulator += _false_peaks(place, noise, self.false_peak_share, rng)
         samples = np.clip(np.rint(accumulator), -32768, 32767).astype(np.int16)
         direct = np.abs(multipath.gain[:, 0]) * scale * gain * count * PULSE_PEAK
-        return self._report(samples, count, direct, place, above_sensitivity, boards, rng)
+        return self.report(samples, count, direct, place, above_sensitivity, boards, rng)
 
-    def _report(
+    def report(
         self,
         samples: NDArray[np.int16],
         count: NDArray[np.int64],
@@ -288,6 +279,7 @@ class Receiver:
         boards: Boards,
         rng: np.random.Generator,
     ) -> Reception:
+        """Return first path, levels and error of accumulators (n, 2 TAPS) with straight-line paths at `place`."""
         quantised = samples.astype(np.float32)
         taps = quantised.view(np.complex64)
         magnitude = np.abs(taps)
@@ -331,7 +323,7 @@ def _side_lobes(
     return np.fft.ifft(np.fft.fft(symbol) * np.fft.fft(kernel)).astype(np.complex64)
 
 
-def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) -> NDArray[np.complex64]:
+def place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) -> NDArray[np.complex64]:
     """Sum pulses at fractional tap positions (n, paths) into complex64 (n, TAPS)."""
     n = len(position)
     step = np.rint(position * _PHASES).astype(np.int64)
@@ -344,26 +336,6 @@ def _place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) ->
     for component, weight in ((result.real, value.real), (result.imag, value.imag)):
         component[:] = np.bincount(where, (shape * weight[:, None]).ravel(), n * TAPS).reshape(n, TAPS)
     return result
-
-
-def _false_peaks(
-    place: NDArray[np.float64], noise: NDArray[np.float64], share: float, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Return one false peak in a `share` of n frames, interleaved real and imaginary, float32 (n, 2 TAPS).
-
-    Args:
-        place: index of the straight-line path, (n,).
-        noise: mean power of the noise in each tap, (n,).
-        share: share of frames with a peak.
-        rng: random generator.
-    """
-    n = len(place)
-    early_m = rng.uniform(*FALSE_PEAK_M, n)
-    amplitude = np.sqrt(noise * 10.0 ** (rng.uniform(*FALSE_PEAK_DB, n) / 10.0)) / PULSE_PEAK
-    amplitude *= rng.random(n) < share
-    gain = amplitude * np.exp(1j * rng.uniform(0.0, 2.0 * math.pi, n))
-    taps = _place_paths((place - early_m / (SPEED_OF_LIGHT_M_PER_NS * TAP_NS))[:, None], gain[:, None])
-    return taps.view(np.float32)
 
 
 def noise_threshold(magnitude: NDArray[np.float32], multiplier: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
-"""Simulated measurements of a drive through a flat, and of static placements.
+"""Simulated measurements of a drive through a flat, and of static placements in random buildings with different boards.
 
-Static placements are in the same flat or in random buildings, with different boards for each placement. The same arguments give the same measurements, independent of how many are consumed: each segment of the scene
+The same arguments give the same measurements, independent of how many are consumed: each segment of the scene
 has its own random generator. Stamps begin at 0 and follow the rate, not a clock.
 """
 
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError
-from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, label, place
-from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, block_of
+from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, label
+from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, Block, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
 from uwb_mitigation.simulation.channel import DiffuseField, check_range
 from uwb_mitigation.simulation.odometry import SimulatedMotion, simulate_motion, yaw_along_route
@@ -49,7 +49,7 @@ ROBOT_FRAME = "base_link"
 FIRST_TAG_ID = 101
 NOT_RECEIVED = "frame too weak to be received"
 
-SURVEY_RATE_HZ = 20.0
+PLACEMENTS_RATE_HZ = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,48 +225,6 @@ class SimulatedSource(Simulated):
         return simulate_motion(self._route, SPEED_M_PER_S, self._count / self._rate_hz, self._seed)
 
 
-class SimulatedSurvey(Simulated):
-    """Independent static placements with many exchanges each, like a surveyed data set; a `Source`.
-
-    Both antennas have random positions in the plan, 0.2 m from its border and at least `MIN_DISTANCE_M` apart. A
-    placement has one channel: its exchanges differ only in noise and sampling phase.
-
-    Args:
-        seed: 0 to 2^32 - 1.
-        configurations: 1 to 10^7 placements. exchanges: 1 to 1000 for each.
-        plan: the scene.
-
-    Raises:
-        ParameterError: an argument is out of its range, or the plan is too small.
-    """
-
-    def __init__(
-        self, *, seed: int = 1, configurations: int = 100, exchanges: int = 20, plan: Building = FLAT
-    ) -> None:
-        check_seed(seed)
-        check_range("simulated survey", "configurations", configurations, 1, 10**7, whole=True)
-        check_range("simulated survey", "exchanges", exchanges, 1, 1000, whole=True)
-        for axis, extent in zip("xy", plan.size, strict=True):
-            check_range("simulated survey", f"plan size in {axis}", extent, 2.0, 1000.0)
-        count = configurations * exchanges
-        super().__init__(f"simulated survey, seed {seed}", SURVEY_RATE_HZ, Receiver(), count)
-        self._plan = plan
-        self._seed = seed
-        self._exchanges = exchanges
-
-    def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
-        placements = -(-BATCH // self._exchanges)
-        rows = np.arange(placements)
-        for batch in range(-(-self._count // (placements * self._exchanges))):
-            rng = np.random.default_rng([self._seed, batch])
-            fields = draw_fields(RESIDENTIAL, placements, rng)
-            anchor, tag = place(self._plan.size, placements, rng)
-            path, first = self._plan.direct_path(anchor, tag), batch * placements
-            pairs = AntennaPairs(anchor, tag, path, RESIDENTIAL, fields, rows, stationary=True)
-            names = [f"simulated survey seed {self._seed}/placement {first + k}" for k in rows.tolist()]
-            yield _static(pairs, rows, self._exchanges, first, names), rng
-
-
 class SimulatedBuildings(Simulated):
     """Static placements in random buildings, about as many LOS as NLOS; a `Source`.
 
@@ -286,7 +244,7 @@ class SimulatedBuildings(Simulated):
         check_range("simulated buildings", "placements", placements, 1, 10**7, whole=True)
         check_range("simulated buildings", "exchanges", exchanges, 1, 1000, whole=True)
         count = placements * exchanges
-        super().__init__(f"simulated buildings, seed {seed}", SURVEY_RATE_HZ, BUILDINGS_RADIO, count)
+        super().__init__(f"simulated buildings, seed {seed}", PLACEMENTS_RATE_HZ, BUILDINGS_RADIO, count)
         self._seed = seed
         self._exchanges = exchanges
 
@@ -298,37 +256,20 @@ class SimulatedBuildings(Simulated):
                 rows = np.arange(first, min(first + together, PLACEMENTS))
                 names = [block.configuration(self._seed, number, k) for k in rows.tolist()]
                 of_all = number * PLACEMENTS + first
-                yield _static(block.pairs, rows, self._exchanges, of_all, names, block.boards), rng
+                yield self._exchange(block, rows, of_all, names), rng
 
-
-def _static(
-    pairs: AntennaPairs,
-    rows: NDArray[np.intp],
-    exchanges: int,
-    first: int,
-    names: list[str],
-    boards: Boards | None = None,
-) -> TwrBatch:
-    """Return exchanges over some of the static pairs.
-
-    Args:
-        pairs: with one field each.
-        rows: int (n,), the pairs that are used.
-        exchanges: number of exchanges of each.
-        first: number of the first of them among all placements.
-        names: their n configurations.
-        boards: those of `pairs`; None: identical ones.
-    """
-    index = np.repeat(np.arange(len(rows)), exchanges)
-    ids = np.ones(len(index), np.int64)
-    return TwrBatch(
-        first * exchanges + np.arange(len(index)),
-        ids,
-        FIRST_TAG_ID * ids,
-        [names[k] for k in index.tolist()],
-        pairs.take(rows, index),
-        None if boards is None else boards.take(rows[index]),
-    )
+    def _exchange(self, block: Block, rows: NDArray[np.intp], first: int, names: list[str]) -> TwrBatch:
+        """Return the exchanges of some placements; `first`: number of the first of them among all placements."""
+        index = np.repeat(np.arange(len(rows)), self._exchanges)
+        ids = np.ones(len(index), np.int64)
+        return TwrBatch(
+            first * self._exchanges + np.arange(len(index)),
+            ids,
+            FIRST_TAG_ID * ids,
+            [names[k] for k in index.tolist()],
+            block.pairs.take(rows, index),
+            block.boards.take(rows[index]),
+        )
 
 
 def _cir(reception: Reception, i: int) -> Cir:

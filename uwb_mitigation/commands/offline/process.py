@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
 from uwb_mitigation.errors import (
     DamagedRecordingError,
     RecordingError,
@@ -27,7 +25,7 @@ from uwb_mitigation.mitigation.model.shipped import AUTO, load_model
 from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors, write_anchors
 from uwb_mitigation.recordings.bag.reader import BagReader, RawMessage, check_channel
 from uwb_mitigation.recordings.bag.writer import METADATA_RECORD, BagWriter
-from uwb_mitigation.types.measurement import RangeMeasurement, Status
+from uwb_mitigation.types.measurement import RangeMeasurement, Status, reason
 from uwb_mitigation.types.offsets import NO_OFFSETS, Offsets
 from uwb_mitigation.types.ros import schemas
 from uwb_mitigation.types.ros.codec import RangeBatch, decode_range, encode_corrected
@@ -68,6 +66,7 @@ class Outcome:
         messages: messages read.
         ranges: the number of raw ranges, corrected or passed through.
         statuses: corrected ranges by status, {name: count}.
+        reasons: ranges that were not corrected, {reason: count}.
         replaced: corrected ranges of the input, which are not copied.
         skipped: warnings, {kind: count}.
         models: ranges by model, {choice: count}.
@@ -80,6 +79,7 @@ class Outcome:
     messages: int = 0
     ranges: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
+    reasons: Counter[str] = field(default_factory=Counter)
     replaced: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
     models: Counter[Choice] = field(default_factory=Counter)
@@ -160,6 +160,7 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         messages=num_read,
         ranges=corrector.statuses.total(),
         statuses=corrector.statuses,
+        reasons=corrector.reasons,
         replaced=corrector.replaced,
         skipped=corrector.skipped + bag.warnings,
         models=mitigation.used,
@@ -180,6 +181,7 @@ class _Corrector:
         self._channels: dict[int, int] = {}
         self._corrected = out.corrected_channel()
         self.statuses: Counter[str] = Counter()
+        self.reasons: Counter[str] = Counter()
         self.skipped: Counter[str] = Counter()
         self.replaced = 0
 
@@ -215,8 +217,11 @@ class _Corrector:
                 self._correct_singly(messages, indices, encoded)
                 continue
             corrected = self._mitigation.correct_columns(batch.columns)
-            for status, count in zip(*np.unique(corrected.status, return_counts=True), strict=True):
-                self.statuses[Status(status).name] += int(count)
+            kinds = zip(corrected.status.tolist(), corrected.fault.tolist(), strict=True)
+            for (status, fault), count in Counter(kinds).items():
+                self.statuses[Status(status).name] += count
+                if text := reason(status, fault, 0.0):
+                    self.reasons[text] += count
             for index, message in zip(indices, batch.encode_corrected(corrected), strict=True):
                 encoded[index] = message
         return encoded
@@ -233,3 +238,5 @@ class _Corrector:
         for (index, measurement), result in zip(decoded.items(), corrected, strict=True):
             encoded[index] = encode_corrected(measurement, result)
             self.statuses[result.status.name] += 1
+            if result.reason:
+                self.reasons[result.reason] += 1

@@ -225,12 +225,7 @@ def track(
         config = settings.config(anchor_map)
     check_one_tag(config, recorded.tags)
     tags, failures = track_tags(recorded.tags, config)
-    warnings = [
-        f"{count} ranges of the unknown anchor {format_id(i)}"
-        for i, count in recorded.unknown_anchors.items()
-    ]
-    warnings += [f"{count} x {reason}" for reason, count in recorded.skipped.items()]
-    warnings += [str(failure) for failure in failures]
+    warnings = [*recorded.warnings, *map(str, failures)]
     warnings += [f"tag {format_id(tag.recording.tag_id)}: {text}" for tag in tags for text in tag.warnings]
     return Tracks(tags, anchor_map, warnings)
 

@@ -14,7 +14,7 @@ from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.recordings.live_ranges import LiveConverter
-from uwb_mitigation.recordings.mapping.chunks import UNREADABLE
+from uwb_mitigation.recordings.mapping.conversion import UNREADABLE
 from uwb_mitigation.recordings.mapping.mapping import Mapping, load_mapping, shipped_mappings
 from uwb_mitigation.types.measurement import RangeMeasurement
 

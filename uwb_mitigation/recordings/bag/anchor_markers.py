@@ -6,17 +6,17 @@ import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace as Fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_mitigation.errors import RecordingError
+from uwb_mitigation.errors import RecordingError, UwbMitigationError
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap, anchors_path, load_anchors
 from uwb_mitigation.types.ros import schemas
-from uwb_mitigation.types.ros.poses import MAP
+from uwb_mitigation.types.ros.poses import MAP, header_fields, quaternion, vector
 from uwb_mitigation.types.ros.topics import ANCHORS, MARKERS_TYPE
-from uwb_mitigation.types.stamps import NS_PER_S
 
 if TYPE_CHECKING:
     from uwb_mitigation.recordings.bag.writer import BagWriter
@@ -51,8 +51,8 @@ def recorded_anchors(bag: Path) -> AnchorMap | None:
         return load_anchors(file)
     with contextlib.suppress(RecordingError):
         for message in BagReader(bag).messages([ANCHORS]):
-            with contextlib.suppress(Exception):  # rosbags raises various types.
-                parsed = parse_markers(schemas.typestore().deserialize_cdr(message.data, MARKERS_TYPE))
+            with contextlib.suppress(UwbMitigationError):
+                parsed = parse_markers(schemas.deserialize(MARKERS_TYPE, message.data))
                 anchors = {anchor.id: anchor for anchor in parsed if math.isfinite(anchor.position[2])}
                 if anchors:
                     return AnchorMap([*anchors.values()][:MAX_ANCHORS], str(bag))
@@ -74,28 +74,19 @@ def write_anchors(bag: BagWriter, anchors: AnchorMap, stamp_ns: int) -> None:
     Raises:
         RecordingError: the bag cannot be written.
     """
-    store = schemas.typestore()
-    types = store.types
+    header, no_bytes = header_fields(stamp_ns, MAP), np.zeros(0, np.uint8)
 
-    def vector(kind: str, *values: float) -> Any:
-        return types[f"geometry_msgs/msg/{kind}"](*values)
-
-    def marker(row: int, namespace: str, text: str) -> Any:
-        time = types["builtin_interfaces/msg/Time"](stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
-        pose = vector(
-            "Pose", vector("Point", *anchors.anchors[row].position), vector("Quaternion", 0.0, 0.0, 0.0, 1.0)
-        )
-        header, no_bytes = types["std_msgs/msg/Header"](time, MAP), np.zeros(0, np.uint8)
-        return types["visualization_msgs/msg/Marker"](
-            header=header, ns=namespace, id=row, type=SPHERE, action=0, pose=pose, scale=vector("Vector3", 0.2, 0.2, 0.2),
-            color=types["std_msgs/msg/ColorRGBA"](0.0, 0.0, 0.0, 1.0), text=text, frame_locked=False, points=[], colors=[],
-            lifetime=types["builtin_interfaces/msg/Duration"](0, 0), texture_resource="", uv_coordinates=[],
-            texture=types["sensor_msgs/msg/CompressedImage"](header, "", no_bytes), mesh_resource="",
-            mesh_file=types["visualization_msgs/msg/MeshFile"]("", no_bytes), mesh_use_embedded_materials=False,
+    def marker(row: int, namespace: str, text: str) -> Fields:
+        position = vector(*anchors.anchors[row].position)
+        return Fields(
+            header=header, ns=namespace, id=row, type=SPHERE, action=0, scale=vector(0.2, 0.2, 0.2), text=text,
+            pose=Fields(position=position, orientation=quaternion(0.0)), color=Fields(r=0.0, g=0.0, b=0.0, a=1.0),
+            lifetime=Fields(sec=0, nanosec=0), frame_locked=False, points=[], colors=[], texture_resource="",
+            texture=Fields(header=header, format="", data=no_bytes), uv_coordinates=[], mesh_resource="",
+            mesh_file=Fields(filename="", data=no_bytes), mesh_use_embedded_materials=False,
         )  # fmt: skip
 
     rows = range(len(anchors))
     markers = [marker(row, "anchors", str(anchors.anchors[row].id)) for row in rows]
     markers += [marker(row, "names", str(anchors.anchors[row])) for row in rows]
-    message = types[MARKERS_TYPE](markers)
-    bag.write_message(ANCHORS, MARKERS_TYPE, bytes(store.serialize_cdr(message, MARKERS_TYPE)), stamp_ns)
+    bag.write_message(ANCHORS, MARKERS_TYPE, schemas.serialize(MARKERS_TYPE, markers=markers), stamp_ns)

@@ -43,24 +43,22 @@ def read_truth(path: Path, topic: str = topics.ODOMETRY_TRUTH) -> dict[int | Non
         return {}
     check_topic(path, bag.topics, topic, POSITION_TYPES)
     where = f"{path}, topic {topic}"
-    bodies = _bodies(bag, topic, where, oriented=False)
-    yaws: dict[str, dict[int, float]] = {}
+    rows: dict[int | None, dict[int, tuple[float, ...]]] = {}
     for decoded in decode_messages(bag, [topic], where):
+        position, q = _pose_of(decoded)
         # An unknown heading has a very large variance, or a type without variances.
-        if getattr(decoded.pose, "covariance", (math.inf,) * 36)[35] < UNOBSERVED:
-            q = decoded.pose.pose.orientation
-            child = _frame(getattr(decoded, "child_frame_id", ""))
-            yaws.setdefault(child, {})[to_ns(decoded.header.stamp)] = 2.0 * math.atan2(q.z, q.w)
-    paths = {}
-    for child, poses in bodies.items():
-        yaw_by_stamp = yaws.get(child, {})
-        yaw = (
-            np.array([yaw_by_stamp.get(stamp, math.nan) for stamp in poses.stamp_ns.tolist()])
-            if yaw_by_stamp
-            else None
-        )
-        paths[tag_of_frame(child)] = TruePath(poses.stamp_ns, poses.position, yaw)
-    return paths
+        is_known = getattr(decoded.pose, "covariance", (math.inf,) * 36)[35] < UNOBSERVED
+        row = position.x, position.y, position.z, 2.0 * math.atan2(q.z, q.w) if is_known else math.nan
+        tag = tag_of_frame(getattr(decoded, "child_frame_id", ""))
+        if all(map(math.isfinite, row[:3])) and (tag in rows or len(rows) < _MAX_FRAMES):
+            rows.setdefault(tag, {}).setdefault(to_ns(decoded.header.stamp), row)
+    return {tag: _true_path(poses) for tag, poses in rows.items()}
+
+
+def _true_path(poses: dict[int, tuple[float, ...]]) -> TruePath:
+    stamps = sorted(poses)
+    values = np.array([poses[stamp] for stamp in stamps])
+    return TruePath(np.array(stamps, np.int64), values[:, :3], values[:, 3])
 
 
 def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -> dict[str, PosePath]:
@@ -100,18 +98,21 @@ def read_bodies(path: Path, topic: str, frames: tuple[str, str] | None = None) -
     return {frame: bodies[frame]}
 
 
-def _bodies(bag: BagReader, topic: str, where: str, *, oriented: bool = True) -> dict[str, PosePath]:
-    """Return {child frame: poses}; `oriented`: skip messages without an orientation."""
+def _bodies(bag: BagReader, topic: str, where: str) -> dict[str, PosePath]:
+    """Return {child frame: poses}."""
     rows: dict[str, list[_Row]] = {}
     for decoded in decode_messages(bag, [topic], where):
-        pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
-        row = _row(decoded.header.stamp, pose.position, pose.orientation if oriented else None)
+        row = _row(decoded.header.stamp, *_pose_of(decoded))
         child = _frame(getattr(decoded, "child_frame_id", ""))
         if row is not None and (child in rows or len(rows) < _MAX_FRAMES):
             rows.setdefault(child, []).append(row)
-    if oriented and not rows:
-        rows[""] = []
-    return {child: _path(poses, where, 2 if oriented else 1) for child, poses in rows.items()}
+    return {child: _path(poses, where) for child, poses in (rows or {"": []}).items()}
+
+
+def _pose_of(decoded: Any) -> tuple[Any, Any]:
+    """Return position and orientation of a message of `POSITION_TYPES`."""
+    pose = decoded.pose if hasattr(decoded.pose, "position") else decoded.pose.pose
+    return pose.position, pose.orientation
 
 
 def read_lever_arm(path: Path, base: str, frame: str) -> tuple[float, float, float] | None:
@@ -226,10 +227,8 @@ def _frame(name: str) -> str:
 
 
 def _row(stamp: Any, position: Any, orientation: Any) -> _Row | None:
-    """Return a pose with a unit quaternion (without an orientation: the identity); None: the numbers are not valid."""
-    turn = (0.0, 0.0, 0.0, 1.0)
-    if orientation is not None:
-        turn = (orientation.x, orientation.y, orientation.z, orientation.w)
+    """Return a pose with a unit quaternion; None: the numbers are not valid."""
+    turn = (orientation.x, orientation.y, orientation.z, orientation.w)
     row = (to_ns(stamp), position.x, position.y, position.z, *turn)
     length = math.hypot(*turn)
     if not all(map(math.isfinite, row)) or not 0.5 < length < 2.0:

@@ -375,7 +375,7 @@ def _index(path: Path) -> _FileIndex:
                 raise RecordingError(
                     f"not an MCAP file: it starts with {magic.hex(' ')}",
                     where=str(path),
-                    valid=f"MCAP starts with {MCAP0_MAGIC.hex(' ')}",
+                    valid="uwb-mitigation data import converts other formats to MCAP",
                 )
             try:
                 return _summary(file) or _scan(file)

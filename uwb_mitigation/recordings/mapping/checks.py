@@ -210,7 +210,8 @@ def check_units(values: ColumnDict, name: str, unit: str, true_unit: str) -> Non
         anchor = next(iter(wrong))
         what = f"the median range of anchor {format_id(anchor)} is {medians[anchor]:,.4g} m, others {typical:,.4g} m"
         lines = ", ".join(f"{anchor}: {fitting}" for anchor, fitting in wrong.items())
-        raise RecordingError(what, where=name, valid=f"probably set units: {{{lines}}} of range")
+        line = f"units: {{{lines}}}" if typical < _LARGE_M else "unit: mm or cm"
+        raise RecordingError(what, where=name, valid=f"probably set {line} of range")
     for column, low, high, si, alternative in (
         ("range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),
         ("true range", MIN_PLAUSIBLE_M, MAX_PLAUSIBLE_M, "m", "mm or cm"),

@@ -10,8 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.chunks import UNREADABLE, Chunk
-from uwb_mitigation.recordings.mapping.conversion import ColumnDict, read_cir
+from uwb_mitigation.recordings.mapping.conversion import UNREADABLE, Chunk, ColumnDict, read_cir
 from uwb_mitigation.recordings.mapping.mapping import CirSource, Join, series
 from uwb_mitigation.types.measurement import Cir, Encoding
 

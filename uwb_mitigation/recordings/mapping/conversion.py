@@ -1,4 +1,4 @@
-"""Values of a mapping in SI units, from columns of a file or message."""
+"""Rows as the readers of all formats return them, and their values in SI units."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import compress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import RecordingError
-from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, UNREADABLE, Chunk
 from uwb_mitigation.recordings.mapping.mapping import SCALES, TIME, FieldRule, RowFilter
 from uwb_mitigation.types.measurement import (
     LINEAR_MAGNITUDES,
@@ -24,6 +25,12 @@ from uwb_mitigation.types.measurement import (
     is_logarithmic,
 )
 from uwb_mitigation.types.stamps import NS_PER_S
+
+LOG_TIME = "@stamp"
+"""Column with the time at which a message was recorded, ns."""
+
+UNREADABLE = (OSError, ValueError, TypeError, KeyError, EOFError, OverflowError, NotImplementedError)
+"""Errors of values that do not have the expected form."""
 
 _MISSING = frozenset(("", "-", "nan", "nat", "none", "null", "n/a", "na"))
 """Texts that mean an unknown value."""
@@ -56,12 +63,46 @@ _LEVEL_OFFSETS = {16: 113.77, 64: 121.74}
 MAX_POSSIBLE = 10_000.0
 """Rows with a larger range (m), level (dBm) or first-path index are not used."""
 
+MAX_NEGATIVE = 0.2
+"""Largest share of negative magnitudes; of real and imaginary parts, about half are negative."""
+
 _LIMITED = ("range", "true range", "rx_power", "first_path_power", "first_path_index")
 
 Mask = NDArray[np.bool_]
 ColumnDict = dict[str, NDArray[Any]]
 """{name: array (n,)} in SI units. `stamp`: ns, int64; `tag`, `anchor`: uint64; `label`, `configuration`: texts; others, such
 as `range`, `true range` and `tag x`: float64, NaN: unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Rows of one file.
+
+    Attributes:
+        columns: {name: array or list}.
+        count: number of rows.
+        path: the file, or the topic.
+        rows: int64 (count,), numbers of the rows in the file, from 0.
+        before: number of rows in the files before.
+    """
+
+    columns: Mapping[str, Any]
+    count: int
+    path: Path | str
+    rows: NDArray[np.int64]
+    before: int = 0
+
+    def where(self, row: int) -> str:
+        """Return the location of a row for errors."""
+        return f"{self.path}: row {self.rows[row] + 1}"
+
+    def take(self, mask: NDArray[np.bool_]) -> Chunk:
+        """Return the chosen rows."""
+        if mask.all():
+            return self
+        items = self.columns.items()
+        columns = {n: v[mask] if isinstance(v, np.ndarray) else [*compress(v, mask)] for n, v in items}
+        return Chunk(columns, int(mask.sum()), self.path, self.rows[mask], self.before)
 
 
 def concat(tables: list[ColumnDict]) -> ColumnDict:
@@ -366,7 +407,7 @@ def read_cir(values: Any, form: str) -> Cir:
     """Return one CIR as int16 samples with the scale that restores the values; NaN: without samples.
 
     Raises:
-        RecordingError: the values are in dB.
+        RecordingError: the values are in dB, or real and imaginary parts instead of magnitudes.
         ValueError: the values are not numbers.
     """
     if isinstance(values, str):
@@ -394,6 +435,8 @@ def read_cir(values: Any, form: str) -> Cir:
     samples = np.rint(flat / scale).astype(np.int16)
     if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
         raise RecordingError("a CIR in dB", valid=LINEAR_MAGNITUDES)
+    if encoding is Encoding.MAGNITUDE and np.mean(samples < 0) > MAX_NEGATIVE:
+        raise RecordingError("negative magnitudes", valid="cir.samples: interleaved, or complex")
     return Cir(samples, encoding, scale=scale)
 
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import dropwhile, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
+from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError, did_you_mean
 from uwb_mitigation.files import read_bounded
-from uwb_mitigation.recordings.mapping.chunks import LOG_TIME, Chunk
-from uwb_mitigation.recordings.mapping.csv_rows import CsvRows, Rows
+from uwb_mitigation.recordings.mapping.conversion import LOG_TIME, Chunk
 from uwb_mitigation.recordings.mapping.mapping import FILE, LIST_INDEX, TOPIC, VARIABLE, TableFormat
 from uwb_mitigation.recordings.mapping.messages import MAX_ROWS, MessageRows
 from uwb_mitigation.recordings.text_blocks import OnWarning, TextBlocks
@@ -32,6 +33,9 @@ MAX_ARRAY_BYTES = 4 << 30
 
 MAX_DOCUMENT_ROWS, MAX_YAML_BYTES = 20_000_000, 1 << 20
 """Largest number of rows of a JSON or YAML document, and largest size of a YAML file."""
+
+Rows = Iterator[tuple[dict[str, Any], NDArray[np.int64]]]
+"""Columns, and the numbers of their rows in the file from 0."""
 
 _SUFFIXES = {
     ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".log": "lines", ".jsonl": "lines", ".json": "json", ".mat": "matlab",
@@ -126,8 +130,7 @@ class TableFile:
             if kind in ("messages", "lines", "json", "yaml"):
                 rows = self._messages(kind)
             elif kind == "csv":
-                arguments = self._choose, self.ids, self.dropped, self.on_warning
-                rows = iter(CsvRows(table, path, self._text('"'), *arguments))
+                rows = iter(_CsvRows(self))
             elif kind:
                 rows = self._arrays(is_matlab=kind == "matlab")
             else:
@@ -156,10 +159,11 @@ class TableFile:
         except DamagedRecordingError as error:
             self._damage = error
 
-    def _text(self, quote: str = "") -> Iterator[str]:
+    def text(self, quote: str = "") -> Iterator[str]:
+        """Yield the text in blocks of complete lines, up to a damage."""
         return self._up_to_damage(TextBlocks(self.path, self.on_warning, quote))
 
-    def _choose(self, names: Sequence[str]) -> dict[str, str]:
+    def choose(self, names: Sequence[str]) -> dict[str, str]:
         """Return {column: column of the file, also with other case}; raise RecordingError if a required one is missing."""
         table, where = self.table, str(self.path)
         folded = {name.strip().lower(): name for name in names}
@@ -186,7 +190,7 @@ class TableFile:
         """Read a MATLAB or HDF5 file in slices."""
         with contextlib.ExitStack() as stack:
             arrays = self._load(stack, is_matlab=is_matlab)
-            chosen = self._choose([str(name) for name in arrays if not str(name).startswith("__")])
+            chosen = self.choose([str(name) for name in arrays if not str(name).startswith("__")])
             # Slices of large files are read later, other values are arrays of one row at least.
             columns = {name: arrays[column] for name, column in chosen.items()}
             columns = {n: a if getattr(a, "ndim", 0) else np.atleast_1d(a) for n, a in columns.items()}
@@ -247,7 +251,7 @@ class TableFile:
             limit, bag = MAX_ROWS, self._up_to_damage(read_messages(path, table.topics))
             messages = (({TOPIC: topic, LOG_TIME: stamp_ns}, message) for topic, stamp_ns, message in bag)
         elif kind == "lines":
-            messages = (({}, line) for block in self._text() for line in block.removesuffix("\n").split("\n"))
+            messages = (({}, line) for block in self.text() for line in block.removesuffix("\n").split("\n"))
         elif kind == "json":
             messages = iter([({}, json.loads(read_bounded(path, MAX_ARRAY_BYTES, RecordingError)))])
         else:
@@ -273,6 +277,92 @@ class TableFile:
                 for name, cells in values.items():
                     rows[name] += cells
             yield rows, np.arange(first, first := first + len(rows[LIST_INDEX]))
+
+
+class _CsvRows:
+    """The rows of a CSV file, read in blocks of complete lines."""
+
+    def __init__(self, file: TableFile) -> None:
+        self._file, self._table = file, file.table
+        separator = file.table.separator
+        # The fields are separated by one mark, by white space, or by an expression that is replaced by tabs.
+        self._regex = separator if len(separator) > 1 and separator != r"\s+" else ""
+        self._mark = "\t" if self._regex else " " if separator == r"\s+" else separator
+        self._chosen, self._header, self._width = dict[str, str](), "", 0
+        self._options: dict[str, Any] = {
+            "sep": r"\s+" if self._mark == " " else self._mark, "decimal": self._table.decimal, "index_col": False,
+            "comment": self._table.comment or None, "skipinitialspace": True,
+        }  # fmt: skip
+
+    def __iter__(self) -> Rows:
+        first, previous = 0, None
+        for block in self._file.text('"'):
+            lines = block.split("\n")
+            if self._regex:
+                lines = [re.sub(self._regex, self._mark, line.strip()) for line in lines]
+            if not self._chosen:
+                lines = self._after_header(lines[self._table.skip :])
+            if previous:
+                yield previous
+            columns, numbers = self._parsed(lines)
+            previous, first = (columns, first + numbers), first + int(numbers.max(initial=-1)) + 1
+        if previous and self._file.on_warning:
+            widths = [self._count(line) for line in lines if line.strip()][-2:]
+            if widths[-1:] < [self._width] and widths[-1:] < widths[:1]:
+                self._file.on_warning(
+                    f"{self._file.path.name}: the last row is short; the last row is not used"
+                )
+                previous = {name: values[:-1] for name, values in columns.items()}, previous[1][:-1]
+        if previous:
+            yield previous
+
+    def _count(self, line: str) -> int:
+        return len(line.split()) if self._mark == " " else line.count(self._mark) + 1
+
+    def _after_header(self, lines: list[str]) -> list[str]:
+        """Choose the columns, and return the lines after the header."""
+        names, comment = [*self._table.columns], self._table.comment or "\n"
+        if not names:
+            lines = list(dropwhile(lambda line: not line.strip() or line.startswith(comment), lines))
+            self._header, lines = lines[0] if lines else "", lines[1:]
+            header = pd.read_csv(io.StringIO(self._header), nrows=0, **self._options)
+            names = [str(name) for name in header.columns]
+            self._width = len(names)
+        self._chosen = self._file.choose(names)
+        originals = [name.strip('" ') for name in self._header.split(self._mark)]
+        if equal := [name for name in self._chosen.values() if originals.count(name) > 1]:
+            what, valid = f"several columns have the name {equal[0]}", f"columns: [{', '.join(names[:40])}]"
+            raise RecordingError(what, where=str(self._file.path), valid=f"{valid} and skip: 1")
+        if self._table.columns:
+            # Pandas refuses columns that no row of a block has.
+            self._header = self._mark.join("x" * len(names))
+            self._options |= {"names": names, "header": 0}
+        self._options["usecols"] = [*self._chosen.values()]
+        return lines
+
+    def _parsed(self, lines: list[str]) -> tuple[dict[str, Any], NDArray[np.int64]]:
+        """Return the columns, and the numbers of their rows in the block."""
+        # A separator may follow the last field.
+        long = {line for line in lines if self._width and line.count(self._mark) >= self._width}
+        long = {line for line in long if self._count(line.rstrip(f"{self._mark} ")) > self._width}
+        numbers = None
+        # A quoted text may contain separators and line breaks.
+        if (long or (self._width and self._header in lines)) and not any('"' in line for line in lines):
+            comment = self._table.comment or "\n"
+            lines = [line for line in lines if line.strip() and not line.startswith(comment)]
+            numbers = np.flatnonzero([line not in long and line != self._header for line in lines])
+            reason = "a repeated header, or more fields than the header (columns: all names; skip: 1)"
+            self._file.dropped[reason] += len(lines) - len(numbers)
+            lines = [lines[number] for number in numbers.tolist()]
+        data = "\n".join([self._header, *lines]).encode()
+        frame = pd.read_csv(io.BytesIO(data), **self._options)
+        # `1e2` may be a hexadecimal id, and float64 merges large ids.
+        ids = {column for name, column in self._chosen.items() if name in self._file.ids}
+        if texts := {column: str for column in ids if frame[column].dtype.kind == "f"}:
+            frame = pd.read_csv(io.BytesIO(data), **self._options, dtype=texts)
+            frame[[*texts]] = frame[[*texts]].replace(r"\.0+$", "", regex=True)
+        arrays = {name: frame[column].to_numpy() for name, column in self._chosen.items()}
+        return arrays, np.arange(len(frame)) if numbers is None else numbers
 
 
 def _entries(document: Any) -> list[dict[str, Any]]:
