@@ -195,7 +195,6 @@ def evaluate(case: Case, has_check: bool) -> dict[str, Any]:
         corrected = test.corrected(bundle, found.offsets)
     row["calibrated_m"] = live_rmse_m(test, corrected)
     row["change"] = row["calibrated_m"] / row["without_m"] - 1.0
-    row["published_sd_m"] = float(np.sqrt(np.median(corrected.variance_m2)))
     return row
 
 
@@ -203,7 +202,7 @@ def show(row: dict[str, Any]) -> None:
     text = f"{row['kind']:9} {row['case']:32} "
     if "chosen" in row:
         text += f"{row['chosen']:42} promised {row['promised']:+.2f} actual {row['change']:+.2f} "
-        text += f"(raw {row['raw_m']:.3f}, {row['without_m']:.3f} to {row['calibrated_m']:.3f} m, sd {row['published_sd_m']:.2f} m) "
+        text += f"(raw {row['raw_m']:.3f}, {row['without_m']:.3f} to {row['calibrated_m']:.3f} m) "
     print(text + (f"REFUSED: {row['refused']}" if row["refused"] else ""), flush=True)
 
 

@@ -24,9 +24,9 @@ from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Ranges
 
-MODEL = NoiseModel(long=1.5, short=1.5)
-"""Once offsets and predictions are subtracted, errors are as often too long as too short. Different thresholds would bias
-the offsets."""
+RAW_MODEL, PREDICTED_MODEL = NoiseModel(), NoiseModel(long=1.5, short=1.5)
+"""Obstacles only lengthen raw ranges: with equal thresholds, walls would look like offsets of anchors. Once predictions are
+subtracted, errors are as often too long as too short, and different thresholds would bias the offsets."""
 
 COMMON_SD_M, OWN_SD_M = 1.0, 0.3
 """Prior standard deviations of the common offset, and of own offsets about it while their scatter is unknown."""
@@ -80,31 +80,22 @@ class SelfCalibration:
 
     def pair(self, tag: int, row: int) -> tuple[float, float]:
         """Return the offset of a tag (its number) and an anchor (its row), m, and its standard deviation."""
-        return self._weighted([(tag, row)], 1.0)
+        return self._mean_of([(tag, row)])
 
     def mean(self) -> tuple[float, float]:
         """The mean offset of all pairs, m, and its standard deviation."""
-        return self._weighted(self.pairs(), 1.0)
+        return self._mean_of(self.pairs())
 
-    def deviation(self, tag: int, row: int) -> tuple[float, float]:
-        """Return the difference of the offset of a pair from the mean, m, and its standard deviation."""
-        pairs = self.pairs()
-        is_pair = np.array([pair == (tag, row) for pair in pairs])
-        return self._weighted(pairs, len(pairs) * is_pair - 1.0)
-
-    def _weighted(
-        self, pairs: Sequence[tuple[int, int]], factor: NDArray[np.float64] | float
-    ) -> tuple[float, float]:
-        """Return the mean of the offsets of pairs, each multiplied by its factor, and its standard deviation, m."""
-        weights_of_pairs = np.broadcast_to(factor, len(pairs)) / len(pairs)
+    def _mean_of(self, pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
+        """Return the mean of the offsets of pairs and its standard deviation, m."""
         weight = np.zeros(len(self.fit.parameters))
-        for (tag, row), share_of_pair in zip(pairs, weights_of_pairs.tolist(), strict=True):
+        for tag, row in pairs:
             names = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
-            weight += share_of_pair * np.array([name in names for name in self.fit.prior.names])
+            weight += np.array([name in names for name in self.fit.prior.names]) / len(pairs)
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
         placed = self.fit.config.anchors.sd[[row for _, row in pairs]] ** 2 / 2.0
-        variance = float(weight @ self.fit.covariance @ weight) + float(weights_of_pairs**2 @ placed)
+        variance = float(weight @ self.fit.covariance @ weight) + float(placed.sum()) / len(pairs) ** 2
         return float(weight @ self.fit.parameters), float(np.sqrt(variance))
 
 
@@ -139,8 +130,8 @@ def self_calibrate(
     if heights_m is not None:
         # Initial positions are found with the median height.
         height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), height_sd_m))
-    config = EstimatorConfig(anchors, MODEL, height, area)
     extra = regressors or Regressors.none(sum(map(len, tags)))
+    config = EstimatorConfig(anchors, PREDICTED_MODEL if extra.names else RAW_MODEL, height, area)
     check_layout(anchors, np.unique(np.concatenate([tag.anchor for tag in tags])), height, area)
     solver = _Solver(config, tags, extra, heights_m, near_offset_m)
     if heights_m is not None and height is not None:
