@@ -34,11 +34,6 @@ MAX_TRUTH_SD_M = 0.25
 MAX_OFFSET_SD_M = 0.2
 """An offset with a larger standard deviation is unknown: uncalibrated antenna delays differ by as much."""
 
-MIN_REDUNDANT = 4
-"""Anchors in addition to the dimensions of the position, from which offsets of single ones are used: with fewer, walls look like
-offsets. Live error of another drive relative to raw ranges, simulated sites with walls, seeds 100 to 134: at most 1.52 with one to
-three, at most X with four or more."""
-
 OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
 """A range is an outlier if the distance of its error from the median exceeds both limits."""
 
@@ -240,8 +235,7 @@ class _RangesOnly:
             stationary=segments.is_stationary,
             pairs=self._pairs,
             common=calibration.mean(),
-            has_redundant_anchors=len(np.unique(observations.anchor))
-            >= calibration.fit.config.dims + MIN_REDUNDANT,
+            has_redundant_anchors=calibration.has_redundant_anchors,
             outliers=outliers,
             notes=tuple(notes),
             errors_of=functools.partial(self._errors_of, has_truth),
