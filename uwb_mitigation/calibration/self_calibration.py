@@ -170,12 +170,17 @@ def self_calibrate(
             distance_sd_m=sd_m[index],
         )
 
-    result = solve(MODEL)
+    num_anchors = len(np.unique(solver.segments.ranges.anchor))
+    is_raw = not extra.names and num_anchors >= config.dims + MIN_REDUNDANT
     if near_offset_m is None:
+        # The limits of these checks are for equal thresholds.
+        result = solve(MODEL)
         check_anchors(solver.segments, result.fit, result.antenna)
         if heights_m is None:
             check_height(result.fit)
-    return solve(RAW_MODEL) if result.has_redundant_anchors and not extra.names else result
+        if not is_raw:
+            return result
+    return solve(RAW_MODEL if is_raw else MODEL)
 
 
 class _Solver:
