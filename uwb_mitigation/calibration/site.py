@@ -347,7 +347,7 @@ def calibrate_site(
     without = {RAW: (NONE, models.NO_MODEL)}
     if site.has_cirs:
         without[SHIPPED] = NONE, models.NETWORK
-        kinds = [models.NETWORK, models.NETWORK_LINE]
+        kinds = [models.NETWORK]
         if without_cir := int((~site.is_usable).sum()):
             notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
     else:
@@ -378,7 +378,7 @@ def calibrate_site(
         baseline=list(without)[-1],
         chosen=chosen,
         level=level,
-        model=models.fit_model(kind, data, site.universal_m[solution.rows]),
+        model=models.fit_model(kind, data),
         notes=tuple(notes),
     )
 
@@ -404,7 +404,7 @@ class _Fold:
         residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         for name, (level, kind) in corrections.items():
             data, _ = _labelled(training_site, solution, level)
-            model = models.fit_model(kind, data, training_site.universal_m[solution.rows])
+            model = models.fit_model(kind, data)
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
             range_m = site.ranges.range_m - predicted_m
             # Without ground truth the reference of ranges without offsets contains no common offset, because the locator
