@@ -6,11 +6,10 @@ the same ranges without CIRs; `bare`, also without powers; `flat` and `flat_leve
 halves of a short real drive. With `--check`, a third drive is the check of the calibration.
 
 Printed for each pair: the correction, the promised change of the live position error, its change on the other drive, RMSE without
-and with the calibration, and the standard deviation that it publishes; or the reason of the refusal. Without a calibration, the
-ranges are corrected by the shipped model if they have CIRs, otherwise raw. Seeds 0 to 15 were used for development; results are
-reported for seeds from 40 on.
+and with the calibration; or the reason of the refusal. Without a calibration, the ranges are corrected by the shipped model if they
+have CIRs, otherwise raw. Seeds below 200 were used for development; results are reported for seeds from 200 on.
 
-    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 40 --seeds 2
+    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 200 --seeds 2
     PYTHONPATH=. python docs/experiments/calibrate_drives.py levels hanyang --check -o drives.jsonl
 """
 
