@@ -82,7 +82,7 @@ def site(tmp_path_factory):
             gross.write(replace(record, measurement=wrong))
             if anchor != 5 or i == len(ranges) - 1:
                 rare.write(replace(record, measurement=replace(record.measurement, frame_id="antenna")))
-            if i < 50:
+            if i < 40:
                 short.write(record)
             if i % 19 == 0:
                 few.write(record)
@@ -197,7 +197,7 @@ def calibrate_with():
     [
         (OWN, "offsets", ""),
         (
-            OWN[:6],
+            OWN[:6] / 4.0,
             "common offset",
             "estimates the common offset itself, and offsets of single anchors need more anchors",
         ),
@@ -335,7 +335,6 @@ def test_calibration_without_gain_is_written_only_with_force(site):
     assert run(words, folder=site).returncode == 1
     refused = json.loads((site / "h.json").read_text())["refused"]
     assert "not written" in refused
-    assert "need more anchors" in refused
     assert not (site / "harm.onnx").exists()
     succeed(f"{words} --force", folder=site)
     assert (site / "harm.onnx").exists()
@@ -374,7 +373,7 @@ def test_calibration_is_refused_without_gain(located, change, refusal):
     assert worse.refusal == f"on the drive of the check {refusal} than with raw ranges"
 
 
-@pytest.mark.parametrize(("wrong", "match"), [(range(1, 8), "check the unit"), ([2], "and anchor 2;")])
+@pytest.mark.parametrize(("wrong", "match"), [(range(1, 8), "check the unit"), ([1], "and anchor 1;")])
 def test_offsets_above_a_metre_are_refused(located, wrong, match):
     site, _, calibration = located
     pairs = {

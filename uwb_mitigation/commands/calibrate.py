@@ -100,8 +100,8 @@ def calibrate(
 ) -> None:
     """Calibrate a site from a drive, without surveyed positions.
 
-    Drive a tag past four anchors or more for two minutes, or put tags at a dozen positions. The track, the offsets of
-    the radios and a model of the NLOS errors are estimated jointly and tested on held-out halves of the drive.
+    Drive a tag past four anchors or more for two minutes, or put tags at a dozen positions. The track and the offsets of
+    the radios are estimated jointly, and tested on held-out halves of the drive.
 
         uwb-mitigation calibrate drive.mcap --anchors anchors.yaml --height 0.4 -o site.onnx
 
