@@ -34,7 +34,7 @@ bias the common offset more than walls do."""
 
 MIN_REDUNDANT = 5
 """Anchors in addition to the dimensions of the position, from which offsets of single ones are used: with one to four, those that fit
-walls increased the live error of another drive by up to 52 % (simulated sites, seeds 100 to 119)."""
+walls increased the live error of another drive by up to 52 % (simulated sites, seeds 100 to 122)."""
 
 COMMON_SD_M, OWN_SD_M = 1.0, 0.3
 """Prior standard deviations of the common offset, and of own offsets about it while their scatter is unknown."""
