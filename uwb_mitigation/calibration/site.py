@@ -167,7 +167,7 @@ class SiteCalibration:
                 return f"{drive}the ranges are not better than with {self._baseline_text}"
         is_raw = self.solution.truth is None and self.baseline == RAW
         if is_raw and not self.live_position_change <= -MIN_PROMISE:
-            reason = "are not clearly better" if self.solution.has_redundant_anchors else "need more anchors"
+            reason = self.solution.offsets_refused or "are not clearly better"
             return f"the locator estimates the common offset itself, and offsets of single anchors {reason}"
         return ""
 
@@ -363,7 +363,7 @@ def calibrate_site(
     names = [COMMON, *with_model]
     if solution.truth is None:
         # What the network leaves behind walls looks like offsets of anchors, on each drive the same.
-        is_common_only = site.has_cirs or not solution.has_redundant_anchors
+        is_common_only = site.has_cirs or bool(solution.offsets_refused)
         names = list(with_model)[: 1 if is_common_only else None]
     chosen = select(held_out, list(dict.fromkeys(names)))
     level, kind = corrections[chosen]
