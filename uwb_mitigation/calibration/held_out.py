@@ -31,7 +31,7 @@ ONE_SIDED_95 = 1.645
 OUTLIER_SDS = 4.0
 """Larger errors count as this multiple of the scatter of the raw ranges: ranges behind obstacles must not decide alone."""
 
-PROMISED_SHARE = 0.25
+PROMISED_SHARE = 0.1
 """Share of the gain in residuals without ground truth that is promised for the live position."""
 
 MIN_RANGES = 20

@@ -57,8 +57,8 @@ MIN_LABELLED = 40
 MAX_OFFSET_M = 1.0
 """Radios of one kind without individual antenna delays differ by 0.3 m at three sigma (Decawave APS014)."""
 
-MIN_PROMISE = 0.03
-"""Offsets of single anchors without ground truth are refused if less is promised: with 0.02, those that fit walls increased the live
+MIN_PROMISE = 0.012
+"""Offsets of single anchors without ground truth are refused if less is promised: with 0.008, those that fit walls increased the live
 error of another drive by 4 % (simulated site 219)."""
 
 HEIGHT_SD_M = 0.1
