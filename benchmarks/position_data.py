@@ -104,12 +104,11 @@ class Run:
         mitigation = Mitigation(bundle or load_bundle(default_model_path()), offsets or self.offsets)
         results = mitigation.correct([record.measurement for record in self.read_records()])
         range_m = np.maximum([result.range_m for result in results], 0.0)
-        return replace(
-            self.ranges,
-            range_m=range_m,
-            variance_m2=np.array([result.variance_m2 for result in results]),
-            is_corrected=np.array([result.status.is_corrected for result in results]),
-        )
+        is_corrected = np.array([result.status.is_corrected for result in results])
+        variance_m2 = np.array([result.variance_m2 for result in results])
+        # As in `MultiTagEstimator`.
+        variance_m2[~np.logical_or.accumulate(is_corrected)] = np.nan
+        return replace(self.ranges, range_m=range_m, variance_m2=variance_m2, is_corrected=is_corrected)
 
 
 @dataclass(frozen=True, slots=True)

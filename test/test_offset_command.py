@@ -13,7 +13,7 @@ import pytest
 from bag_material import write_records
 from model_material import amplitudes_only, changed
 
-from uwb_mitigation.calibration.radio_offsets import OffsetEstimate, bundle_with_line, estimate_offset
+from uwb_mitigation.calibration.radio_offsets import OffsetEstimate, estimate_offset
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
@@ -148,72 +148,6 @@ def test_los_of_the_real_logs_gives_the_offset_of_the_boards(apartment_imported:
     offsets = parse_offsets((tmp_path / "o.yaml").read_text(), "o.yaml")
     assert offsets.lookup([5], [6])[0] == pytest.approx(result["offset_m"], abs=1e-6)
     assert not offsets.pairs
-
-
-def with_level_bias(records: list[Record], per_db: float) -> list[Record]:
-    """Return five ranges of each placement, longer by `per_db` times their first-path level above -90 dBm."""
-    biased = []
-    for number, record in enumerate(records):
-        level_dbm = record.measurement.cir.first_path_power_dbm
-        placed = replace(record, truth=replace(record.truth, configuration=str(number)))
-        biased += longer([placed] * 5, per_db * (level_dbm + 90.0))
-    return biased
-
-
-def test_line_in_the_first_path_level_is_fitted_and_written_only_if_it_helps(
-    universal: Mitigation, direct: list[Record], tmp_path: Path
-):
-    plain = estimate_offset(universal, with_level_bias(direct[:60], 0.0)).line
-    assert "on held-out placements" in plain.refused
-    estimate = estimate_offset(universal, with_level_bias(direct[:60], 0.03))
-    line = estimate.line
-    assert not line.refused
-    assert line.slope_m_per_db == pytest.approx(0.03, abs=0.006)
-    assert line.line_mae_m < 0.9 * line.constant_mae_m
-    few = estimate_offset(universal, with_level_bias(direct[:3], 0.03)).line
-    assert "at least 6 over 3 dB are needed" in few.refused
-
-    bag = tmp_path / "los.mcap"
-    write_records(bag, with_level_bias(direct[:60], 0.03))
-    asked = ("offset", bag, "--truth", "--common", "-o", "o.yaml", "--bundle", "line.onnx")
-    outcome = command_line.run(*asked, "--model", default_model_path(), "--json", "o.json", folder=tmp_path)
-    assert outcome.returncode == 0, outcome.stderr
-    assert json.loads((tmp_path / "o.json").read_text())["line"]["refused"] is None
-    model, offsets = (
-        load_bundle(tmp_path / "line.onnx"),
-        parse_offsets((tmp_path / "o.yaml").read_text(), "o.yaml"),
-    )
-    mae = []
-    for mitigation in (Mitigation(universal.bundle, offsets), Mitigation(model, offsets)):
-        others = with_level_bias(direct[60:], 0.03)
-        results = mitigation.correct([record.measurement for record in others])
-        mae.append(
-            np.mean(
-                [abs(r.range_m - record.truth.range_m) for r, record in zip(results, others, strict=True)]
-            )
-        )
-    assert mae[1] < 0.8 * mae[0]
-
-
-def test_line_is_fitted_without_cirs(universal: Mitigation, direct: list[Record], tmp_path: Path):
-    records = [changed(record, {"samples": NO_SAMPLES}) for record in with_level_bias(direct[:60], 0.03)]
-    estimate = estimate_offset(universal, records)
-    assert (estimate.line.refused, estimate.has_cirs) == ("", False)
-    bundle, _ = bundle_with_line(universal.bundle, estimate.line, tmp_path / "l.onnx", has_cirs=False)
-    results = Mitigation(bundle).correct([record.measurement for record in records])
-    assert all(result.status.is_corrected for result in results)
-    level_dbm = np.array([record.measurement.cir.first_path_power_dbm for record in records])
-    expected = estimate.line.slope_m_per_db * (level_dbm - estimate.line.level_dbm)
-    assert [result.correction_m for result in results] == pytest.approx(expected, abs=1e-4)
-
-
-def test_bundle_is_refused_without_support(direct: list[Record], tmp_path: Path):
-    write_records(tmp_path / "los.mcap", [direct[0]] * 20)
-    asked = ("offset", "los.mcap", "--distance", "3", "--bundle", "line.onnx")
-    outcome = command_line.run(*asked, "--model", default_model_path(), folder=tmp_path)
-    assert outcome.returncode != 0
-    assert "no line in the first-path level: 0 LOS placements" in outcome.stderr
-    assert not (tmp_path / "line.onnx").exists()
 
 
 def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tmp_path: Path):

@@ -59,10 +59,6 @@ def test_pair_offsets_of_a_drive_match_their_standard_deviations(solved):
     error = found[:, 0] - 0.25 - OWN
     assert np.abs(error).max() < 0.12
     assert np.abs(error / found[:, 1]).max() < 3.0
-    deviation = np.array([solved.deviation(0, row) for row in range(5)])
-    assert deviation[:, 0] == pytest.approx(found[:, 0] - solved.mean()[0])
-    assert (deviation[:, 1] < found[:, 1] + solved.mean()[1]).all()
-    assert np.abs(deviation[:, 0] / deviation[:, 1]).max() > 3.0
 
 
 def test_pseudo_truth_uses_the_other_anchors_and_has_a_standard_deviation(solved, recorded):
@@ -92,13 +88,13 @@ def test_ranges_with_larger_errors_have_lower_weights(recorded):
     blocked = rng.random(len(ranges)) < np.array([0.8, 0.1, 0.1, 0.8, 0.4])[ranges.anchor]
     late = with_own(ranges, OWN).range_m + np.where(blocked, np.abs(rng.normal(0.0, 0.4, len(ranges))), 0.0)
     changed = replace(ranges, range_m=late)
-    nothing = Regressors.none(len(ranges))
+    predicted = Regressors.single("network", np.zeros(len(ranges)), 1.0, 0.03)
 
     def worst(noise_group):
-        found = self_calibrate(HALL, [changed], replace(nothing, noise_group=noise_group), height=LEVEL)
+        found = self_calibrate(HALL, [changed], replace(predicted, noise_group=noise_group), height=LEVEL)
         return np.abs([found.pair(0, row)[0] - 0.25 - OWN[row] for row in range(5)]).max()
 
-    assert worst(blocked.astype(int)) < 0.07 < worst(nothing.noise_group)
+    assert worst(blocked.astype(int)) < 0.07 < worst(predicted.noise_group)
 
 
 def test_dozen_unknown_positions_determine_offset_and_line():
@@ -191,7 +187,9 @@ def test_track_with_two_mirror_images_is_refused():
     # The anchors are almost in a plane and the tag is 0.5 m below it: 0.5 m above fits equally well.
     flat = HALL.position.copy()
     flat[:, 2] = (1.1, 1.9, 1.1, 1.9, 1.5)
-    ranges, _ = drive(HALL.moved(flat, HALL.sd), seconds=40, rate_hz=25.0, model=NoiseModel(range_sd=0.3))
+    ranges, _ = drive(
+        HALL.moved(flat, HALL.sd), seconds=40, rate_hz=25.0, seed=3, model=NoiseModel(range_sd=0.3)
+    )
     refused("mirror images", HALL.moved(flat, HALL.sd), [ranges])
 
 

@@ -6,11 +6,10 @@ the same ranges without CIRs; `bare`, also without powers; `flat` and `flat_leve
 halves of a short real drive. With `--check`, a third drive is the check of the calibration.
 
 Printed for each pair: the correction, the promised change of the live position error, its change on the other drive, RMSE without
-and with the calibration, and the standard deviation that it publishes; or the reason of the refusal. Without a calibration, the
-ranges are corrected by the shipped model if they have CIRs, otherwise raw. Seeds 0 to 15 were used for development; results are
-reported for seeds from 40 on.
+and with the calibration; or the reason of the refusal. Without a calibration, the ranges are corrected by the shipped model if they
+have CIRs, otherwise raw. Seeds below 200 were used for development; results are reported for seeds from 200 on.
 
-    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 40 --seeds 2
+    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 200 --seeds 2
     PYTHONPATH=. python docs/experiments/calibrate_drives.py levels hanyang --check -o drives.jsonl
 """
 
@@ -195,7 +194,6 @@ def evaluate(case: Case, has_check: bool) -> dict[str, Any]:
         corrected = test.corrected(bundle, found.offsets)
     row["calibrated_m"] = live_rmse_m(test, corrected)
     row["change"] = row["calibrated_m"] / row["without_m"] - 1.0
-    row["published_sd_m"] = float(np.sqrt(np.median(corrected.variance_m2)))
     return row
 
 
@@ -203,7 +201,7 @@ def show(row: dict[str, Any]) -> None:
     text = f"{row['kind']:9} {row['case']:32} "
     if "chosen" in row:
         text += f"{row['chosen']:42} promised {row['promised']:+.2f} actual {row['change']:+.2f} "
-        text += f"(raw {row['raw_m']:.3f}, {row['without_m']:.3f} to {row['calibrated_m']:.3f} m, sd {row['published_sd_m']:.2f} m) "
+        text += f"(raw {row['raw_m']:.3f}, {row['without_m']:.3f} to {row['calibrated_m']:.3f} m) "
     print(text + (f"REFUSED: {row['refused']}" if row["refused"] else ""), flush=True)
 
 

@@ -31,7 +31,7 @@ ONE_SIDED_95 = 1.645
 OUTLIER_SDS = 4.0
 """Larger errors count as this multiple of the scatter of the raw ranges: ranges behind obstacles must not decide alone."""
 
-PROMISED_SHARE = 0.3
+PROMISED_SHARE = 0.1
 """Share of the gain in residuals without ground truth that is promised for the live position."""
 
 MIN_RANGES = 20
@@ -125,7 +125,7 @@ def decisive(error_sets: Sequence[HeldOut]) -> list[HeldOut]:
     return [errors for errors in error_sets if errors.is_separate] or list(error_sets)
 
 
-def select(error_sets: Sequence[HeldOut], names: Sequence[str], needs_separate: Sequence[str]) -> str:
+def select(error_sets: Sequence[HeldOut], names: Sequence[str]) -> str:
     """Return the simplest correction that no more complex one improves.
 
     A more complex correction must improve significantly on each separate drive, and without any on the halves of the drive; the
@@ -135,10 +135,8 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], needs_separate: 
     Args:
         error_sets: errors of each drive, or of its halves.
         names: corrections in order of complexity.
-        needs_separate: corrections that must improve a separate drive.
     """
     decisive_sets = decisive(error_sets)
-    has_separate = decisive_sets[0].is_separate
 
     def improves(errors: HeldOut, name: str, base: str) -> bool:
         gain, live = errors.range_gain(name, base), errors.live_gain(name, base)
@@ -150,7 +148,6 @@ def select(error_sets: Sequence[HeldOut], names: Sequence[str], needs_separate: 
 
     best = names[0]
     for name in names[1:]:
-        has_evidence = has_separate or name not in needs_separate
-        if has_evidence and all(improves(errors, name, best) for errors in error_sets):
+        if all(improves(errors, name, best) for errors in error_sets):
             best = name
     return best

@@ -2,72 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.site_data import SiteData
-from uwb_mitigation.mitigation.model.floating import predict_m
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.fit import linear_fit
 
-NO_MODEL, LINE, NETWORK, NETWORK_LINE = "", "line", "universal network", "universal network + line"
-FINE_TUNED = "fine-tuned network"
-"""Offsets only; a line in the received power and, if it is known, the power gap; the universal network, also with a line, or
-trained further. In order of complexity."""
-
-FineTune = Callable[[Dataset, NDArray[np.float64]], tuple[LinearBiasModel, FloatWeights]]
-"""Returns a constant and a network for ranges and the predictions of the universal network for them, (n,), m."""
+NO_MODEL, LINE, NETWORK = "", "line", "universal network"
+"""Offsets only; a line in the received power and, if it is known, the power gap; the universal network."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteModel:
-    """A linear bias model, and if it `has_network` the universal one, or `network` instead of it."""
+    """A linear bias model, or if it `has_network` the universal network."""
 
     linear_bias: LinearBiasModel
     has_network: bool = False
-    network: FloatWeights | None = None
+
+    @property
+    def is_line(self) -> bool:
+        """Whether it is a line in the received power."""
+        return self.linear_bias.needs_power
 
     def correction_m(self, site: SiteData) -> NDArray[np.float64]:
         """Return the predicted errors of all ranges, float64 (r,), m; 0 where a power that the line needs is unknown."""
+        if self.has_network:
+            return site.universal_m
         line = self.linear_bias
         # Without a power gap, the first-path power is not needed.
         first_path_dbm = site.first_path_power_dbm if line.per_power_gap else site.rx_power_dbm
         predicted_m = line.predict_m(site.rx_power_dbm, first_path_dbm).astype(np.float64)
-        if self.network is not None:
-            predicted_m = predicted_m + predict_m(self.network, site.inputs)
-        elif self.has_network:
-            predicted_m = predicted_m + site.universal_m
         return np.where(np.isfinite(predicted_m), predicted_m, 0.0)
 
 
-def fit_model(
-    kind: str, data: Dataset, universal_m: NDArray[np.float64], fine_tune: FineTune | None = None
-) -> SiteModel:
+def fit_model(kind: str, data: Dataset) -> SiteModel:
     """Fit a model.
 
     Args:
         kind: one of the names above.
         data: ranges with the offsets subtracted.
-        universal_m: predictions of the universal network for them, float64 (n,), m.
-        fine_tune: trains the network of `FINE_TUNED`.
 
     Raises:
         DatasetError: the fit fails.
     """
-    if kind == FINE_TUNED and fine_tune is not None:
-        constant, network = fine_tune(data, universal_m)
-        return SiteModel(constant, has_network=True, network=network)
-    has_network = kind in (NETWORK, NETWORK_LINE)
+    if kind != LINE:
+        return SiteModel(LinearBiasModel(0.0), has_network=kind == NETWORK)
     has_gap = bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
-    # A bundle with a network passes a range through if its first-path power is unknown.
-    if kind in (NO_MODEL, NETWORK) or (has_network and not has_gap):
-        return SiteModel(LinearBiasModel(0.0), has_network)
-    residual_m = data.error_m - universal_m if has_network else data.error_m
     first_path_dbm = data.first_path_power_dbm if has_gap else None
-    line = linear_fit.fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, residual_m)
-    return SiteModel(line, has_network)
+    return SiteModel(
+        linear_fit.fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, data.error_m)
+    )

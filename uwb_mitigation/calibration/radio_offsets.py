@@ -8,25 +8,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError, format_id
 from uwb_mitigation.mitigation.correction import Mitigation
-from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.mitigation.model.choice import CirKind
-from uwb_mitigation.mitigation.model.floating import float_network, scaled
-from uwb_mitigation.mitigation.model.graph import float_model
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import FIRST_PATH_TAPS
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
-from uwb_mitigation.training.fit.linear_fit import least_absolute_deviations
-from uwb_mitigation.training.fit.selection import COLD_START_MIN_GAIN
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     CorrectedRange,
@@ -48,10 +42,6 @@ MIN_RANGES = 10
 _BATCH = 256
 _MAD_TO_SD = 1.4826
 _MEDIAN_SD_FACTOR = math.sqrt(math.pi / 2.0)
-
-MIN_LINE_PLACEMENTS, MIN_LINE_SPAN_DB = 6, 3.0
-"""A line in the first-path level needs as many LOS placements, whose levels differ by as much: the bias of a DW1000 changes
-by up to 0.1 m in 10 dB (Decawave APS011), less than `PLACEMENT_SD_M`."""
 
 _Sample = tuple[float, float, float, float, float, str]
 """Offset, m; predicted error, m, or NaN; power gap, dB, or NaN; first-path level, dBm, or NaN; 1: LOS, 0: NLOS, NaN: unknown;
@@ -86,34 +76,6 @@ class PlacementOffset:
 
 
 @dataclass(frozen=True, slots=True)
-class LevelLine:
-    """The bias of LOS ranges as a line in the first-path level, which the gain control and the detector of a radio cause.
-
-    Attributes:
-        slope_m_per_db: change of the range error per dB; NaN: not fitted.
-        level_dbm: level at which the line is 0, the median over placements; NaN: unknown.
-        span_db: difference between the highest and the lowest level.
-        placements: number of placements with levels.
-        constant_mae_m, line_mae_m: MAE on held-out placements without and with the line; NaN: not fitted.
-        refused: reason why the data do not support a line; empty if they do.
-    """
-
-    slope_m_per_db: float
-    level_dbm: float
-    span_db: float
-    placements: int
-    constant_mae_m: float
-    line_mae_m: float
-    refused: str
-
-    @property
-    def linear_bias(self) -> LinearBiasModel:
-        """The line as linear bias model: the first-path level is the received level minus the power gap."""
-        slope = float(np.float32(self.slope_m_per_db))
-        return LinearBiasModel(float(np.float32(-slope * self.level_dbm)), slope, -slope)
-
-
-@dataclass(frozen=True, slots=True)
 class OffsetEstimate:
     """The offset of a recording.
 
@@ -122,8 +84,6 @@ class OffsetEstimate:
         ranges: number of ranges that were used.
         placements: all placements, including those that are not used.
         model_id: id of the model for the predicted errors.
-        line: change of the offset with the first-path level.
-        has_cirs: False: no range had a CIR.
     """
 
     offset_m: float
@@ -131,8 +91,6 @@ class OffsetEstimate:
     ranges: int
     placements: tuple[PlacementOffset, ...]
     model_id: int
-    line: LevelLine
-    has_cirs: bool
 
     def offsets(self, *, common: bool = False) -> Offsets:
         """Return the median for unknown pairs and, unless `common`, the offset of each pair."""
@@ -152,7 +110,6 @@ class OffsetEstimate:
             "ranges": self.ranges,
             "model_id": self.model_id,
             "pairs": [asdict(row) | {"refused": row.refused or None} for row in self.placements],
-            "line": asdict(self.line) | {"refused": self.line.refused or None},
         }
 
 
@@ -163,7 +120,6 @@ def estimate_offset(
     *,
     tag_id: int | None = None,
     anchor_id: int | None = None,
-    common: bool = False,
     on_record: Callable[[], None] = lambda: None,
 ) -> OffsetEstimate:
     """Estimate the offset of the radios in a recording.
@@ -174,7 +130,6 @@ def estimate_offset(
         distance_m: distance of the antennas; None: use the true range of each record.
         tag_id: use only this tag; None: all.
         anchor_id: use only this anchor; None: all.
-        common: the same two boards were at all placements, whatever their ids.
         on_record: called for each record that was read.
 
     Raises:
@@ -182,7 +137,7 @@ def estimate_offset(
         DatasetError: no placement is in LOS, or there are no true ranges.
     """
     groups: dict[tuple[int, int, str], list[_Sample]] = {}
-    without_truth, has_cirs = 0, False
+    without_truth = 0
     stream = iter(records)
     while batch := list(islice(stream, _BATCH)):
         for _ in batch:
@@ -207,7 +162,6 @@ def estimate_offset(
             label = None if len(measured.cir) else "" if truth is None else truth.label
             is_los = _is_los(gap_db, label)
             offset_m = measured.range_m - predicted_m - true_m
-            has_cirs |= len(measured.cir) > 0
             level_dbm = measured.cir.first_path_power_dbm
             sample = offset_m, predicted_m, gap_db, level_dbm, is_los, result.status.name
             groups.setdefault((measured.tag_id, measured.anchor_id, placement), []).append(sample)
@@ -216,7 +170,7 @@ def estimate_offset(
     includes_offset = any(bundle.linear_bias != LinearBiasModel(0.0) for bundle in mitigation.bundles)
     limit_m = MAX_ERROR_M if includes_offset else MAX_EXCESS_M
     placements = tuple(_placement_offset(*key, groups[key], limit_m) for key in sorted(groups))
-    return _combined(placements, mitigation.bundle.model_id, common, has_cirs)
+    return _combined(placements, mitigation.bundle.model_id)
 
 
 def _check_pairs(pairs: list[tuple[int, int]], without_truth: int, *, has_one_distance: bool) -> None:
@@ -311,9 +265,7 @@ def _placement_offset(
     return PlacementOffset(tag_id, anchor_id, placement, count, median_offset, sd, noise, *levels, refused)
 
 
-def _combined(
-    placements: tuple[PlacementOffset, ...], model_id: int, common: bool, has_cirs: bool
-) -> OffsetEstimate:
+def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> OffsetEstimate:
     accepted = [placement for placement in placements if not placement.refused]
     if not accepted:
         first = placements[0]
@@ -331,73 +283,7 @@ def _combined(
     # The median of two or fewer is their mean.
     factor = _MEDIAN_SD_FACTOR if len(accepted) > 2 else 1.0
     sd = factor * math.hypot(spread, float(np.sqrt(np.mean(noise * noise)))) / math.sqrt(len(accepted))
-    line = _level_line(accepted, common)
-    return OffsetEstimate(float(np.median(offset)), sd, ranges, placements, model_id, line, has_cirs)
-
-
-def _level_line(placements: Sequence[PlacementOffset], common: bool) -> LevelLine:
-    """Fit the line to accepted placements; unless `common`, each pair has its own offset."""
-    usable = [placement for placement in placements if math.isfinite(placement.first_path_dbm)]
-    ids = [(0, 0) if common else (placement.tag_id, placement.anchor_id) for placement in usable]
-    pairs = sorted(set(ids))
-    pair = np.array([pairs.index(key) for key in ids], np.int64)
-    level, offset = (
-        np.array([getattr(placement, name) for placement in usable])
-        for name in ("first_path_dbm", "offset_m")
-    )
-    # A pair with one placement has no held-out prediction.
-    held_out = [row for row, key in enumerate(ids) if ids.count(key) > 1]
-    n, reference = len(held_out), float(np.median(level)) if usable else math.nan
-    span = float(np.ptp(level[held_out])) if n else 0.0
-    if n < MIN_LINE_PLACEMENTS or span < MIN_LINE_SPAN_DB:
-        refused = (
-            f"{n} LOS placements of pairs with several, with first-path levels over {span:.1f} dB; at least "
-            f"{MIN_LINE_PLACEMENTS} over {MIN_LINE_SPAN_DB:g} dB are needed"
-        )
-        return LevelLine(math.nan, reference, span, n, math.nan, math.nan, refused)
-    intercepts = (pair[:, None] == np.arange(len(pairs))).astype(np.float64)
-    design = np.column_stack([level - reference, intercepts])
-    mae = [math.nan, math.nan]
-    for index, columns in enumerate((intercepts, design)):
-        residuals = []
-        for row in held_out:
-            training = np.arange(len(pair)) != row
-            coefficients = least_absolute_deviations(columns[training], offset[training])
-            residuals.append(abs(offset[row] - columns[row] @ coefficients))
-        mae[index] = float(np.mean(residuals))
-    slope = float(least_absolute_deviations(design, offset)[0])
-    refused = ""
-    if not mae[1] < (1.0 - COLD_START_MIN_GAIN) * mae[0]:
-        refused = (
-            f"on held-out placements the line has an MAE of {mae[1]:.3f} m, a constant {mae[0]:.3f} m; at least "
-            f"{COLD_START_MIN_GAIN:.0%} less is needed"
-        )
-    return LevelLine(slope, reference, span, n, mae[0], mae[1], refused)
-
-
-def bundle_with_line(bundle: Bundle, line: LevelLine, path: Path, *, has_cirs: bool) -> tuple[Bundle, bytes]:
-    """Return a bundle that adds the line to its corrections, and its bytes for `path`.
-
-    Args:
-        bundle: model with which the line was fitted.
-        line: an accepted line.
-        path: file of the new bundle.
-        has_cirs: False: the line only, for ranges without CIRs.
-
-    Raises:
-        ModelError: the bundle cannot be read.
-    """
-    ours, added = bundle.linear_bias, line.linear_bias
-    total = LinearBiasModel(
-        *(float(np.float32(a + b)) for a, b in zip(astuple(ours), astuple(added), strict=True))
-    )
-    card = replace(bundle.card, name=path.stem, linear_bias=total)
-    if has_cirs:
-        return build_bundle(path, bundle.model, card)
-    network = scaled(float_network(bundle), 0.0)
-    return build_bundle(
-        path, float_model(network), replace(card, quantised=False, needs_cir=False, ood_bands=None)
-    )
+    return OffsetEstimate(float(np.median(offset)), sd, ranges, placements, model_id)
 
 
 def _spread(values: NDArray[np.float64]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
+import importlib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,7 +19,6 @@ from uwb_mitigation.commands.support.console import JsonOption, print_line, show
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
-    from uwb_mitigation.calibration.models import FineTune
     from uwb_mitigation.calibration.site import SiteCalibration
     from uwb_mitigation.calibration.site_data import SiteData
     from uwb_mitigation.calibration.solution import Localisation
@@ -85,8 +84,7 @@ def calibrate(
         list[Path] | None,
         typer.Option(
             metavar="BAG",
-            help="Recording of another drive at the same site, on which the calibration is only tested; may be repeated. "
-            "Without CIRs and ground truth, a line in the received power is used only if it improves this drive.",
+            help="Recording of another drive at the same site, on which the calibration is only tested; may be repeated.",
         ),
     ] = None,
     report: Annotated[
@@ -102,8 +100,8 @@ def calibrate(
 ) -> None:
     """Calibrate a site from a drive, without surveyed positions.
 
-    Drive a tag past four anchors or more for two minutes, or put tags at a dozen positions. The track, the offsets of
-    the radios and a model of the NLOS errors are estimated jointly and tested on held-out halves of the drive.
+    Drive a tag past four anchors or more for two minutes, or put tags at a dozen positions. The track and the offsets of
+    the radios are estimated jointly, and tested on held-out halves of the drive.
 
         uwb-mitigation calibrate drive.mcap --anchors anchors.yaml --height 0.4 -o site.onnx
 
@@ -142,14 +140,7 @@ def calibrate(
                     height_sd_m=settings.height_sd_m,
                     on_progress=on_progress,
                 )
-            calibration = calibrate_site(
-                site,
-                source,
-                solution,
-                check=drives,
-                fine_tune=_fine_tune(source) if site.has_cirs else None,
-                on_progress=on_progress,
-            )
+            calibration = calibrate_site(site, source, solution, check=drives, on_progress=on_progress)
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
         refused: dict[str, object] = {
@@ -200,17 +191,6 @@ def _check_files(output: Path, report: Path | None, force: bool) -> None:
 
     check_output(output)
     check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
-
-
-def _fine_tune(source: Bundle) -> FineTune | None:
-    """Return the function that trains the network of a bundle further; None without torch."""
-    if importlib.util.find_spec("torch") is None:
-        warn("no fine-tuned network: torch is not installed (`make setup-training`)")
-        return None
-    from uwb_mitigation.mitigation.model.floating import float_network
-    from uwb_mitigation.training.fit.fine_tuning import fine_tune
-
-    return functools.partial(fine_tune, float_network(source))
 
 
 def _write(

@@ -14,7 +14,7 @@ from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
 from uwb_mitigation.commands.support.checks import check_replaceable, output_option
 from uwb_mitigation.commands.support.console import JsonOption
-from uwb_mitigation.errors import DatasetError, ParameterError, parse_id
+from uwb_mitigation.errors import ParameterError, parse_id
 
 if TYPE_CHECKING:
     from uwb_mitigation.calibration.radio_offsets import OffsetEstimate
@@ -51,14 +51,6 @@ def offset(
             "--common", help="Write one common offset, if the same boards were at several positions."
         ),
     ] = False,
-    bundle: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.onnx",
-            help="Also write the model plus a line in the first-path level, if several placements show that the offset "
-            "depends on it.",
-        ),
-    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -81,10 +73,10 @@ def offset(
         raise ParameterError("no distance, or two sources of it", valid="either --distance or --truth")
     if distance is not None and not 0.0 < distance <= MAX_DISTANCE_M:
         raise ParameterError(f"distance = {distance}", valid=f"above 0, at most {MAX_DISTANCE_M:g} m")
-    for path in filter(None, (output, bundle)):
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            raise ParameterError("cannot be written", where=str(path), valid="a file in an existing folder")
-        check_replaceable([path], force)
+    if output is not None:
+        if output.is_dir() or not output.absolute().parent.is_dir():
+            raise ParameterError("cannot be written", where=str(output), valid="a file in an existing folder")
+        check_replaceable([output], force)
     anchor_id, tag_id = (
         _id(name, text) if text is not None else None for name, text in (("anchor", anchor), ("tag", tag))
     )
@@ -96,7 +88,6 @@ def offset(
             distance,
             tag_id=tag_id,
             anchor_id=anchor_id,
-            common=common,
             on_record=on_record,
         )
     _show(estimate)
@@ -107,17 +98,6 @@ def offset(
         )
         write_atomically(output, dump_offsets(estimate.offsets(common=common), comment), ParameterError)
     console.write_json(json, estimate)
-    if bundle is not None:
-        if estimate.line.refused:
-            raise DatasetError(
-                f"no line in the first-path level: {estimate.line.refused}",
-                valid="more LOS placements, near and far",
-            )
-        written, content = radio_offsets.bundle_with_line(
-            mitigation.bundle, estimate.line, bundle, has_cirs=estimate.has_cirs
-        )
-        write_atomically(bundle, content, ParameterError)
-        console.print_line(f"{bundle}: model {written.model_id:08x}, with the line; use it with the offsets")
 
 
 def _id(name: str, text: str) -> int:
@@ -160,9 +140,3 @@ def _show(estimate: OffsetEstimate) -> None:
         f"offset {estimate.offset_m:.3f} m, standard deviation {estimate.sd_m:.3f} m, from {estimate.ranges} ranges, "
         f"for model {estimate.model_id:08x}"
     )
-    line = estimate.line
-    if not line.refused:
-        print_line(
-            f"The offset changes by {10.0 * line.slope_m_per_db:+.3f} m in 10 dB of first-path level: MAE on held-out "
-            f"placements {line.line_mae_m:.3f} m with this line, {line.constant_mae_m:.3f} m without (--bundle FILE.onnx)"
-        )
