@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +11,11 @@ import pytest
 import yaml
 from bag_material import corrected, record, write_corrected
 from mcap.reader import SeekingReader
-from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.errors import ParameterError, RecordingError
-from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, Record
@@ -102,28 +99,6 @@ def test_mcap_library_reads_a_bag_with_every_checksum_tested(tmp_path: Path) -> 
         "rosbag2_bagfile_information"
     ]
     assert yaml.safe_load(records["rosbag2"]["serialized_metadata"]) == described
-
-
-def test_files_equal_those_of_the_mcap_library() -> None:
-    ours, theirs = BytesIO(), BytesIO()
-    file, library = McapFile(ours, "test"), McapWriter(theirs)
-    library.start("ros2", "test")
-    file.add_metadata("origin", {"a": "b"})
-    library.add_metadata("origin", {"a": "b"})
-    for number in range(3):
-        schema, channel = (f"T{number}", "ros2msg", b"x" * 9), (f"/t{number}", "cdr", number, {"k": "v"})
-        assert file.add_schema(*schema) == library.register_schema(*schema)
-        assert file.add_channel(*channel) == library.register_channel(*channel)
-        for time in (5, 3, 9):
-            data = np.random.default_rng(number).bytes(400_000)
-            message = 1 + time % (number + 1), time, data, time + 1, number
-            file.add_message(*message)
-            library.add_message(*message)
-    assert file.bounds_ns == (3, 9)
-    assert file.counts.total() == 9
-    file.finish()
-    library.finish()
-    assert ours.getvalue() == theirs.getvalue()
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "folder"])

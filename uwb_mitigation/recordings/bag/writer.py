@@ -16,12 +16,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
-from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import Writer
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.files import VERSION, partial_path, write_atomically
 from uwb_mitigation.recordings.bag import rosbag2
-from uwb_mitigation.recordings.bag.mcap_file import McapFile
 from uwb_mitigation.recordings.bag.reader import Channel, Schema
 from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.ros import schemas, topics
@@ -73,6 +73,7 @@ class BagWriter:
 
     Attributes:
         file: the MCAP file.
+        counts: messages written, {topic: count}.
 
     Raises:
         ParameterError: as `check_bag_output`.
@@ -90,6 +91,8 @@ class BagWriter:
         self._topics: dict[str, dict[str, Any]] = {}
         self._schemas: dict[Schema, int] = {}
         self._stream: BinaryIO | None = None
+        self.counts: Counter[str] = Counter()
+        self._bounds_ns: tuple[int, int] | None = None
 
         check_bag_output(path, force=force)
         self._created_folder = self._folder is not None and not self._folder.exists()
@@ -98,20 +101,13 @@ class BagWriter:
                 if self._folder is not None:
                     self._folder.mkdir(parents=True, exist_ok=True)
                 self._stream = self._partial.open("wb")
-                self._mcap = McapFile(self._stream, f"uwb_mitigation {VERSION}")
+                self._mcap = Writer(self._stream)
+                self._mcap.start(Profile.ROS2, f"uwb_mitigation {VERSION}")
                 self._mcap.add_metadata(METADATA_RECORD, self._metadata)
         except BaseException:
             # Ctrl-C before the `with` block of the caller.
             self._discard()
             raise
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Messages written, {topic: count}."""
-        counts = Counter[str]()
-        for channel, count in self._mcap.counts.items():
-            counts[self._topic_of_channel[channel]] += count
-        return counts
 
     def write(self, record: Record) -> None:
         """Write a measurement to `/uwb/range_raw` and, if known, its truth to `/uwb/range_truth`.
@@ -171,6 +167,9 @@ class BagWriter:
             raise RecordingError(f"times {times} of a message", valid="0 to 2^64 - 1 ns") from error
         except OSError as error:
             raise self._write_error(error) from error
+        self.counts[self._topic_of_channel[channel]] += 1
+        first_ns, last_ns = self._bounds_ns or (log_time_ns, log_time_ns)
+        self._bounds_ns = min(first_ns, log_time_ns), max(last_ns, log_time_ns)
 
     def __enter__(self) -> BagWriter:
         return self
@@ -206,9 +205,9 @@ class BagWriter:
             return self._channel_ids[key]
         with self._translate_os_errors():
             if schema is not None and schema not in self._schemas:
-                self._schemas[schema] = self._mcap.add_schema(schema.name, schema.encoding, schema.data)
+                self._schemas[schema] = self._mcap.register_schema(schema.name, schema.encoding, schema.data)
             schema_id = _NO_SCHEMA if schema is None else self._schemas[schema]
-            number = self._mcap.add_channel(topic, channel.encoding, schema_id, metadata)
+            number = self._mcap.register_channel(topic, channel.encoding, schema_id, metadata)
         self._channel_ids[key], self._topic_of_channel[number] = number, topic
         # A topic may have several channels, of several publishers; rosbag2 lists it once.
         kind, qos = schema.name if schema else "", rosbag2.recorded_qos(metadata[_QOS_KEY])
@@ -217,11 +216,13 @@ class BagWriter:
         return number
 
     def _finish(self) -> None:
-        bounds_ns, topics_written = self._mcap.bounds_ns, [*self._topics.values()]
-        document = rosbag2.describe(self.file.name, topics_written, self.counts, bounds_ns, self._metadata)
+        bounds_ns = self._bounds_ns or (0, 0)
+        document = rosbag2.describe(
+            self.file.name, [*self._topics.values()], self.counts, bounds_ns, self._metadata
+        )
         with self._translate_os_errors():
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": rosbag2.dump(document)})
-            self._mcap.finish()
+            self._mcap.finish()  # type: ignore[no-untyped-call]
             self._close()
             self._partial.replace(self.file)
             if self._folder is not None:
