@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from drives import HALL, drive
+from drives import HALL, NANOSECONDS, drive
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
@@ -30,7 +30,6 @@ pytestmark = pytest.mark.ros
 
 CORRECTED = "/uwb/range_corrected"
 SHARED = ("-r", f"uwb/range_corrected:={CORRECTED}")
-NANOSECONDS = 1_000_000_000
 
 
 class Drive:
@@ -65,8 +64,7 @@ class Drive:
 
     def errors(self, poses: list) -> np.ndarray:
         """Return the horizontal errors of poses."""
-        stamps = [pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec for pose in poses]
-        at = self.truth.position_at(np.array(stamps) - self.start_ns)
+        at = self.truth.position_at(np.array([stamp_ns(pose) for pose in poses]) - self.start_ns)
         places = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in poses])
         return np.hypot(*(places - at[:, :2]).T)
 
@@ -102,7 +100,7 @@ def test_ranges_yield_poses_odometry_smoothed_poses_and_markers(ros: Ros, anchor
     run.send(range(half, len(run.ranges)))
     run.send(range(half), tag=9)
     ros.spin_until(lambda: len(second) > 20 and values(diagnostics).get("ranges of unknown anchors") == "3")
-    moving = [pose for pose in poses if pose.header.stamp.sec * NANOSECONDS < run.start_ns + 19 * NANOSECONDS]
+    moving = [pose for pose in poses if stamp_ns(pose) < run.start_ns + 18 * NANOSECONDS]
     errors = run.errors(moving)
     known = np.isfinite(errors)
     assert known.sum() > 500

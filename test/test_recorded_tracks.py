@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import threading
@@ -154,6 +155,7 @@ def test_placements_have_no_positions_in_track_and_view(apartment_imported: Path
         {"imu": "/imu"},
         {"stamp_offset_s": 4000.0},
         {"acceleration": -1.0},
+        {"height_sd_m": math.nan},
     ],
 )
 def test_contradictory_settings_are_refused(options: dict[str, object]):

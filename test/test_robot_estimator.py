@@ -22,7 +22,6 @@ from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.dead_reckoning import ODOMETRY_TIMEOUT_S, DeadReckoning, PathPoint
 from uwb_mitigation.positioning.online.filter import FIRST_ERROR, RangeFilter
 from uwb_mitigation.positioning.online.heading_test import HeadingTest
-from uwb_mitigation.positioning.online.measurements import TagRange
 from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.online.robot_estimator import KNOWN_YAW_SD, RobotEstimator
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
@@ -96,15 +95,8 @@ def test_slipping_wheels_are_detected():
 
 def test_missing_odometry_leaves_ranges_only():
     robot = Robot()
-    kept = np.flatnonzero(
-        (robot.odometry.stamp_ns < 20 * NANOSECONDS) | (robot.odometry.stamp_ns > 30 * NANOSECONDS)
-    )
-    columns = (robot.odometry.pose, robot.odometry.pose_covariance, robot.odometry.twist)
-    odometry = Odometry(
-        robot.odometry.stamp_ns[kept],
-        *(column[kept] for column in columns),
-        robot.odometry.twist_covariance[kept],
-    )
+    time_s = robot.odometry.stamp_ns / NANOSECONDS
+    odometry = robot.odometry.take((time_s < 20) | (time_s > 30))
     estimator = RobotEstimator(replace(robot.config, robot=RobotData(odometry)))
     ranges = robot.ranges()
     track = estimator.run(ranges)
@@ -175,10 +167,11 @@ def test_estimates_stay_inside_the_area():
 
 def test_antenna_is_projected_onto_the_area():
     one, area = _filter(), Area((0.0, 0.0, 0.0), (4.5, 3.5, 1.0))
-    assert np.linalg.norm(one.estimate(0, DeadReckoning()).position - (4.5, 3.5, 1.0)) > 0.4
+    assert math.dist(one.antenna, (4.5, 3.5, 1.0)) > 0.4
     one.confine(area)
-    # The projection also turns the robot a little.
-    assert one.estimate(0, DeadReckoning()).position == pytest.approx((4.5, 3.5, 1.0), abs=0.05)
+    # The projection also turns the robot a little, and its lever arm.
+    assert one.antenna == pytest.approx((4.5, 3.5, 1.0), abs=0.05)
+    assert np.max(np.subtract(one.antenna, area.high)) < 1e-9
 
 
 HUGE = (math.nan, math.inf, -math.inf, 1e300, -1e300, 1e38, 1e9, 1e5, 0.0, -1.0, 1e-300)
@@ -229,19 +222,9 @@ def test_hostile_input_leaves_finite_estimates(seed: int):
 
 def test_prediction_after_the_last_range_uses_the_motion():
     robot = Robot()
-    estimator = RobotEstimator(replace(robot.config, robot=None))
+    estimator = RobotEstimator(robot.config)
     ranges = robot.ranges(seconds=20.0)
-    rows = iter(range(len(robot.odometry)))
-    for stamp, row, range_m in zip(*(one.tolist() for one in (ranges.stamp_ns, ranges.anchor, ranges.range_m)), strict=True):  # fmt: skip
-        for one in rows:
-            estimator.odometry.add(
-                int(robot.odometry.stamp_ns[one]),
-                robot.odometry.pose[one].tolist(),
-                robot.odometry.twist[one].tolist(),
-            )
-            if robot.odometry.stamp_ns[one] >= stamp:
-                break
-        estimate = estimator.add(TagRange(stamp, row, range_m))
+    *_, estimate = estimator.run(ranges)
     ahead = estimator.predict_at(int(ranges.stamp_ns[-1]) + 300_000_000)
     assert ahead.heading is not None
     true = robot.antenna(np.array([ahead.stamp_ns / NANOSECONDS]))[0]

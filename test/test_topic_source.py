@@ -95,12 +95,14 @@ PLACES = [Pose(position=Point(x=x, y=y, z=z)) for x, y, z in CORNERS.values()]
 
 
 @pytest.mark.ros
-def test_locator_takes_a_mapping_and_anchors_from_a_topic(ros: Ros, markers: Path):
+def test_locator_takes_a_mapping_with_its_range_sd_and_anchors_from_a_topic(ros: Ros, markers: Path):
+    markers.write_text(f"{MAPPING}\nrange_sd: 1.0\n")
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")
     ros.start("locator", f"ranges:={markers}", "anchors:=poses:/site/anchors", *LEVEL)
     ros.node.create_publisher(PoseArray, "/site/anchors", LATCHED).publish(PoseArray(poses=PLACES))
     send_ranges(ros)
-    ros.spin_until(lambda: has_position(poses))
+    ros.spin_until(lambda: has_position(poses) and len(poses) > 10)
+    assert poses[10].pose.covariance[0] > 0.1, "0.02 with the default of 0.1 m"
 
 
 def test_anchors_are_markers_or_poses():

@@ -102,7 +102,7 @@ def determination(
 
 def current_determination(estimator: TagEstimator) -> Determination:
     """Return the statement for the latest ranges of a tag."""
-    rows, ambiguity = estimator.received_anchors(RANGE_TIMEOUT_S), estimator.ambiguity
+    rows, ambiguity = estimator.received_anchors(RANGE_TIMEOUT_S), estimator.images.ambiguity
     if estimator.candidates > 1 and not estimator.is_ambiguous:
         ambiguity = Ambiguity.MIRROR
     anchors, position = estimator.anchors.position[rows], estimator.likely_position

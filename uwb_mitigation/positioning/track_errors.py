@@ -8,11 +8,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.positioning.geometry import PROTECTION, protection_levels
+from uwb_mitigation.positioning.geometry import CHI2_95, PROTECTION, protection_levels
 from uwb_mitigation.types.tracks import Track, TruePath
-
-ELLIPSE95 = 5.991
-"""95th percentile of chi-squared with two degrees of freedom."""
 
 NORMAL95 = 1.96
 """Deviations that a normal error exceeds in 5 % of all cases (two-sided)."""
@@ -107,7 +104,7 @@ def errors_of(
     height_error = np.abs(position[:, 2] - true[:, 2])
     if len(error) and np.isfinite(plane).all():
         squared = np.einsum("ni,ni->n", error, np.linalg.solve(plane, error[..., None])[..., 0])
-        coverage = float((squared <= ELLIPSE95).mean())
+        coverage = float((squared <= CHI2_95).mean())
         nees = float(squared.mean() / 2.0)
         exceeded = float((np.abs(error) > protection_levels(plane)).any(axis=1).mean())
         height_sd = np.sqrt(covariance[:, 2, 2])

@@ -69,10 +69,11 @@ class Ranges(TimeSeries):
 
     @classmethod
     def joined(cls, groups: Sequence[Ranges]) -> Ranges:
-        """Concatenate raw ranges; the tag id is 0."""
+        """Concatenate ranges; the tag id is 0."""
         names = ("stamp_ns", "anchor", "range_m", "variance_m2", "rx_power_dbm")
         columns: Any = (np.concatenate([getattr(group, name) for group in groups]) for name in names)
-        return cls(*columns)
+        is_corrected = [np.broadcast_to(group.is_corrected, len(group)) for group in groups]
+        return replace(cls(*columns), is_corrected=np.concatenate(is_corrected))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -69,11 +69,7 @@ class AmbiguityCheck:
 
     ambiguity: Ambiguity
     mirror: Symmetry | None
-    shift: NDArray[np.float64]
-    _is_side_known: bool
-    _evidence: float
     _checked: list[int]
-    _next_s: float
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.counts, self.error_sd_m = Counter[Ambiguity](), RANGE_ERROR_M

@@ -34,12 +34,13 @@ class RangeFilter:
         level: the height is known and constant: no vertical motion.
 
     Attributes:
+        is_level: as given.
         time_s: of the state, s.
         state: mean, covariance and updates.
         unseen: float64 (3, 3), m^2, covariance of the position for what the state does not contain: constant errors, other solutions.
     """
 
-    __slots__ = ("_anchors", "_level", "_model", "_views", "state", "time_s", "unseen")
+    __slots__ = ("_anchors", "_model", "_views", "is_level", "state", "time_s", "unseen")
 
     def __init__(
         self,
@@ -51,7 +52,7 @@ class RangeFilter:
         *,
         level: bool = False,
     ) -> None:
-        self._anchors, self._model, self._level, self.time_s = anchors.position, model, level, time_s
+        self._anchors, self._model, self.is_level, self.time_s = anchors.position, model, level, time_s
         self.state = RobustUpdate(anchors, model, np.concatenate([position, np.zeros(3)]))
         self._views: tuple[NDArray[np.float64], ...] = ()
         self.P[:3, :3], self.unseen = covariance, np.zeros((3, 3))
@@ -68,11 +69,6 @@ class RangeFilter:
         """Covariance of the state, float64 (n, n)."""
         return self.state.P
 
-    @property
-    def is_level(self) -> bool:
-        """Whether the height is known and constant."""
-        return self._level
-
     def copy(self) -> RangeFilter:
         """Return an independent copy."""
         twin = copy.copy(self)
@@ -88,7 +84,7 @@ class RangeFilter:
         x, P = self.state.x, self.state.P
         if not self._views or self._views[0].base is not x:
             # They are made once: new ones would take much of the time.
-            positions, velocities = slice(2 if self._level else 3), slice(3, 5 if self._level else 6)
+            positions, velocities = slice(2 if self.is_level else 3), slice(3, 5 if self.is_level else 6)
             self._views = (
                 *(x[:3], x[3:6], P[:3], P[3:6], P[:, :3], P[:, 3:6]),
                 *(
@@ -160,8 +156,3 @@ class RangeFilter:
     def position(self) -> NDArray[np.float64]:
         """Float64 (3,), m."""
         return self.x[:3]
-
-    @property
-    def horizontal_sd(self) -> float:
-        """Root of the larger of the two horizontal variances, m."""
-        return math.sqrt(max(self.P[0, 0], self.P[1, 1]))

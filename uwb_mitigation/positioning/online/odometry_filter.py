@@ -136,13 +136,15 @@ class OdometryFilter:
             self.state.x[2], P[2, 2] = height_m - self._lever_arm[2], variance_m2
 
     def confine(self, area: Area) -> None:
-        """Project the antenna onto a box."""
-        x, arm = self.state.x, (*self._arm(), self._lever_arm[2])
-        antenna = [float(x[axis]) + arm[axis] for axis in range(3)]
-        for axis in range(3):
-            nearest = min(max(antenna[axis], area.low[axis]), area.high[axis])
-            if nearest != antenna[axis]:
-                self.state.project(axis, nearest - arm[axis])
+        """Move the antenna into a box."""
+        antenna = self.antenna
+        if all(low <= at <= high for low, at, high in zip(area.low, antenna, area.high, strict=True)):
+            return
+        nearest, arm = area.clip(np.array(antenna)), np.subtract(antenna, self.state.x[:3])
+        for axis in np.flatnonzero(nearest != antenna).tolist():
+            self.state.project(axis, float(nearest[axis] - arm[axis]))
+        # The projection has turned the lever arm.
+        self.state.x[:3] += area.clip(np.array(self.antenna)) - self.antenna
 
     def estimate(self, stamp_ns: int, odometry: DeadReckoning) -> Estimate:
         """Return position and velocity of the antenna and the heading, with the latest twist of the odometry."""
@@ -163,14 +165,14 @@ class OdometryFilter:
         covariance[:3, :3] = pose[:3, :3]
         speed_variance = odometry.twist_variance[0] + float(P[YAW, YAW]) * (vx * vx + vy * vy)
         covariance[[3, 4], [3, 4]] = speed_variance
-        position = x[:3] + np.array([arm_x, arm_y, self._lever_arm[2]])
-        return Estimate(stamp_ns, position, velocity, covariance, Heading(yaw, pose[YAW]))
+        return Estimate(stamp_ns, np.array(self.antenna), velocity, covariance, Heading(yaw, pose[YAW]))
 
     @property
-    def antenna_xy(self) -> tuple[float, float]:
-        """Horizontal position of the antenna, m."""
+    def antenna(self) -> tuple[float, float, float]:
+        """Position of the antenna, m."""
+        x, y, z = self.state.x[:3].tolist()
         arm_x, arm_y = self._arm()
-        return float(self.state.x[0]) + arm_x, float(self.state.x[1]) + arm_y
+        return x + arm_x, y + arm_y, z + self._lever_arm[2]
 
     @property
     def yaw(self) -> float:

@@ -237,7 +237,7 @@ class RobotEstimator:
     def _update_separation(self, heading_filter: OdometryFilter, dt: float) -> None:
         filter_ = self.tag.filter
         assert filter_ is not None
-        x, y = heading_filter.antenna_xy
+        x, y, _ = heading_filter.antenna
         dx, dy = x - float(filter_.x[0]), y - float(filter_.x[1])
         (a, b), (_, c) = (filter_.P[:2, :2]).tolist()
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)

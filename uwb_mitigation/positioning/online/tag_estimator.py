@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Dop, Height, dop
-from uwb_mitigation.positioning.online.ambiguity import SAME_M, Ambiguity, AmbiguityCheck
+from uwb_mitigation.positioning.online.ambiguity import SAME_M, AmbiguityCheck
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.positioning.online.initialization import (
     IMPLAUSIBLE,
@@ -94,11 +94,7 @@ class TagEstimator:
     _hypotheses: list[_PositionHypothesis]
     _origin_ns: int | None
     _time_s: float
-    _search_began_s: float
-    _next_check_s: float
     _found_s: float
-    _ambiguous_s: float
-    undetermined: bool
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.anchors = config.anchors
@@ -111,11 +107,6 @@ class TagEstimator:
         self._heights: deque[tuple[float, float, float]] = deque(maxlen=_RETAINED_RANGES)
         self._recent: deque[tuple[float, int, float, float]] = deque(maxlen=_RETAINED_RANGES)
         self.restart()
-
-    @property
-    def ambiguity(self) -> Ambiguity:
-        """Which other positions explain the ranges."""
-        return self.images.ambiguity
 
     @property
     def is_ambiguous(self) -> bool:
@@ -372,7 +363,7 @@ class TagEstimator:
                 plausible.append(hypothesis)
         self._hypotheses = plausible
         leader = plausible[0].filter
-        self.undetermined = leader.horizontal_sd > _UNDETERMINED_M
+        self.undetermined = bool(leader.P[:2, :2].diagonal().max() > _UNDETERMINED_M**2)
         differences = [hypothesis.filter.position - leader.position for hypothesis in plausible[1:]]
         if not self.undetermined and all(math.hypot(x, y) < SAME_M for x, y, _ in differences):
             self.images.reset()
