@@ -26,6 +26,9 @@ from uwb_mitigation.commands.positioning import track
 from uwb_mitigation.commands.support.position_options import track_settings
 from uwb_mitigation.commands.view import view
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.mitigation.correction import Mitigation
+from uwb_mitigation.mitigation.model.bundle import load_bundle
+from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.config import EstimatorConfig, RobotData
 from uwb_mitigation.positioning.geometry import Area, Height
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
@@ -167,9 +170,11 @@ def test_variance_of_ranges_without_cir_is_that_of_real_errors(tmp_path: Path):
     """The mean squared error of each real drive is at most four variances."""
     if not (HANYANG.exists() and LABYRINTH.exists()):
         pytest.skip(f"no {DATA}")
+    corrector = Mitigation(load_bundle(default_model_path()), read_offsets("0.1"))
     for run_source in real_runs(DATA)[0]:
         recorded = run_source.read()
-        variance_m2 = recorded.corrected(offsets=read_offsets("0.1")).variance_m2
+        measurements = [item.measurement for item in recorded.read_records()]
+        variance_m2 = np.array([result.variance_m2 for result in corrector.correct(measurements)])
         true = recorded.truth.position_at(recorded.ranges.stamp_ns)
         error_m = recorded.ranges.range_m - np.linalg.norm(
             true - recorded.anchors.position[recorded.ranges.anchor], axis=1

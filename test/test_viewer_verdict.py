@@ -58,7 +58,7 @@ def test_good_position_has_its_accuracy_age_and_share_of_corrected_ranges():
     state, reason, _, facts = controls(scene).verdict
     assert (state, reason) == ("good", "")
     assert facts.startswith(
-        "sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp \u00b7 100 % of ranges corrected"
+        "horizontal sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp \u00b7 100 % of ranges corrected"
     )
 
 
@@ -71,6 +71,18 @@ def test_anchor_that_reads_long_degrades_the_position_by_its_name():
     assert page.column("map", "label") == ["1 \u2713", "door \u2297 +0.6 m", "3 \u2713", "4 \u2713"]
     assert page.column("map", "health")[1] == health.BAD
     assert page.column("pairs", "state").count(health.BAD) == 1
+
+
+def test_anchor_to_check_is_named_below_a_good_position():
+    state, reason, action, _ = controls(driven({2: 0.2})[0]).verdict
+    assert (state, reason) == ("good", "")
+    assert action == "Anchor door reads 0.20 m long: calibrate, or check its position."
+
+
+def test_position_of_a_lost_tag_is_the_last_one_without_accuracy():
+    scene, clock = driven()
+    clock.now_s += 12.0
+    assert shown(scene).controls.tag_rows[0][1:4] == ["last: 4.00, 3.00, 0.00", "-", "no data for 12 s"]
 
 
 @pytest.mark.parametrize(("error_m", "state"), [(0.2, health.CHECK), (0.4, health.BAD)])

@@ -170,7 +170,8 @@ class Positions:
 def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str]:
     """Return what the correction changes, as texts."""
     change_percent = 100.0 * (corrected_m / raw_m - 1.0)
-    text = "no change" if abs(change_percent) < 0.5 else f"{change_percent:+.0f} %"
+    size, direction = f"{abs(change_percent):.0f} %", "more" if change_percent > 0.0 else "less"
+    text = "no change" if abs(change_percent) < 0.5 else f"{size} {direction} error"
     return text, f"position RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
 
 

@@ -54,7 +54,7 @@ COLUMNS = {
     "status": ("status", "last range", "whether the network could correct the range"),
     "raw": ("raw, m", "last range", "measured range"),
     "corrected": ("corrected, m", "last range", "corrected range"),
-    "sigma": ("\u03c3, m", "last range", "standard deviation of the corrected range"),
+    "sigma": ("sd, m", "last range", "standard deviation of the corrected range"),
     "correction": ("correction, m", _RANGES, "mean of raw minus corrected range"),
     "residual": ("residual, m", _RANGES, "mean of corrected range minus distance to the estimated position"),
     "not_ok": ("not OK, %", _RANGES, "share of ranges whose status is not OK"),
@@ -235,7 +235,7 @@ class Models:
         accuracy = LinearColorMapper(cividis(count), low=-0.5, high=count - 0.5, nan_color=clear)
         labels = {step: f"\u2264 {limit_m:g}" for step, limit_m in enumerate(STEPS_M)}
         bar = ColorBar(
-            color_mapper=accuracy, width=10, padding=4, title="predicted \u03c3, m", visible=False,
+            color_mapper=accuracy, width=10, padding=4, title="predicted sd, m", visible=False,
             ticker=FixedTicker(ticks=list(labels)), major_label_overrides=labels,
         )  # fmt: skip
         plot.add_layout(bar, "right")
@@ -274,7 +274,7 @@ class Models:
                 "size": 15, "line_color": NIGHT, "fill_color": {"field": "health", "transform": anchor},
             }),
             ("selected anchor", "scatter", self.selected, {
-                "marker": "circle", "size": 22, "fill_color": None, "line_color": GREEN, "line_width": 4,
+                "marker": "circle", "size": 22, "fill_color": None, "line_color": NIGHT, "line_width": 3,
             }),
             ("tag", "scatter", self.tags, {
                 "marker": "star", "size": 18, "fill_color": {"field": "status", "transform": tag}, "line_color": NIGHT,

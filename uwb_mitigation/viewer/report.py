@@ -124,7 +124,11 @@ def write_report(
     models = draw_scene(View(feed.scene, feed.lock, player=player, missing=player.missing))
     controls = models.controls
     state, reason, action, facts = controls.verdict
-    lines = [f"Position {state}" + (f": {reason}. {action}" if reason else ""), facts, *controls.notice]
+    lines = [
+        f"Position {state}" + (f": {reason}" if reason else "") + (f". {action}" if action else ""),
+        facts,
+        *controls.notice,
+    ]
     sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
     sections |= {FIGURES[name]: models.figures[name] for name in SHOWN}
     titles: tuple[str, ...] = "state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"

@@ -19,7 +19,7 @@ from uwb_mitigation.viewer.verdict import UNDETERMINED, WAITING, Verdict, verdic
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
 
-TAG_TITLES = "tag", "x, y, z, m", "\u03c3, m", "age", "ranges, Hz", "range age by stamp"
+TAG_TITLES = "tag", "x, y, z, m", "sd, m", "age", "ranges, Hz", "range age by stamp"
 """Columns of the table of tags."""
 MAX_SHOWN_EVENTS = 8
 
@@ -105,7 +105,9 @@ class Texts:
             label, place, sd_m, age = tag_label(name, plain_id), "-", math.nan, "no position"
             if (pose := view.pose) is not None:
                 place, sd_m, age_s = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, scene.age_s(view)
-                age = f"no data for {age_s:.0f} s" if age_s > NO_DATA_S else f"{age_s:.1f} s"
+                age = f"{age_s:.1f} s"
+                if age_s > NO_DATA_S:
+                    place, sd_m, age = f"last: {place}", math.nan, f"no data for {age_s:.0f} s"
             rows[label] = [label, place, _number(sd_m, 2), age, "-", "-"]
         for tag_id in sorted({tag_id for _, tag_id in pairs}):
             label, name = f"tag {format_id(tag_id)}", tag_name(tag_id, scene.tags, pairs)
@@ -128,7 +130,7 @@ class Texts:
                 f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else not_corrected
             )
             cards = [card for card in self._cards if card[0].startswith("Correction")]
-            texts += [f"correction: {value} ({text})" for _, value, text in cards]
+            texts += [f"{title.lower()}: {value} ({text})" for title, value, text in cards]
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
         return " \u00b7 ".join(texts)

@@ -72,7 +72,7 @@ def verdict(
         reason = f"no position of {name} for {scene.age_s(tag):.0f} s"
         return _verdict(LOST, reason, remedy or "Drive into the area of the anchors.")
     sd_m = tag.pose.sd_m
-    accuracy = "" if math.isnan(sd_m) else f"sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
+    accuracy = "" if math.isnan(sd_m) else f"horizontal sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
     common, advice = health.advice(anchors, names)
     # With a common cause, anchors that need attention are bad together.
     wrong = {health.BAD, health.CHECK} if common else {health.BAD}
@@ -91,6 +91,8 @@ def verdict(
         reason, action = "its standard deviation is unknown", "Publish poses with a covariance."
     elif sd_m > MAX_SD_M:
         reason, action = f"uncertain by {sd_m:.2f} m", "Add an anchor, or set height and area of the locator."
+    if not reason:
+        action = next((advice[key] for key, state in states.items() if state == health.CHECK), "")
     return _verdict(DEGRADED if reason else GOOD, reason, action, accuracy)
 
 

@@ -331,6 +331,8 @@ def assemble_bundle(graph: bytes, card: ModelCard) -> bytes:
             "scaling": card.preprocessing.scaling.value,
         },
     }
+    if not card.channels:
+        del metadata["channels"]
     text = json.dumps(metadata, sort_keys=True, separators=(",", ":"), allow_nan=False)
     try:
         model = onnx.load_model_from_string(graph)
