@@ -357,9 +357,11 @@ def calibrate_site(
         kinds = kinds[:1]
     with_model = {_name(level, kind): (_LEVELS[level], kind) for kind in kinds for level in _LEVELS}
     corrections = without | {COMMON: (ONE, models.NO_MODEL)} | with_model
-    one, other = (fold.evaluate(universal, corrections, is_separate=is_separate) for fold in folds)
+    first_half, second_half = (
+        fold.evaluate(universal, corrections, is_separate=is_separate) for fold in folds
+    )
     drives = (fold.evaluate(universal, corrections, is_separate=True) for fold in checks)
-    held_out = [one.merged(other, is_first), *drives]
+    held_out = [first_half.merged(second_half, is_first), *drives]
     names = [COMMON, *with_model]
     if solution.truth is None:
         # What the network leaves behind walls looks like offsets of anchors, on each drive the same.

@@ -247,7 +247,7 @@ class Mitigator(ManagedNode):
             self._mitigation = mitigation
             self.health.reset_model()
         self._reset_offset_check(mitigation)
-        bundle, labels = mitigation.bundle, [each.card.label for each in mitigation.bundles]
+        bundle, labels = mitigation.bundle, [model_bundle.card.label for model_bundle in mitigation.bundles]
         model = f"{bundle.name}, id {diagnostics.model_id(bundle.model_id)}; {bundle.card.origin}"
         if len(labels) > 1:
             model = f"auto: the first of {', '.join(labels)} that fits"

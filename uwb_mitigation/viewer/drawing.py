@@ -103,14 +103,18 @@ class Figures:
 
     def _draw_tracks(self, scene: Scene) -> None:
         for kind, source in self._models.tracks.items():
-            tracks = [view for (_, of), view in scene.tracks.items() if of is kind and len(view.points)]
+            tracks = [
+                view
+                for (_, track_kind), view in scene.tracks.items()
+                if track_kind is kind and len(view.points)
+            ]
             state = [(len(view.points), view.points[-1][0], math.floor(scene.age_s(view))) for view in tracks]
             if self._state.changed(kind.value, state):
                 # A NaN separates the tracks of two tags.
-                parts = [np.zeros((0, 2))]
+                points = [np.zeros((0, 2))]
                 for view in tracks:
-                    parts += [self._trail(view.columns(), scene.age_s(view)), np.full((1, 2), np.nan)]
-                x, y = np.concatenate(parts).astype(np.float32).T
+                    points += [self._trail(view.columns(), scene.age_s(view)), np.full((1, 2), np.nan)]
+                x, y = np.concatenate(points).astype(np.float32).T
                 source.data = {"x": x, "y": y}
 
     def _trail(self, track: NDArray[np.float64], age_s: float) -> NDArray[np.float64]:

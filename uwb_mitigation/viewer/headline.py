@@ -70,9 +70,11 @@ def _range_cards(counts: Counts, errors_m: NDArray[np.float64], window: str) -> 
     corrected, count, faults = counts
     if not count:
         return []
-    share = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
+    percentage = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
     text = f"{corrected} of {count} ranges corrected" + ("" if corrected or faults else ": no CIRs")
-    cards = [[f"Ranges corrected, {window}", share, text + (f"; {faults} need attention" if faults else "")]]
+    cards = [
+        [f"Ranges corrected, {window}", percentage, text + (f"; {faults} need attention" if faults else "")]
+    ]
     raw, mean = (_metres(np.abs(errors)) for errors in errors_m)
     return cards if mean == "-" else [*cards, [f"Mean absolute range error, {window}", mean, f"raw: {raw}"]]
 
@@ -157,13 +159,15 @@ class Positions:
         errors = {
             name: self.errors(kind, begin_s) for kind, name in names.items() if self.track(kind) is not None
         }
-        own, cards = self.errors(TrackKind.CORRECTED, begin_s), []
+        corrected, cards = self.errors(TrackKind.CORRECTED, begin_s), []
         for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95")):
-            others = "; ".join(f"{other}: {_metres(getattr(error, name))}" for other, error in errors.items())
-            cards.append([f"{title}, {window}", _metres(getattr(own, name)), others])
+            comparison = "; ".join(
+                f"{track_name}: {_metres(getattr(error, name))}" for track_name, error in errors.items()
+            )
+            cards.append([f"{title}, {window}", _metres(getattr(corrected, name)), comparison])
         # Without corrections, offsets make the difference.
-        if counts[0] and raw_name in errors and own.rmse + errors[raw_name].rmse > 0.0:
-            cards.append([f"Correction, {window}", *_change(own.rmse, errors[raw_name].rmse, raw_name)])
+        if counts[0] and raw_name in errors and corrected.rmse + errors[raw_name].rmse > 0.0:
+            cards.append([f"Correction, {window}", *_change(corrected.rmse, errors[raw_name].rmse, raw_name)])
         return cards
 
 

@@ -89,8 +89,8 @@ class Timeline:
         """Rows of each pair."""
         order = np.lexsort((self.tag, self.anchor))
         is_new = (np.diff(self.anchor[order]) != 0) | (np.diff(self.tag[order]) != 0)
-        parts = np.split(order, np.flatnonzero(is_new) + 1) if len(order) else []
-        return {(int(self.anchor[rows[0]]), int(self.tag[rows[0]])): rows for rows in parts}
+        rows_of_pairs = np.split(order, np.flatnonzero(is_new) + 1) if len(order) else []
+        return {(int(self.anchor[rows[0]]), int(self.tag[rows[0]])): rows for rows in rows_of_pairs}
 
     def ranges(self, pair: Pair, begin_s: float = -np.inf, end_s: float = np.inf) -> RangeColumns:
         """Return the ranges of a pair in an interval of the log time."""
@@ -135,7 +135,7 @@ def index_recording(
         with contextlib.suppress(RecordingError):
             truths = read_truth(recording.path, recording.prefix + ODOMETRY_TRUTH)
         recorded = reader.table.by_tag(config.anchors, stamp_offset_s, truths)
-        known = {tracks.recording.tag_id: tracks for tracks in estimated}
+        by_tag = {tracks.recording.tag_id: tracks for tracks in estimated}
         has_positions = bool(recording.contents & POSITIONS)
         names = {name for name, kind in timeline.tracks if kind is TrackKind.CORRECTED}
         for tag in recorded.tags[:MAX_TAGS]:
@@ -146,15 +146,15 @@ def index_recording(
             else:
                 try:
                     check_one_tag(config, recorded.tags)
-                    found = known.get(tag.tag_id) or track_tag(tag, config)
+                    estimate = by_tag.get(tag.tag_id) or track_tag(tag, config)
                 except (DatasetError, ParameterError) as error:
                     timeline.notices.append(str(error))
                     continue
-                timeline.estimates[name] = found
-                tracks = {kind: getattr(found, attribute) for kind, attribute in ATTRIBUTES.items()}
-                label, state = f"tag {format_id(tag.tag_id)}", str(found.determination)
+                timeline.estimates[name] = estimate
+                tracks = {kind: getattr(estimate, attribute) for kind, attribute in ATTRIBUTES.items()}
+                label, state = f"tag {format_id(tag.tag_id)}", str(estimate.determination)
                 timeline.notices += [
-                    f"{label}{' determination' * (text == state)}: {text}" for text in found.warnings
+                    f"{label}{' determination' * (text == state)}: {text}" for text in estimate.warnings
                 ]
             rows = np.flatnonzero(ranges["tag"] == tag.tag_id)
             rows = rows[np.argsort(ranges["stamp_ns"][rows], kind="stable")]

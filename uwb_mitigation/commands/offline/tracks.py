@@ -93,7 +93,7 @@ class Tracks:
         import pandas as pd
 
         check_name("kind of track", kind, _KINDS)
-        parts = []
+        tables = []
         for tag in self.tags:
             track = getattr(tag, kind)
             error = track.position - tag.recording.truth.position_at(track.stamp_ns)
@@ -106,12 +106,12 @@ class Tracks:
                 (("sd_x", "sd_y", "sd_z"), np.sqrt(variance)),
             ):
                 columns |= dict(zip(names, values.T, strict=True))
-            parts.append(
+            tables.append(
                 pd.DataFrame(
                     columns | {"yaw": track.yaw[:, 0], "error_m": np.hypot(error[:, 0], error[:, 1])}
                 )
             )
-        return pd.concat(parts, ignore_index=True)
+        return pd.concat(tables, ignore_index=True)
 
     def write_tum(self, path: Path | str, kind: str = "smoothed") -> list[Path]:
         """Write the tracks in TUM's format, as evo reads it; return the files: one for each tag, with its id in the name.

@@ -92,8 +92,12 @@ def load_node(name: str) -> Callable[[threading.Event], Iterator[Node]]:
     has subscribers. Names, topics, parameters and diagnostics are the same as of separate nodes.
     """
     names = ("mitigator", "driver", "locator") if name == "pipeline" else (name,)
-    modules = {each: importlib.import_module(f"uwb_mitigation.nodes.{each}") for each in names}
-    classes = {each: getattr(module, each.capitalize()) for each, module in modules.items()}
+    modules = {
+        module_name: importlib.import_module(f"uwb_mitigation.nodes.{module_name}") for module_name in names
+    }
+    classes = {
+        module_name: getattr(module, module_name.capitalize()) for module_name, module in modules.items()
+    }
 
     def make_nodes(stop: threading.Event) -> Iterator[Node]:
         if name == "pipeline":

@@ -161,9 +161,11 @@ class RobustUpdate:
         row = k + 1 + anchor
         variance, error_variance = model.variance(variance_m2), float(self._error_variance[anchor])
         # The part of the variance that the persisting error does not explain is white noise.
-        share = CORRECTED_WHITE if is_corrected else model.white
-        white = max(share * variance, variance - error_variance)
-        self._error_variance[anchor] = error_variance + 0.1 * ((1.0 - share) * variance - error_variance)
+        white_share = CORRECTED_WHITE if is_corrected else model.white
+        white = max(white_share * variance, variance - error_variance)
+        self._error_variance[anchor] = error_variance + 0.1 * (
+            (1.0 - white_share) * variance - error_variance
+        )
         H[k:] = 0.0
         H[k] = H[row] = 1.0
         residual = range_m - distance_m - x.item(k)
