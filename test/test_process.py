@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import Foreign, chunk_offsets, damage_after_first_chunk, write_records
+from bag_material import Foreign, damage_after_first_chunk, write_records
 from command_line import ENVIRONMENT, command, run, start, succeed
 from firmware_models import random_measurement
 from model_material import cir
@@ -250,19 +250,27 @@ def test_folders_of_sources_are_kept_and_earlier_outputs_skipped(
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_leaves_no_partial_file(number: signal.Signals, tmp_path: Path) -> None:
-    source = write_bag(tmp_path / "in.mcap", exchanges(200))
-    data, ((first, end), *_) = source.read_bytes(), chunk_offsets(source)
-    # The same chunk two hundred times: more than is processed before the signal.
-    source.write_bytes(data[:end] + data[first:end] * 200)
-    words = command("process", source, "-o", "out.mcap")
+    code, bags = tmp_path / "code", tmp_path / "bags"
+    code.mkdir()
+    # The first message is not written before the signal.
+    (code / "sitecustomize.py").write_text(
+        "import time\n"
+        "from uwb_mitigation.commands.offline import process as job\n"
+        "class Waiting(job.BagWriter):\n"
+        "    def write_serialized(self, *arguments, **options):\n"
+        "        time.sleep(600)\n"
+        "job.BagWriter = Waiting\n"
+    )
+    words = command("process", write_bag(bags / "in.mcap", exchanges(9)), "-o", "out.mcap")
     output = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    with subprocess.Popen(words, cwd=tmp_path, env=ENVIRONMENT, start_new_session=True, **output) as process:
-        wait_until((tmp_path / "out.mcap.part").exists)
+    environment = ENVIRONMENT | {"PYTHONPATH": f"{code}:{REPOSITORY}"}
+    with subprocess.Popen(words, cwd=bags, env=environment, start_new_session=True, **output) as process:
+        wait_until((bags / "out.mcap.part").exists)
         os.killpg(process.pid, number)
         _, stderr = process.communicate(timeout=240)
     assert process.returncode == 128 + number, stderr
     assert b"Traceback" not in stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
+    assert [path.name for path in bags.iterdir()] == ["in.mcap"]
 
 
 def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
