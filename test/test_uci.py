@@ -595,6 +595,22 @@ def test_a_parameter_that_is_refused_is_named(is_missing: bool):
     assert all(text in state for text in texts)
 
 
+def test_a_second_session_that_is_refused_is_not_explained_by_parameters():
+    initialised: set[bytes] = set()
+
+    def first_only(payload: bytes) -> bytes | None:
+        initialised.add(payload[:4])
+        return None if len(initialised) == 1 else b"\x14"
+
+    def rejecting(payload: bytes) -> bytes | None:
+        return b"\x04\x01\x13\x04" if b"\x13\x01\x00" in payload else None
+
+    answers = {codes.SESSION_INIT: first_only, codes.SET_APP_CONFIG: rejecting}
+    run = Bench(Answering(answers), peers=(2, 3))
+    assert "rejects" not in run.wait_for("too many sessions (status 0x14)")
+    assert run.session.ranging.rejected
+
+
 @pytest.mark.parametrize("line", [b"error\r\n", b"error \r\n\r\nerror\r\n", b"\r\n> unknown command\r\n"])
 def test_a_board_that_answers_with_text_is_not_called_mute(line: bytes):
     run = Bench()

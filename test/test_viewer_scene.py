@@ -84,8 +84,11 @@ def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:
             continue
         scene.add_sample((1, 7), Sample(1000.0 + number / 10, 5.3, 5.1, 0.1, Status.OK))
         scene.pairs[1, 7].count_lost(number)
-    assert scene.pairs[1, 7].rate_hz() == pytest.approx(10.0)
-    assert scene.pairs[1, 7].lost == 0
+    history = scene.pairs[1, 7]
+    assert (history.rate_hz(), history.lost) == (pytest.approx(10.0), 0)
+    assert history.rate_hz(age_s=2.0) < 8.0
+    scene.count_dropped(1)
+    assert history.rate_hz(age_s=2.0) == pytest.approx(10.0)
 
 
 def test_rates_depend_on_stamps_and_not_on_when_they_are_read(view: View, clock: Clock) -> None:

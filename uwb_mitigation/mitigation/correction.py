@@ -40,7 +40,7 @@ UNRELIABLE_VARIANCE_M2 = 0.25
 with an error of more than 0.5 m."""
 
 OTHER_CHANNEL_FACTOR = 2.0
-"""Factor of the standard deviation on a known channel for which the model was not trained. Simulated, channels 4 and 7 need 1.4 to 2.6,
+"""Factor of the standard deviation on a known channel for which the model was not trained. Simulated, channels 4 and 7 need 1.4 to 2.5,
 depending on the width of the pulse (docs/experiments/other_channels.py)."""
 
 CLEARLY_IN_DISTRIBUTION = -0.01

@@ -158,8 +158,6 @@ class UciPort(StreamPort):
     def _warning(self) -> str:
         """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
         session, counts = self.session, self.session.counts
-        if not counts["ranges"] and counts["unknown_session"]:
-            return "the only ranges are of other addresses: are the ids swapped, or other boards in reach?"
         totals = session.totals()
         damages = totals["damaged"] + totals["gaps"]
         if damages > max(_MIN_DAMAGES, _DAMAGE_SHARE * counts["ranges"]):
@@ -167,6 +165,8 @@ class UciPort(StreamPort):
                 f"bytes or notifications are lost between board and host, {damages} times in {counts['ranges']} ranges, "
                 f"of which {counts['without_cir']} have no CIR: use another cable or USB port, and stop other programs"
             )
+        if not counts["ranges"] and counts["unknown_session"]:
+            return "the only ranges are of other addresses: are the ids swapped, or other boards in reach?"
         interval_s = session.settings.effective_interval_ms / 1e3
         if session.settings.delivers and (warning := self.monitor.warning(interval_s)):
             return warning

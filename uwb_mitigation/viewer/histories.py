@@ -204,7 +204,8 @@ class History:
         """Return the rate of the last `RATE_RANGES` ranges by their stamps; NaN before the second one.
 
         Args:
-            age_s: time since the last range by stamps; the rate decreases if this is several mean intervals.
+            age_s: time since the last range by stamps; the rate decreases if this is several mean intervals, unless the viewer
+                has dropped ranges since then.
         """
         # Copy in one step: the monitor draws its table in another thread than the one that adds ranges.
         recent = list(islice(reversed(self.samples), RATE_RANGES))
@@ -213,7 +214,8 @@ class History:
         if not span_s > 0:
             return math.nan
         rate_hz = len(intervals_s) / span_s
-        return rate_hz if age_s * rate_hz <= NO_DATA_INTERVALS else (len(intervals_s) + 1) / (span_s + age_s)
+        is_recent = age_s * rate_hz <= NO_DATA_INTERVALS or self._is_interrupted
+        return rate_hz if is_recent else (len(intervals_s) + 1) / (span_s + age_s)
 
     @property
     def max_gap_s(self) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from uwb_mitigation.radios.fira import codes, messages
@@ -133,7 +133,8 @@ class Ranging:
             yield Command(codes.SESSION_DEINIT, number, tries=1)
             answer = yield Command(codes.SESSION_INIT, number + b"\0")
         if answer is None or answer.status != STATUS_OK:
-            return self._refused("SESSION_INIT", answer)
+            # It does not depend on the parameters of other sessions.
+            return _refused("SESSION_INIT", answer)
         # FiRa 1.3 firmware answers without a handle: it uses the session's number.
         (handle,) = struct.unpack("<I", answer.payload[1:5] if len(answer.payload) >= 5 else number)
         if problem := (yield from self._configure(handle, self.settings.app_config(peer))):
@@ -147,7 +148,7 @@ class Ranging:
         if session.ended or session.active:
             return ""
         if answer is None or answer.status != STATUS_OK:
-            return self._refused("RANGE_START", answer)
+            return _refused("RANGE_START", answer, self.rejected_texts())
         # The notification of the active state may be lost.
         session.active = True
         return ""
@@ -159,7 +160,7 @@ class Ranging:
             packet = waiting.pop(0)
             answer = yield Command(codes.SET_APP_CONFIG, messages.app_config(handle, packet))
             if answer is None:
-                return self._refused("SET_APP_CONFIG", answer)
+                return _refused("SET_APP_CONFIG", answer)
             named = messages.rejected_tags(answer.payload)
             rejected = {tag: named[tag] for tag, _ in packet if tag in named}
             failed = answer.status != STATUS_OK
@@ -171,21 +172,22 @@ class Ranging:
                 rejected = {packet[0][0]: answer.status}
             self.rejected |= rejected
             if _NEEDED & rejected.keys():
-                return self._refused("SET_APP_CONFIG", answer)
+                return _refused("SET_APP_CONFIG", answer, self.rejected_texts())
             accepted = [entry for entry in packet if entry[0] not in rejected]
             if failed and accepted:
                 # An answer that names no parameter: set each one with its own command.
                 waiting = [accepted] if rejected else [[entry] for entry in accepted]
         return ""
 
-    def _refused(self, command: str, answer: Packet | None) -> str:
-        """Return a problem, with the parameters that the board has rejected: one of them may be the cause."""
-        names = "".join(f"; it rejects {text}" for text in self.rejected_texts())
-        if answer is None:
-            return f"the board does not answer {command}{names}"
-        return f"the board refuses {command}: {codes.status_text(answer.status)}{names}"
-
     def rejected_texts(self) -> Iterator[str]:
         """Yield the parameters that the board did not accept, with their statuses."""
         for tag, status in sorted(self.rejected.items()):
             yield f"{codes.parameter_name(tag)}: {codes.status_text(status)}"
+
+
+def _refused(command: str, answer: Packet | None, rejected: Iterable[str] = ()) -> str:
+    """Return a problem, with the parameters that the board has rejected: one of them may be the cause."""
+    names = "".join(f"; it rejects {text}" for text in rejected)
+    if answer is None:
+        return f"the board does not answer {command}{names}"
+    return f"the board refuses {command}: {codes.status_text(answer.status)}{names}"
