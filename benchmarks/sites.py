@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from uwb_mitigation.simulation.antenna_pairs import draw_fields
 from uwb_mitigation.simulation.buildings import (
     INDUSTRIAL,
     KINDS,
@@ -36,7 +37,7 @@ from uwb_mitigation.simulation.scene import (
     Building,
     Point,
 )
-from uwb_mitigation.simulation.simulated import SimulatedSource
+from uwb_mitigation.simulation.simulated import SimulatedSource, TwrBatch
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import Record
 
@@ -193,16 +194,44 @@ def _received_share(plan: Building, anchor: Point, cells: NDArray[np.float64]) -
     return float((mean_level_dbm(*powers, boards) >= RADIO.sensitivities_dbm(boards)).mean())
 
 
+class Standing(SimulatedSource):
+    """A robot at a random place of the route: clusters and fading of each pair stay the same."""
+
+    def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
+        rng = np.random.default_rng([self._seed, 0])
+        batch = self._exchanges(
+            np.arange(self._count), 0, draw_fields(self._environments, len(self._anchors), rng)
+        )
+        pairs = batch.pairs
+        place = np.broadcast_to(rng.choice(pairs.tag), pairs.tag.shape)
+        path = self._plan.direct_path(pairs.anchor, place)
+        yield replace(batch, pairs=replace(pairs, tag=place, path=path, stationary=True)), rng
+
+    def __iter__(self) -> Iterator[Record]:
+        place = next(iter(self._batches()))[0].pairs.tag[0]
+        position = (float(place[0]), float(place[1]), 0.0)
+        return (replace(record, tag_position=position) for record in super().__iter__())
+
+
 class Drive:
     """A drive at a simulated site; a `Source` whose pairs have offsets.
 
     Args:
         kind: "site", a random building; "site_gains", the same with other boards; or one of `FLATS` or `ROOMS`.
+        source: `Standing` for a robot at rest.
     """
 
     simulated = True
 
-    def __init__(self, seed: int, drive: int, anchors: int, seconds: float, kind: str = "site") -> None:
+    def __init__(
+        self,
+        seed: int,
+        drive: int,
+        anchors: int,
+        seconds: float,
+        kind: str = "site",
+        source: type[SimulatedSource] = SimulatedSource,
+    ) -> None:
         rng = np.random.default_rng(UNSEEN + seed)
         self.offset_m = 0.2 + rng.normal(0.0, 0.12, anchors)
         if kind in FLATS:
@@ -221,7 +250,7 @@ class Drive:
             gains_db = (-1) ** seed * GAIN_DB + rng.uniform(-ANCHOR_GAIN_DB, ANCHOR_GAIN_DB, anchors)
         self._slow_m = DRONE_SLOW_M * (kind == "drone_room")
         self._waves = rng.normal(0.0, 1.0 / DRONE_LENGTH_M, (anchors, 2))
-        self._inner = SimulatedSource(
+        self._inner = source(
             seed=seed * 1000 + drive, count=round(seconds * RATE_HZ), rate_hz=RATE_HZ,
             anchors=places, plan=plan, radio=DRONE_RADIO if kind == "drone_room" else RADIO, route=route,
             environments=INDUSTRIAL if kind == "open_hall" else RESIDENTIAL, gains_db=gains_db.tolist(),

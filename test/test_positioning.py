@@ -233,6 +233,20 @@ def test_statement_of_each_state_names_remedies_for_its_layout(
     assert found.is_unique == (not found.remedy)
 
 
+@pytest.mark.parametrize("is_swapped", [False, True])
+def test_swapped_anchors_are_reported_and_not_drives_past_right_ones(is_swapped):
+    ranges, _ = drive()
+    order = [2, 1, 0, 3, 4] if is_swapped else [0, 1, 2, 3, 4]
+    locator = TagEstimator(
+        EstimatorConfig(HALL.moved(HALL.position[order], HALL.sd), height=Height(1.0, 0.1))
+    )
+    found = drive_determination(locator, ranges, locator.run(ranges))
+    assert (found.state == "contradicted") == is_swapped
+    locator.restart()
+    locator.run(ranges.take(ranges.stamp_ns < 2 * NANOSECONDS))
+    assert current_determination(locator).state != "contradicted"
+
+
 def test_remedies_for_a_mirrored_height_work():
     ranges, _ = drive(SQUARE, path=around, seconds=30)
     locator = TagEstimator(EstimatorConfig(SQUARE))

@@ -3,24 +3,28 @@
 Drives of a minute through the flat of the simulator, whose inner walls are of one material, or which has neither walls nor obstacles
 ("open"), with boards of other offsets in each drive. Prints the horizontal RMSE of the live filter in metres, mean of the
 drives, and the worst ratio of corrected to raw ranges: with the offsets of the boards in the ranges, with these offsets
-subtracted ("calibrated"), and with odometry. The seeds are not those of `benchmarks positions`.
+subtracted ("calibrated"), with odometry, and at rest at a place of each drive, where errors do not average out. The seeds are not those of `benchmarks positions`.
 """
 
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.position_data import simulated_run
 from benchmarks.positions import WARM_UP_S, locate
-from benchmarks.sites import FLATS, Drive
+from benchmarks.sites import FLATS, Drive, Standing
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.types.offsets import Offsets
 from uwb_mitigation.types.stamps import NS_PER_S
 
 COUNTS = (4, 6, 8)
 SEEDS = range(900, 906)
+GROUPS = list(product(FLATS, COUNTS))
+REST_SEEDS = range(900, 924)
 
 
 def evaluate(building: str, anchors: int, seed: int) -> list[float]:
@@ -43,19 +47,29 @@ def evaluate(building: str, anchors: int, seed: int) -> list[float]:
     return [track_errors(track, truth).rmse for track in tracks]
 
 
-if __name__ == "__main__":
-    print(
-        "building     anchors   raw / corrected (worst)   calibrated: raw / corrected   odometry: raw / corrected"
-    )
-    groups = list(product(FLATS, COUNTS))
+def evaluate_at_rest(building: str, anchors: int, seed: int) -> list[float]:
+    """Return the RMSE of raw and of corrected ranges of a robot at rest."""
+    run = simulated_run(building, str(seed), Drive(seed, seed % 4, anchors, 20.0, building, Standing))
+    truth = run.truth.take(run.truth.stamp_ns >= run.ranges.stamp_ns[0] + round(WARM_UP_S * NS_PER_S))
+    return [track_errors(locate(run, ranges), truth).rmse for ranges in (run.ranges, run.corrected())]
+
+
+def all_errors(function: Callable[[str, int, int], list[float]], seeds: range) -> NDArray[np.float64]:
+    """Return the RMSE of all drives, float64 (buildings and numbers of anchors, seeds, results of the function)."""
+    cases = [(*group, seed) for group in GROUPS for seed in seeds]
     with ProcessPoolExecutor() as pool:
-        results = pool.map(
-            evaluate, *zip(*((*group, seed) for group in groups for seed in SEEDS), strict=True)
+        return np.array(list(pool.map(function, *zip(*cases, strict=True)))).reshape(
+            len(GROUPS), len(seeds), -1
         )
-        errors = np.array(list(results)).reshape(len(groups), len(SEEDS), -1)
-    for (building, anchors), of_group in zip(groups, errors, strict=True):
-        mean, worst = of_group.mean(axis=0), (of_group[:, 1] / of_group[:, 0]).max()
+
+
+if __name__ == "__main__":
+    print("building     anchors   raw / corrected (worst)   calibrated   odometry   at rest (worst)")
+    moving, resting = all_errors(evaluate, SEEDS), all_errors(evaluate_at_rest, REST_SEEDS)
+    for (building, anchors), errors, at_rest in zip(GROUPS, moving, resting, strict=True):
+        mean, rest = errors.mean(axis=0), at_rest.mean(axis=0)
+        worst, worst_rest = ((runs[:, 1] / runs[:, 0]).max() for runs in (errors, at_rest))
         print(
-            f"{building:13}{anchors:4}{mean[0]:12.3f} / {mean[1]:.3f} ({worst:.2f}){mean[2]:16.3f} / {mean[3]:.3f}"
-            f"{mean[4]:19.3f} / {mean[5]:.3f}"
+            f"{building:13}{anchors:4}{mean[0]:10.3f} / {mean[1]:.3f} ({worst:.2f}){mean[2]:10.3f} / {mean[3]:.3f}"
+            f"{mean[4]:10.3f} / {mean[5]:.3f}{rest[0]:10.3f} / {rest[1]:.3f} ({worst_rest:.2f})"
         )

@@ -14,7 +14,7 @@ from uwb_mitigation.positioning.online.ambiguity import EXCLUDED_SD, LEVEL, RANG
 from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
 from uwb_mitigation.types.tracks import Ranges, Track
 
-UNIQUE, UNKNOWN = Ambiguity.NONE.value, "unknown"
+UNIQUE, UNKNOWN, CONTRADICTED = Ambiguity.NONE.value, "unknown", "contradicted"
 
 POOR_DOP = 10.0
 """A direction is weak if errors of ranges are multiplied by more."""
@@ -30,7 +30,7 @@ class Determination:
     """How well the position of a tag is determined.
 
     Attributes:
-        state: a value of `Ambiguity`, or `UNKNOWN`.
+        state: a value of `Ambiguity`, `UNKNOWN`, or `CONTRADICTED`.
         reason, remedy: empty: none.
     """
 
@@ -45,6 +45,13 @@ class Determination:
 
     def __str__(self) -> str:
         return f"{self.state}: {self.reason}" + (f". Remedy: {self.remedy}" if self.remedy else "")
+
+
+_CONTRADICTED = Determination(
+    CONTRADICTED,
+    "most ranges contradicted it twice within a minute",
+    "check ids, coordinates and units in the anchors file, and the height; `uwb-mitigation survey` finds swapped anchors",
+)
 
 
 def determination(
@@ -102,6 +109,8 @@ def determination(
 
 def current_determination(estimator: TagEstimator) -> Determination:
     """Return the statement for the latest ranges of a tag."""
+    if estimator.is_contradicted:
+        return _CONTRADICTED
     rows, ambiguity = estimator.received_anchors(RANGE_TIMEOUT_S), estimator.images.ambiguity
     if estimator.candidates > 1 and not estimator.is_ambiguous:
         ambiguity = Ambiguity.MIRROR
@@ -125,6 +134,8 @@ def drive_determination(estimator: TagEstimator, ranges: Ranges, track: Track) -
         ranges: of the drive.
         track: positions of the drive; empty: the statement is that for the latest ranges.
     """
+    if estimator.counts["contradicted"]:
+        return _CONTRADICTED
     ambiguities = estimator.images.counts.most_common(1)
     if not len(track) or not ambiguities:
         return current_determination(estimator)

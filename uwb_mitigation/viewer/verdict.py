@@ -98,7 +98,9 @@ def verdict(
 
 def _of_remedy(remedy: str) -> tuple[str, str]:
     """Return a reason that fits a headline, and the explanation with the remedy, of a determination."""
-    text, _, action = re.sub(r"^(from \d+ ranges: )?(unknown: )?", "", remedy).partition(". Remedy: ")
+    text, _, action = re.sub(r"^(from \d+ ranges: )?((unknown|contradicted): )?", "", remedy).partition(
+        ". Remedy: "
+    )
     if len(text) <= MAX_HEADLINE:
         return text, action
     reason, _, explanation = text.partition(": ")
