@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import struct
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -854,21 +855,14 @@ def test_a_window_that_the_board_does_not_accept_is_not_written_again():
     assert run.session.window == (64, 5)
 
 
-class Originals(OriginalsFile):
-    """As of a process that has ended."""
-
-    def save(self, changes):
-        super().save(changes)
-        if self._path.exists():
-            self._path.write_text(self._path.read_text().replace(str(os.getpid()), "4194305"))
-
-
 @pytest.fixture
 def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UciBoardModel:
-    """Return a board with the window of a driver that was killed."""
+    """Return a board with the window of a driver that was killed, whose locks the kernel has released."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    run = Bench(originals=Originals("/dev/ttyACM0"), window=157).start()
+    originals = OriginalsFile("/dev/ttyACM0")
+    run = Bench(originals=originals, window=157).start()
     assert tuple(run.board._calibration.values()) == (157, 5)
+    originals.close()
     return run.board
 
 
@@ -876,23 +870,38 @@ def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UciBoardModel:
 def test_calibration_is_restored_after_the_driver_was_killed(
     killed: UciBoardModel, tmp_path: Path, port: str
 ):
-    assert Bench(killed, Originals(port), window=157).start().stop() == UciBoardModel()._calibration
+    assert Bench(killed, OriginalsFile(port), window=157).start().stop() == UciBoardModel()._calibration
     assert not list(tmp_path.rglob("*.json"))
+
+
+def test_calibration_at_a_port_in_use_is_not_that_of_another_board_with_its_id(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    program = (
+        f"import time; from {OriginalsFile.__module__} import OriginalsFile; file = OriginalsFile('/dev/ttyACM0'); "
+        "file.load('board'); file.save({'key': (16, [157])}); print(1, flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as driver:
+        driver.stdout.readline()
+        assert OriginalsFile("/dev/ttyACM1").load("board") == {}
+        driver.kill()
+    assert OriginalsFile("/dev/ttyACM1").load("board") == {"key": (16, [157])}
 
 
 @pytest.mark.parametrize("silent", [codes.GET_CALIBRATION, codes.SET_CALIBRATION], ids=["read", "write"])
 def test_original_calibration_is_kept_until_it_was_restored(killed: UciBoardModel, silent: tuple[int, int]):
-    run, usual = Bench(killed, Originals("/dev/ttyACM0"), window=157).start(), killed._command
+    run, usual = Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start(), killed._command
     killed._command = lambda name, *rest: b"" if name == silent else usual(name, *rest)
     assert run.stop()[TAPS] == 157
     killed._command = usual
-    restored = Bench(killed, Originals("/dev/ttyACM0"), window=157).start().stop()
+    restored = Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start().stop()
     assert restored == UciBoardModel()._calibration
 
 
 def test_calibration_that_another_program_has_changed_is_kept(killed: UciBoardModel):
     killed._calibration[TAPS] = 64
-    assert Bench(killed, Originals("/dev/ttyACM0"), window=157).start().stop()[TAPS] == 64
+    assert Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start().stop()[TAPS] == 64
 
 
 @pytest.mark.parametrize(
@@ -901,7 +910,7 @@ def test_calibration_that_another_program_has_changed_is_kept(killed: UciBoardMo
 def test_damaged_files_of_the_calibration_are_ignored(killed: UciBoardModel, tmp_path: Path, text: str):
     (path,) = tmp_path.rglob("*.json")
     path.write_text(text)
-    assert Bench(killed, Originals("/dev/ttyACM0"), window=157).start().session.window == (157, 5)
+    assert Bench(killed, OriginalsFile("/dev/ttyACM0"), window=157).start().session.window == (157, 5)
 
 
 # Captures --------------------------------------------------------------------------------------------------------

@@ -117,6 +117,11 @@ class UciPort(StreamPort):
         self._starts = 0
         self._worked_ns = self._stop_ns = 0
 
+    def close(self) -> None:
+        """Stop the thread, and close the hardware and the files; may be called twice."""
+        super().close()
+        self._originals.close()
+
     def apply(self, settings: UciPortSettings) -> None:
         """Start the board again with other settings.
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
 from collections import Counter
 from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from uwb_mitigation.errors import UwbMitigationError
 from uwb_mitigation.files import read_bounded, write_atomically
@@ -28,9 +29,10 @@ Changes = dict[str, tuple[int, list[int]]]
 class OriginalsFile:
     """Keeps the original values of changed keys on this computer until they are restored, also after a crash.
 
-    `$XDG_STATE_HOME/uwb_mitigation/uci/BOARD-PORT.json` (default `~/.local/state`) has the keys `format`, `process` and
-    `keys` (see `Changes`). BOARD and PORT are hashes of the device id and of the port, because several boards may have one
-    id. At another port, a board is found if only one file has its id, and the process that wrote it has ended.
+    `$XDG_STATE_HOME/uwb_mitigation/uci/BOARD-PORT.json` (default `~/.local/state`) has the keys `format` and `keys` (see
+    `Changes`). BOARD and PORT are hashes of the device id and of the port, because several boards may have one id. At
+    another port, a board is found if only one file has its id and a port that no process uses. A process that uses a port
+    holds a lock on `PORT.lock`, which the kernel releases also if the process is killed.
 
     Args:
         port: name of the port.
@@ -42,6 +44,7 @@ class OriginalsFile:
     def __init__(self, port: str) -> None:
         home = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
         self._folder, self._port, self._path = Path(home, "uwb_mitigation", "uci"), _digest(port), Path()
+        self._lock: IO[str] | None = None
         self.problem = ""
 
     def load(self, board: str) -> Changes:
@@ -49,9 +52,8 @@ class OriginalsFile:
         self._path = self._folder / f"{_digest(board)}-{self._port}.json"
         with contextlib.suppress(UwbMitigationError, OSError, ValueError, KeyError, TypeError):
             if board and not self._path.exists():
-                (other,) = self._folder.glob(f"{_digest(board)}-*.json")
-                if not Path("/proc", str(_read(other)["process"])).exists():
-                    other.replace(self._path)
+                (other,) = filter(_is_unused, self._folder.glob(f"{_digest(board)}-*.json"))
+                other.replace(self._path)
             keys = _read(self._path)["keys"]
             return {str(key): (int(first), [*map(int, written)]) for key, (first, written) in keys.items()}
         return {}
@@ -61,13 +63,34 @@ class OriginalsFile:
         try:
             if changes:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                document = {"format": FORMAT, "process": os.getpid(), "keys": changes}
-                write_atomically(self._path, json.dumps(document))
+                if self._lock is None:
+                    self._lock = _lock_path(self._path).open("a")
+                    fcntl.flock(self._lock, fcntl.LOCK_SH)
+                write_atomically(self._path, json.dumps({"format": FORMAT, "keys": changes}))
             else:
                 self._path.unlink(missing_ok=True)
             self.problem = ""
         except (OSError, UwbMitigationError) as error:
             self.problem = f"the original calibration of the board cannot be stored: {error}"
+
+    def close(self) -> None:
+        """Release the port: other ports may use the values that were not restored."""
+        if self._lock is not None:
+            self._lock.close()
+
+
+def _lock_path(path: Path) -> Path:
+    return path.with_name(f"{path.stem.partition('-')[2]}.lock")
+
+
+def _is_unused(path: Path) -> bool:
+    """Return whether no process uses the port of a file."""
+    try:
+        with _lock_path(path).open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _read(path: Path) -> dict[str, Any]:
