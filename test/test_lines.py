@@ -15,7 +15,7 @@ import ros_harness
 from port_events import PortEvents, wait_until
 from ros_harness import diagnostic_values
 from typer.testing import CliRunner
-from uwb_mitigation_msgs.msg import RangeCir
+from uwb_mitigation_msgs.msg import Cir, RangeCir
 
 from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
@@ -304,6 +304,7 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
         message = next(message for message in raw if message.anchor_id == 0x9280)
         assert message.range == pytest.approx(boards.true_ranges_m[1], abs=0.15)
         assert (len(message.cir.samples), message.header.stamp.sec >= int(began)) == (0, True)
+        assert message.cir.radio == Cir.UNKNOWN
         status = ros.diagnosis("driver", lambda status: status.message == "receiving")
         assert diagnostic_values(status)["radio 1: mapping"] == "DWM1001 PANS"
         assert node.output.count("DWM1001 PANS at /") == 2

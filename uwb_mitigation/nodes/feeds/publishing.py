@@ -19,7 +19,7 @@ from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
 from uwb_mitigation.nodes.support.sensor_ranges import SensorRanges
 from uwb_mitigation.radios.wire.messages import Correction
-from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import encode_corrected, encode_range, encode_truth
 from uwb_mitigation.types.ros.poses import encode_true_position, prepare_encoders
@@ -71,11 +71,7 @@ class RangePublisher:
 
     def publish_range(self, measurement: RangeMeasurement) -> None:
         """Publish a range of a radio."""
-        cir = measurement.cir
-        if cir.radio is RadioType.UNKNOWN:
-            # The protocols of boards and local radios are those of the DW1000.
-            cir = replace(cir, radio=RadioType.DW1000, segment=Segment.IPATOV)
-        measurement = replace(measurement, cir=cir, frame_id=self._frame_id)
+        measurement = replace(measurement, frame_id=self._frame_id)
         if self._bag is not None:
             self._record(Record(measurement))
         self._publish([measurement])

@@ -32,7 +32,9 @@ from uwb_mitigation.types.measurement import (
     CorrectedBy,
     CorrectedRange,
     Encoding,
+    RadioType,
     RangeMeasurement,
+    Segment,
     Status,
 )
 from uwb_mitigation.types.offsets import Offsets
@@ -289,7 +291,8 @@ def _range(values: tuple[Any, ...], payload: bytes, stamp_ns: int) -> RangeMeasu
         )
     samples = np.frombuffer(payload, "<i2", count, offset)
     shape = _member(Encoding, encoding), first_index, first_path, period_s, scale
-    cir = Cir(samples, *shape, preambles, threshold, rx_dbm, first_path_dbm, channel, prf_mhz)
+    levels, radio = (rx_dbm, first_path_dbm), (RadioType.DW1000, Segment.IPATOV)
+    cir = Cir(samples, *shape, preambles, threshold, *levels, channel, prf_mhz, *radio)
     return RangeMeasurement(stamp_ns, tag, anchor, sequence, _device_time(ticks), range_m, cir)
 
 
