@@ -9,11 +9,12 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from queue import SimpleQueue
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from port_events import PortEvents, terminal, wait_until
+from port_events import TIMEOUT_S, PortEvents, terminal, wait_until
 
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
@@ -107,6 +108,15 @@ def test_faulty_channel_delivers_only_sent_messages(link):
     assert counts["lost"] > 0
     assert counts["corrupt"] > 0
     assert counts["stale"] > 0
+
+
+def test_absent_port_is_logged_with_the_second_attempt(monkeypatch: pytest.MonkeyPatch):
+    attempts: list[PortAddress] = []
+    monkeypatch.setattr(PortAddress, "find", lambda address: attempts.append(address))
+    counts: SimpleQueue[int] = SimpleQueue()
+    (port,) = serial.open([SerialSettings(PortAddress("/dev/absent"))], lambda _: counts.put(len(attempts)))
+    with closing(port):
+        assert counts.get(timeout=TIMEOUT_S) == 2
 
 
 @pytest.mark.parametrize("exclusive", [True, False])

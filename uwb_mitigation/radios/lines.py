@@ -293,7 +293,7 @@ class LinePort(StreamPort):
             if session.example:
                 values["last line that does not match"] = session.example
             values |= {"bytes": session.received, "openings": self.openings}
-            hardware = f"{session.mapping.name} at {self._address}"
+            hardware = f"{session.mapping.name} at {self._name}"
             return PortReport(self.device, hardware, self.problem, self._warning(), "receiving", values)
 
     def _warning(self) -> str:
@@ -326,7 +326,7 @@ class LinePort(StreamPort):
         if data:
             self._received_ns, self._was_connected = now_ns, True
         elif not self._is_udp and now_ns - self._received_ns > REOPEN_NS:
-            raise LinkError("sends no data", where=str(self._address))
+            raise LinkError("sends no data", where=self._name)
         measurements: list[Any] = [*self.session.receive(data, now_ns, stamp_ns)]
         if measurements and not self._has_ranges:
             self._has_ranges = True

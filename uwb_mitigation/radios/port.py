@@ -205,12 +205,43 @@ class RadioPort(ABC):
         """Use other settings of the same source; those of the port itself stay."""
 
     @abstractmethod
-    def _connect(self) -> None:
-        """Open the hardware and serve it until the port is closed.
+    def _open(self) -> Any:
+        """Open the hardware and start the radio; return what `close` closes.
 
         Raises:
-            UwbMitigationError: it cannot be opened, or was lost.
+            UwbMitigationError: it cannot be opened.
         """
+
+    @abstractmethod
+    def _serve(self, hardware: Any) -> list[Any]:
+        """Wait for the radio for a short time; return events.
+
+        Raises:
+            UwbMitigationError, OSError: the hardware was lost, or must be opened again.
+        """
+
+    def _is_stopped(self, now_ns: int) -> bool:
+        """Return whether the hardware may be closed; called after `close`, until it returns true."""
+        return True
+
+    @abstractmethod
+    def _closed(self, now_ns: int) -> list[Any]:
+        """End the state of the radio, with the lock held, before the hardware is closed; return events."""
+
+    def _connect(self) -> None:
+        """Open the hardware and serve it until the port is closed; raise UwbMitigationError if that fails."""
+        hardware = self._open()
+        try:
+            while not (self.closed and self._is_stopped(time.monotonic_ns())):
+                self._emit(self._serve(hardware))
+                self._log_problem()
+        except OSError as error:
+            raise LinkError(f"was lost: {error.strerror}", where=self._name) from error
+        finally:
+            with self._lock:
+                events = self._closed(time.monotonic_ns())
+            self._emit(events)
+            hardware.close()
 
     def _emit(self, events: Iterable[object]) -> None:
         for event in events:
@@ -222,14 +253,14 @@ class RadioPort(ABC):
     def _log(self, level: int, text: str) -> None:
         self._on_event(PortMessage(level, text))
 
-    def _log_problem(self) -> None:
+    def _log_problem(self, *, lasts: bool = False) -> None:
         """Log a problem once if it lasts; call it at least every `PROBLEM_DELAY_S`."""
         problem, now_s = self.problem, time.monotonic()
         if not problem:
             self._logged_problem, self._problem_since_s = "", 0.0
             return
         self._problem_since_s = self._problem_since_s or now_s
-        lasts = now_s - self._problem_since_s >= PROBLEM_DELAY_S
+        lasts |= now_s - self._problem_since_s >= PROBLEM_DELAY_S
         if lasts and problem != self._logged_problem and not self.closed:
             self._log(logging.WARNING, f"{problem}; waiting for the radio")
             self._logged_problem = problem
@@ -237,18 +268,19 @@ class RadioPort(ABC):
     def _run(self) -> None:
         retry_s = MIN_RETRY_S
         while not self.closed:
-            self._was_connected = False
+            self._was_connected = is_repeated = False
             try:
                 self._connect()
             except UwbMitigationError as error:
                 with self._lock:
-                    self._lost = str(error)
+                    is_repeated, self._lost = self._lost == str(error), str(error)
                     self.monitor.reset()
             with self._lock:
                 self.device = ""
             if self._was_connected:
                 retry_s = MIN_RETRY_S
-            self._log_problem()
+            # On a busy computer, a few attempts take longer than the delay.
+            self._log_problem(lasts=is_repeated)
             self._stop.wait(retry_s)
             retry_s = min(2 * retry_s, MAX_RETRY_S)
 
@@ -303,30 +335,25 @@ class StreamPort(RadioPort):
     ) -> None:
         self._number, self._capture, on_event, self._stamp_clock = place
         super().__init__(str(settings.address), on_event, monitor)
-        self._settings, self._address = settings, settings.address
-        self.session = session
+        self._settings = settings
+        self.session, self._outgoing = session, bytearray()
         self._empty_read_is_loss = True
 
     @abstractmethod
     def _opened(self, now_ns: int) -> list[Any]:
-        """Start the session; called with the lock held, like the three functions below. Return events."""
+        """Start the session, with the lock held; return events."""
 
     @abstractmethod
     def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
-        """Pass bytes and the time to the session; return events.
+        """Pass bytes and the time to the session, with the lock held; return events.
 
         Raises:
             LinkError: the port must be opened again.
         """
 
     def _closed(self, now_ns: int) -> list[Any]:
-        """End the session after the port was lost; return events."""
         events: list[Any] = self.session.closed(now_ns)
         return events
-
-    def _is_stopped(self, now_ns: int) -> bool:
-        """Return whether the port may be closed; called after `close`, until it returns true."""
-        return True
 
     def close(self) -> None:
         """Stop the thread, and close the hardware and the capture; may be called twice."""
@@ -339,47 +366,38 @@ class StreamPort(RadioPort):
         if self._capture is not None:
             self._capture.add(self._number, data, sent=sent)
 
-    def _connect(self) -> None:
-        port = self._address.open(self._settings.baud, self._settings.dtr)
+    def _open(self) -> Any:
+        port = self._settings.address.open(self._settings.baud, self._settings.dtr)
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Without this flag USB bridges delay bytes by 16 ms. Other ports do not support it.
             port.set_low_latency_mode(True)
+        self._outgoing.clear()
         with self._lock:
             self.device, self._lost = port.port, ""
             self.openings += 1
             events = self._opened(time.monotonic_ns())
-        try:
-            self._emit(events)
-            self._serve(port.fileno())
-        except OSError as error:
-            raise LinkError(f"was lost: {error.strerror}", where=str(self._address)) from error
-        finally:
-            with self._lock:
-                events = self._closed(time.monotonic_ns())
-            self._emit(events)
-            port.close()
+        self._emit(events)
+        return port
 
-    def _serve(self, fd: int) -> None:
-        outgoing = bytearray()
-        while not (self.closed and self._is_stopped(time.monotonic_ns())):
-            readable, _, _ = select.select([fd], [], [], self._tick_s)
-            data = os.read(fd, _READ_BYTES) if readable else b""
-            if readable and not data and self._empty_read_is_loss:
-                raise LinkError("was unplugged", where=str(self._address))
-            now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
-            self._add_to_capture(data, sent=False)
-            with self._lock:
-                events = self._received(data, now_ns, stamp_ns)
-                # While the port accepts no bytes, requests wait in the bounded queue of the session.
-                if not outgoing:
-                    outgoing += self.session.outgoing()
-            if outgoing:
-                with contextlib.suppress(BlockingIOError):
-                    written = os.write(fd, outgoing)
-                    self._add_to_capture(bytes(outgoing[:written]), sent=True)
-                    del outgoing[:written]
-            self._emit(events)
-            self._log_problem()
+    def _serve(self, hardware: Any) -> list[Any]:
+        fd = hardware.fileno()
+        readable, _, _ = select.select([fd], [], [], self._tick_s)
+        data = os.read(fd, _READ_BYTES) if readable else b""
+        if readable and not data and self._empty_read_is_loss:
+            raise LinkError("was unplugged", where=self._name)
+        now_ns, stamp_ns = time.monotonic_ns(), self._stamp_clock()
+        self._add_to_capture(data, sent=False)
+        with self._lock:
+            events = self._received(data, now_ns, stamp_ns)
+            # While the port accepts no bytes, requests wait in the bounded queue of the session.
+            if not self._outgoing:
+                self._outgoing += self.session.outgoing()
+        if self._outgoing:
+            with contextlib.suppress(BlockingIOError):
+                written = os.write(fd, self._outgoing)
+                self._add_to_capture(bytes(self._outgoing[:written]), sent=True)
+                del self._outgoing[:written]
+        return events
 
 
 StreamPlace = tuple[int, CaptureWriter | None, OnEvent, Callable[[], int]]

@@ -187,7 +187,7 @@ class BoardPort(StreamPort):
     def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
         observed = self._observed(self.session.receive(data, now_ns, stamp_ns))
         if self.session.idle_ns(now_ns) > REOPEN_TIMEOUT_NS:
-            raise LinkError("sends no data", where=str(self._address))
+            raise LinkError("sends no data", where=self._name)
         return observed
 
     def _closed(self, now_ns: int) -> list[Any]:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from uwb_mitigation.errors import ParameterError, format_id
 from uwb_mitigation.radios.dw1000.bus import Bus
@@ -16,6 +17,7 @@ from uwb_mitigation.radios.settings import (
     DEFAULT_RADIO,
     EXCHANGE_REMEDIES,
     PREFIX,
+    PortMessage,
     RadioSettings,
     RadioState,
     RadioStatus,
@@ -109,6 +111,8 @@ class ChipPort(RadioPort):
         self._requested_settings = settings.radio
         self._settings_changed = False
         self._radio: NativeRadio | None = None
+        self._is_started = False
+        self._status_due_s = self._sensors_due_s = 0.0
 
     def apply(self, settings: ChipSettings) -> None:
         """Use other settings of the radio, starting with the next exchange.
@@ -141,52 +145,49 @@ class ChipPort(RadioPort):
         if self._radio is not None:
             self._radio.close()
 
-    def _connect(self) -> None:
+    def _open(self) -> Bus:
         bus = self._open_bus()
-        try:
-            if self._radio is None:
-                self._radio = NativeRadio(bus, self._requested_settings, stamp_clock=self._stamp_clock)
-            self._radio.use(bus)
-            with self._lock:
-                self.device = bus.name
-                self.openings += 1
-            self._serve(self._radio)
-        finally:
-            bus.close()
-            with self._lock:
-                self.settings = None
+        if self._radio is None:
+            self._radio = NativeRadio(bus, self._requested_settings, stamp_clock=self._stamp_clock)
+        self._radio.use(bus)
+        self._is_started, self._status_due_s, self._sensors_due_s = False, 0.0, 0.0
+        with self._lock:
+            self.device = bus.name
+            self.openings += 1
+        return bus
 
-    def _serve(self, radio: NativeRadio) -> None:
-        """Range until the port is closed; raise an exception if the bus is lost."""
-        started = False
-        status_due = sensors_due = 0.0
-        while not self.closed:
-            with self._lock:
-                changed, self._settings_changed = self._settings_changed, False
-                requested = self._requested_settings
-            if changed:
-                radio.configure(requested)
-                started = False
-            measured = radio.exchange(_EXCHANGE_TIMEOUT_S)
-            events: list[object] = [] if measured is None else [measured]
-            starts = not started and radio.address != 0
-            started |= starts
-            now_s = time.monotonic()
-            if now_s >= sensors_due:
-                sensors_due = now_s + SENSORS_INTERVAL_S
-                radio.read_sensors()
-            status = radio.status()
-            if now_s >= status_due:
-                status_due = now_s + STATUS_INTERVAL_S
-                events.append(status)
-            with self._lock:
-                self._lost = ""
-                self.settings = radio.settings if started else None
-                self.monitor.add_status(self.status, status, now_s)
-                self.status = status
-            if starts:
-                self._was_connected = True
-                text = f"radio {format_id(radio.address)} at {self.device}: {settings_text(radio.settings)}"
-                self._log(logging.INFO, text)
-            self._emit(events)
-            self._log_problem()
+    def _serve(self, hardware: Bus) -> list[Any]:
+        radio = self._radio
+        assert radio is not None
+        with self._lock:
+            changed, self._settings_changed = self._settings_changed, False
+            requested = self._requested_settings
+        if changed:
+            radio.configure(requested)
+            self._is_started = False
+        measured = radio.exchange(_EXCHANGE_TIMEOUT_S)
+        events: list[Any] = [] if measured is None else [measured]
+        starts = not self._is_started and radio.address != 0
+        self._is_started |= starts
+        now_s = time.monotonic()
+        if now_s >= self._sensors_due_s:
+            self._sensors_due_s = now_s + SENSORS_INTERVAL_S
+            radio.read_sensors()
+        status = radio.status()
+        if now_s >= self._status_due_s:
+            self._status_due_s = now_s + STATUS_INTERVAL_S
+            events.append(status)
+        with self._lock:
+            self._lost = ""
+            self.settings = radio.settings if self._is_started else None
+            self.monitor.add_status(self.status, status, now_s)
+            self.status = status
+        if starts:
+            self._was_connected = True
+            text = f"radio {format_id(radio.address)} at {self.device}: {settings_text(radio.settings)}"
+            events.insert(0, PortMessage(logging.INFO, text))
+        return events
+
+    def _closed(self, now_ns: int) -> list[Any]:
+        self.settings = None
+        return []
