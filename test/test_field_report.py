@@ -106,6 +106,22 @@ def test_faults_of_uci_boards_are_detected(report: Report, tmp_path: Path):
         assert failed(report("uci")) == {*errors, "clock error"}
 
 
+@pytest.mark.parametrize(
+    ("tag", "check", "name"),
+    [
+        (0x1B, "problem of the driver", "SLOTS_PER_RR"),
+        (0x2D, "warnings of the driver", "BLOCK_STRIDE_LENGTH"),
+    ],
+)
+def test_rejected_parameters_of_uci_boards_are_named(
+    report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: int, check: str, name: str
+):
+    monkeypatch.setattr("uwb_mitigation.commands.field.test.START_TIMEOUT_S", 5.0)
+    with EmulatedUciBoards(links=tmp_path / "uci", rejects=frozenset([tag])):
+        value = report("uci")[check]["value"]
+    assert f"{name} (0x{tag:02x}): invalid parameter (status 0x04)" in value
+
+
 @NEEDS_CC
 def test_good_evb1000s_pass_and_a_low_supply_fails(report: Report, tmp_path: Path):
     with EmulatedEvb1000s(None, port_links=tmp_path / "evb1000") as boards:

@@ -143,9 +143,11 @@ class Answering(UciBoardModel):
         answers: {name of the command: payload of the answer, or a function of the payload of the command}; None: the usual one.
     """
 
-    def __init__(self, answers: dict[tuple[int, int], bytes | Callable[[bytes], bytes | None]]) -> None:
+    def __init__(
+        self, answers: dict[tuple[int, int], bytes | Callable[[bytes], bytes | None]], **board: object
+    ) -> None:
         self.answers = answers
-        super().__init__()
+        super().__init__(**board)
 
     def _command(self, name, payload, now_s):
         answer = self.answers.get(name)
@@ -449,18 +451,24 @@ def test_the_benchmark_finds_no_wrong_join_but_would_find_one(monkeypatch: pytes
         (lambda packet: packet[:60] + packet[61:], "bytes or notifications are lost between board and host"),
         (lambda packet: packet[:-100], "bytes or notifications are lost between board and host"),
         (lambda packet: b"", "most ranges have no CIR: the firmware may not support it"),
+        (lambda packet: packet, "ranging without the parameters that the board rejected"),
     ],
-    ids=["lost byte", "lost fragment", "never sent"],
+    ids=["lost byte", "lost fragment", "never sent", "sent"],
 )
-def test_ranges_without_cir_are_explained_by_damaged_notifications_first(keep, warning: str):
-    run = Bench(window=157).start()
+def test_ranges_without_cir_are_explained_by_damages_and_rejected_parameters(keep, warning: str):
+    run = Bench(UciBoardModel(rejects=frozenset([0x2D])), window=157).start()
     port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), (0, None, print, lambda: 0))
     port.session = run.session
     for sequence in range(1, 60):
         port.monitor.add_range(time.monotonic())
         run.step(run.range(sequence), 5.0)
         run.step(keep(run.diagnostics(sequence)), 95.0)
-    assert port.report().warning.startswith(warning)
+    report = port.report()
+    assert report.warning.startswith(warning)
+    assert (
+        report.values["rejected parameters"] == "BLOCK_STRIDE_LENGTH (0x2d): invalid parameter (status 0x04)"
+    )
+    assert report.warning.endswith(report.values["rejected parameters"])
 
 
 # Sessions --------------------------------------------------------------------------------------------------------
@@ -582,17 +590,21 @@ def test_an_anchor_without_its_tag_waits_if_the_board_cannot_report_its_state():
     assert run.exchange(1).wait(10.0).session.starts == 2
 
 
-@pytest.mark.parametrize("is_missing", [False, True], ids=["out of range", "missing at the start"])
-def test_a_parameter_that_is_refused_is_named(is_missing: bool):
-    answers = {codes.SET_APP_CONFIG: b"\x04\x01\x06\x05"}
-    texts = ("DEVICE_MAC_ADDRESS (0x06): value out of range (status 0x05)",)
-    if is_missing:
-        # It rejects the slots per round, without which it does not range.
-        answers[codes.SET_APP_CONFIG] = lambda data: b"\x04\x01\x1b\x04" if b"\x1b\1" in data else None
-        answers[codes.RANGE_START] = b"\x15"
-        rejected = "it rejects SLOTS_PER_RR (0x1b): invalid parameter (status 0x04)"
-        texts = "a parameter is missing (status 0x15)", rejected
-    state = Bench(Answering(answers)).wait_for(texts[0])
+@pytest.mark.parametrize(
+    ("tag", "texts"),
+    [
+        (
+            0x06,
+            [
+                "refuses SET_APP_CONFIG",
+                "it rejects DEVICE_MAC_ADDRESS (0x06): invalid parameter (status 0x04)",
+            ],
+        ),
+        (0x1B, ["a parameter is missing (status 0x15)", "it rejects SLOTS_PER_RR (0x1b): invalid parameter"]),
+    ],
+)
+def test_a_parameter_without_which_a_board_does_not_range_is_named(tag: int, texts: list[str]):
+    state = Bench(UciBoardModel(rejects=frozenset([tag]))).wait_for(texts[0])
     assert all(text in state for text in texts)
 
 
@@ -603,11 +615,8 @@ def test_a_second_session_that_is_refused_is_not_explained_by_parameters():
         initialised.add(payload[:4])
         return None if len(initialised) == 1 else b"\x14"
 
-    def rejecting(payload: bytes) -> bytes | None:
-        return b"\x04\x01\x13\x04" if b"\x13\x01\x00" in payload else None
-
-    answers = {codes.SESSION_INIT: first_only, codes.SET_APP_CONFIG: rejecting}
-    run = Bench(Answering(answers), peers=(2, 3))
+    board = Answering({codes.SESSION_INIT: first_only}, rejects=frozenset([0x13]))
+    run = Bench(board, peers=(2, 3))
     assert "rejects" not in run.wait_for("too many sessions (status 0x14)")
     assert run.session.ranging.rejected
 

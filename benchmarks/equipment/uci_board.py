@@ -101,6 +101,7 @@ class UciBoardModel:
         max_taps: largest window that it accepts.
         tap_bytes: size of a complex tap.
         count_bytes: size of the count in SET_CALIBRATION.
+        rejects: parameters of sessions that it does not know.
         faults: see `UciFaults`.
         seed: seed of the faults.
     """
@@ -111,12 +112,14 @@ class UciBoardModel:
         max_taps: int = 255,
         tap_bytes: int = 6,
         count_bytes: int = 2,
+        rejects: frozenset[int] = frozenset(),
         faults: UciFaults = UciFaults(),
         seed: int = 1,
     ) -> None:
         self.faults = faults
         self.exchanges = 0
         self._max_taps, self._tap_bytes, self._count_bytes = max_taps, tap_bytes, count_bytes
+        self._rejects = rejects
         self._random = np.random.default_rng(seed)
         self._buffer = bytearray()
         self._fragments = bytearray()
@@ -170,10 +173,14 @@ class UciBoardModel:
         if session is None:
             return self._respond(name, bytes([_NO_SESSION]))
         if name == codes.SET_APP_CONFIG:
-            offset = 5
+            offset, config = 5, {}
             while offset + 1 < len(payload):
-                session.config[payload[offset]] = payload[offset + 2 : offset + 2 + payload[offset + 1]]
+                config[payload[offset]] = payload[offset + 2 : offset + 2 + payload[offset + 1]]
                 offset += 2 + payload[offset + 1]
+            if rejected := bytes(sorted(self._rejects & config.keys())):
+                statuses = b"".join(bytes([tag, _INVALID_PARAMETER]) for tag in rejected)
+                return self._respond(name, bytes([_INVALID_PARAMETER, len(rejected)]) + statuses)
+            session.config |= config
             return self._respond(name, b"\0\0") + self._state(handle, SessionState.IDLE)
         if name == codes.GET_SESSION_STATE:
             return self._respond(

@@ -44,6 +44,7 @@ SHUTDOWN_NS = 10**9
 
 _MIN_RANGES, _CIR_SHARE = 20, 0.5
 _MIN_DAMAGES, _DAMAGE_SHARE = 20, 0.05
+_REJECTED = "ranging without the parameters that the board rejected"
 
 
 @dataclass(frozen=True)
@@ -154,11 +155,15 @@ class UciPort(StreamPort):
                 values |= {"CIR taps": session.window[0], "CIR taps before the first path": session.window[1]}
             if unit := session.assembly.position_unit.name:
                 values["unit of the first-path positions"] = unit
+            rejected = session.ranging.rejected_text
+            values["rejected parameters"] = rejected or "none"
             values |= {name.replace("_", " "): count for name, count in session.totals().items()}
             values |= {"openings": self.openings}
             hardware = f"UCI board {format_id(s.address)}"
             activity = "ranging" if s.role is Role.TAG else "answering"
-            return PortReport(self.device, hardware, self.problem, self._warning(), activity, values)
+            warnings = self._warning(), rejected and f"{_REJECTED}: {rejected}"
+            warning = "; ".join(filter(None, warnings))
+            return PortReport(self.device, hardware, self.problem, warning, activity, values)
 
     def _warning(self) -> str:
         """Return a possible reason why a board without a problem has no useful ranges, or an empty string."""
@@ -182,10 +187,7 @@ class UciPort(StreamPort):
                 return "the reported first path contradicts the samples of most CIRs; they are not used"
             if session.assembly.position_unit.name == "contradictory":
                 return "the first-path positions contradict the whole taps, which are used instead"
-        if self._originals.problem:
-            return self._originals.problem
-        rejected = "; ".join(session.ranging.rejected_texts())
-        return rejected and f"ranging without the parameters that the board rejected: {rejected}"
+        return self._originals.problem
 
     def _opened(self, now_ns: int) -> list[Any]:
         if self._capture is not None:
@@ -206,10 +208,12 @@ class UciPort(StreamPort):
         if session.starts != self._starts:
             self._starts, self._was_connected = session.starts, True
             messages.append(PortMessage(logging.INFO, self._started_text()))
+            if rejected := session.ranging.rejected_text:
+                messages.append(PortMessage(logging.WARNING, f"{_REJECTED}: {rejected}"))
         if not session.state or session.is_waiting:
             self._worked_ns = now_ns
         if now_ns - self._worked_ns > REOPEN_NS:
-            raise LinkError(session.state, where=str(self._address))
+            raise LinkError(session.state, where=self._name)
         return messages + measurements if session.settings.delivers else messages
 
     def _is_stopped(self, now_ns: int) -> bool:

@@ -133,7 +133,6 @@ class _Collector:
     ) -> None:
         self._radios, self._events = radios, events
         self._observation, self._on_warning = observation, on_warning
-        self._kinds: set[str] = set()
         self._report_due_s = time.monotonic() + REPORT_INTERVAL_S
 
     def collect(self) -> None:
@@ -159,11 +158,13 @@ class _Collector:
 
     def _add_warning(self, text: str) -> None:
         # A warning may contain a duration and counts, which change.
-        kind = re.sub(r"[\d.]+", "", text)
-        if kind not in self._kinds:
-            self._kinds.add(kind)
+        if _kind(text) not in map(_kind, self._observation.warnings):
             self._observation.warnings.append(text)
             self._on_warning(text)
+
+
+def _kind(warning: str) -> str:
+    return re.sub(r"[\d.]+", "", warning)
 
 
 def _open(
@@ -203,10 +204,7 @@ def _describe(radios: Sequence[RadioPort], o: Observation) -> None:
         session, settings = tag.session, tag.session.settings
         counts = session.totals()
         o.expected_ids = (settings.address, settings.peers[0])
-        o.identity = {
-            "device info": session.device_info.hex() or "not answered",
-            "rejected parameters": "; ".join(session.ranging.rejected_texts()) or "none",
-        }
+        o.identity = {"device info": session.device_info.hex() or "not answered"}
         o.written = {"CIR taps": settings.window, "CIR taps before the first path": 5}
         if session.window is not None:
             o.read = dict(zip(o.written, session.window, strict=True))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from uwb_mitigation.radios.fira import codes, messages
@@ -148,7 +147,7 @@ class Ranging:
         if session.ended or session.active:
             return ""
         if answer is None or answer.status != STATUS_OK:
-            return _refused("RANGE_START", answer, self.rejected_texts())
+            return _refused("RANGE_START", answer, self.rejected_text)
         # The notification of the active state may be lost.
         session.active = True
         return ""
@@ -172,22 +171,25 @@ class Ranging:
                 rejected = {packet[0][0]: answer.status}
             self.rejected |= rejected
             if _NEEDED & rejected.keys():
-                return _refused("SET_APP_CONFIG", answer, self.rejected_texts())
+                return _refused("SET_APP_CONFIG", answer, self.rejected_text)
             accepted = [entry for entry in packet if entry[0] not in rejected]
             if failed and accepted:
                 # An answer that names no parameter: set each one with its own command.
                 waiting = [accepted] if rejected else [[entry] for entry in accepted]
         return ""
 
-    def rejected_texts(self) -> Iterator[str]:
-        """Yield the parameters that the board did not accept, with their statuses."""
-        for tag, status in sorted(self.rejected.items()):
-            yield f"{codes.parameter_name(tag)}: {codes.status_text(status)}"
+    @property
+    def rejected_text(self) -> str:
+        """The parameters that the board did not accept, with their statuses; empty: none."""
+        rejected = sorted(self.rejected.items())
+        return "; ".join(
+            f"{codes.parameter_name(tag)}: {codes.status_text(status)}" for tag, status in rejected
+        )
 
 
-def _refused(command: str, answer: Packet | None, rejected: Iterable[str] = ()) -> str:
+def _refused(command: str, answer: Packet | None, rejected: str = "") -> str:
     """Return a problem, with the parameters that the board has rejected: one of them may be the cause."""
-    names = "".join(f"; it rejects {text}" for text in rejected)
+    names = f"; it rejects {rejected}" if rejected else ""
     if answer is None:
         return f"the board does not answer {command}{names}"
     return f"the board refuses {command}: {codes.status_text(answer.status)}{names}"

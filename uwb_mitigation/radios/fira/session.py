@@ -139,7 +139,9 @@ class UciSession:
             self._handle(packet, now_ns, stamp_ns)
         measurements = self.assembly.measurements(now_ns)
         if self._is_unanswered and (text := self._decoder.text):
-            self.state = f"{_TEXT_ANSWER} ({text!r}): flash the UCI image"
+            self.state = (
+                f"{_TEXT_ANSWER} ({text!r}): flash the UCI image, or use source:=lines map:=dwm3001_cli"
+            )
         self._commands.check_timeout(now_ns)
         self._supervise(now_ns)
         return measurements
