@@ -152,9 +152,8 @@ def _write(folder: Path, source: str, observation: Observation, checks: list[Che
         "checks": [asdict(check) for check in checks],
     }
     truth = Truth(observation.distance_m, "LOS", "field report")
-    (folder / "report.html").write_text(
-        _page(SOURCES[source], observation, truth, checks, values), encoding="utf-8"
-    )
+    title, _ = SOURCES[source]
+    (folder / "report.html").write_text(_page(title, observation, truth, checks, values), encoding="utf-8")
     (folder / "report.json").write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     with BagWriter(folder / "ranges.mcap", {"source": "field report", "simulated": "unknown"}) as bag:
         for measured in observation.ranges:

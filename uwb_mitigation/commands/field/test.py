@@ -11,45 +11,42 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 from uwb_mitigation.commands.field.checks import Observation
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios import evb1000, lines, serial, spi, uci
-from uwb_mitigation.radios.dw1000.port import ChipPort, ChipSettings
+from uwb_mitigation.radios.dw1000.port import ChipPort
 from uwb_mitigation.radios.evb1000 import Evb1000Bus
-from uwb_mitigation.radios.fira.session import UciSettings
-from uwb_mitigation.radios.lines import LinePort, LineSettings
+from uwb_mitigation.radios.lines import LinePort
 from uwb_mitigation.radios.port import OnEvent, PortAddress, RadioPort
-from uwb_mitigation.radios.serial import BoardPort, SerialSettings
-from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
+from uwb_mitigation.radios.serial import BoardPort
+from uwb_mitigation.radios.settings import DEFAULT_RADIO, PortMessage, RadioSettings
 from uwb_mitigation.radios.spi import SpidevBus
-from uwb_mitigation.radios.uci import UciPort, UciPortSettings
-from uwb_mitigation.radios.wire.layout import Mode
+from uwb_mitigation.radios.uci import UciPort
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 if TYPE_CHECKING:
     from uwb_mitigation.radios.dw1000.bus import Bus
 
-SOURCES = {
-    "uci": "board with UCI firmware",
-    "evb1000": "EVB1000",
-    "spi": "DW1000 on SPI",
-    "serial": "board with the firmware of uwb_mitigation",
-    "lines": "board that prints lines",
-    "pans": "DWM1001 with PANS",
+SOURCES: dict[str, tuple[str, Any]] = {
+    "uci": ("board with UCI firmware", uci),
+    "evb1000": ("EVB1000", evb1000),
+    "spi": ("DW1000 on SPI", spi),
+    "serial": ("board with the firmware of uwb_mitigation", serial),
+    "lines": ("board that prints lines", lines),
+    "pans": ("DWM1001 with PANS", lines),
 }
-"""Names of the kinds of radios."""
+"""Names of the kinds of radios, and the modules that open them."""
 
 START_TIMEOUT_S = 30.0
 UNPLUG_TIMEOUT_S = 60.0
 REPORT_INTERVAL_S = 0.5
 """Interval at which the warnings of the driver are collected."""
 
-_WINDOW = 157
 # Registers of the DW1000: name, header of a read, octets (user manual, chapters 2.2 and 7).
 _REGISTERS = (
     ("device id", b"\x00", 4),
@@ -87,8 +84,6 @@ def observe(
         LinkError: a port does not exist.
         MissingDependencyError: a library of the source is not installed.
     """
-    if source not in SOURCES:
-        raise ParameterError(f"source {source!r}", valid=", ".join(SOURCES))
     if not 1 <= len(ports) <= (1 if source in ("serial", "lines", "pans") else 2):
         raise ParameterError(f"{len(ports)} ports", valid="the tag's, or the tag's and the anchor's")
     for port in ports:
@@ -170,24 +165,11 @@ def _kind(warning: str) -> str:
 def _open(
     source: str, ports: list[str], mapping: str, capture: Path, on_event: OnEvent
 ) -> Sequence[RadioPort]:
-    if source in ("lines", "pans"):
-        used = lines.read_mapping({"map": mapping, "source": source}.__getitem__)
-        return lines.open([LineSettings(lines.parse_address(ports[0]), used, capture=capture)], on_event)
-    if source == "serial":
-        return serial.open([SerialSettings(PortAddress.parse(ports[0]), mode=Mode.HOST)], on_event)
-    if source == "uci":
-        boards = (UciSettings(), UciSettings(Role.ANCHOR, 2, (1,)))
-        return uci.open(
-            [
-                UciPortSettings(PortAddress.parse(port), board, capture=capture)
-                for port, board in zip(ports, boards, strict=False)
-            ],
-            on_event,
-        )
-    tag = RadioSettings(window=_WINDOW)
-    radios = (tag, replace(tag, role=Role.ANCHOR))
-    module: Any = spi if source == "spi" else evb1000
-    opened: Sequence[RadioPort] = module.open(list(map(ChipSettings, ports, radios)), on_event)
+    """Open the radios with the default parameters of the driver."""
+    values = {row.name: row.default for row in DRIVER}
+    values |= {"source": source, "port": ",".join(ports), "map": mapping, "capture": str(capture)}
+    _, module = SOURCES[source]
+    opened: Sequence[RadioPort] = module.open(module.read_settings(values.__getitem__), on_event)
     return opened
 
 
@@ -223,7 +205,7 @@ def _describe(radios: Sequence[RadioPort], o: Observation) -> None:
         o.damaged = tag.session.totals()["corrupt"]
     elif isinstance(tag, ChipPort):
         o.identity = {"bus": report.device.partition(" at ")[0]}
-        o.written = _values(RadioSettings(window=_WINDOW))
+        o.written = _values(DEFAULT_RADIO)
         o.temperature_c, o.voltage = tag.status.temperature_c, tag.status.voltage
         if tag.settings is not None:
             o.read |= _values(tag.settings)
