@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
-from uwb_mitigation.types.measurement import RangeMeasurement, Record
+from uwb_mitigation.types.measurement import Record
 from uwb_mitigation.types.source import Source
 from uwb_mitigation.types.stamps import NS_PER_S
 
@@ -78,18 +78,27 @@ class CaptureWriter:
                 self._file.flush()
 
 
-class CapturedSession(Protocol):
-    """Decodes the bytes of a board."""
+class Session(Protocol):
+    """The host's side of a board on a stream of bytes, at a port or in a capture. No I/O.
+
+    `now_ns` is monotonic, `stamp_ns` is the clock of the stamps.
+    """
 
     @property
     def delivers(self) -> bool:
-        """Whether the ranges of the board belong to the recording."""
+        """Whether the ranges of the board are published."""
 
-    def opened(self, now_ns: int) -> None: ...
+    def opened(self, now_ns: int) -> Any:
+        """Start after the port was opened."""
 
-    def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[RangeMeasurement]: ...
+    def closed(self, now_ns: int) -> list[Any]:
+        """End after the port was lost or closed; return events."""
 
-    def outgoing(self) -> bytes: ...
+    def receive(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
+        """Handle received bytes and timeouts; return measurements and other events."""
+
+    def outgoing(self) -> bytes:
+        """Return the bytes to send, once."""
 
 
 class Capture(Source):
@@ -106,9 +115,7 @@ class Capture(Source):
 
     simulated = None
 
-    def __init__(
-        self, path: Path, kind: str, open_session: Callable[[dict[str, Any]], CapturedSession]
-    ) -> None:
+    def __init__(self, path: Path, kind: str, open_session: Callable[[dict[str, Any]], Session]) -> None:
         self.name = f"{kind} capture {path}"
         self.skipped: Counter[str] = Counter()
         self._path, self._open_session = path, open_session
@@ -119,7 +126,7 @@ class Capture(Source):
 
     def __iter__(self) -> Iterator[Record]:
         self.skipped.clear()
-        boards: dict[int, CapturedSession] = {}
+        boards: dict[int, Session] = {}
         now_ns = 0
         with self._open() as file:
             number = 0
@@ -153,7 +160,7 @@ class Capture(Source):
             raise RecordingError(f"cannot be read: {error.strerror}", where=str(self._path)) from error
 
 
-def _records(session: CapturedSession, data: bytes, now_ns: int) -> Iterator[Record]:
+def _records(session: Session, data: bytes, now_ns: int) -> Iterator[Record]:
     measurements = session.receive(data, now_ns, now_ns)
     # The commands of the replayed session repeat the captured ones.
     session.outgoing()

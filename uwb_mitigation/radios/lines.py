@@ -70,21 +70,13 @@ class UdpAddress(PortAddress):
         return str(self)
 
     def open(self, baud: int = 0, dtr: bool = True) -> Any:
-        receiver = _UdpSocket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:
             receiver.bind((self.host, self.number))
         except OSError as error:
             receiver.close()
             raise LinkError(f"cannot be opened: {error.strerror or error}", where=str(self)) from error
-        receiver.port = str(self)
         return receiver
-
-
-class _UdpSocket(socket.socket):
-    port = ""
-
-    def set_low_latency_mode(self, _: bool) -> None:
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

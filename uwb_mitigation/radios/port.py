@@ -24,7 +24,7 @@ import serial
 from serial.tools import list_ports
 
 from uwb_mitigation.errors import LinkError, ParameterError, UwbMitigationError
-from uwb_mitigation.radios.capture import CaptureWriter
+from uwb_mitigation.radios.capture import CaptureWriter, Session
 from uwb_mitigation.radios.settings import PortMessage, RadioStatus
 from uwb_mitigation.types.measurement import RangeMeasurement
 
@@ -323,15 +323,15 @@ class StreamPort(RadioPort):
         place: number of the board, capture of its bytes, receiver of its events, and the clock of the stamps, ns.
 
     Attributes:
-        session: see above; `outgoing` returns the bytes to send.
+        session: see above.
     """
 
-    session: Any
+    session: Session
     _tick_s = 0.05
     """Maximum time between two calls of the session."""
 
     def __init__(
-        self, settings: StreamSettings, session: Any, monitor: ExchangeMonitor, place: StreamPlace
+        self, settings: StreamSettings, session: Session, monitor: ExchangeMonitor, place: StreamPlace
     ) -> None:
         self._number, self._capture, on_event, self._stamp_clock = place
         super().__init__(str(settings.address), on_event, monitor)
@@ -352,8 +352,7 @@ class StreamPort(RadioPort):
         """
 
     def _closed(self, now_ns: int) -> list[Any]:
-        events: list[Any] = self.session.closed(now_ns)
-        return events
+        return self.session.closed(now_ns)
 
     def close(self) -> None:
         """Stop the thread, and close the hardware and the capture; may be called twice."""
@@ -368,12 +367,12 @@ class StreamPort(RadioPort):
 
     def _open(self) -> Any:
         port = self._settings.address.open(self._settings.baud, self._settings.dtr)
-        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+        with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
             # Without this flag USB bridges delay bytes by 16 ms. Other ports do not support it.
             port.set_low_latency_mode(True)
         self._outgoing.clear()
         with self._lock:
-            self.device, self._lost = port.port, ""
+            self.device, self._lost = getattr(port, "port", self._name), ""
             self.openings += 1
             events = self._opened(time.monotonic_ns())
         self._emit(events)

@@ -108,8 +108,7 @@ class ChipPort(RadioPort):
         self.status = RadioStatus(state=RadioState.BUS)
         self._open_bus = open_bus
         self._stamp_clock = stamp_clock
-        self._requested_settings = settings.radio
-        self._settings_changed = False
+        self._requested_settings = self._configured_settings = settings.radio
         self._radio: NativeRadio | None = None
         self._is_started = False
         self._status_due_s = self._sensors_due_s = 0.0
@@ -121,9 +120,7 @@ class ChipPort(RadioPort):
             ParameterError: the settings are invalid.
         """
         settings.radio.check()
-        with self._lock:
-            if settings.radio != self._requested_settings:
-                self._requested_settings, self._settings_changed = settings.radio, True
+        self._requested_settings = settings.radio
 
     def report(self) -> PortReport:
         """Return the present state."""
@@ -159,12 +156,9 @@ class ChipPort(RadioPort):
     def _serve(self, hardware: Bus) -> list[Any]:
         radio = self._radio
         assert radio is not None
-        with self._lock:
-            changed, self._settings_changed = self._settings_changed, False
-            requested = self._requested_settings
-        if changed:
+        if (requested := self._requested_settings) != self._configured_settings:
+            self._configured_settings, self._is_started = requested, False
             radio.configure(requested)
-            self._is_started = False
         measured = radio.exchange(_EXCHANGE_TIMEOUT_S)
         events: list[Any] = [] if measured is None else [measured]
         starts = not self._is_started and radio.address != 0

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.radios.fira.messages import CirBlock, Diagnostics, FrameReport, RxFrame, SegmentMetrics
+from uwb_mitigation.radios.fira.messages import CirBlock, Diagnostics, FrameReport, SegmentMetrics
 from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, Cir, RadioType, Segment
 
 _PEAK_SHARE = 0.5
@@ -22,7 +22,9 @@ _TAP_NS = SAMPLE_PERIOD_S * 1e9
 
 _MAX_COUNT = np.iinfo(np.int16).max - 1
 _NO_SAMPLES = np.zeros(0, np.int16)
-_EXCHANGE_FRAMES = frozenset(RxFrame)
+_EXCHANGE_FRAMES = range(3)
+"""`msg_id` of the frames on which a radio reports a CIR."""
+
 _SEGMENTS = {0: Segment.IPATOV} | dict.fromkeys(range(1, 5), Segment.STS)
 
 

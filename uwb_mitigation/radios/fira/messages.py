@@ -6,7 +6,6 @@ skips unknown fields by their size, and takes the sizes of taps and windows from
 
 from __future__ import annotations
 
-import enum
 import math
 import struct
 from collections import defaultdict
@@ -18,14 +17,6 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios.fira.codes import STATUS_OK, PacketType
-
-
-class RxFrame(enum.IntEnum):
-    """Frames of an exchange on which the radio reports a CIR (`msg_id`)."""
-
-    INITIATION = 0
-    RESPONSE = 1
-    FINAL = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +90,7 @@ class FrameReport:
     """Diagnostics of one frame of an exchange.
 
     Attributes:
-        frame: `msg_id`; see `RxFrame`.
+        frame: `msg_id`; 0 to 2: initiation, response and final frame.
         received: the board received the frame; otherwise it transmitted it.
         emitter: address of the transmitter; None = unknown.
         clock_offset_ppm: carrier frequency offset; NaN = unknown.

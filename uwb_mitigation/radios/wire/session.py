@@ -103,6 +103,8 @@ class BoardSession:
         clock: estimate of the board's clock relative to the node's.
     """
 
+    delivers = True
+
     def __init__(self, *, mode: Mode | None = None, expected_model_id: int | None = None) -> None:
         self.state = LinkState.CONNECTING
         self.hello: Hello | None = None
