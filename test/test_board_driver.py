@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -23,11 +24,7 @@ from uwb_mitigation.radios import serial
 from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import SerialSettings
-from uwb_mitigation.radios.wire.events import Connected, Disconnected, Loss
-from uwb_mitigation.radios.wire.messages import Hello
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
-
-IDENTITY = Hello(board_id=0xB0, model_id=0xCAFE, window=157)
 
 
 class Recording:
@@ -36,66 +33,19 @@ class Recording:
     name = "recording"
     simulated = True
 
-    def __init__(self, count: int = 1000) -> None:
-        self.count = count
+    def __init__(self) -> None:
         self.skipped: Counter[str] = Counter()
 
     def __iter__(self) -> Iterator[Record]:
-        for i in range(self.count):
+        for i in itertools.count():
             samples = np.full(314, i % 100, np.int16)
             yield Record(RangeMeasurement(0, 1, 2, i, i * 7, 4.0, Cir(samples, preamble_count=9)))
 
 
-@pytest.fixture
-def link(tmp_path: Path) -> Path:
-    return tmp_path / "uwb_board"
-
-
-@pytest.fixture
-def board(link: Path) -> Iterator[EmulatedBoard]:
-    with EmulatedBoard(Recording(), rate_hz=200, identity=IDENTITY, link=link) as emulated:
-        yield emulated
-
-
-@pytest.fixture
-def events(board: EmulatedBoard, link: Path) -> Iterator[PortEvents]:
-    with PortEvents(serial, SerialSettings(PortAddress(str(link)))) as opened:
-        yield opened
-
-
-def test_measurements_arrive_complete_and_in_order(events):
-    (first,) = events.wait_for(RangeMeasurement)
-    sequences = [measured.sequence for measured in events.wait_for(RangeMeasurement, 50)]
-
-    assert sequences == list(range(first.sequence + 1, first.sequence + 51))
-    assert first.cir.samples.tolist() == [first.sequence % 100] * 314
-    assert first.device_time == first.sequence * 7
-
-
-def test_replugged_board_is_found_under_another_port_name(board, events, tmp_path):
-    events.wait_for(RangeMeasurement)
-    first = board.port
-    board.unplug()
-    events.wait_for(lambda event: event == Disconnected(Loss.CLOSED))
-    holders = [EmulatedBoard(link=tmp_path / "other")]  # Takes the free name,
-    board.plug()
-    while board.port == first:  # unless another process uses it.
-        board.unplug()
-        holders.append(EmulatedBoard(link=tmp_path / f"other{len(holders)}"))
-        board.plug()
-
-    events.wait_for(Connected)
-    events.wait_for(RangeMeasurement)
-
-    for holder in holders:
-        holder.close()
-
-
-def test_faulty_channel_delivers_only_sent_messages(link):
-    faults = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05)
-    # Long enough that the numbers do not start again while the port is opened.
+def test_faulty_channel_delivers_only_sent_messages(tmp_path: Path):
+    faults, link = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05), tmp_path / "board"
     with (
-        EmulatedBoard(Recording(10**6), rate_hz=1000, faults=faults, link=link, seed=4),
+        EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4),
         PortEvents(serial, SerialSettings(PortAddress(str(link)))) as events,
     ):
         received = events.wait_for(RangeMeasurement, 300)

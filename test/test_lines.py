@@ -122,9 +122,8 @@ def test_a_long_line_takes_no_more_steps_than_its_length(name: str, text: str):
 
 def test_the_stamp_is_that_of_the_first_byte_unless_the_mapping_gives_a_time():
     session = session_of("string_json")
-    good = GOOD
-    assert read(session, good[:20], 100) == []
-    stamps = [m.stamp_ns for m in session.receive(f"{good[20:]}\n{good}\n{good}".encode(), 0, 200)]
+    assert read(session, GOOD[:20], 100) == []
+    stamps = [m.stamp_ns for m in session.receive(f"{GOOD[20:]}\n{GOOD}\n{GOOD}".encode(), 0, 200)]
     stamps += [m.stamp_ns for m in session.receive(b"\n", 0, 300)]
     assert stamps == [100, 200, 200]
     document = {"name": "x", "pattern": r"(?P<t>\d+) (?P<a>\d+) (?P<r>[\d.]+)"}

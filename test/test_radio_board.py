@@ -21,12 +21,10 @@ pytestmark = NEEDS_CC
 class Host:
     """A session with a modelled board in virtual time."""
 
-    def __init__(self, air: ModelledAir, board: int, settings: RadioSettings | None = None) -> None:
+    def __init__(self, air: ModelledAir, board: int) -> None:
         self.air, self.board = air, board
         self.session = BoardSession()
         self.events: list[Event] = self.session.opened(0)
-        if settings is not None:
-            self.session.set_radio(settings)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.01)):
@@ -69,24 +67,6 @@ def test_ranges_settings_and_status_of_the_radio_reach_the_host():
     assert in_reach.address == addresses[1]
     assert -100 < in_reach.rx_power_dbm < -60
     assert in_reach.age_ms < 500
-
-
-def test_host_configures_the_radio_while_it_ranges():
-    requested = RadioSettings(channel=2, prf_mhz=16, window=40, pan=7)
-    with ModelledAir() as air:
-        tag = air.add(RadioSettings(), serial_link=SerialLink())
-        anchor = air.add(RadioSettings(role=Role.ANCHOR, channel=2, prf_mhz=16, pan=7))
-        air.set_pair(tag, anchor, Pair(6))
-        host = Host(air, tag)
-        host.run(0.5)
-        assert not host.received(RangeMeasurement)
-        host.session.set_radio(requested)
-        host.run(1)
-        ranges = host.received(RangeMeasurement)
-    assert not host.received(Refused)
-    assert host.session.radio.settings.channel == 2
-    assert len(ranges) > 50
-    assert (len(ranges[-1].cir), ranges[-1].cir.prf_mhz) == (40, 16)
 
 
 def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import ros_harness
 from compilers import NEEDS_CC
 from diagnostic_msgs.msg import DiagnosticStatus
 from ros_harness import diagnostic_values
-from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
+from uwb_mitigation_msgs.msg import Cir, RangeCir, RangeCorrected
 
 from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
 from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
@@ -58,6 +59,7 @@ def test_tag_ranges_with_two_anchors_and_settings_are_applied_live(
     message = raw[0]
     assert len(message.cir.samples) == 2 * 157
     assert message.cir.preamble_count > 0
+    assert (message.cir.radio, message.cir.segment) == (Cir.DW1000, Cir.IPATOV)
     assert np.isfinite([message.range, message.cir.rx_power, message.cir.first_path_power]).all()
     status = ros.diagnosis("driver", lambda status: level_of(status) == 0 and "ranging" in status.message)
     values = diagnostic_values(status)
@@ -108,19 +110,13 @@ def test_default_parameters_do_not_change_the_radio_of_a_board():
     assert read_radio(DEFAULTS.__getitem__) == RadioSettings()
 
 
-class ModelledBoard:
-    """A board with a radio on a modelled chip and its UART on a pseudo-terminal; a second chip is the anchor."""
+@contextmanager
+def modelled_board(link: Path) -> Iterator[None]:
+    """Operate a board with a radio on a modelled chip and its UART on a pseudo-terminal; other chips are the anchors."""
+    terminal, stop, step_s = PseudoTerminal(link), threading.Event(), 0.005
+    terminal.plug()
 
-    STEP_S = 0.005
-
-    def __init__(self, link: Path) -> None:
-        self._terminal = PseudoTerminal(link)
-        self._terminal.plug()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
+    def run() -> None:
         with ModelledAir() as air:
             tag = air.add(RadioSettings(), serial_link=SerialLink())
             nearby = air.add(RadioSettings(role=Role.ANCHOR))
@@ -128,22 +124,25 @@ class ModelledBoard:
             air.set_pair(tag, nearby, Pair(5))
             air.set_pair(tag, far, Pair(9))
             waiting = bytearray()
-            while not self._stop.wait(self.STEP_S):
-                air.write(tag, self._terminal.read())
-                air.run(self.STEP_S)
+            while not stop.wait(step_s):
+                air.write(tag, terminal.read())
+                air.run(step_s)
                 waiting += air.read(tag)
-                self._terminal.write(waiting)
+                terminal.write(waiting)
 
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._terminal.unplug()
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        terminal.unplug()
 
 
 def test_radio_of_a_serial_board_is_configured_and_reports_its_status(ros: ros_harness.Ros, tmp_path: Path):
     raw = ros.collect(RangeCir, "/uwb/range_raw")
-    board = ModelledBoard(tmp_path / "board")
-    try:
+    with modelled_board(tmp_path / "board"):
         driver = ros.start("driver", "source:=serial", f"port:={tmp_path / 'board'}", "radio.window:=40")
         ros.spin_until(lambda: bool(raw) and len(raw[-1].cir.samples) == 80)
         assert abs(raw[-1].range - 5) < 0.1
@@ -160,8 +159,6 @@ def test_radio_of_a_serial_board_is_configured_and_reports_its_status(ros: ros_h
         ros.spin_until(lambda: raw[-1].cir.prf == 16)
         assert abs(raw[-1].range - 9) < 0.1
         driver.wait_for_output("channel 2, 6800 kbit/s")
-    finally:
-        board.close()
 
 
 def test_board_without_radio_support_is_reported_and_keeps_running(ros: ros_harness.Ros, tmp_path: Path):

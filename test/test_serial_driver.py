@@ -148,23 +148,6 @@ def test_measurements_of_a_board_are_published_with_their_stamps(ros: Ros, link:
     assert driver.signal(signal.SIGINT) == 0, driver.output
 
 
-def test_correction_on_the_board_equals_that_on_the_host(ros: Ros, link: Path):
-    raw = ros.collect(RangeCir, RAW)
-    corrected = ros.collect(RangeCorrected, CORRECTED)
-    host = Mitigation(load_bundle(default_model_path()))
-    expected = {number: host.correct([measured])[0] for number, measured in played().items()}
-    with board(link, model=True):
-        drive(ros, link, "mode:=device")
-        ros.spin_until(lambda: len(corrected) >= 60)
-    for message in corrected:
-        assert message.source == CorrectedBy.DEVICE
-        assert message.model_id == host.bundle.model_id
-        assert message.range == np.float32(expected[message.sequence].range_m)
-        assert message.variance == np.float32(expected[message.sequence].variance_m2)
-    # Before the board changes its mode, it may send a few ranges in the old mode.
-    assert not stamped_after(raw, to_ns(corrected[0].header.stamp))
-
-
 def test_mode_changes_without_a_restart(ros: Ros, link: Path):
     corrected = ros.collect(RangeCorrected, CORRECTED)
     ros.start("mitigator").wait_for_output("correcting with model")
@@ -261,34 +244,34 @@ def test_malformed_port_is_refused(name: str, value: object, named: str):
         serial_source.read_settings(values.__getitem__)
 
 
-def test_board_subtracts_the_offsets_of_the_driver(ros: Ros, link: Path):
-    corrected = ros.collect(RangeCorrected, CORRECTED)
-    host = Mitigation(load_bundle(default_model_path()))
-    recorded = played()
+def test_board_corrects_as_the_host_with_the_offsets_of_the_driver(ros: Ros, link: Path):
+    raw, corrected = ros.collect(RangeCir, RAW), ros.collect(RangeCorrected, CORRECTED)
+    host, recorded = Mitigation(load_bundle(default_model_path())), played()
 
-    def latest_has(offset_m: float) -> bool:
-        host.offsets = Offsets(offset_m)
-        fresh = corrected[-20:]
-        expected = [np.float32(host.correct([recorded[m.sequence]])[0].range_m) for m in fresh]
-        return len(fresh) == 20 and [np.float32(m.range) for m in fresh] == expected
+    def is_that_of_the_host(message: RangeCorrected) -> bool:
+        (expected,) = host.correct([recorded[message.sequence]])
+        values = np.float32([expected.range_m, expected.variance_m2])
+        return np.array_equal(np.float32([message.range, message.variance]), values)
 
     with board(link, model=True, rate_hz=200.0):
         drive(ros, link, "mode:=device", "offsets:=0.25")
-        ros.spin_until(lambda: len(corrected) >= 20)
+        ros.spin_until(lambda: len(corrected) >= 60)
         # All corrections include them, from the first one on.
         host.offsets = Offsets(0.25)
-        first = corrected[0]
-        assert np.float32(first.range) == np.float32(host.correct([recorded[first.sequence]])[0].range_m)
-        assert latest_has(0.25)
+        assert all(map(is_that_of_the_host, corrected))
+        assert {(m.source, m.model_id) for m in corrected} == {(CorrectedBy.DEVICE, host.bundle.model_id)}
+        # Before the board changes its mode, it may send a few ranges in the old mode.
+        assert not stamped_after(raw, to_ns(corrected[0].header.stamp))
         assert ros.set_parameter("driver", "offsets", "-0.5").successful
+        host.offsets = Offsets(-0.5)
         corrected.clear()
-        ros.spin_until(lambda: latest_has(-0.5))
+        ros.spin_until(lambda: len(corrected) >= 20 and all(map(is_that_of_the_host, corrected[-20:])))
         refused = ros.set_parameter("driver", "offsets", 220.0)
         assert not refused.successful
         assert "millimetres" in refused.reason
 
 
-def test_unusable_port_is_logged_once(ros: Ros, link: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_unusable_port_is_logged_once(ros: Ros, link: Path):
     driver = drive(ros, link)
     absent = f"{link}: is not there (plug the board in); waiting for the radio"
     driver.wait_for_output(absent)

@@ -143,11 +143,9 @@ class Answering(UciBoardModel):
         answers: {name of the command: payload of the answer, or a function of the payload of the command}; None: the usual one.
     """
 
-    def __init__(
-        self, answers: dict[tuple[int, int], bytes | Callable[[bytes], bytes | None]], **board: object
-    ) -> None:
+    def __init__(self, answers: dict[tuple[int, int], bytes | Callable[[bytes], bytes | None]]) -> None:
         self.answers = answers
-        super().__init__(**board)
+        super().__init__()
 
     def _command(self, name, payload, now_s):
         answer = self.answers.get(name)
@@ -615,7 +613,8 @@ def test_a_second_session_that_is_refused_is_not_explained_by_parameters():
         initialised.add(payload[:4])
         return None if len(initialised) == 1 else b"\x14"
 
-    board = Answering({codes.SESSION_INIT: first_only}, rejects=frozenset([0x13]))
+    board = Answering({codes.SESSION_INIT: first_only})
+    board._rejects = frozenset([0x13])
     run = Bench(board, peers=(2, 3))
     assert "rejects" not in run.wait_for("too many sessions (status 0x14)")
     assert run.session.ranging.rejected
