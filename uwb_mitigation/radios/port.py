@@ -250,9 +250,6 @@ class RadioPort(ABC):
                     self.monitor.add_range(time.monotonic())
             self._on_event(event)
 
-    def _log(self, level: int, text: str) -> None:
-        self._on_event(PortMessage(level, text))
-
     def _log_problem(self, *, lasts: bool = False) -> None:
         """Log a problem once if it lasts; call it at least every `PROBLEM_DELAY_S`."""
         problem, now_s = self.problem, time.monotonic()
@@ -262,7 +259,7 @@ class RadioPort(ABC):
         self._problem_since_s = self._problem_since_s or now_s
         lasts |= now_s - self._problem_since_s >= PROBLEM_DELAY_S
         if lasts and problem != self._logged_problem and not self.closed:
-            self._log(logging.WARNING, f"{problem}; waiting for the radio")
+            self._on_event(PortMessage(logging.WARNING, f"{problem}; waiting for the radio"))
             self._logged_problem = problem
 
     def _run(self) -> None:

@@ -93,6 +93,7 @@ def open_capture(path: Path, value: ValueReader | None = None) -> Capture:
     """Open a capture as a recording; raise RecordingError if it cannot be read."""
 
     def session(settings: dict[str, Any]) -> UciSession:
+        settings.pop("identify", None)  # of earlier versions
         role, peers = Role[settings["role"]], tuple(map(int, settings["peers"]))
         return UciSession(UciSettings(**settings | {"role": role, "peers": peers}))
 
