@@ -156,6 +156,7 @@ def test_cirs_in_text_keep_their_values(form: str, text: str, samples: list[int]
 def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):
     text = "t,a,r,C0,C1\n0,1,2,65534,32767\n1,1,2,0.5,1.0\n"
     big, small = (one.measurement.cir for one in of(text, tmp_path / "x.csv", cir={"column": "C{0..1}"}))
+    assert max(big.samples.max(), small.samples.max()) < 32767  # a saturated sample
     assert (big.samples * big.scale).tolist() == pytest.approx([65534, 32767], rel=1e-4)
     assert (small.samples * small.scale).tolist() == pytest.approx([0.5, 1.0], rel=1e-4)
 

@@ -20,6 +20,7 @@ from model_material import changed
 import uwb_mitigation
 from uwb_mitigation import (
     AnchorMap,
+    Cir,
     Encoding,
     Mitigation,
     RangeMeasurement,
@@ -123,6 +124,18 @@ def test_arrays_are_corrected_like_measurements(mitigation: Mitigation, records:
     limit = 0.0 if gain == 1.0 else 0.03
     assert np.abs(result.range_m - [corrected.range_m for corrected in expected]).max() <= limit
     assert model.correct(measurements[0]) == expected[0]
+
+
+def test_complex_samples_are_corrected_like_their_pairs(mitigation: Mitigation, records: list[Record]):
+    record = records[0]
+    converted = changed(record, {"samples": samples(record.measurement)}).measurement
+    assert mitigation.correct(converted) == mitigation.correct(record.measurement)
+
+
+@pytest.mark.parametrize("values", [np.ones(9), np.ones((2, 9), complex), ["a"]])
+def test_a_cir_of_other_samples_is_refused_with_a_remedy(values: object):
+    with pytest.raises(ParameterError, match="1j"):
+        Cir(values)
 
 
 def test_cir_that_is_not_finite_is_not_used(mitigation: Mitigation, records: list[Record]):

@@ -15,6 +15,7 @@ from uwb_mitigation.types.measurement import (
     MAX_REACH_M,
     Encoding,
     RangeColumns,
+    int16_samples,
     is_logarithmic,
 )
 
@@ -72,7 +73,7 @@ def columns_of_arrays(
     encoding = Encoding.COMPLEX_INT16 if np.iscomplexobj(samples) else Encoding.MAGNITUDE
     for start in range(0, max(len(samples), 1), _ROWS):
         rows = slice(start, start + _ROWS)
-        int16, scale = _as_int16(samples[rows])
+        int16, scale = int16_samples(samples[rows])
         yield RangeColumns(
             encoding=encoding,
             samples=int16,
@@ -113,19 +114,3 @@ def _check_units(range_m: NDArray[np.float64], index: NDArray[np.float64], sampl
     if samples and len(finite) and ((finite < 0) | (finite >= samples)).all():
         what = f"first_path_index - start_index: {finite.min():g} to {finite.max():g} is outside of every row of the cir"
         raise ParameterError(what, valid=f"an index into the row, 0 to {samples - 1}")
-
-
-def _as_int16(cir: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
-    """Return samples for `Cir.samples`, int16 (n, m or 2 m), and scales (n,), NaN for rows that are not finite."""
-    kind = np.complex128 if np.iscomplexobj(cir) else np.float64
-    values = np.ascontiguousarray(cir, kind).view(np.float64)
-    largest = np.maximum(values.max(axis=1, initial=0.0), -values.min(axis=1, initial=0.0))
-    is_finite = np.isfinite(largest)
-    rounded = np.rint(values)
-    is_int16 = (largest <= np.iinfo(np.int16).max) & (values == rounded).all(axis=1)
-    # Below the limit of saturated samples.
-    scale = np.where(is_int16 | ~is_finite, 1.0, largest / 30_000.0)
-    if not is_int16.all():
-        np.rint(np.divide(values, scale[:, None], out=rounded), out=rounded)
-    rounded[~is_finite], scale[~is_finite] = 0.0, np.nan
-    return rounded.astype(np.int16), scale

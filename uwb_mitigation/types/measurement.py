@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwb_mitigation.errors import ParameterError
+
 DEVICE_TICK_HZ = 128 * 499.2e6
 """Rate of the DW1000's timestamp counter (DW1000 user manual, section 2.5.8: 1 / 15.65 ps)."""
 
@@ -165,12 +167,35 @@ class CorrectedBy(enum.IntEnum):
     DEVICE = 1
 
 
+_INT16 = np.dtype(np.int16)
+
+
+def int16_samples(values: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
+    """Return real or complex samples (n, m) as those of `Cir`, int16 (n, m or 2 m), and their scales (n,).
+
+    Integers of 16 bits remain unchanged; other values are rounded to 1/30,000 of the largest component of their row, which is
+    below that of a saturated sample. The scale of a row that is not finite is NaN.
+    """
+    kind = np.complex128 if np.iscomplexobj(values) else np.float64
+    numbers = np.ascontiguousarray(values, kind).view(np.float64)
+    largest = np.maximum(numbers.max(axis=1, initial=0.0), -numbers.min(axis=1, initial=0.0))
+    is_finite = np.isfinite(largest)
+    rounded = np.rint(numbers)
+    is_int16 = (largest <= np.iinfo(np.int16).max) & (numbers == rounded).all(axis=1)
+    scale = np.where(is_int16 | ~is_finite, 1.0, largest / 30_000.0)
+    if not is_int16.all():
+        np.rint(np.divide(numbers, scale[:, None], out=rounded), out=rounded)
+    rounded[~is_finite], scale[~is_finite] = 0.0, np.nan
+    return rounded.astype(np.int16), scale
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Cir:
     """A channel impulse response from the radio's accumulator.
 
     Attributes:
-        samples: int16. COMPLEX_INT16: shape (2 n,), interleaved real, imaginary. MAGNITUDE: (n,).
+        samples: int16. COMPLEX_INT16: shape (2 n,), interleaved real, imaginary. MAGNITUDE: (n,). A complex array (n,), or other
+            magnitudes, are converted with `int16_samples`.
         encoding: encoding of `samples`.
         start_index: accumulator index of the first sample.
         first_path_index: accumulator index of the first path, sub-sample; NaN = unknown.
@@ -184,6 +209,9 @@ class Cir:
         prf_mhz: pulse repetition frequency, 16 or 64; 0 = unknown.
         radio: type of the radio; UNKNOWN in recordings of earlier versions, which contain only the DW1000.
         segment: part of the frame; UNKNOWN as for `radio`.
+
+    Raises:
+        ParameterError: the samples are neither complex numbers, nor magnitudes, nor integers, in one dimension.
     """
 
     samples: NDArray[np.int16]
@@ -200,6 +228,23 @@ class Cir:
     prf_mhz: int = 0
     radio: RadioType = RadioType.UNKNOWN
     segment: Segment = Segment.UNKNOWN
+
+    def __post_init__(self) -> None:
+        # The type of arrays from messages and radios, of which each range has one.
+        if getattr(self.samples, "dtype", None) != _INT16:
+            self._convert()
+
+    def _convert(self) -> None:
+        values: NDArray[Any] = np.asarray(self.samples)
+        is_complex, is_magnitude = np.iscomplexobj(values), self.encoding == Encoding.MAGNITUDE
+        if values.ndim != 1 or not (is_complex or values.dtype.kind in ("iuf" if is_magnitude else "iu")):
+            valid = "complex `i + 1j * q`, int16 pairs, or magnitudes with encoding=Encoding.MAGNITUDE; one dimension"
+            raise ParameterError(f"samples of type {values.dtype}, shape {values.shape}", valid=valid)
+        (samples,), (scale,) = int16_samples(values[None])
+        object.__setattr__(self, "samples", samples)
+        object.__setattr__(self, "scale", self.scale * float(scale))
+        if is_complex:
+            object.__setattr__(self, "encoding", Encoding.COMPLEX_INT16)
 
     def __len__(self) -> int:
         """The number of samples in time (a complex sample counts once)."""

@@ -22,6 +22,7 @@ from uwb_mitigation.types.measurement import (
     Cir,
     Encoding,
     RangeMeasurement,
+    int16_samples,
     is_logarithmic,
 )
 from uwb_mitigation.types.stamps import NS_PER_S
@@ -420,24 +421,19 @@ def read_cir(values: Any, form: str) -> Cir:
     array = np.asarray(values)
     if array.dtype == object and array.ndim:
         array = np.stack(list(array))
-    encoding = Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
     if form == "complex":
-        pairs = array if array.ndim == 2 else np.stack([array.real, array.imag], axis=1)
-        array = pairs.reshape(-1)
+        array = array if array.ndim == 1 else array @ (1, 1j)
     elif np.iscomplexobj(array):
         array = np.abs(array)
-    flat = array.reshape(-1).astype(np.float64)
-    if not np.isfinite(flat).all():
+    (samples,), (scale,) = int16_samples(array.reshape(1, -1))
+    if np.isnan(scale):
         return NO_CIR
-    largest = float(np.abs(flat).max()) if len(flat) else 0.0
-    exact = largest <= 32767 and bool(np.all(flat == np.rint(flat)))
-    scale = 1.0 if exact or largest == 0.0 else largest / 32767
-    samples = np.rint(flat / scale).astype(np.int16)
+    encoding = Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
     if encoding is Encoding.MAGNITUDE and is_logarithmic(samples):
         raise RecordingError("a CIR in dB", valid=LINEAR_MAGNITUDES)
     if encoding is Encoding.MAGNITUDE and np.mean(samples < 0) > MAX_NEGATIVE:
         raise RecordingError("negative magnitudes", valid="cir.samples: interleaved, or complex")
-    return Cir(samples, encoding, scale=scale)
+    return Cir(samples, encoding, scale=float(scale))
 
 
 def filter_rows(rules: list[RowFilter], chunk: Chunk, prefix: str = "") -> dict[str, Mask]:
