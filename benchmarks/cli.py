@@ -386,39 +386,86 @@ def _report(result: Mapping[str, Any], json: Path | None) -> None:
     console.write_json(json, result)
 
 
-def _show_positions(result: Mapping[str, Any]) -> None:
-    """Print the RMSE of each row of each run, and the summary."""
-    from benchmarks.positions import ROWS
+_RUN_TABLES = {
+    "Horizontal RMSE, m": {
+        "least squares": "raw_least_squares:.3f",
+        "EKF": "raw_ekf:.3f",
+        "EKF offset": "raw_ekf_offset:.3f",
+        "locator": "raw_locator:.3f",
+        "ratio": "ratio_to_best_baseline:.2f",
+        "NEES": "nees_per_dof:.2f",
+        "in 95 %": "coverage95:.0%",
+    },
+    "Horizontal RMSE of the locator with other inputs, m": {
+        "corrected": "corrected_locator:.3f",
+        "calibrated": "calibrated_locator:.3f",
+        "odometry": "odometry_locator:.3f",
+        "both": "corrected_odometry_locator:.3f",
+        "smoothed": "smoothed:.3f",
+    },
+}
+_SET_TABLES = {
+    "Mean ratios of the locator's RMSE to that of the best simple filter, and of other inputs to raw ranges": {
+        "runs": "runs:d",
+        "simple": "ratio_mean:.2f",
+        "corrected": "corrected_to_raw_mean:.2f",
+        "calibrated": "calibrated_to_raw_mean:.2f",
+        "odometry": "odometry_to_raw_mean:.2f",
+    },
+    "Largest ratios (faults: of odometry)": {
+        "simple": "ratio_max:.2f",
+        "corrected": "corrected_to_raw_max:.2f",
+        "calibrated": "calibrated_to_raw_max:.2f",
+        "faults": "odometry_fault_ratio_max:.2f",
+    },
+    "Consistency with raw ranges": {
+        "NEES min": "nees_per_dof_min:.2f",
+        "NEES max": "nees_per_dof_max:.2f",
+        "in 95 % min": "coverage95_min:.0%",
+        "in 95 % max": "coverage95_max:.0%",
+    },
+    "Smallest share of published positions, largest shares beyond the protection levels": {
+        "published": "published_min:.0%",
+        "beyond": "protection_exceeded_max:.2%",
+        "height beyond": "height_exceeded_max:.2%",
+    },
+    "Headings: shares that are published, and that are wrong": {
+        "mean": "heading_published_mean:.0%",
+        "min": "heading_published_min:.0%",
+        "wrong, max": "heading_wrong_max:.2%",
+    },
+}
+"""Tables of `positions` with a line for each run or set, for a terminal of 80 columns."""
 
-    titles = [row.replace("raw_", "").replace("_locator", "").replace("_", " ") for row in ROWS]
-    columns = ("set", "run", *titles, "ratio", "coverage", "NEES")
-    rows = []
+
+def _show_positions(result: Mapping[str, Any]) -> None:
+    """Print the errors of each run, and the summary of each set."""
+    runs = []
     for entry in result["sets"]:
-        scores = entry["rows"]
-        locator = scores.get("raw_locator", {})
-        rows.append(
-            [
-                entry["name"],
-                entry["run"],
-                *(_text(scores.get(row, {}).get("rmse_m", "")) for row in ROWS),
-                *(_text(entry["ratio_to_best_baseline"]), _text(locator.get("coverage95", ""))),
-                _text(locator.get("nees_per_dof", "")),
-            ]
-        )
-    console.show_table("Horizontal RMSE, m", columns, rows, left=2, max_rows=len(rows))
-    summary = dict(result["summary"])
-    by_set = summary.pop("by_set")
-    console.show_table(
-        "Summary", ("figure", *by_set, "all"),
-        [[key, *(_text(one[key]) if key in one else "" for one in by_set.values()), _text(value)]
-         for key, value in summary.items()],
-        max_rows=len(summary),
-    )  # fmt: skip
+        rows, name = entry["rows"], f"{entry['name']} {entry['run']}"
+        figures = {row: scores["rmse_m"] for row, scores in rows.items()}
+        runs.append(entry | rows.get("raw_locator", {}) | figures | {"name": name})
+    summary = result["summary"]
+    sets = [{"name": name, **figures} for name, figures in summary["by_set"].items()]
+    _show_tables("run", _RUN_TABLES, runs)
+    _show_tables("set", _SET_TABLES, [*sets, {**summary, "name": "all"}])
+    console.print_line(
+        f"Largest share beyond the protection levels in ambiguous drives: {_text(summary['ambiguous_protection_exceeded'])}"
+    )
     for entry in result["sets"]:
         for row, reason in entry["failed"].items():
             console.warn(f"{entry['name']} {entry['run']}: no {row}: {reason}")
     for entry in result["skipped"]:
         console.warn(f"skipped {entry['path']}: {entry['reason']}")
+
+
+def _show_tables(kind: str, tables: Mapping[str, Mapping[str, str]], rows: list[dict[str, Any]]) -> None:
+    """Print tables without the rows that have no figure in them."""
+    for title, columns in tables.items():
+        keys = [column.partition(":")[0] for column in columns.values()]
+        present = [row for row in rows if any(row.get(key) is not None for key in keys if key != "runs")]
+        shown = {kind: "name", **columns}
+        console.show_table(title, shown, present, max_rows=len(present), optional=[*columns])
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
