@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable
+from numbers import Integral, Real
 
 
 class UwbMitigationError(Exception):
@@ -101,6 +102,17 @@ def check_name(
         raise ParameterError(
             f"unknown {what} {name!r:.60}", where=where, valid=valid, suggestion=did_you_mean(name, names)
         )
+
+
+def check_range(where: str, name: str, value: float, low: float, high: float, *, whole: bool = False) -> None:
+    """Raise a ParameterError that names all of them, unless `value` is a number from `low` to `high`.
+
+    NaN is rejected; with `whole`, also a number that is not an integer.
+    """
+    checked: object = value
+    if not isinstance(checked, Integral if whole else Real) or not low <= value <= high:
+        kind = "a whole number from " if whole else ""
+        raise ParameterError(f"{name} = {value!r}", where=where, valid=f"{kind}{low:g} to {high:g}")
 
 
 _DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyyaml"}

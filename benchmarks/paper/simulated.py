@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.paper.environments import OBSTACLES, RANGE_OFFSET_M, ROOMS, draw_obstacles, obstruct
 from benchmarks.paper.rooms import ROOM_ROWS
+from uwb_mitigation.errors import check_range
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, draw_fields, place
-from uwb_mitigation.simulation.channel import check_range
 from uwb_mitigation.simulation.radio import Receiver
 from uwb_mitigation.simulation.scene import DirectPath
 from uwb_mitigation.simulation.simulated import (

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import check_range
 
 STUDENT_DOF = 4.0
 """Degrees of freedom of the likelihood that compares hypotheses: heavy tails."""
@@ -64,11 +64,7 @@ class NoiseModel:
             "short": (0.1, 100.0),
         }
         for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ParameterError(
-                    f"{name} = {value}", where="motion and range model", valid=f"{low} to {high}"
-                )
+            check_range("motion and range model", name, getattr(self, name), low, high)
 
     def inflation(self, z: float) -> float:
         """Return the factor of the variance of a range with the normalised residual `z` (measured - expected)."""

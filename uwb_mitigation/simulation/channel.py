@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +35,6 @@ MAX_DECAY_NS = 200.0
 MAX_CLUSTERS = 10
 RAYS_PER_CLUSTER = 28
 """The omitted rays contain less than 0.1 % of the mean power of a residential cluster."""
-
-
-def check_range(where: str, name: str, value: float, low: float, high: float, *, whole: bool = False) -> None:
-    """Raise a ParameterError with all three unless `value` is a number from `low` to `high`.
-
-    NaN is rejected; with `whole`, also a number that is not an integer.
-    """
-    checked: object = value
-    if not isinstance(checked, Integral if whole else Real) or not low <= value <= high:
-        kind = "a whole number from " if whole else ""
-        raise ParameterError(f"{name} = {value!r}", where=where, valid=f"{kind}{low:g} to {high:g}")
 
 
 @dataclass(frozen=True, slots=True)

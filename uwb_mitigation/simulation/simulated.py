@@ -15,11 +15,11 @@ from itertools import count as counting
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, check_range
 from uwb_mitigation.simulation.antenna_pairs import AntennaPairs, Environments, draw_fields, label
 from uwb_mitigation.simulation.buildings import PLACEMENTS, RESIDENTIAL, Block, block_of
 from uwb_mitigation.simulation.buildings import RADIO as BUILDINGS_RADIO
-from uwb_mitigation.simulation.channel import DiffuseField, check_range
+from uwb_mitigation.simulation.channel import DiffuseField
 from uwb_mitigation.simulation.odometry import SimulatedMotion, simulate_motion, yaw_along_route
 from uwb_mitigation.simulation.radio import Boards, Receiver, Reception
 from uwb_mitigation.simulation.scene import ANCHORS, FLAT, MORE_ANCHORS, ROUTE, Building, Point, along_route

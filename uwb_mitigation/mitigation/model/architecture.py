@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import ParameterError, check_range
 
 HEAD = "head"
 """Name of the dense layer after the last module, whose output is flattened channel by channel."""
@@ -58,15 +58,11 @@ class Remnet:
     modules: int = 3
 
     def __post_init__(self) -> None:
-        for name, value, low, high in (
-            ("samples", self.samples, 1, 1016),
-            ("first_kernel", self.first_kernel, 1, 31),
-            ("kernel", self.kernel, 1, 31),
-            ("filters", self.filters, 1, 256),
-            ("modules", self.modules, 1, 6),
-        ):
-            if not low <= value <= high:
-                raise ParameterError(f"{name} = {value}", where="REMNet", valid=f"{low} to {high}")
+        check_range("REMNet", "samples", self.samples, 1, 1016)
+        check_range("REMNet", "first_kernel", self.first_kernel, 1, 31)
+        check_range("REMNet", "kernel", self.kernel, 1, 31)
+        check_range("REMNet", "filters", self.filters, 1, 256)
+        check_range("REMNet", "modules", self.modules, 1, 6)
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -97,19 +93,14 @@ class Remnet:
     @property
     def parameters(self) -> int:
         """Trainable parameters (paper, Table 1)."""
-        f, k = self.filters, self.kernel
-        first = self.first_kernel * f + f
-        module = 2 * (k * f * f + f) + (f * f + f)
-        return first + self.modules * module + self.lengths[-1] * f + 1
+        in_convolutions = sum((c.inputs * c.kernel + 1) * c.filters for c in self.convolutions)
+        return in_convolutions + self.features + 1
 
     @property
     def multiply_accumulates(self) -> int:
         """Multiply-accumulates of one inference, including padding."""
-        f, k = self.filters, self.kernel
-        total = self.samples * self.first_kernel * f
-        for length, half in zip(self.lengths, self.lengths[1:], strict=False):
-            total += length * k * f * f + half * (k + 1) * f * f
-        return total + self.lengths[-1] * f
+        outputs = ((c, c.filters * -(-c.length // c.stride)) for c in self.convolutions)
+        return sum(c.inputs * c.kernel * count for c, count in outputs) + self.features
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +127,7 @@ class Mlp:
     hidden: tuple[int, ...] = (240, 64, 16)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.samples <= 1016:
-            raise ParameterError(f"samples = {self.samples}", where="MLP", valid="1 to 1016")
+        check_range("MLP", "samples", self.samples, 1, 1016)
         if not 1 <= len(self.hidden) <= 6 or not all(1 <= size <= 1024 for size in self.hidden):
             raise ParameterError(f"hidden = {self.hidden}", where="MLP", valid="1 to 6 sizes of 1 to 1024")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.errors import check_range
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +28,9 @@ class FitOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, value, low, high in (
-            ("epochs", self.epochs, 1, 10_000),
-            ("learning_rate", self.learning_rate, 1e-8, 1.0),
-            ("batch", self.batch, 1, 65_536),
-            ("dropout", self.dropout, 0.0, 0.95),
-            ("weight_decay", self.weight_decay, 0.0, 10.0),
-            ("seed", self.seed, 0, 2**32 - 1),
-        ):
-            if not low <= value <= high:
-                raise ParameterError(f"{name} = {value}", valid=f"{low} to {high}")
+        check_range("training", "epochs", self.epochs, 1, 10_000)
+        check_range("training", "learning_rate", self.learning_rate, 1e-8, 1.0)
+        check_range("training", "batch", self.batch, 1, 65_536)
+        check_range("training", "dropout", self.dropout, 0.0, 0.95)
+        check_range("training", "weight_decay", self.weight_decay, 0.0, 10.0)
+        check_range("training", "seed", self.seed, 0, 2**32 - 1)
