@@ -50,6 +50,7 @@ def test_large_sites_are_accepted():
         (listed(*((n, n / 2) for n in range(MAX_ANCHORS + 1))), "257 anchors"),
         (f"{listed((1, 0))}\nrooms: []", "not a list of anchors"),
         ("[" * 5000, "not YAML"),
+        ("anchors: [{id: 1, x: 0, x: 1, y: 0, z: 0}]", "duplicate key 'x'"),
         ("#" * (MAX_TEXT + 1), "characters"),
         ("anchors: [3]", "entry 1: 3 is no anchor"),
         ("anchors: [{id: 1, x: 0, y: 0}]", "entry 1: the field z is missing"),

@@ -283,13 +283,13 @@ def info(
 
 
 def _save_anchors(source: Source, bag: Path) -> None:
-    from uwb_mitigation.types.anchors import HasAnchors, anchors_path, save_anchors
+    from uwb_mitigation.types.anchors import anchors_path, save_anchors
 
-    if isinstance(source, HasAnchors):
+    if anchors := getattr(source, "anchors", None):
         path = anchors_path(bag)
         # An existing bag was already refused, unless `--force` is given.
-        save_anchors(path, source.anchors, f"anchors of {source.name}", force=True)
-        print_line(f"Wrote {len(source.anchors)} anchors to {path}.")
+        save_anchors(path, anchors, f"anchors of {source.name}", force=True)
+        print_line(f"Wrote {len(anchors)} anchors to {path}.")
 
 
 _KINDS = {True: "simulated", False: "measured by radios", None: "unknown whether measured or simulated"}

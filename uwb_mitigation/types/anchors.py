@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, TypeAlias
 
 import numpy as np
 import yaml
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 from uwb_mitigation.files import read_bounded, write_atomically
+from uwb_mitigation.types.yaml_text import parse_yaml
 
 SD_M = 0.05
 """Accuracy of a tape measure."""
@@ -117,7 +118,7 @@ class AnchorMap:
         )
 
 
-def parse_anchors(text: str, where: str) -> AnchorMap:
+def parse_anchors(text: str | bytes, where: str) -> AnchorMap:
     """Parse the text of an anchors file, YAML or JSON; `where`: its name in errors.
 
     Raises:
@@ -125,11 +126,7 @@ def parse_anchors(text: str, where: str) -> AnchorMap:
     """
     if len(text) > MAX_TEXT:
         raise ParameterError(f"{len(text)} characters", where=where, valid=f"{MAX_TEXT} at most")
-    try:
-        document = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ParameterError(f"not YAML: {first}", where=where, valid=SCHEMA) from error
+    document = parse_yaml(text, where, SCHEMA)
     entries = document.get("anchors") if isinstance(document, dict) else None
     if not isinstance(entries, list) or not isinstance(document, dict) or len(document) != 1:
         raise ParameterError("not a list of anchors", where=where, valid=SCHEMA)
@@ -197,17 +194,6 @@ def _number(entry: dict[str, Any], name: str, where: str, low: float, high: floa
     return float(value)
 
 
-@runtime_checkable
-class HasAnchors(Protocol):
-    """A source with known anchor positions.
-
-    Attributes:
-        anchors: all anchors.
-    """
-
-    anchors: AnchorMap
-
-
 AnyAnchors: TypeAlias = AnchorMap | Mapping[int, Sequence[float]] | Sequence[Anchor] | str | Path
 """What `as_anchors` accepts."""
 
@@ -235,12 +221,7 @@ def load_anchors(path: Path | str) -> AnchorMap:
         ParameterError: it cannot be read, or does not have the format of `positioning.anchors`.
     """
     path = Path(path)
-    data = read_bounded(path, MAX_TEXT, ParameterError, SCHEMA)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ParameterError("not a text file", where=str(path), valid="YAML in UTF-8") from error
-    return parse_anchors(text, str(path))
+    return parse_anchors(read_bounded(path, MAX_TEXT, ParameterError, SCHEMA), str(path))
 
 
 def save_anchors(path: Path, anchors: AnchorMap, comment: str = "", *, force: bool = False) -> None:

@@ -20,11 +20,11 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 from uwb_mitigation.files import read_bounded
+from uwb_mitigation.types.yaml_text import parse_yaml
 
 MAX_OFFSET_M = 10.0
 """A DW1000 without any antenna delay has an offset of 154 m: set `antenna_delay` in the radio instead."""
@@ -132,11 +132,7 @@ def read_offsets(value: str) -> Offsets:
         number = float(text)
     except ValueError:
         path = Path(text).expanduser()
-        data = read_bounded(path, MAX_TEXT, ParameterError, VALID)
-        try:
-            return parse_offsets(data.decode(), str(path))
-        except UnicodeDecodeError as error:
-            raise ParameterError("not a text file", where=str(path), valid=SCHEMA) from error
+        return parse_offsets(read_bounded(path, MAX_TEXT, ParameterError, VALID), str(path))
     return Offsets(number)
 
 
@@ -159,7 +155,7 @@ def as_offsets(value: AnyOffsets) -> Offsets:
     return read_offsets(str(value))
 
 
-def parse_offsets(text: str, where: str) -> Offsets:
+def parse_offsets(text: str | bytes, where: str) -> Offsets:
     """Parse the text of an offsets file.
 
     Args:
@@ -169,11 +165,7 @@ def parse_offsets(text: str, where: str) -> Offsets:
     Raises:
         ParameterError: the text is not YAML or has another format; the message names the entry.
     """
-    try:
-        document = yaml.load(text, _UniqueKeyLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ParameterError(f"not YAML: {first}", where=where, valid=SCHEMA) from error
+    document = parse_yaml(text, where, SCHEMA)
     if isinstance(document, int | float) and not isinstance(document, bool):
         return Offsets(document, where=where)
     if not isinstance(document, dict):
@@ -208,20 +200,6 @@ def dump_offsets(offsets: Offsets, comment: str = "") -> str:
         entry = f"anchor: {format_id(anchor)}, tag: {format_id(tag)}, offset: {round(value, 6)}"
         lines.append(f"  - {{{entry}{'' if sd is None else f', sd: {round(sd, 6)}'}}}")
     return "\n".join(lines) + "\n"
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """Rejects duplicate keys, of which YAML would keep the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, int | float | str) and key in keys:
-                raise yaml.YAMLError(f"duplicate key {key!r} in line {key_node.start_mark.line + 1}")
-            if isinstance(key, int | float | str):
-                keys.add(key)
-        return super().construct_mapping(node, deep)
 
 
 def _by_id(entries: object, name: str, where: str) -> dict[int, float]:

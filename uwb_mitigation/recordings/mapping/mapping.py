@@ -11,7 +11,6 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -25,6 +24,7 @@ from pydantic import (
 from uwb_mitigation.errors import ParameterError, did_you_mean
 from uwb_mitigation.files import read_bounded
 from uwb_mitigation.types.stamps import NS_PER_S
+from uwb_mitigation.types.yaml_text import parse_yaml
 
 MAX_BYTES = 1 << 20
 _FOLDER = Path(__file__).parents[1] / "mappings"
@@ -481,11 +481,7 @@ def load_mapping(name: str) -> Mapping:
     elif not path.exists():
         valid, suggestion = f"a file, or one of {', '.join(shipped)}", did_you_mean(name, shipped)
         raise ParameterError(f"no mapping {name!r}", valid=valid, suggestion=suggestion)
-    try:
-        document = yaml.safe_load(read_bounded(path, MAX_BYTES, ParameterError))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ParameterError(f"not YAML: {first}", where=str(path)) from error
+    document = parse_yaml(read_bounded(path, MAX_BYTES, ParameterError), str(path))
     if isinstance(document, dict) and "refused" in document:
         raise ParameterError(f"{document.get('name')} cannot be imported: {document['refused']}")
     try:

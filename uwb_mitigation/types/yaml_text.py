@@ -1,0 +1,45 @@
+"""YAML and JSON that users write: anchors, offsets, mappings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from uwb_mitigation.errors import ParameterError
+
+
+def parse_yaml(text: str | bytes, where: str, valid: str = "") -> Any:
+    """Return the content of a YAML or JSON text without duplicate keys; bytes are UTF-8 or UTF-16.
+
+    Args:
+        text: the text.
+        where: name of its file in errors.
+        valid: text for `valid` of errors.
+
+    Raises:
+        ParameterError: it is no text, or not YAML.
+    """
+    try:
+        return yaml.load(text, _UniqueKeyLoader)
+    except yaml.reader.ReaderError as error:
+        raise ParameterError("not a text file", where=where, valid=valid) from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ParameterError(f"not YAML: {first}", where=where, valid=valid) from error
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """Rejects duplicate keys, of which YAML would keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = set()
+        for key_node, _ in node.value:
+            # Keys of a mapping that is merged with `<<` may be replaced.
+            is_merge = key_node.tag == "tag:yaml.org,2002:merge"
+            key = None if is_merge else self.construct_object(key_node, deep=True)
+            if isinstance(key, int | float | str) and key in keys:
+                raise yaml.YAMLError(f"duplicate key {key!r} in line {key_node.start_mark.line + 1}")
+            if isinstance(key, int | float | str):
+                keys.add(key)
+        return super().construct_mapping(node, deep)
