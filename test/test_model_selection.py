@@ -265,8 +265,6 @@ def test_network_is_compared_with_the_best_baseline(tmp_path, monkeypatch):
         ("--from-bag", "b", "--recipe", "auto"),
         ("--from-bag", "b", "--samples", 157),
         ("--from-bag", "b", "--scaling", "max"),
-        ("--from-bag", "b", "--first-kernel", 3),
-        ("--from-bag", "b", "--per-configuration", 20),
     ],
 )
 def test_contradictory_options_are_refused(tmp_path, arguments):

@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import output_option
+from uwb_mitigation.commands.support.checks import check_output, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line
-from uwb_mitigation.errors import ModelError, ParameterError
+from uwb_mitigation.errors import ModelError
 
 ModelOption = Annotated[
     Path | None, typer.Option(help="Int8 bundle. Default: the shipped one.", show_default=False)
@@ -72,8 +72,7 @@ def build_image(
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.mitigation.model.shipped import model_path
 
-    if not output.absolute().parent.is_dir():
-        raise ParameterError(f"--output {output}", valid="a file in an existing folder")
+    check_output(output, suffix="")
     bundle = load_bundle(model_path(model))
     with tempfile.TemporaryDirectory() as folder:
         export_bundle(bundle, Path(folder))

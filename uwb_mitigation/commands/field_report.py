@@ -25,7 +25,7 @@ import typer
 
 import uwb_mitigation
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import check_replaceable, output_option
+from uwb_mitigation.commands.support.checks import check_output, output_option
 from uwb_mitigation.commands.support.console import JsonOption, print_line
 from uwb_mitigation.errors import LinkError, ParameterError
 from uwb_mitigation.files import write_atomically
@@ -70,9 +70,7 @@ def field_report(
     """
     if not 0.1 <= distance <= 500.0:
         raise ParameterError(f"--distance {distance}", valid="0.1 to 500 m")
-    if output.suffix != ".zip" or output.is_dir() or not output.absolute().parent.is_dir():
-        raise ParameterError(f"-o {output}", valid="a file .zip in a folder that exists")
-    check_replaceable([output], force)
+    check_output(output, force, suffix=".zip")
     ports = [name.strip() for name in port.split(",") if name.strip()]
     for name in ports:
         if name.startswith("/") and not Path(name).exists():

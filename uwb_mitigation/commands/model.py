@@ -34,8 +34,6 @@ _DATA_OPTIONS = {
     "recipe_name": "--recipe",
     "samples": "--samples",
     "scaling": "--scaling",
-    "first_kernel": "--first-kernel",
-    "per_configuration": "--per-configuration",
 }
 _CROSS_VALIDATION_OPTIONS = {"seeds": "--seeds", "folds": "--folds", "scaling": "--scaling"}
 
@@ -72,14 +70,8 @@ def train(
         ScalingName,
         typer.Option(help="With --data: scaling of the CIR by its preamble count, or by its maximum."),
     ] = "preamble",
-    first_kernel: Annotated[
-        int, typer.Option(help="With --data: kernel size of the network's first convolution.")
-    ] = 3,
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
-    per_configuration: Annotated[
-        int, typer.Option(min=1, help="With --data: use at most this number of ranges of each placement.")
-    ] = 20,
     seed: Annotated[
         int, typer.Option(help="Seed of the splits, the initial weights and the order of the data.")
     ] = 0,
@@ -113,7 +105,7 @@ def train(
     set_options: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
     set_options = {key: value for key, value in set_options.items() if value is not None}
     options = FitOptions(**set_options)
-    architecture = Remnet(samples=samples, first_kernel=first_kernel)
+    architecture = Remnet(samples)
     check_output(output, force)
     with needs_torch():
         from uwb_mitigation.training import train as training
@@ -128,14 +120,12 @@ def train(
         job = training.TrainingJob(dataset, name, output, folds, on_progress)
         if source is None:
             network_only = replace(candidates.NETWORK_ONLY, **set_options)
-            recipe = candidates.Recipe(
-                architecture, options, network_only, per_configuration=per_configuration
-            )
+            recipe = candidates.Recipe(architecture, options, network_only)
             trained = training.train_new_model(job, recipe, recipe_name)
         else:
             trained = training.train_from_bundle(job, source, options, offer_cold_start=model is None)
     model_tables.show_trained(trained)
-    console.write_json(json, trained.as_json())
+    console.write_json(json, trained)
 
 
 def quantise(
@@ -237,7 +227,7 @@ def evaluate(
     model_tables.show_accuracy(result)
     if len(mitigation.used) > 1:
         show_models(mitigation.used)
-    console.write_json(json, result.as_json())
+    console.write_json(json, result)
 
 
 def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
@@ -259,7 +249,7 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
     with console.step_bar("cross-validating", total) as on_fold:
         result = comparison.compare_models(dataset, recipe, kind, folds, seeds, on_fold, universal)
     model_tables.show_comparison(result)
-    console.write_json(json, result.as_json())
+    console.write_json(json, result)
 
 
 def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = ()) -> tuple[str, Dataset]:

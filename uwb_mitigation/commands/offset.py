@@ -12,7 +12,7 @@ import typer
 
 from uwb_mitigation.commands.support import console
 from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for
-from uwb_mitigation.commands.support.checks import check_replaceable, output_option
+from uwb_mitigation.commands.support.checks import check_output, output_option
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, parse_id
 
@@ -74,9 +74,7 @@ def offset(
     if distance is not None and not 0.0 < distance <= MAX_DISTANCE_M:
         raise ParameterError(f"distance = {distance}", valid=f"above 0, at most {MAX_DISTANCE_M:g} m")
     if output is not None:
-        if output.is_dir() or not output.absolute().parent.is_dir():
-            raise ParameterError("cannot be written", where=str(output), valid="a file in an existing folder")
-        check_replaceable([output], force)
+        check_output(output, force, suffix="")
     anchor_id, tag_id = (
         _id(name, text) if text is not None else None for name, text in (("anchor", anchor), ("tag", tag))
     )

@@ -310,7 +310,7 @@ def _result(tracks: list[TagTracks], recorded: RecordedRanges) -> dict[str, Any]
     hdops = [tag.hdop for tag in tracks if math.isfinite(tag.hdop)]
     overall = {kind: pooled([tag.errors[kind] for tag in tracks]) for kind in KINDS}
     return {
-        "tags": [tag.as_json() for tag in tracks],
+        "tags": tracks,
         **(overall if has_truth else dict.fromkeys(KINDS)),
         "hdop_median": max(hdops) if hdops else None,
         "corrected": all(tag.recording.corrected for tag in tracks),

@@ -66,10 +66,9 @@ def process(
     path = bundle.path.absolute() if isinstance(bundle, Bundle) else AUTO
     radio_offsets = read_offsets(offsets or "")
     jobs = []
-    for planned in bags:
-        source, place = planned.source.absolute(), planned.output.absolute()
-        jobs.append(Job(source, place, path, force, radio_offsets))
-        if not planned.alone:
+    for place, bag in bags.items():
+        jobs.append(Job(bag.absolute(), place.absolute(), path, force, radio_offsets))
+        if place != output:
             _make_folder(place.parent)
 
     started = time.perf_counter()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,16 @@ NAMES = (
 NAMES_WITHOUT_CIRS = ("raw", "los_median", "overall_median", "l1_line", "shipped_float")
 """The rows for a recording without CIRs; the last one is the line with its limits."""
 
-Coverage = Mapping[str, tuple[float, float]]
-"""{label, or "" for all: shares of the errors within the 68 % and the 95 % intervals}."""
+
+class Shares(NamedTuple):
+    """Shares of the errors within the 68 % and the 95 % intervals."""
+
+    coverage68: float
+    coverage95: float
+
+
+Coverage = Mapping[str, Shares]
+"""{label, or "" for all: shares}."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,28 +87,18 @@ class Comparison:
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation evaluate --cross-validate`."""
-
-        def table(coverage: Coverage) -> dict[str, dict[str, float]]:
-            return {
-                label: {"coverage68": coverage68, "coverage95": coverage95}
-                for label, (coverage68, coverage95) in coverage.items()
-            }
-
-        universal, (coverage68, coverage95) = self.universal_coverage, self.coverage[""]
+        universal = self.universal_coverage
         return {
             "split": f"{self.folds} splits by {self.group.value}",
             "seeds": self.seeds,
             "configurations": self.configurations,
-            "rows": [asdict(row) for row in self.rows],
-            "coverage68": coverage68,
-            "coverage95": coverage95,
-            "coverage_by_label": {label: row for label, row in table(self.coverage).items() if label},
+            "rows": self.rows,
+            **self.coverage[""]._asdict(),
+            "coverage_by_label": {label: shares for label, shares in self.coverage.items() if label},
             "rejection": [{"rejected": fraction, "mae": mae} for fraction, mae in self.rejection],
             "passed_through": self.passed_through,
             "without_levels": self.without_levels,
-            "universal_coverage": None
-            if universal is None
-            else {label or "all": row for label, row in table(universal).items()},
+            "universal_coverage": universal and {label or "all": one for label, one in universal.items()},
         }
 
 
@@ -182,9 +181,8 @@ def _coverage(
 ) -> Coverage:
     """Return the coverage by label (n,) of errors (seeds, n) and their variances."""
 
-    def shares(rows: NDArray[np.bool_]) -> tuple[float, float]:
-        narrow, wide = (coverage(error_m[:, rows], each[:, rows], 1.0) for each in (variance_m2, wide_m2))
-        return narrow, wide
+    def shares(rows: NDArray[np.bool_]) -> Shares:
+        return Shares(*(coverage(error_m[:, rows], each[:, rows], 1.0) for each in (variance_m2, wide_m2)))
 
     names = ("", *dict.fromkeys(labels.tolist()))
     return {name: shares((labels == name) | (name == "")) for name in names}
@@ -231,7 +229,7 @@ def _baselines(
     yield "ridge_header", baselines.ridge(train_data, header=True)(test)
     yield "gradient_boosting", baselines.gradient_boosting(train_data, seed)(test)
     yield "l1_line", linear_bias_m(candidates.fit_line(train_data), test)
-    subset = train_data.rows(splits.subsample(train_data.configurations, recipe.per_configuration, seed))
+    subset = train_data.rows(splits.subsample(train_data.configurations, candidates.PER_CONFIGURATION, seed))
     options, samples = replace(candidates.NETWORK_ONLY, seed=seed), recipe.architecture.samples
     yield "mlp", network_m(fit(Mlp(samples=samples), subset.inputs, subset.error_m, options), test.inputs)
     network_only = fit(Remnet(samples=samples), subset.inputs, subset.error_m, options)

@@ -96,8 +96,8 @@ class TrainedBundle:
             "skipped": dict(dataset.skipped),
             "improved": self.improved,
             "rows": [{"name": row, **values} for row, values in self.validation.statistics().items()],
-            "by_configuration": {name: group._asdict() for name, group in groups.items()},
-            **({} if self.selection is None else {"choice": self.selection.as_json()}),
+            "by_configuration": groups,
+            **({} if self.selection is None else {"choice": self.selection}),
         }
 
 
@@ -283,7 +283,7 @@ def site_card(
 ) -> ModelCard:
     """Return the card of a float model that was fitted to the dataset of `validation`."""
     dataset = validation.dataset
-    options = asdict(recipe.fit) | {"per_configuration": recipe.per_configuration} if recipe.network else {}
+    options = asdict(recipe.fit) | {"per_configuration": models.PER_CONFIGURATION} if recipe.network else {}
     training = {
         "data": data,
         "configurations": names if len(names := dataset.names) <= MAX_NAMED else len(names),

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from uwb_mitigation.commands.offline.process import Job, Outcome, try_process
@@ -17,17 +17,8 @@ from uwb_mitigation.recordings.bag.rosbag2 import listed_files
 from uwb_mitigation.recordings.bag.writer import partial_file
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedBag:
-    """A bag and its output; `alone`: there is no other bag."""
-
-    source: Path
-    output: Path
-    alone: bool
-
-
-def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
-    """Return every bag in `sources` with its output path.
+def plan(sources: Sequence[Path], output: Path) -> dict[Path, Path]:
+    """Return every bag in `sources` with its output path, {output: bag}.
 
     A single bag is written to `output` itself. Several bags, or a folder of bags, are written to the folder `output` with
     their names and subfolders. Outputs of an earlier run inside a source folder are skipped.
@@ -37,7 +28,7 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
         ParameterError: `output` is a file instead of a folder, or two bags have the same output path.
     """
     if len(sources) == 1 and _is_one_bag(sources[0]):
-        return [PlannedBag(sources[0], output, True)]
+        return {output: sources[0]}
     folders = {source: list(_bags(source, output.resolve())) for source in sources if not _is_one_bag(source)}
     for source, bags in folders.items():
         if not bags:
@@ -49,7 +40,7 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
             where=str(output),
             valid="a folder, which is created if it does not exist",
         )
-    planned: dict[Path, PlannedBag] = {}
+    planned: dict[Path, Path] = {}
     for source in sources:
         if source not in folders:
             named = [(source, Path(source.resolve().name))]
@@ -61,12 +52,12 @@ def plan(sources: Sequence[Path], output: Path) -> list[PlannedBag]:
             place = output / name
             if place in planned:
                 raise ParameterError(
-                    f"{planned[place].source} and {bag} have the same name",
+                    f"{planned[place]} and {bag} have the same name",
                     where=str(place),
                     valid="different names, or separate runs",
                 )
-            planned[place] = PlannedBag(bag, place, False)
-    return list(planned.values())
+            planned[place] = bag
+    return planned
 
 
 def _is_one_bag(path: Path) -> bool:

@@ -47,14 +47,13 @@ def check_replaceable(files: Iterable[Path], force: bool) -> None:
             raise ParameterError("exists already", where=str(file), valid="--force replaces it")
 
 
-def check_output(output: Path, force: bool = True) -> None:
-    """Check that a bundle can be written to a path, with `force` also over an existing file.
+def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> None:
+    """Check that a file with a suffix can be written to a path, with `force` also over an existing file.
 
     Raises:
         ParameterError: it cannot.
     """
-    if output.suffix != ".onnx" or output.is_dir() or not output.resolve().parent.is_dir():
-        raise ParameterError(
-            "not a path for a bundle", where=str(output), valid="a file .onnx in an existing folder"
-        )
+    if not output.name.endswith(suffix) or output.is_dir() or not output.resolve().parent.is_dir():
+        valid = f"a file {suffix} in an existing folder" if suffix else "a file in an existing folder"
+        raise ParameterError("cannot be written", where=str(output), valid=valid)
     check_replaceable([output], force)

@@ -208,40 +208,23 @@ def _write(
     read: Callable[[str, str], str],
 ) -> None:
     """Write the nodes of a network. `read(tensor, value)` returns the name of the value that readers of `tensor` use."""
-    if isinstance(architecture, Mlp):
-        _write_mlp(graph, architecture, parameters, read)
-        return
-    layers = {layer.name: layer for layer in architecture.convolutions}
+    is_mlp = isinstance(architecture, Mlp)
+    layers = (
+        {} if isinstance(architecture, Mlp) else {layer.name: layer for layer in architecture.convolutions}
+    )
     reads = layer_inputs(architecture)
-    tensor = "input"
+    values = {"input": graph.node("Flatten", [INPUT], "flat", axis=1) if is_mlp else INPUT}
     for tensor in activation_tensors(architecture)[1:]:
         if tensor not in reads:
             graph.node("Add", [read(name, name) for name in sum_operands(tensor)], tensor)
             continue
-        layer, source = layers[tensor], reads[tensor]
-        output = graph.node(
-            "Conv",
-            [read(source, INPUT if source == "input" else source), *parameters(tensor)],
-            f"{tensor}.accumulated",
-            kernel_shape=[layer.kernel],
-            strides=[layer.stride],
-            pads=list(layer.padding),
-        )
-        graph.node("Relu", [output], tensor)
-    flat = graph.node("Flatten", [read(tensor, tensor)], "flat", axis=1)
-    graph.node("Gemm", [read("flat", flat), *parameters(HEAD)], OUTPUT)
-
-
-def _write_mlp(
-    graph: _Graph,
-    architecture: Mlp,
-    parameters: Callable[[str], list[str]],
-    read: Callable[[str, str], str],
-) -> None:
-    flat = graph.node("Flatten", [INPUT], "flat", axis=1)
-    for layer, source in layer_inputs(architecture).items():
-        inputs = [read(source, flat if source == "input" else source), *parameters(layer)]
-        if layer == HEAD:
-            graph.node("Gemm", inputs, OUTPUT)
-        else:
-            graph.node("Relu", [graph.node("Gemm", inputs, f"{layer}.accumulated")], layer)
+        source, shape = reads[tensor], {}
+        if layer := layers.get(tensor):
+            shape = {"kernel_shape": [layer.kernel], "strides": [layer.stride], "pads": list(layer.padding)}
+        inputs = [read(source, values.get(source, source)), *parameters(tensor)]
+        sums = graph.node("Gemm" if is_mlp else "Conv", inputs, f"{tensor}.accumulated", **shape)
+        graph.node("Relu", [sums], tensor)
+    last = read(reads[HEAD], reads[HEAD])
+    if not is_mlp:
+        last = read("flat", graph.node("Flatten", [last], "flat", axis=1))
+    graph.node("Gemm", [last, *parameters(HEAD)], OUTPUT)

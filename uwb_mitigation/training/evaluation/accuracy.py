@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,13 +40,6 @@ class Accuracy:
     statuses: Mapping[str, int]
     model_id: int
     trained_on: tuple[str, ...]
-
-    def as_json(self) -> dict[str, object]:
-        """Return the result of `uwb-mitigation evaluate`."""
-        groups = {"by_label": self.by_label, "by_configuration": self.by_configuration}
-        return asdict(self) | {
-            key: {name: group._asdict() for name, group in by_name.items()} for key, by_name in groups.items()
-        }
 
 
 def evaluate_accuracy(

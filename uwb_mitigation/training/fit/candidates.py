@@ -35,6 +35,9 @@ NETWORK_ONLY = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
 """Options of a network without a line: it needs more training than one that refines a line."""
 
 PER_CONFIGURATION = 20
+"""The network is fitted to at most this number of ranges of a configuration, so that a long recording of one placement does not
+outweigh a short one."""
+
 MIN_CONFIGURATIONS = 20
 """With fewer configurations, the universal network with an offset is preferred."""
 
@@ -80,8 +83,6 @@ class Recipe:
         fit: options of a network that refines a line. network_only: options of a network without a line.
         line: fit a line; otherwise the network predicts the whole error.
         network: fit the network; otherwise it predicts 0. With neither, the linear bias model is a constant.
-        per_configuration: the network is fitted to at most this number of ranges of a configuration, so that a long
-            recording of one placement does not outweigh a short one.
     """
 
     architecture: Remnet
@@ -89,7 +90,6 @@ class Recipe:
     network_only: FitOptions = NETWORK_ONLY
     line: bool = True
     network: bool = True
-    per_configuration: int = PER_CONFIGURATION
 
     def for_candidate(self, name: str) -> Recipe:
         """Return the recipe of one of `NEW_MODELS`."""
@@ -141,16 +141,13 @@ def fit_new_model(
                 linear_bias, networks.weights_of(networks.build_network(recipe.architecture, 0))
             )
     options = replace(recipe.fit, seed=seed)
-    network = _fit_residuals(
-        data, linear_bias, recipe.per_configuration, options, recipe.architecture, on_epoch
-    )
+    network = _fit_residuals(data, linear_bias, options, recipe.architecture, on_epoch)
     return FittedModel(linear_bias, network)
 
 
 def _fit_residuals(
     data: Dataset,
     linear_bias: LinearBiasModel,
-    per_configuration: int,
     options: FitOptions,
     architecture: Architecture,
     on_epoch: Callable[[], None] = lambda: None,
@@ -159,7 +156,7 @@ def _fit_residuals(
     """Fit a network to the residuals of a linear bias model."""
     from uwb_mitigation.training.fit import fitting
 
-    subset = data.rows(splits.subsample(data.configurations, per_configuration, options.seed))
+    subset = data.rows(splits.subsample(data.configurations, PER_CONFIGURATION, options.seed))
     residual = subset.error_m - linear_bias_m(linear_bias, subset)
     # If the linear bias model needs a power that is unknown, the range is passed through.
     rows = np.isfinite(residual)
@@ -211,12 +208,14 @@ def _fine_tuned(
     network: FloatWeights, options: FitOptions, has_line: bool, data: Dataset, seed: int
 ) -> FittedModel:
     """Return a network that is trained further on the residuals of a line or of an offset."""
-    linear_bias = fit_line(data) if has_line else _offset(data, network)
+    if has_line:
+        linear_bias = fit_line(data)
+    else:
+        linear_bias = _with_new_offset(LinearBiasModel(0.0), network, data, seed).linear_bias
     options = replace(options, seed=seed)
-    architecture = network.architecture
     return FittedModel(
         linear_bias,
-        _fit_residuals(data, linear_bias, PER_CONFIGURATION, options, architecture, start=network),
+        _fit_residuals(data, linear_bias, options, network.architecture, start=network),
     )
 
 
@@ -270,7 +269,3 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
 def has_few_configurations(data: Dataset) -> bool:
     """Whether the cold start is preferred because there are few configurations."""
     return len(data.names) < MIN_CONFIGURATIONS
-
-
-def _offset(data: Dataset, network: FloatWeights) -> LinearBiasModel:
-    return linear_fit.fit_constant(data.configurations, data.error_m - network_m(network, data.inputs))
