@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from uwb_mitigation.commands.cli import app
 from uwb_mitigation.mitigation.model.architecture import Remnet
-from uwb_mitigation.training.data.splits import GroupKey
 
 pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import comparison
@@ -34,7 +33,7 @@ def _short():
 @pytest.fixture(scope="module")
 def found() -> comparison.Comparison:
     data = dataset(12, 6, samples=8)
-    return comparison.compare_models(data, RECIPE, GroupKey.CONFIGURATION, folds=3, seeds=2)
+    return comparison.compare_models(data, RECIPE, folds=3, seeds=2)
 
 
 def mae(result: comparison.Comparison) -> dict[str, float]:
@@ -65,7 +64,7 @@ def test_coverage_is_computed_from_the_stated_intervals(found):
 def test_measurements_without_levels_are_skipped():
     data = dataset(8, 4, samples=8)
     data.rx_power_dbm[data.configurations == "c0"] = np.nan
-    found = comparison.compare_models(data, RECIPE, GroupKey.CONFIGURATION, folds=2, seeds=1)
+    found = comparison.compare_models(data, RECIPE, folds=2, seeds=1)
     assert found.configurations == 7
     assert np.isfinite([row.mae_mean for row in found.rows]).all()
 

@@ -2,55 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from model_material import dataset
 
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.training.data import splits
-from uwb_mitigation.training.data.splits import GroupKey
 from uwb_mitigation.training.evaluation import baselines
 from uwb_mitigation.training.evaluation.intervals import MIN_DEVIATION_M, fit_intervals, fit_scale
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, mae_after_rejection
 
 NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
-
-
-def placed(tags: list[int], anchors: list[int]):
-    """Return a dataset with one configuration for each tag and anchor."""
-    data = dataset(len(tags), 4, samples=8)
-    return replace(data, tags=np.repeat(np.uint64(tags), 4), anchors=np.repeat(np.uint64(anchors), 4))
-
-
-@pytest.mark.parametrize("group", list(GroupKey))
-def test_no_configuration_is_in_both_parts(group):
-    data = placed([1, 1, 2, 2, 3, 4], [1, 2, 1, 2, 3, 4])
-    for split in splits.by_group(data, group, 3, 0):
-        assert not set(data.configurations[split.train]) & set(data.configurations[split.test])
-        assert min(len(split.train), len(split.test)) > 0
-
-
-def test_each_tag_location_is_left_out_once():
-    data = placed([1, 1, 2, 3], [1, 2, 1, 2])
-    held = [set(data.tags[split.test].tolist()) for split in splits.by_group(data, GroupKey.TAG, 6, 0)]
-    assert held == [{1}, {2}, {3}]
-
-
-def test_configuration_with_two_tags_is_not_split():
-    data = placed([1, 2, 3, 4], [1, 1, 2, 2])
-    data.configurations[:8] = "c0"
-    for split in splits.by_group(data, GroupKey.TAG, 6, 0):
-        assert not {"c0"} <= set(data.configurations[split.train]) & set(data.configurations[split.test])
-
-
-@pytest.mark.parametrize("group", [GroupKey.TAG, GroupKey.HALF])
-def test_single_placement_cannot_be_split(group):
-    with pytest.raises(DatasetError, match="2 or more"):
-        splits.by_group(placed([1, 1], [1, 1]), group, 6, 0)
-    with pytest.raises(DatasetError):
-        splits.by_group(dataset(4, 2, samples=8), group, 6, 0)
 
 
 def test_bootstrap_draws_configurations_not_ranges():

@@ -22,7 +22,7 @@ from benchmarks.cli import app
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.data.splits import GroupKey, Split
+from uwb_mitigation.training.data.splits import Split
 from uwb_mitigation.training.evaluation import baselines
 from uwb_mitigation.training.fit import linear_fit
 
@@ -144,7 +144,7 @@ def in_room_2(data: Dataset) -> NDArray[np.bool_]:
 
 
 def test_no_row_of_the_comparison_was_fitted_on_its_test_data(data, watch):
-    comparison.compare_models(data, RECIPE, GroupKey.CONFIGURATION, folds=2, seeds=1)
+    comparison.compare_models(data, RECIPE, folds=2, seeds=1)
     watch.called(*(f"baselines.{name}" for name in LEARNERS[baselines].split()))
     watch.called("train.fit_with_card", "linear_fit.fit_linear_bias", "model_card.fit_intervals")
     watch.called("comparison.fit", "comparison.calibration_inputs", "comparison.quantise_network")

@@ -181,10 +181,10 @@ def evaluate(
     model: ModelOption = None,
     offsets: OffsetsOption = None,
     cross_validate: Annotated[
-        Literal["configuration", "tag", "half"] | None,
+        Literal["configuration"] | None,
         typer.Option(
             help="Instead of evaluating a model: fit the shipped recipe and the baselines, and test them on held-out "
-            "placements (configuration), locations (tag) or half of the anchors."
+            "placements (configuration)."
         ),
     ] = None,
     seeds: Annotated[
@@ -195,7 +195,7 @@ def evaluate(
             help="With --cross-validate: number of repetitions with other splits and networks.",
         ),
     ] = 3,
-    folds: Annotated[int, typer.Option(help="With --cross-validate configuration: number of folds.")] = 6,
+    folds: Annotated[int, typer.Option(help="With --cross-validate: number of folds.")] = 6,
     scaling: Annotated[
         ScalingName, typer.Option(help="With --cross-validate: max for data without preamble counts.")
     ] = "preamble",
@@ -211,7 +211,7 @@ def evaluate(
             )
         from uwb_mitigation.mitigation.preprocessing import Scaling
 
-        _compare(data, cross_validate, folds, seeds, Scaling(scaling), json)
+        _compare(data, folds, seeds, Scaling(scaling), json)
         return
     if unused := _options_given(context, _CROSS_VALIDATION_OPTIONS):
         raise ParameterError(f"{unused} without --cross-validate", valid="only with --cross-validate")
@@ -230,12 +230,11 @@ def evaluate(
     console.write_json(json, result)
 
 
-def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
+def _compare(data: Path, folds: int, seeds: int, scaling: Scaling, json: Path | None) -> None:
     from uwb_mitigation.mitigation.model.architecture import Remnet
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.mitigation.model.shipped import default_model_path
     from uwb_mitigation.mitigation.preprocessing import Preprocessing
-    from uwb_mitigation.training.data import splits
     from uwb_mitigation.training.fit.options import FitOptions
 
     with needs_torch():
@@ -244,10 +243,9 @@ def _compare(data: Path, group: str, folds: int, seeds: int, scaling: Scaling, j
 
     _, dataset = _dataset(data, Preprocessing(Remnet().samples, scaling))
     universal = load_bundle(default_model_path(scaling))
-    kind, recipe = splits.GroupKey(group), Recipe(Remnet(), FitOptions())
-    total = seeds * len(splits.by_group(dataset, kind, folds, 0))
-    with console.step_bar("cross-validating", total) as on_fold:
-        result = comparison.compare_models(dataset, recipe, kind, folds, seeds, on_fold, universal)
+    recipe = Recipe(Remnet(), FitOptions())
+    with console.step_bar("cross-validating", seeds * folds) as on_fold:
+        result = comparison.compare_models(dataset, recipe, folds, seeds, on_fold, universal)
     model_tables.show_comparison(result)
     console.write_json(json, result)
 

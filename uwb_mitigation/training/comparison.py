@@ -15,7 +15,6 @@ from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.training import train
 from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
-from uwb_mitigation.training.data.splits import GroupKey
 from uwb_mitigation.training.evaluation import baselines, zero_shot
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, coverage, mae_after_rejection
 from uwb_mitigation.training.fit import candidates
@@ -70,7 +69,7 @@ class Comparison:
         rejection: (share rejected, MAE of the remaining ranges); ranges with the largest variance are rejected first.
         passed_through: share of held-out ranges that the shipped recipe does not correct.
         without_levels: number of ranges that are left out, because baselines need both levels.
-        group, folds, seeds, configurations: parameters of the splits.
+        folds, seeds, configurations: parameters of the splits.
         universal_coverage: coverage of `universal_los_offset`; None without a universal model.
     """
 
@@ -79,7 +78,6 @@ class Comparison:
     rejection: tuple[tuple[float, float], ...]
     passed_through: float
     without_levels: int
-    group: GroupKey
     folds: int
     seeds: int
     configurations: int
@@ -89,7 +87,7 @@ class Comparison:
         """Return the result of `uwb-mitigation evaluate --cross-validate`."""
         universal = self.universal_coverage
         return {
-            "split": f"{self.folds} splits by {self.group.value}",
+            "split": f"{self.folds} splits by configuration",
             "seeds": self.seeds,
             "configurations": self.configurations,
             "rows": self.rows,
@@ -115,7 +113,6 @@ class _HeldOut:
 def compare_models(
     dataset: Dataset,
     recipe: Recipe,
-    group: GroupKey,
     folds: int,
     seeds: int,
     on_fold: Callable[[], None] = lambda: None,
@@ -126,12 +123,12 @@ def compare_models(
     `universal` adds a model that is not fitted to the data, if its preprocessing matches.
 
     Raises:
-        DatasetError, ParameterError: see `splits.by_group` and `fit`. MissingDependencyError: no scikit-learn.
+        DatasetError, ParameterError: see `splits.by_configuration` and `fit`. MissingDependencyError: no scikit-learn.
     """
     has_levels = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
     without_levels = int((~has_levels).sum()) if has_levels.any() else 0
     dataset = dataset.rows(has_levels) if has_levels.any() else dataset
-    held_out_by_seed = [_hold_out(dataset, recipe, group, folds, seed, on_fold) for seed in range(seeds)]
+    held_out_by_seed = [_hold_out(dataset, recipe, folds, seed, on_fold) for seed in range(seeds)]
     names = NAMES if dataset.has_cirs else NAMES_WITHOUT_CIRS
     errors_by_row = {
         name: np.array([seed_result.errors[name] for seed_result in held_out_by_seed]) for name in names
@@ -165,8 +162,7 @@ def compare_models(
         ),
         passed_through=float(np.mean([seed_result.passed_through for seed_result in held_out_by_seed])),
         without_levels=without_levels,
-        group=group,
-        folds=len(splits.by_group(dataset, group, folds, 0)),
+        folds=folds,
         seeds=seeds,
         configurations=len(dataset.names),
         universal_coverage=universal_coverage,
@@ -189,7 +185,7 @@ def _coverage(
 
 
 def _hold_out(
-    dataset: Dataset, recipe: Recipe, group: GroupKey, folds: int, seed: int, on_fold: Callable[[], None]
+    dataset: Dataset, recipe: Recipe, folds: int, seed: int, on_fold: Callable[[], None]
 ) -> _HeldOut:
     recipe = replace(recipe, fit=replace(recipe.fit, seed=seed))
     if not dataset.has_cirs:
@@ -197,7 +193,7 @@ def _hold_out(
     errors = {name: dataset.error_m.copy() for name in NAMES}
     variance, sigmas95 = np.empty(len(dataset)), np.empty(len(dataset))
     passed_through = np.zeros(len(dataset), np.bool_)
-    for fold in splits.by_group(dataset, group, folds, seed):
+    for fold in splits.by_configuration(dataset.configurations, folds, seed):
         train_data, test = dataset.rows(fold.train), dataset.rows(fold.test)
         for name, predicted in _baselines(train_data, test, recipe, seed):
             errors[name][fold.test] -= predicted

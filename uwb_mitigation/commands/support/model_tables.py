@@ -90,7 +90,7 @@ def show_comparison(result: Comparison) -> None:
         )
 
     show_table(
-        f"{result.configurations} configurations, {result.folds} splits by {result.group.value}, "
+        f"{result.configurations} configurations, {result.folds} splits by configuration, "
         f"MAE in m, mean of {result.seeds} seeds",
         ("", "all, m", "std, m", "95 % interval, m", *(f"{label or 'no label'}, m" for label in labels)),
         [

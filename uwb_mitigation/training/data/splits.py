@@ -6,25 +6,12 @@ therefore test whether the model memorised the placement, not whether it correct
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, ParameterError
-
-if TYPE_CHECKING:
-    from uwb_mitigation.training.data.dataset import Dataset
-
-
-class GroupKey(str, enum.Enum):
-    """The unit that is held out as a whole."""
-
-    CONFIGURATION = "configuration"
-    TAG = "tag"
-    HALF = "half"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,36 +42,6 @@ def by_configuration(configurations: NDArray[np.str_], folds: int, seed: int) ->
     for held_out_indices in np.array_split(order, folds):
         held_out = np.isin(configurations, names[held_out_indices])
         splits.append(Split(np.flatnonzero(~held_out), np.flatnonzero(held_out)))
-    return splits
-
-
-def by_group(dataset: Dataset, group: GroupKey, folds: int, seed: int) -> list[Split]:
-    """Return the splits by `group`; no configuration is in both parts of a split.
-
-    CONFIGURATION: `folds` folds of configurations. TAG: each tag location is held out in turn. HALF: the anchors are
-    sorted by id and divided into two halves; each half is held out in turn.
-
-    Raises:
-        ParameterError, DatasetError: see `by_configuration`; TAG and HALF need at least two tags or anchors.
-    """
-    if group is GroupKey.CONFIGURATION:
-        return by_configuration(dataset.configurations, folds, seed)
-    ids = dataset.tags if group is GroupKey.TAG else dataset.anchors
-    unique_ids = np.unique(ids) if ids is not None else np.zeros(0, np.uint64)
-    if ids is None or len(unique_ids) < 2:
-        raise DatasetError(
-            f"{len(unique_ids)} {'tags' if group is GroupKey.TAG else 'anchors'} do not make a split",
-            valid="2 or more",
-        )
-    held_out_groups = unique_ids[:, None] if group is GroupKey.TAG else np.array_split(unique_ids, 2)
-    splits = []
-    for held_out_ids in held_out_groups:
-        held_out = np.isin(ids, held_out_ids)
-        # Measurements without a configuration name count as one configuration and must not be in both parts.
-        is_train = ~np.isin(dataset.configurations, np.unique(dataset.configurations[held_out]))
-        if not is_train.any():
-            raise DatasetError("one configuration contains every tag or anchor", valid="named configurations")
-        splits.append(Split(np.flatnonzero(is_train), np.flatnonzero(held_out)))
     return splits
 
 
