@@ -118,6 +118,12 @@ def check_range(where: str, name: str, value: float, low: float, high: float, *,
 _DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyyaml"}
 """{name of the import: name of the package}, if they differ."""
 
+_DOCTOR = "run uwb-mitigation doctor"
+_REMEDIES = dict.fromkeys(("torch", "sklearn", "threadpoolctl"), "run `make setup-training`") | {
+    "distributed": "python -m pip install distributed"
+}
+"""{name of the import of an optional package: how to install it}."""
+
 
 def missing_dependency(error: ImportError) -> MissingDependencyError | None:
     """Return the error for a library that cannot be imported; None for a module of this package, which is a bug."""
@@ -125,7 +131,7 @@ def missing_dependency(error: ImportError) -> MissingDependencyError | None:
     if module in ("", "uwb_mitigation"):
         return None
     if not isinstance(error, ModuleNotFoundError):
-        return MissingDependencyError(f"{module} cannot be used: {error}", valid="run uwb-mitigation doctor")
+        return MissingDependencyError(f"{module} cannot be used: {error}", valid=_DOCTOR)
     if module.startswith(
         ("rcl", "rosidl", "builtin_interfaces", "lifecycle_msgs", "ament")
     ) or module.endswith("_msgs"):
@@ -133,12 +139,12 @@ def missing_dependency(error: ImportError) -> MissingDependencyError | None:
             f"ROS 2 is not set up: {module} is missing",
             valid="source the setup.sh of ROS and of the workspace; see uwb-mitigation doctor",
         )
-    return not_installed(_DISTRIBUTIONS.get(module, module))
+    return not_installed(_DISTRIBUTIONS.get(module, module), _REMEDIES.get(module, _DOCTOR))
 
 
-def not_installed(package: str) -> MissingDependencyError:
+def not_installed(package: str, remedy: str = _DOCTOR) -> MissingDependencyError:
     """Return the error for a package that cannot be found."""
-    return MissingDependencyError(f"{package} is not installed", valid="run uwb-mitigation doctor")
+    return MissingDependencyError(f"{package} is not installed", valid=remedy)
 
 
 def format_id(number: int) -> str:

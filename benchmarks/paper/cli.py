@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwb_mitigation.commands.support import console
-from uwb_mitigation.commands.support.checks import needs_torch
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError, UwbMitigationError
 
@@ -120,8 +119,7 @@ def protocol(
     An interrupted run can be continued: networks that are already in DIR are not trained again.
     """
     lengths = _lengths(windows)
-    with needs_torch():
-        from benchmarks.paper import experiment
+    from benchmarks.paper import experiment
     from benchmarks.paper.results import RESULTS
 
     tasks = experiment.list_tasks([name.strip() for name in networks.split(",")], lengths, seeds)

@@ -26,7 +26,6 @@ from benchmarks.paper.tables import Cell, Provenance, ReportTable
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.deepuwb import ROOMS
-from uwb_mitigation.training.evaluation.baselines import scikit_learn
 
 LOS = "LOS"
 MAX_SAMPLES = 3
@@ -280,12 +279,14 @@ def principal_components(inputs: NDArray[np.floating]) -> tuple[NDArray[np.float
         Coordinates (n, 3) and the share of the variance along each, (3,). Components that the data does not have are 0.
 
     Raises:
-        MissingDependencyError: scikit-learn is not installed.
+        ImportError: scikit-learn is not installed.
     """
     points, explained = np.zeros((len(inputs), 3)), np.zeros(3)
     count = min(3, *inputs.shape)
     if np.ptp(inputs, axis=0).any():
-        analysis = scikit_learn("decomposition").PCA(count, svd_solver="full")
+        from sklearn.decomposition import PCA
+
+        analysis = PCA(count, svd_solver="full")
         points[:, :count] = analysis.fit_transform(inputs.astype(np.float64))
         explained[:count] = analysis.explained_variance_ratio_
     return points, explained

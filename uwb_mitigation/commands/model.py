@@ -15,7 +15,6 @@ from uwb_mitigation.commands.support.checks import (
     OffsetsOption,
     ScalingName,
     check_output,
-    needs_torch,
     output_option,
 )
 from uwb_mitigation.commands.support.console import JsonOption
@@ -107,9 +106,8 @@ def train(
     options = FitOptions(**set_options)
     architecture = Remnet(samples)
     check_output(output, force)
-    with needs_torch():
-        from uwb_mitigation.training import train as training
-        from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)
+    from uwb_mitigation.training import train as training
+    from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)
 
     recording = data or from_bag
     assert recording is not None
@@ -235,11 +233,9 @@ def _compare(data: Path, folds: int, seeds: int, scaling: Scaling, json: Path | 
     from uwb_mitigation.mitigation.model.bundle import load_bundle
     from uwb_mitigation.mitigation.model.shipped import default_model_path
     from uwb_mitigation.mitigation.preprocessing import Preprocessing
+    from uwb_mitigation.training import comparison
+    from uwb_mitigation.training.fit.candidates import Recipe
     from uwb_mitigation.training.fit.options import FitOptions
-
-    with needs_torch():
-        from uwb_mitigation.training import comparison
-        from uwb_mitigation.training.fit.candidates import Recipe
 
     _, dataset = _dataset(data, Preprocessing(Remnet().samples, scaling))
     universal = load_bundle(default_model_path(scaling))

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from uwb_mitigation.commands.support import console, model_tables
-from uwb_mitigation.commands.support.checks import ScalingName, check_output, needs_torch, output_option
+from uwb_mitigation.commands.support.checks import ScalingName, check_output, output_option
 from uwb_mitigation.commands.support.console import JsonOption
 
 
@@ -61,8 +61,7 @@ def train_universal(
     radios = {"dw1000": RADIO, "dw3000": DW3000_STS}
     for path in (output, *([float_output] if float_output else [])):
         check_output(path, force)
-    with needs_torch():
-        from uwb_mitigation.training import universal
+    from uwb_mitigation.training import universal
 
     plan = universal.TrainingPlan(
         seed=seed, samples=samples, scaling=preprocessing.scaling, radio=radios[radio]

@@ -123,7 +123,7 @@ def compare_models(
     `universal` adds a model that is not fitted to the data, if its preprocessing matches.
 
     Raises:
-        DatasetError, ParameterError: see `splits.by_configuration` and `fit`. MissingDependencyError: no scikit-learn.
+        DatasetError, ParameterError: see `splits.by_configuration` and `fit`. ImportError: no scikit-learn.
     """
     has_levels = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
     without_levels = int((~has_levels).sum()) if has_levels.any() else 0

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from uwb_mitigation.commands.offline.process import Job, Outcome, try_process
-from uwb_mitigation.errors import MissingDependencyError, ParameterError, RecordingError
+from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.recordings.bag.rosbag2 import listed_files
 from uwb_mitigation.recordings.bag.writer import partial_file
 
@@ -132,16 +132,12 @@ def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
     iterator is closed, since Dask cannot interrupt it.
 
     Raises:
-        MissingDependencyError: `distributed` is not installed.
+        ImportError: `distributed` is not installed.
         ParameterError: no scheduler responds.
     """
-    try:
-        from distributed import Client
-        from distributed.comm import get_address_host
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            "--scheduler needs Dask", valid="python -m pip install distributed"
-        ) from error
+    from distributed import Client
+    from distributed.comm import get_address_host
+
     try:
         # If the client itself tries an invalid address, closing it takes a minute.
         get_address_host(address)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from uwb_mitigation.errors import MissingDependencyError, ParameterError
+from uwb_mitigation.errors import ParameterError
 
 ScalingName = Literal["preamble", "max"]
 """Values of `Scaling`, which takes long to import."""
@@ -27,17 +26,6 @@ OffsetsOption = Annotated[
 def output_option(metavar: str, description: str) -> Any:
     """Return the option `-o` for what a command writes."""
     return typer.Option("-o", "--output", metavar=metavar, help=description)
-
-
-@contextmanager
-def needs_torch() -> Iterator[None]:
-    """Wrap imports: if torch is missing, the error names the command that installs it."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise MissingDependencyError("training needs torch", valid="run `make setup-training`") from error
 
 
 def check_replaceable(files: Iterable[Path], force: bool) -> None:

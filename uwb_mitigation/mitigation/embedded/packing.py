@@ -6,7 +6,7 @@ The layouts are documented in `firmware/src/uwb_mitigation.h` and `uwb_kernels.h
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,23 +89,23 @@ def pack(weights: Int8Weights) -> PackedNetwork:
         ModelError: the firmware has no kernels for its shape, or a layer has no exact integer
             constants; the message names the layer and channel.
     """
-    if isinstance(weights.architecture, Mlp):
-        return _pack_mlp(weights, weights.architecture)
-    return _pack_remnet(weights, weights.architecture)
+    shape, scale = weights.architecture, weights.activation_scale
+    layers = (
+        _packed_layers(weights, shape) if isinstance(shape, Mlp) else _packed_convolutions(weights, shape)
+    )
+    return PackedNetwork(
+        samples=shape.samples,
+        input_scale=scale["input"],
+        head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
+        head_scale=np.float32(scale[layer_inputs(shape)[HEAD]] * weights.weight_scale[HEAD][0]),
+        **layers,
+    )
 
 
-def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
+def _packed_convolutions(weights: Int8Weights, shape: Remnet) -> dict[str, Any]:
+    """Return the fields of `PackedNetwork` that only a REMNet has, and the head."""
     _check_shape(shape)
     scale = weights.activation_scale
-    reads = layer_inputs(shape)
-
-    def channels(layer: str) -> Channels:
-        return _channels(
-            layer,
-            weights.weight[layer],
-            weights.bias[layer],
-            requantisation_scale(scale[reads[layer]], weights.weight_scale[layer], scale[layer]),
-        )
 
     def total(name: str, first: str, second: str) -> Sum:
         exact = solve_sum(np.float32(scale[first] / scale[name]), np.float32(scale[second] / scale[name]))
@@ -126,26 +126,22 @@ def _pack_remnet(weights: Int8Weights, shape: Remnet) -> PackedNetwork:
         modules.append(
             PackedModule(
                 _packed_taps(f"{name}.residual", weights.weight[f"{name}.residual"]),
-                channels(f"{name}.residual"),
+                _channels(weights, f"{name}.residual"),
                 total(f"{name}.sum", f"{name}.residual", tensor),
                 _channel_pairs(taps).astype(np.int16).reshape(-1),
-                channels(f"{name}.reduce"),
-                channels(f"{name}.skip"),
+                _channels(weights, f"{name}.reduce"),
+                _channels(weights, f"{name}.skip"),
                 total(name, f"{name}.reduce", f"{name}.skip"),
             )
         )
         tensor = name
-    return PackedNetwork(
-        samples=shape.samples,
-        input_scale=scale["input"],
-        head_weights=_head_words(_head_in_blocks(weights.weight[HEAD], shape)),
-        head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
-        head_scale=np.float32(scale[tensor] * weights.weight_scale[HEAD][0]),
-        first_kernel=shape.first_kernel,
-        first_weights=first,
-        first=channels("first"),
-        modules=tuple(modules),
-    )
+    return {
+        "head_weights": _head_words(_head_in_blocks(weights.weight[HEAD], shape)),
+        "first_kernel": shape.first_kernel,
+        "first_weights": first,
+        "first": _channels(weights, "first"),
+        "modules": tuple(modules),
+    }
 
 
 def _check_shape(shape: Remnet) -> None:
@@ -164,47 +160,32 @@ def _check_shape(shape: Remnet) -> None:
             )
 
 
-def _pack_mlp(weights: Int8Weights, shape: Mlp) -> PackedNetwork:
-    """Pack an MLP; pad inputs and outputs with zeros to multiples of 8."""
+def _packed_layers(weights: Int8Weights, shape: Mlp) -> dict[str, Any]:
+    """Return the fields of `PackedNetwork` that only an MLP has, and the head; inputs and outputs are padded to multiples of 8."""
     layers = []
-    scale = weights.activation_scale["input"]
     for dense in shape.layers:
-        name = dense.name
-        output_scale = weights.activation_scale[name]
-        channels = _channels(
-            name,
-            weights.weight[name],
-            weights.bias[name],
-            requantisation_scale(scale, weights.weight_scale[name], output_scale),
-        )
         outputs, inputs = (-(-size // 8) * 8 for size in (dense.outputs, dense.inputs))
         padded = np.zeros((outputs, inputs), np.int8)
-        padded[: dense.outputs, : dense.inputs] = weights.weight[name]
+        padded[: dense.outputs, : dense.inputs] = weights.weight[dense.name]
         quads = padded.reshape(outputs // 4, 4, inputs // 4, 4).transpose(0, 2, 1, 3)
         layers.append(
             PackedLayer(
                 _share_words(quads.reshape(-1, 2)),
-                Channels(*(_padded(values, outputs) for values in channels)),
+                Channels(*(_padded(values, outputs) for values in _channels(weights, dense.name))),
                 inputs,
                 outputs,
             )
         )
-        scale = output_scale
     head = _padded(weights.weight[HEAD][:, 0], -(-shape.features // 8) * 8)
-    return PackedNetwork(
-        samples=shape.samples,
-        input_scale=weights.activation_scale["input"],
-        head_weights=_head_words(head),
-        head_bias=_head_bias(weights.weight[HEAD].T, weights.bias[HEAD]),
-        head_scale=np.float32(scale * weights.weight_scale[HEAD][0]),
-        layers=tuple(layers),
-    )
+    return {"head_weights": _head_words(head), "layers": tuple(layers)}
 
 
-def _channels(
-    name: str, weight: NDArray[np.int8], bias: NDArray[np.int32], scales: NDArray[np.float32]
-) -> Channels:
-    low, high = accumulator_range(weight, bias)
+def _channels(weights: Int8Weights, name: str) -> Channels:
+    """Return the requantisation of a layer; raises ModelError if it has no exact integer form."""
+    scale, bias = weights.activation_scale, weights.bias[name]
+    read = layer_inputs(weights.architecture)[name]
+    scales = requantisation_scale(scale[read], weights.weight_scale[name], scale[name])
+    low, high = accumulator_range(weights.weight[name], bias)
     constants = np.empty((3, len(bias)), np.int32)
     for channel, scale in enumerate(scales):
         constant = solve_requantisation(scale, int(low[channel]), int(high[channel]), int(bias[channel]))

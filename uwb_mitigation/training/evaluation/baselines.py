@@ -6,13 +6,11 @@ The nine features of the CIR are those used in the literature to classify NLOS p
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.training.data.dataset import Dataset
 
 LOS = "LOS"
@@ -39,19 +37,25 @@ def overall_median(train: Dataset) -> Predict:
 
 def ridge(train: Dataset, *, header: bool) -> Predict:
     """Fit a ridge regression on standardised features of the CIR and, with `header`, of the header."""
-    pipeline, linear, preprocessing = map(scikit_learn, ("pipeline", "linear_model", "preprocessing"))
-    model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear.Ridge(RIDGE_PENALTY))
+    from sklearn.linear_model import Ridge
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    model = make_pipeline(StandardScaler(), Ridge(RIDGE_PENALTY))
     model.fit(baseline_features(train, header=header), train.error_m, ridge__sample_weight=_weights(train))
     return lambda data: np.asarray(model.predict(baseline_features(data, header=header)), np.float64)
 
 
 def gradient_boosting(train: Dataset, seed: int) -> Predict:
     """Fit gradient-boosted trees with absolute error on all features."""
-    model = scikit_learn("ensemble").HistGradientBoostingRegressor(
+    from sklearn.ensemble import HistGradientBoostingRegressor
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    model = HistGradientBoostingRegressor(
         loss="absolute_error", max_iter=TREES, max_leaf_nodes=LEAVES, random_state=seed
     )
     # On data this small, threads only add overhead.
-    with importlib.import_module("threadpoolctl").threadpool_limits(1):
+    with threadpool_limits(1):
         model.fit(baseline_features(train, header=True), train.error_m, sample_weight=_weights(train))
     return lambda data: np.asarray(model.predict(baseline_features(data, header=True)), np.float64)
 
@@ -99,11 +103,3 @@ def _weights(train: Dataset) -> NDArray[np.float64]:
     """Return weights of the rows that give every configuration the same total weight."""
     _, group_index, count = np.unique(train.configurations, return_inverse=True, return_counts=True)
     return np.asarray(len(train) / (len(count) * count[group_index]), np.float64)
-
-
-def scikit_learn(module: str):  # type: ignore[no-untyped-def]
-    """Return a module of scikit-learn; raises `MissingDependencyError`."""
-    try:
-        return importlib.import_module(f"sklearn.{module}")
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError("this needs scikit-learn", valid="run `make setup-training`") from error
