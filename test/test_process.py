@@ -245,7 +245,7 @@ def test_folders_of_sources_are_kept_and_earlier_outputs_skipped(
     for name in ("one/a.mcap", "one/sub/b.mcap", "two/a.mcap", "one/out/c.mcap"):
         write_bag(tmp_path / name, [])
     planned = plan([tmp_path / name for name in sources], tmp_path / output)
-    assert [str(each.output.relative_to(tmp_path)) for each in planned] == written
+    assert [str(output.relative_to(tmp_path)) for output in planned] == written
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
