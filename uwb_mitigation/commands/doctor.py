@@ -51,7 +51,7 @@ def doctor(json: JsonOption = None) -> None:
         table.add_row(name, {"ok": "[green]ok", "broken": "[red]broken"}.get(state, state), escape(detail))
     console.out.print(table)
     broken = [name for name, state, _ in findings if state == "broken"]
-    console.write_json(json, {"ok": not broken, "findings": [finding._asdict() for finding in findings]})
+    console.write_json(json, {"ok": not broken, "findings": findings})
     if broken:
         remedy = "run `make setup` in the checkout, or install the named packages"
         raise UwbMitigationError(f"broken: {', '.join(broken)}", valid=remedy)

@@ -106,7 +106,7 @@ def field_report(
     print_line(
         f"{output}: {len(checks)} checks, {failed} failed; read report.html in it, and attach the file to an issue"
     )
-    console.write_json(json, {"checks": [asdict(check) for check in checks]})
+    console.write_json(json, {"checks": checks})
     if failed:
         raise typer.Exit(1)
 

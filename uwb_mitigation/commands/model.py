@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -29,12 +29,8 @@ DataOption = Annotated[
 ]
 OutputOption = Annotated[Path, output_option("FILE", "Bundle to write.")]
 # Options for one mode of `train` or `evaluate`; they are errors in the other mode.
-_DATA_OPTIONS = {
-    "recipe_name": "--recipe",
-    "samples": "--samples",
-    "scaling": "--scaling",
-}
-_CROSS_VALIDATION_OPTIONS = {"seeds": "--seeds", "folds": "--folds", "scaling": "--scaling"}
+_DATA_OPTIONS = ("recipe_name", "samples", "scaling")
+_CROSS_VALIDATION_OPTIONS = ("seeds", "folds", "scaling")
 
 
 def train(
@@ -256,7 +252,8 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
     return name, dataset
 
 
-def _options_given(context: typer.Context, flags: Mapping[str, str]) -> str:
-    """Return the options of `flags`, {parameter: option}, in the command line, separated by commas."""
-    sources = {flag: context.get_parameter_source(name) for name, flag in flags.items()}
+def _options_given(context: typer.Context, names: Sequence[str]) -> str:
+    """Return the options of these parameters that the command line contains, separated by commas."""
+    parameters = [parameter for parameter in context.command.params if parameter.name in names]
+    sources = {each.opts[0]: context.get_parameter_source(each.name or "") for each in parameters}
     return ", ".join(flag for flag, source in sources.items() if source and source.name == "COMMANDLINE")

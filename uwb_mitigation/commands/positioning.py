@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.recordings.recorded_ranges import RecordedRanges
     from uwb_mitigation.types.anchors import AnchorMap
-    from uwb_mitigation.types.tracks import TagRecording
 
 TRACK_NAMES = {
     "snapshot": "least squares, raw",
@@ -107,14 +105,9 @@ def track(
     tum_files = {tag.tag_id: tum_file(tum, tag.tag_id, several) for tag in recorded.tags if tum is not None}
     check_replaceable((*tum_files.values(), *filter(None, (report, png))), force)
     origin = {"source": f"track of {bag.name}", "simulated": "false"}
-    with BagWriter(output, origin, force=force) as out, console.progress() as bar:
-        task, number = bar.add_task("tracking", total=len(recorded.tags)), itertools.count()
-
-        def on_tag(tag: TagRecording) -> None:
-            name = f"tracking tag {format_id(tag.tag_id)}: {len(tag.ranges)} ranges"
-            bar.update(task, completed=next(number), description=name)
-
-        tracks, failures = track_tags(recorded.tags, config, on_tag)
+    with BagWriter(output, origin, force=force) as out:
+        with console.step_bar("tracking tags", len(recorded.tags)) as advance:
+            tracks, failures = track_tags(recorded.tags, config, advance)
         write_tracks(out, tracks)
     for failure in failures:
         warn(f"{failure}.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -68,14 +68,9 @@ def train_universal(
     )
     if blocks is not None:
         plan = replace(plan, blocks=blocks)
-    with console.progress() as bar:
-        task = bar.add_task("simulating", total=1.0)
-        trained = universal.train_universal_model(
-            plan,
-            output.stem,
-            workers or os.cpu_count() or 1,
-            lambda fraction, what: bar.update(task, completed=fraction, description=what),
-        )
+    with console.stage_bars() as on_progress:
+        processes = workers or os.cpu_count() or 1
+        trained = universal.train_universal_model(plan, output.stem, processes, on_progress)
     if float_output is not None:
         save_bundle(
             float_output, graph.float_model(trained.network), replace(trained.card, name=float_output.stem)
@@ -89,9 +84,6 @@ def train_universal(
             "model_id": bundle.model_id,
             "seed": seed,
             "simulated": True,
-            "held_out": {
-                row: {label: asdict(statistics) for label, statistics in by.items()}
-                for row, by in trained.held_out.items()
-            },
+            "held_out": trained.held_out,
         },
     )

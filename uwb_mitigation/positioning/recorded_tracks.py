@@ -85,20 +85,20 @@ def check_one_tag(config: EstimatorConfig, recordings: Sequence[TagRecording]) -
 def track_tags(
     recordings: Sequence[TagRecording],
     config: EstimatorConfig,
-    on_tag: Callable[[TagRecording], None] = lambda recording: None,
+    on_tag: Callable[[], None] = lambda: None,
 ) -> tuple[list[TagTracks], list[DatasetError]]:
-    """Return the tracks of the tags, and the errors of those without a position; `on_tag` is called before each tag.
+    """Return the tracks of the tags, and the errors of those without a position; `on_tag` is called after each tag.
 
     Raises:
         DatasetError: no position of any tag can be determined.
     """
     tracks, failures = list[TagTracks](), list[DatasetError]()
     for recording in recordings:
-        on_tag(recording)
         try:
             tracks.append(track_tag(recording, config))
         except DatasetError as error:
             failures.append(error)
+        on_tag()
     if not tracks:
         raise failures[0]
     return tracks, failures

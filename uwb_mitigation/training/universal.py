@@ -98,12 +98,12 @@ def train_universal_model(
     plan: TrainingPlan,
     name: str,
     workers: int,
-    on_share: Callable[[float, str], None] = lambda fraction, what: None,
+    on_progress: Callable[[str, float], None] = lambda stage, fraction: None,
 ) -> UniversalModel:
-    """Train the model of `plan`. The result does not depend on `workers`; `on_share` gets the step and its progress."""
+    """Train the model of `plan`. The result does not depend on `workers`; `on_progress` gets the stage and its finished share."""
     preprocessing = Preprocessing(plan.samples, plan.scaling)
     total_blocks = plan.blocks + plan.held_out_blocks
-    count_block = step_counter(total_blocks, lambda fraction: on_share(0.2 * fraction, "simulating"))
+    count_block = step_counter(total_blocks, lambda fraction: on_progress("simulating", fraction))
     # Augmentation needs the levels, even if the scaling removes them.
     level_preprocessing = Preprocessing(plan.samples)
     train_data = building_dataset(
@@ -118,7 +118,7 @@ def train_universal_model(
     held_out = building_dataset(
         plan.seed + HELD_OUT_SEED, plan.held_out_blocks, preprocessing, workers, count_block, radio=plan.radio
     )
-    count_epoch = step_counter(plan.fit.epochs, lambda fraction: on_share(0.2 + 0.75 * fraction, "training"))
+    count_epoch = step_counter(plan.fit.epochs, lambda fraction: on_progress("training", fraction))
     options = replace(plan.fit, seed=plan.seed)
     # The network does not correct missed direct paths: nothing in its window shows them.
     early_m = train_data.early_path_m
@@ -133,7 +133,6 @@ def train_universal_model(
     )
     subset = network_data.inputs[:: max(1, len(network_data) // CALIBRATION_INPUTS)]
     integers = quantise_network(network, augmentation.scaled_calibration_inputs(subset, plan.scaling))
-    on_share(1.0, "evaluating")
     return _evaluate(plan, name, network, integers, train_data, held_out)
 
 

@@ -19,7 +19,7 @@ from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.shipped import load_model
 from uwb_mitigation.positioning.geometry import Area
 from uwb_mitigation.positioning.noise_model import NoiseModel
-from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tags
+from uwb_mitigation.positioning.recorded_tracks import KINDS, TagTracks, check_one_tag, track_tags
 from uwb_mitigation.positioning.track_settings import TrackSettings
 from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
 from uwb_mitigation.recordings.formats import open_recording
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-_KINDS = ("smoothed", "live", "raw_live", "snapshot")
 _STYLES: dict[str, dict[str, Any]] = {
     "snapshot": {"color": "#b87f00", "linestyle": "none", "marker": "+", "markersize": 3},
     "raw_live": {"color": "#d55e00", "linewidth": 1},
@@ -92,7 +91,7 @@ class Tracks:
         """
         import pandas as pd
 
-        check_name("kind of track", kind, _KINDS)
+        check_name("kind of track", kind, KINDS)
         tables = []
         for tag in self.tags:
             track = getattr(tag, kind)
@@ -119,7 +118,7 @@ class Tracks:
         Raises:
             ParameterError: another kind, or a file cannot be written.
         """
-        check_name("kind of track", kind, _KINDS)
+        check_name("kind of track", kind, KINDS)
         files = {
             tum_file(Path(path), tag.recording.tag_id, len(self) > 1): tum(getattr(tag, kind))
             for tag in self.tags

@@ -309,12 +309,6 @@ def build_bundle(path: Path, graph: bytes, card: ModelCard) -> tuple[Bundle, byt
     Raises:
         ModelError: the card does not fit the graph.
     """
-    data = assemble_bundle(graph, card)
-    return parse_bundle(data, path), data
-
-
-def assemble_bundle(graph: bytes, card: ModelCard) -> bytes:
-    """Return the bytes of a bundle."""
     import onnx
 
     metadata = asdict(card)
@@ -337,12 +331,13 @@ def assemble_bundle(graph: bytes, card: ModelCard) -> bytes:
     try:
         model = onnx.load_model_from_string(graph)
         onnx.helper.set_model_props(model, {METADATA_KEY: text})
-        data: bytes = model.SerializeToString(deterministic=True)
+        blank: bytes = model.SerializeToString(deterministic=True)
     except Exception as error:  # protobuf's errors are not part of the API of onnx.
         raise ModelError(f"not an ONNX graph: {error}") from error
-    (marker,) = _MARKER.finditer(data)
+    (marker,) = _MARKER.finditer(blank)
     start = marker.start(1)
-    return data[:start] + b"%08x" % _checksum(data, start) + data[start + len(_BLANK) :]
+    data = blank[:start] + b"%08x" % _checksum(blank, start) + blank[start + len(_BLANK) :]
+    return parse_bundle(data, path), data
 
 
 def _checksum(data: bytes, digits: int) -> int:
