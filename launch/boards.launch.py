@@ -22,25 +22,25 @@ PARAMETERS = {
 }
 ARGUMENTS = {
     "params": ("", "Parameter file of all nodes; it overrides the files of single nodes."),
-    "use_sim_time": ("false", "Take the time from /clock: true or false."),
-    "log_level": ("info", f"Log level of every node: {', '.join(launching.LOG_LEVELS)}."),
-    "respawn": ("true", "Restart a node that crashes: true or false."),
+    "use_sim_time": ("false", "Take the time from /clock."),
+    "log_level": ("info", "Log level of every node."),
+    "respawn": ("true", "Restart a node that crashes."),
+}
+CHOICES = {
+    "use_sim_time": launching.BOOLEANS,
+    "log_level": launching.LOG_LEVELS,
+    "respawn": launching.BOOLEANS,
 }
 FILES = tuple(f"{node}_params" for node in NODES)
 
 
-@launching.report_errors
 def nodes_of(context):
     names = (*PARAMETERS, *ARGUMENTS, *FILES, "boards")
     launching.check_names(getattr(context, "argv", ()), names)
     texts = {name: LaunchConfiguration(name).perform(context) for name in names}
-    flags = {name: launching.choice(name, texts[name]) == "true" for name in ("use_sim_time", "respawn")}
-    level = launching.choice("log_level", texts["log_level"], launching.LOG_LEVELS)
     files = {node: [texts[f"{node}_params"], *filter(None, [texts["params"]])] for node in NODES}
-    for node in NODES:
-        launching.from_files(node, *files[node])
     values = launching.parameters({name: texts[name] for name in PARAMETERS}, NODES, NODES)
-    common = {"use_sim_time": flags["use_sim_time"]}
+    common = {"use_sim_time": texts["use_sim_time"].lower() == "true"}
     environment = launching.respawn_environment()
     nodes = []
     for entry in texts["boards"].split():
@@ -56,12 +56,13 @@ def nodes_of(context):
                     executable=node,
                     name=node,
                     namespace=name,
-                    parameters=[*files[node], launching.quoted(node_values), common],
+                    parameters=[*files[node], node_values, common],
                     output="screen",
-                    respawn=flags["respawn"],
+                    respawn=texts["respawn"].lower() == "true",
                     respawn_delay=0.1,
+                    on_exit=launching.on_exit,
                     additional_env=environment,
-                    ros_arguments=["--log-level", level],
+                    ros_arguments=["--log-level", texts["log_level"]],
                 )
             )
     return nodes
@@ -73,7 +74,10 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument("boards", description="NAME=PORT of each board, separated by spaces."),
-            *(DeclareLaunchArgument(n, default_value=v, description=d) for n, (v, d) in texts.items()),
+            *(
+                DeclareLaunchArgument(n, default_value=v, description=d, choices=CHOICES.get(n))
+                for n, (v, d) in texts.items()
+            ),
             *(
                 DeclareLaunchArgument(
                     f"{name}_params",

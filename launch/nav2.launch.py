@@ -9,14 +9,14 @@ argument of `uwb.launch.py` is accepted. With `namespace:=robot1` all nodes and 
 """
 
 import re
+from pathlib import Path
 
+from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
-
-from uwb_mitigation.nodes.support import launching
 
 MAP_SERVER = "map_server"
 TF = [("/tf", "tf"), ("/tf_static", "tf_static")]
@@ -25,8 +25,8 @@ NAMESPACE = LaunchConfiguration("namespace")
 
 def navigation_pushes_namespace():
     """Return whether the installed Nav2 puts its nodes into the namespace: since Lyrical, but not in Jazzy and Kilted."""
-    file = launching.installed("nav2_bringup", "launch/navigation_launch.py")
-    text = "" if file is None else file.read_text(encoding="utf-8")
+    file = Path(get_package_share_directory("nav2_bringup"), "launch", "navigation_launch.py")
+    text = file.read_text(encoding="utf-8")
     return re.search(r"^[^#\n]*\bPushR(os|OS)Namespace\(", text, re.MULTILINE) is not None
 
 

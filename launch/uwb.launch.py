@@ -17,64 +17,56 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes.support import launching
 
 NODES = ("driver", "mitigator", "locator", "viewer")
 PARAMETERS = launching.arguments(NODES)
 FLAGS = {
-    "one_process": ("false", "Run driver and mitigator in one process: true or false."),
-    "locate": ("false", "Start a locator too: true or false."),
-    "viewer": ("false", "Start a viewer too, which serves a page: true or false."),
-    "rviz": ("false", "Start RViz with the configuration of this package too: true or false."),
-    "foxglove": ("false", "Start foxglove_bridge too, for Foxglove at ws://localhost:8765: true or false."),
-    "use_sim_time": ("false", "Take the time from /clock: true or false."),
-    "respawn": ("true", "Restart a node that crashes, but not after the end of a recording: true or false."),
+    "one_process": ("false", "Run driver and mitigator in one process."),
+    "locate": ("false", "Start a locator too."),
+    "viewer": ("false", "Start a viewer too, which serves a page."),
+    "rviz": ("false", "Start RViz with the configuration of this package too."),
+    "foxglove": ("false", "Start foxglove_bridge too, for Foxglove at ws://localhost:8765."),
+    "use_sim_time": ("false", "Take the time from /clock."),
+    "respawn": ("true", "Restart a node that crashes, but not after the end of a recording."),
 }
+CHOICES = dict.fromkeys(FLAGS, launching.BOOLEANS) | {"log_level": launching.LOG_LEVELS}
 ARGUMENTS = FLAGS | {
     "params": ("", "Parameter file of all nodes; it overrides the files of single nodes."),
     "namespace": ("", "Namespace of the nodes."),
-    "log_level": ("info", f"Log level of every node: {', '.join(launching.LOG_LEVELS)}."),
+    "log_level": ("info", "Log level of every node."),
 }
 FILES = tuple(f"{node}_params" for node in NODES)
 
 
-@launching.report_errors
 def nodes_of(context):
     launching.check_names(getattr(context, "argv", ()), {*PARAMETERS, *ARGUMENTS, *FILES})
     texts = {name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, *ARGUMENTS, *FILES)}
-    flags = {name: launching.choice(name, texts[name]) == "true" for name in FLAGS}
-    level = launching.choice("log_level", texts["log_level"], launching.LOG_LEVELS)
+    flags = {name: texts[name].lower() == "true" for name in FLAGS}
     files = {node: [texts[f"{node}_params"], *filter(None, [texts["params"]])] for node in NODES}
     file_values = {node: launching.from_files(node, *files[node]) for node in NODES}
     source = texts["source"] or file_values["driver"].get("source")
     started = [node for node, flag in (("locator", "locate"), ("viewer", "viewer")) if flags[flag]]
     if not (source or started or flags["rviz"] or flags["foxglove"]):
-        raise ParameterError(
-            "no source of ranges",
-            valid="source:=serial port:=/dev/ttyACM0, source:=mcap path:=FILE, source:=decaranging path:=FILE, or "
-            "source:=simulated for ranges that no radio measured",
+        raise RuntimeError(
+            "no source of ranges (source:=serial port:=/dev/ttyACM0, source:=mcap path:=FILE, source:=decaranging path:=FILE, "
+            "or source:=simulated for ranges that no radio measured)"
         )
     radio_nodes = ["driver", "mitigator"] if source else []
     values = launching.parameters(texts, [*radio_nodes, *started], NODES)
-    if source:
-        launching.check_driver(file_values["driver"] | values["driver"])
     if texts["params"]:
         launching.separate_conflicts(values, file_values)
     if flags["locate"] and flags["viewer"]:
         # The locator publishes the anchors for the viewer.
         values["viewer"].pop("anchors", None)
     common = {"use_sim_time": flags["use_sim_time"]}
-    parameters = {node: [*files[node], launching.quoted(values[node]), common] for node in values}
+    parameters = {node: [*files[node], values[node], common] for node in values}
     if flags["one_process"] and source:
         # Without a node name, because it would apply to both nodes of the process.
-        merged = launching.quoted(values["driver"] | values["mitigator"])
+        merged = values["driver"] | values["mitigator"]
+        started_parameters = {node: parameters[node] for node in started}
         merged_files = [texts["driver_params"], *files["mitigator"]]
-        parameters = {"pipeline": [*merged_files, merged, common]} | {
-            node: parameters[node] for node in started
-        }
-    # The driver ends after the recording and must not be respawned.
-    ending = ("driver", "pipeline") if source in ("mcap", "decaranging") else ()
+        parameters = {"pipeline": [*merged_files, merged, common]} | started_parameters
     environment = launching.respawn_environment()
     return displays(flags, common) + [
         Node(
@@ -84,10 +76,11 @@ def nodes_of(context):
             namespace=texts["namespace"],
             parameters=parameters[name],
             output="screen",
-            respawn=flags["respawn"] and name not in ending,
+            respawn=flags["respawn"],
             respawn_delay=0.1,
+            on_exit=launching.on_exit,
             additional_env=environment,
-            ros_arguments=["--log-level", level],
+            ros_arguments=["--log-level", texts["log_level"]],
         )
         for name in parameters
     ]
@@ -99,7 +92,6 @@ def displays(flags, common):
     nodes = []
     for flag, package, arguments in (("rviz", "rviz2", ["-d", layout]), ("foxglove", "foxglove_bridge", [])):
         if flags[flag]:
-            launching.check_package(flag, package)
             nodes.append(
                 Node(
                     package=package,
@@ -117,7 +109,10 @@ def generate_launch_description():
     texts = {name: ("", launching.description(rows)) for name, rows in PARAMETERS.items()} | ARGUMENTS
     return LaunchDescription(
         [
-            *(DeclareLaunchArgument(n, default_value=v, description=d) for n, (v, d) in texts.items()),
+            *(
+                DeclareLaunchArgument(n, default_value=v, description=d, choices=CHOICES.get(n))
+                for n, (v, d) in texts.items()
+            ),
             *(
                 DeclareLaunchArgument(
                     f"{name}_params",

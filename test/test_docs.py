@@ -20,7 +20,7 @@ import yaml
 from browser import Browser
 from conftest import REPOSITORY
 from test_launch import generate as generate
-from test_launch import launch
+from test_launch import launch, settings
 
 from benchmarks import cli as benchmarks
 from uwb_mitigation.commands import cli
@@ -195,7 +195,10 @@ def test_launch_commands_start_nodes(
             "uwb.launch.py",
             {"locate": "true"} | {n: v for n, v in values.items() if n not in nav2},
         )
-    assert launch(generate, file, **values)
+    for node in launch(generate, file, **values):
+        rows = {row.name: row for row in ALL_TABLES.get(node.executable, ())}
+        for name in settings(node).keys() & rows.keys():
+            rows[name].check(settings(node)[name])
 
 
 def test_parameter_files_on_pages_contain_known_parameters():

@@ -24,8 +24,7 @@ from uwb_mitigation.types.offsets import parse_offsets
     [
         (partial(model_path, "Universl"), "universal"),
         (partial(launching.check_names, ["raet:=1"], ["rate", "seed"]), "rate"),
-        (partial(launching.choice, "log_level", "inof", launching.LOG_LEVELS), "info"),
-        (partial(launching.value_of, DRIVER[0], "decarangin"), "decaranging"),
+        (partial(DRIVER[0].check, "decarangin"), "decaranging"),
         (partial(parse_offsets, "ancors: {1: 0.2}", "file"), "anchors"),
         (partial(parse_offsets, "pairs: [{anchor: 1, tagg: 2, offset: 0}]", "file"), "tag"),
         (partial(parse_anchors, "anchors: [{id: 1, x: 0, y: 0, z: 0, nmae: A}]", "file"), "name"),

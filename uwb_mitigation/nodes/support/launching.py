@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
-import functools
-import json
-import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from uwb_mitigation.errors import ParameterError, UwbMitigationError, check_name, did_you_mean
+from uwb_mitigation.errors import ParameterError, check_name
 from uwb_mitigation.nodes.support.parameter_tables import (
+    REFUSED,
     RESPAWN_FOLDER,
-    STANDARD,
     TABLES,
     Parameter,
     ParameterValue,
 )
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
+BOOLEANS = ("true", "false", "True", "False")
 
 _WILDCARDS = ("*", "**", "/*", "/**")
 """Sections of a parameter file that apply to every node."""
@@ -33,25 +30,23 @@ _WILDCARDS = ("*", "**", "/*", "/**")
 _LAUNCH_FILES = (".launch.py", ".launch.xml", ".launch.yaml", ".launch.yml")
 _OWN_LAUNCH_FILES = ("uwb.launch.py", "boards.launch.py")
 
-_PARSERS: dict[type, Callable[[str], ParameterValue]] = {
-    bool: lambda text: {"true": True, "false": False}[text.lower()],
-    int: lambda text: int(text, 0),
-    float: float,
-    str: str,
-}
 
+def on_exit(event: Any, context: object) -> list[Any]:
+    """Handle the exit of a node during its `respawn_delay`, so that only a crashed node is respawned.
 
-def report_errors(function: Callable[[Any], list[Any]]) -> Callable[[Any], list[Any]]:
-    """Make a launch function raise RuntimeError, which `ros2 launch` reports in one line, and then stops."""
+    Args:
+        event: `ProcessExited`. Code 0: the node ended, for example after a recording. `REFUSED`: the launch stops.
+        context: unused.
+    """
+    from launch.actions import EmitEvent, Shutdown
+    from launch.events import matches_action
+    from launch.events.process import ShutdownProcess
 
-    @functools.wraps(function)
-    def wrapped(context: Any) -> list[Any]:
-        try:
-            return function(context)
-        except UwbMitigationError as error:
-            raise RuntimeError(str(error)) from None
-
-    return wrapped
+    if event.returncode == REFUSED:
+        return [Shutdown()]
+    if event.returncode == 0:
+        return [EmitEvent(event=ShutdownProcess(process_matcher=matches_action(event.action)))]
+    return []
 
 
 def arguments(nodes: Iterable[str]) -> dict[str, dict[str, Parameter]]:
@@ -88,7 +83,7 @@ def parameters(
         argument_nodes: the nodes whose parameters are arguments.
 
     Raises:
-        ParameterError: a value is invalid, or for a node that is not started.
+        ParameterError: an argument is for a node that is not started.
     """
     values: dict[str, dict[str, Any]] = {node: {} for node in nodes}
     for name, rows in arguments(argument_nodes).items():
@@ -106,39 +101,19 @@ def parameters(
     return values
 
 
-def quoted(values: Mapping[str, ParameterValue]) -> dict[str, ParameterValue]:
-    """Return parameters for launch_ros, which reads a text as YAML: a text such as 1234 needs quotes."""
-    return {name: json.dumps(value) if isinstance(value, str) else value for name, value in values.items()}
-
-
 def value_of(row: Parameter, text: str) -> ParameterValue:
-    """Return the value of a parameter from the text of an argument.
-
-    Raises:
-        ParameterError: the text is not a valid value.
-    """
-    value: ParameterValue = text
-    kinds = (int, float) if row.or_number else (type(row.default),)
-    for kind in kinds:
-        with contextlib.suppress(ValueError, KeyError):
-            value = _PARSERS[kind](text)
-            break
-    if row.or_number and isinstance(value, int) and abs(value) >= 1 << 63:
-        # ROS integers are signed: an address of 64 bits stays a string.
-        value = text
-    if row.or_number and isinstance(value, str):
-        # In quotes, as on the command line.
-        value = value.strip("'\"")
-    row.check(value)
-    return value
-
-
-def choice(name: str, text: str, choices: Sequence[str] = ("true", "false")) -> str:
-    """Return the value of an argument in lower case; raise ParameterError if it is not one of the choices."""
-    if text.lower() not in choices:
-        valid, suggestion = f"one of {', '.join(choices)}", did_you_mean(text, choices)
-        raise ParameterError(f"argument {name}:={text}", valid=valid, suggestion=suggestion)
-    return text.lower()
+    """Return the value of a parameter from the text of an argument; a text of another type is left to the node."""
+    try:
+        if isinstance(row.default, bool):
+            return {"true": True, "false": False}[text.lower()]
+        if isinstance(row.default, int):
+            return int(text, 0)
+        if isinstance(row.default, float):
+            return float(text)
+    except (KeyError, ValueError):
+        return text
+    # An address may be in quotes, as on the command line of a node.
+    return text.strip("'\"") if row.or_number else text
 
 
 def check_names(words: Sequence[str], declared: Collection[str]) -> None:
@@ -157,65 +132,22 @@ def check_names(words: Sequence[str], declared: Collection[str]) -> None:
             check_name("argument", name, declared, valid="--show-args lists them")
 
 
-def installed(package: str, file: str) -> Path | None:
-    """Return the path of a file of an installed ROS package; None: it is in no prefix of AMENT_PREFIX_PATH."""
-    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
-    paths = (Path(prefix, "share", package, file) for prefix in prefixes)
-    return next(filter(Path.is_file, paths), None)
-
-
-def check_package(argument: str, package: str) -> None:
-    """Check that a ROS package is installed.
-
-    Args:
-        argument: launch argument that needs it.
-        package: its name.
-
-    Raises:
-        ParameterError: it is not in any prefix of AMENT_PREFIX_PATH.
-    """
-    if installed(package, "package.xml") is None:
-        name = package.replace("_", "-")
-        raise ParameterError(
-            f"{argument}:=true needs {package}, which is not installed",
-            valid=f"sudo apt install ros-jazzy-{name}",
-        )
-
-
-def check_driver(values: Mapping[str, Any]) -> None:
-    """Raise ParameterError if the source needs a port or a recording, and none is given, or the recording is missing."""
-    serial = ("port", "/dev/ttyACM0")
-    captured = ("path" if values.get("path") else "port", "/dev/ttyACM0")
-    needed = {
-        "serial": serial,
-        "evb1000": serial,
-        **dict.fromkeys(("uci", "lines", "pans"), captured),
-        "spi": ("port", "/dev/spidev0.0"),
-        "mcap": ("path", "FILE"),
-        "decaranging": ("path", "FILE"),
-        "topic": ("map", "nlink_nodeframe2"),
-    }
-    source = values.get("source")
-    name, example = needed.get(str(source), ("", ""))
-    if name and not values.get(name):
-        raise ParameterError(f"source {source} without a {name}", valid=f"{name}:={example}")
-    if name == "path" and not Path(str(values["path"])).expanduser().exists():
-        raise ParameterError(f"parameter path = {values['path']}: no such file or folder")
-
-
 def from_files(node: str, node_file: str, shared: str = "") -> dict[str, Any]:
-    """Return the parameters that the files of a node set.
+    """Return the parameters that the files of a node set; the node checks them.
 
     Args:
         node: name of the node.
         node_file: path of the file for this node.
         shared: path of a file for all nodes, which overrides the other; may be empty.
-
-    Raises:
-        ParameterError: a file cannot be read, or a parameter in it is unknown or invalid.
     """
-    values = _parameters_in(Path(node_file), node, ())
-    return values | _parameters_in(Path(shared), node, conflicting_parameters(node)) if shared else values
+    values = {name: value for _, name, value in _entries_of(node, node_file)}
+    conflicts = conflicting_parameters(node)
+    shared_entries = _entries_of(node, shared) if shared else ()
+    return values | {
+        name: value
+        for section, name, value in shared_entries
+        if section not in _WILDCARDS or name not in conflicts
+    }
 
 
 def conflicting_parameters(node: str) -> dict[str, ParameterValue]:
@@ -246,31 +178,10 @@ def separate_conflicts(
         } | values[node]
 
 
-def _parameters_in(path: Path, node: str, excluded: Collection[str]) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
-        raise ParameterError(f"parameter file {path}: {reason}") from error
-    values: dict[str, Any] = {}
-    all_names = {row.name for table in TABLES.values() for row in table}
-    rows = {row.name: row for row in TABLES[node]}
-    for section, name, value in _entries(tree, ""):
-        if section in _WILDCARDS:
-            if name in excluded:
-                continue
-        elif section.rpartition("/")[2] != node:
-            continue
-        if name in rows:
-            try:
-                rows[name].check(value)
-            except ParameterError as error:
-                error.where = str(path)
-                raise
-            values[name] = value
-        elif name not in all_names and not name.startswith(STANDARD):
-            check_name("parameter", name, all_names, str(path), "`ros2 launch ... --show-args` lists them")
-    return values
+def _entries_of(node: str, path: str) -> Iterator[tuple[str, str, Any]]:
+    """Yield section, name and value of every parameter in a file that is for a node of this name or for all nodes."""
+    tree = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    return (one for one in _entries(tree, "") if one[0] in _WILDCARDS or one[0].rpartition("/")[2] == node)
 
 
 def respawn_environment() -> dict[str, str]:

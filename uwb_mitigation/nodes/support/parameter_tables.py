@@ -272,6 +272,13 @@ RESPAWN_FOLDER = "UWB_MITIGATION_RESPAWN_FOLDER"
 """Environment variable with a folder that exists while a launch file runs. A respawned node finds there the parameters
 that were set at run time, and the locator also its latest state."""
 
+REFUSED = 1
+"""Exit code of a node that refuses a parameter, a file or a name at its start, or whose recording is damaged. A node
+that crashes has another one, with which a launch file respawns it."""
+
+CRASHED = 70
+"""Exit code of a node after an exception that it does not handle (EX_SOFTWARE of sysexits.h)."""
+
 STANDARD = ("qos_overrides.", "use_sim_time", "start_type_description_service")
 """Prefixes of the parameters that rclpy declares for every node."""
 

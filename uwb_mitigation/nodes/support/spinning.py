@@ -7,6 +7,7 @@ import importlib
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -20,6 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from uwb_mitigation.errors import ParameterError, UwbMitigationError, missing_dependency
+from uwb_mitigation.nodes.support.parameter_tables import CRASHED, REFUSED
 
 NodeT = TypeVar("NodeT", bound=Node)
 
@@ -116,7 +118,12 @@ def load_node(name: str) -> Callable[[threading.Event], Iterator[Node]]:
 
 def run_node(name: str) -> None:
     """Run an executable until a signal or until one of its nodes ends it; exit with its code."""
-    sys.exit(_run(name))
+    try:
+        code = _run(name)
+    except Exception:
+        traceback.print_exc()
+        code = CRASHED
+    sys.exit(code)
 
 
 def _run(name: str) -> int:
@@ -126,6 +133,7 @@ def _run(name: str) -> int:
     callbacks still publish.
     """
     nodes: list[Node] = []
+    code_of_errors = REFUSED
     try:
         _initialise()
         try:
@@ -136,15 +144,16 @@ def _run(name: str) -> int:
             nodes.extend(make_nodes(stop))
         except (RuntimeError, NameValidationException) as error:  # rcl's errors are RuntimeErrors
             raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
+        code_of_errors = CRASHED
         spin(nodes, stop)
     except ImportError as error:
         if (absent := missing_dependency(error)) is None:
             raise
         print(f"error: {absent}", file=sys.stderr)
-        return 1
+        return code_of_errors
     except UwbMitigationError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
+        return code_of_errors
     finally:
         for node in reversed(nodes):
             node.destroy_node()
