@@ -9,8 +9,10 @@ import os
 import signal
 import subprocess
 import sys
+from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,11 +23,12 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from builtin_interfaces.msg import Time
 from conftest import REPOSITORY
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, PoseWithCovarianceStamped
-from ros_harness import Process, Ros
+from ros_harness import Process, Ros, diagnostic_values
 from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.errors import ParameterError
+from uwb_mitigation.nodes import px4
 from uwb_mitigation.positioning.geodetic import parse_origin, to_geodetic
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 
@@ -281,7 +284,17 @@ def test_ranges_are_sent_as_ekf2_accepts_them(ros: Ros, px4_msgs: None, tmp_path
         assert math.dist(beacon, vehicle) == pytest.approx(message["range"], abs=1e-3)
     # Ten correlated ranges a second from each anchor: each has ten times the variance.
     assert {round(message["range_accuracy"] ** 2, 4) for message in messages[8:]} <= {0.1, 0.05}
-    ros.diagnosis("px4", lambda status: "anchors that are not in the file: 7" in status.message)
+    status = ros.diagnosis("px4", lambda status: "anchors that are not in the file: 7" in status.message)
+    counts = diagnostic_values(status)
+    assert all(
+        int(counts[f"ranges {reason}"]) > 10 for reason in (px4.NO_RANGE, px4.NO_VARIANCE, px4.UNKNOWN_ANCHOR)
+    )
+    # EKF2 uses no smaller standard deviation.
+    stamp, before = Time(sec=next(rounds)), len(received())
+    fields = {"tag_id": 1, "anchor_id": 0x022E, "range": 1.0, "variance": 1e-6}
+    publisher.publish(RangeCorrected(header=Header(stamp=stamp), **fields))
+    ros.spin_until(lambda: len(received()) > before)
+    assert received()[-1]["range_accuracy"] == pytest.approx(0.1)
     # Which of two tags is on the vehicle is not known.
     publisher.publish(RangeCorrected(tag_id=9))
     ros.diagnosis("px4", lambda status: "set parameter tag to that of the vehicle (1, 9)" in status.message)
@@ -291,6 +304,27 @@ def test_ranges_are_sent_as_ekf2_accepts_them(ros: Ros, px4_msgs: None, tmp_path
         ros.spin_for(0.1)
     assert len(received()) == before
     assert node.signal(signal.SIGINT) == 0, node.output
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason", "is_late"),
+    [
+        ({}, "", False),
+        ({"anchor_id": 7}, px4.UNKNOWN_ANCHOR, False),
+        ({"range": math.nan}, px4.NO_RANGE, False),
+        ({"age_s": 200.0}, px4.NO_RANGE, False),
+        ({"variance": math.inf}, px4.NO_VARIANCE, False),
+        ({"age_s": -0.1}, px4.FUTURE, False),
+        ({"age_s": 0.4}, "", True),
+    ],
+)
+def test_each_range_that_ekf2_cannot_use_has_a_reason(changes: dict[str, float], reason: str, is_late: bool):
+    anchors = AnchorMap([Anchor(key, place) for key, place in ANCHORS.items()])
+    node = SimpleNamespace(_anchors=anchors, _unknown=set(), _dropped=Counter(), now_ns=lambda: 100 * 10**9)
+    fields = {"anchor_id": 0x022E, "range": 1.0, "variance": 0.01, "age_s": 0.1} | changes
+    stamp_ns = 100 * 10**9 - round(fields.pop("age_s") * 1e9)
+    assert px4.Px4._reason_to_drop(node, RangeCorrected(**fields), stamp_ns) == reason
+    assert node._dropped == (Counter({px4.LATE: 1}) if is_late else Counter())
 
 
 def test_invalid_settings_of_ranges_are_named(ros: Ros, px4_msgs: None):

@@ -7,6 +7,7 @@ compass. Mode ranges: `/uwb/range_corrected` with the positions of the anchors, 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,19 @@ RANGE_PERIOD_NS = 15_000_000
 """Interval between ranges: EKF2 drops ranges whose stamps are less than about 11 ms apart, and PX4 queues only one."""
 
 MAX_SHIFT_NS = 60_000_000
-"""A range whose stamp would have to be later by more than this is not sent: at 1 m/s, it is 0.06 m."""
+"""A range whose stamp would have to be later by more than this is not sent: at 1 m/s, it is 0.06 m. Nor is one whose stamp
+is later than now by more: EKF2 would drop all ranges until that time."""
+
+MAX_AGE_NS = 300_000_000
+"""EKF2 ignores older ranges: its buffer holds EKF2_DELAY_MAX (200 ms), and 100 ms more are accepted (RingBuffer.h)."""
+
+MIN_SD_M = 0.1
+"""Smallest standard deviation that EKF2 uses (minimum of EKF2_RNGBC_NOISE)."""
+
+TOO_OFTEN, NO_ORIGIN = "more often than EKF2 accepts", "before the origin was known"
+FUTURE, LATE = "stamp in the future", "older than 0.3 s, sent nevertheless"
+NO_RANGE, NO_VARIANCE = "no valid range or stamp", "no variance"
+OTHER_TAG, UNKNOWN_ANCHOR = "of other tags", "anchor not in the file"
 
 MAX_IDS = 10
 """Number of tags, and of unknown anchors, that are named."""
@@ -76,6 +89,7 @@ class Px4(ManagedNode):
         self._waiting: dict[int, tuple[int, RangeCorrected]] = {}
         self._last_ns: dict[int, int] = {}
         self._unknown: set[int] = set()
+        self._dropped: Counter[str] = Counter()
         self.autostart()
 
     def open(self) -> None:
@@ -90,6 +104,7 @@ class Px4(ManagedNode):
 
     def describe(self) -> Description:
         values: dict[str, object] = {"sent": self._sent, "mode": self.value("mode")}
+        values |= {f"ranges {reason}": count for reason, count in sorted(self._dropped.items())}
         warning = ""
         if self.value("mode") == "ranges" and self._positions is None:
             warning = "the origin of PX4 is unknown: set parameter origin, or wait for GNSS"
@@ -99,6 +114,10 @@ class Px4(ManagedNode):
         elif self._unknown:
             ids = ", ".join(map(format_id, sorted(self._unknown)))
             warning = f"ranges of anchors that are not in the file: {ids}"
+        elif self._dropped[LATE] + self._dropped[FUTURE] > self._sent // 2:
+            warning = "EKF2 ignores most ranges, because of their stamps: synchronise the clocks"
+        elif self._dropped and not self._sent:
+            warning = f"no ranges are sent: {self._dropped.most_common(1)[0][0]}"
         text = warning or ("sending" if self._sent else "no positions or ranges yet")
         return "PX4", diagnostics.WARN if warning else diagnostics.OK, text, values
 
@@ -114,6 +133,7 @@ class Px4(ManagedNode):
         self._anchors = load_anchors(Path(self.value("anchors")).expanduser())
         self._tag, self._positions = self.value("tag"), None
         self._waiting, self._last_ns, self._unknown, self._tags = {}, {}, set(), set()
+        self._dropped = Counter()
         if self.value("origin"):
             self._place_anchors(parse_origin(self.value("origin")))
         else:
@@ -138,20 +158,38 @@ class Px4(ManagedNode):
         """Keep the latest range of each anchor until it is sent."""
         stamp_ns = to_ns(message.header.stamp)
         if message.tag_id != (self._tag or message.tag_id):
+            self._dropped[OTHER_TAG] += 1
             return
         if len(self._tags) < MAX_IDS:
             self._tags.add(message.tag_id)
         if len(self._tags) > 1:
             # One of them is on the vehicle. The ranges of another one would move it.
+            self._dropped[OTHER_TAG] += 1 + len(self._waiting)
             self._waiting.clear()
             return
+        reason = self._reason_to_drop(message, stamp_ns)
+        if reason:
+            self._dropped[reason] += 1
+            return
+        if message.anchor_id in self._waiting:
+            self._dropped[NO_ORIGIN if self._positions is None else TOO_OFTEN] += 1
+        self._waiting[message.anchor_id] = stamp_ns, message
+
+    def _reason_to_drop(self, message: RangeCorrected, stamp_ns: int) -> str:
+        """Return why EKF2 cannot use a range; empty: it can."""
         if message.anchor_id not in self._anchors.index:
             if len(self._unknown) < MAX_IDS:
                 self._unknown.add(message.anchor_id)
-            return
-        is_valid = stamp_ns >= 0 and 0.0 < message.range < MAX_VALUE and 0.0 < message.variance < MAX_VALUE
-        if is_valid:
-            self._waiting[message.anchor_id] = stamp_ns, message
+            return UNKNOWN_ANCHOR
+        if stamp_ns < 0 or not 0.0 < message.range < MAX_VALUE:
+            return NO_RANGE
+        if not 0.0 < message.variance < MAX_VALUE:
+            return NO_VARIANCE
+        age_ns = self.now_ns() - stamp_ns
+        if age_ns > MAX_AGE_NS:
+            # They are sent, because EKF2_DELAY_MAX may be larger than its default.
+            self._dropped[LATE] += 1
+        return FUTURE if age_ns < -MAX_SHIFT_NS else ""
 
     def _send_range(self) -> None:
         """Send the range that has waited longest."""
@@ -166,6 +204,7 @@ class Px4(ManagedNode):
         if self._latest_ns is not None and abs(stamp_ns - self._latest_ns) < CORRELATION_S * NS_PER_S:
             sent_ns = max(stamp_ns, self._latest_ns + RANGE_PERIOD_NS)
             if sent_ns - stamp_ns > MAX_SHIFT_NS:
+                self._dropped[TOO_OFTEN] += 1
                 return
         since_ns = max(abs(stamp_ns - self._last_ns.get(anchor, -NS_PER_S)), RANGE_PERIOD_NS)
         increase = max(1.0, CORRELATION_S * NS_PER_S / since_ns)
@@ -188,7 +227,7 @@ class Px4(ManagedNode):
                 hacc=float(self._anchors.sd[row]),
                 vacc=float(self._anchors.sd[row]),
                 sequence_nr=message.sequence % 256,
-                range_accuracy=math.sqrt(message.variance * increase),
+                range_accuracy=max(math.sqrt(message.variance * increase), MIN_SD_M),
             )
         )
 
