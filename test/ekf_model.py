@@ -56,9 +56,7 @@ class Ekf:
         if sensor not in self._parameters:
             return
         rows, columns = self._selection(sensor, tuple(values))
-        if self.time_s is not None and time_s > self.time_s:
-            self._predict(time_s - self.time_s)
-        self.time_s = time_s if self.time_s is None else max(time_s, self.time_s)
+        self.predict(time_s)
         z, R = np.array(list(values.values()))[columns], R[columns][:, columns]
         # H selects rows of the state.
         covariance = self.P[rows]
@@ -67,6 +65,12 @@ class Ekf:
         residual = np.eye(8)
         residual[:, rows] -= K
         self.P = residual @ self.P @ residual.T + K @ R @ K.T
+
+    def predict(self, time_s: float) -> None:
+        """Predict the state at a time; an earlier one has no effect."""
+        if self.time_s is not None and time_s > self.time_s:
+            self._predict(time_s - self.time_s)
+        self.time_s = time_s if self.time_s is None else max(time_s, self.time_s)
 
     @cache  # noqa: B019
     def _selection(self, sensor: str, measured: tuple[int, ...]) -> tuple[list[int], list[int]]:

@@ -63,15 +63,17 @@ class Drive:
         return replace(self, track=replace(self.track, position=position))
 
     def fuse(
-        self, rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float = 0.0
+        self, rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float | None = 0.0
     ) -> NDArray[np.float64]:
         """Run the global filter with poses at a rate; return NEES/dof of x and y, squared error and yaw error, ten a second.
 
         `antenna_x_m` is the x of its base_link_frame in the frame of the odometry, from /tf_static: the filter moves
         twists to this frame, with the yaw rate of its state (`prepareTwist`), and map -> odom is that of its pose there.
+        None: there is no transform, so that it ignores odometry and IMU, and its pose is that of the antenna.
         """
+        has_transform, antenna_x_m = antenna_x_m is not None, antenna_x_m or 0.0
         ekf = Ekf(CONFIG["ekf_map"]["ros__parameters"])
-        odometry, imu = self.motion.odometry, self.motion.imu
+        odometry = self.motion.odometry
         poses = list(_at_rate(self.track, rate_hz))
         events = sorted(
             [(int(stamp), 0, row) for row, stamp in enumerate(odometry.stamp_ns)]
@@ -84,10 +86,10 @@ class Drive:
                 values = dict(zip((X, Y), self.track.position[row], strict=False))
                 ekf.fuse("pose0", time_s, values, self.track.covariance[row, :2, :2] * noise_factor)
                 continue
-            twist = dict(zip((VX, VY, VYAW), odometry.twist[row], strict=True))
-            twist[VY] += antenna_x_m * ekf.x[VYAW]
-            ekf.fuse("odom0", time_s, twist, odometry.twist_covariance[row])
-            ekf.fuse("imu0", time_s, {VYAW: imu.yaw_rate[row]}, np.eye(1) * imu.yaw_rate_variance[row])
+            if has_transform:
+                self._fuse_motion(ekf, time_s, row, antenna_x_m)
+            else:
+                ekf.predict(time_s)
             if row % 5 == 0:
                 cosine, sine = np.cos(ekf.x[YAW]), np.sin(ekf.x[YAW])
                 G = np.eye(8)[:2]
@@ -97,6 +99,13 @@ class Drive:
                 yaw = np.angle(np.exp(1j * (ekf.x[YAW] - self.motion.yaw[row])))
                 errors.append((nees, error @ error, yaw))
         return np.array(errors)
+
+    def _fuse_motion(self, ekf: Ekf, time_s: float, row: int, antenna_x_m: float) -> None:
+        odometry, imu = self.motion.odometry, self.motion.imu
+        twist = dict(zip((VX, VY, VYAW), odometry.twist[row], strict=True))
+        twist[VY] += antenna_x_m * ekf.x[VYAW]
+        ekf.fuse("odom0", time_s, twist, odometry.twist_covariance[row])
+        ekf.fuse("imu0", time_s, {VYAW: imu.yaw_rate[row]}, np.eye(1) * imu.yaw_rate_variance[row])
 
 
 def _at_rate(track: Track, rate_hz: float):
@@ -131,7 +140,7 @@ def drives() -> list[Drive]:
 
 
 def errors(
-    drives: list[Drive], rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float = 0.0
+    drives: list[Drive], rate_hz: float, noise_factor: float = 1.0, antenna_x_m: float | None = 0.0
 ) -> tuple[float, float]:
     """Return NEES/dof and RMSE of the position after the first 10 s."""
     rows = np.concatenate([drive.fuse(rate_hz, noise_factor, antenna_x_m)[100:] for drive in drives])
@@ -158,6 +167,8 @@ def test_the_documented_setup_is_consistent_and_20_positions_per_second_are_not(
     nees, with_transform = errors(in_front, 1.0, antenna_x_m=0.3)
     assert 0.5 < nees < 2.0
     assert with_transform < 1.2 * rmse
+    print("without any transform", end=": ")
+    assert errors(in_front, 1.0, antenna_x_m=None)[1] > 4.0 * rmse
 
 
 def locator_rmse(drives: list[Drive], name: str) -> float:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -73,6 +74,8 @@ class ManagedNode(LifecycleNode):
         self._last_unique_s = time.monotonic()
         self._reported: set[str] = set()
         self._opened: list[Callable[[], object]] = []
+        (change_state,) = [each for each in self.services if each.srv_type is ChangeState]
+        change_state.callback = partial(self._answer_change_state, change_state.callback)
         self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         # Use a steady clock: diagnostics must be published even if a simulated clock is paused.
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -176,6 +179,15 @@ class ManagedNode(LifecycleNode):
     def destroy_node(self) -> None:
         self._end_and_close()
         super().destroy_node()
+
+    def _answer_change_state(self, change_state: Callable[..., Any], request: Any, response: Any) -> Any:
+        """Refuse a transition that is not possible in this state, for which rclpy would end the process."""
+        try:
+            return change_state(request, response)
+        except RuntimeError as error:  # rclpy's RCLError
+            self.get_logger().warning(f"transition {request.transition.id} refused: {error}")
+            response.success = False
+            return response
 
     def _end_and_close(self) -> None:
         self.end()
