@@ -215,17 +215,6 @@ def test_ranges_of_a_pipeline_are_those_of_the_library_to_the_bit(ros: Ros):
     assert "unknown" not in pipeline.output
 
 
-def test_a_pipeline_publishes_raw_ranges_for_subscribers(ros: Ros):
-    raw = ros.collect(RangeCir, RAW)
-    corrected = ros.collect(RangeCorrected, CORRECTED)
-    ros.start("pipeline", *PLAY)
-    ros.play()
-    ros.spin_until(lambda: len(raw) == 200 and len(corrected) == 200)
-    assert [m.header for m in raw] == [m.header for m in corrected]
-    assert [m.range for m in raw] == [m.range_raw for m in corrected]
-    assert all(len(m.cir.samples) for m in raw)
-
-
 def test_several_pipelines_do_not_interfere(ros: Ros):
     received = {name: ros.collect(RangeCorrected, f"/{name}{CORRECTED}") for name in ("left", "right")}
     pipelines = [ros.start("pipeline", *PLAY, arguments=("-r", f"__ns:=/{name}")) for name in received]

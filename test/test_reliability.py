@@ -15,9 +15,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from lifecycle_msgs.msg import Transition
 from model_material import bundle
-from model_material import measurement as make_measurement
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
 from ros_harness import PAUSED, Ros, stamped_after
@@ -43,7 +41,6 @@ from uwb_mitigation.nodes.support.diagnostics import (
 )
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.types.offsets import Offsets, read_offsets
 from uwb_mitigation.types.ros.codec import encode_range
 
 RAW = "/uwb/range_raw"
@@ -133,26 +130,6 @@ def test_model_is_swapped_live_without_losing_a_range_and_a_bad_one_is_refused(r
     swap = identities.index(other.model_id)
     assert set(identities[:swap]) == {shipped.model_id}
     assert set(identities[swap:]) == {other.model_id}
-
-
-@pytest.mark.ros
-def test_every_transition_of_the_driver_can_be_repeated_and_a_replay_starts_over(ros: Ros):
-    received = ros.collect(RangeCir, RAW)
-    ros.start("driver", "simulated_rate:=100.0", "start_delay:=0.0", "autostart:=false")
-    for _ in range(2):
-        up_ns = time.time_ns()
-        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
-            assert ros.change_state("driver", transition)
-        # A range that was published before a transition may arrive late.
-        ros.spin_until(lambda up_ns=up_ns: len(stamped_after(received, up_ns)) > 3)
-        assert stamped_after(received, up_ns)[0].sequence == 0
-        assert ros.change_state("driver", Transition.TRANSITION_DEACTIVATE)
-        assert ros.change_state("driver", Transition.TRANSITION_ACTIVATE)
-        assert ros.change_state("driver", Transition.TRANSITION_DEACTIVATE)
-        assert ros.change_state("driver", Transition.TRANSITION_CLEANUP)
-        assert ros.state_of("driver") == "unconfigured"
-    assert ros.change_state("driver", Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
-    assert ros.state_of("driver") == "finalized"
 
 
 @pytest.mark.ros
@@ -321,42 +298,3 @@ def test_corrected_ranges_are_published_as_sensor_msgs_on_request(ros: Ros):
     publisher.publish(encode_range(replace(measurement, range_m=math.nan)))
     ros.spin_until(lambda: bool(plain) and plain[-1].range == math.inf)
     assert plain[-1].variance == math.inf
-
-
-@pytest.mark.ros
-def test_offsets_are_set_live_and_invalid_ones_are_refused(ros: Ros, tmp_path: Path):
-    path = tmp_path / "offsets.yaml"
-    path.write_text("pairs: [{anchor: 2, tag: 1, offset: 1.5}]")
-    asked = make_measurement(5.0)
-    host = Mitigation(load_bundle(default_model_path()))
-    publisher = ros.node.create_publisher(RangeCir, "/uwb/range_raw", 10)
-    corrected = ros.collect(RangeCorrected, "/uwb/range_corrected")
-    ros.start("mitigator", "offsets:=0.25").wait_for_output("correcting with")
-    ros.find_each_other(publisher, deserialize_message(encode_range(asked), RangeCir), corrected)
-
-    def answer() -> RangeCorrected:
-        corrected.clear()
-        publisher.publish(deserialize_message(encode_range(asked), RangeCir))
-        ros.spin_until(lambda: len(corrected) == 1)
-        return corrected[0]
-
-    def expected(offsets: Offsets) -> np.float32:
-        host.offsets = offsets
-        return np.float32(host.correct([asked])[0].range_m)
-
-    assert answer().range == expected(Offsets(0.25))
-    assert ros.set_parameter("mitigator", "offsets", str(path)).successful
-    assert answer().range == expected(read_offsets(str(path)))
-    for invalid, excerpt in (
-        ("220", "millimetres"),
-        (str(tmp_path / "no.yaml"), "no such file"),
-        (True, "number of metres"),
-    ):
-        refused = ros.set_parameter("mitigator", "offsets", invalid)
-        assert not refused.successful
-        assert excerpt in refused.reason
-    assert answer().range == expected(read_offsets(str(path)))
-    assert ros.set_parameter("mitigator", "offsets", 0.5).successful
-    last = answer()
-    assert last.range == expected(Offsets(0.5))
-    assert last.range_raw == np.float32(asked.range_m)
