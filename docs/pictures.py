@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Lock
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -189,12 +188,12 @@ def show_states(browser: Browser, folder: Path) -> None:
         source, bag = ChangedDrive(state), folder / f"{name}.mcap"
         write_simulated(source, DRIVE_RANGES, 1, bag, True, None)
         anchors = state.anchors(source.anchors)
-        feed = SceneUpdater(Scene(), Lock())
+        feed = SceneUpdater(Scene())
         player = BagPlayer(bag, feed, lambda: mitigation(settings))
         feed.anchors(anchors)
         if state.is_indexed:
             player.index(settings.config(anchors), check=displaced_anchor).join()
-        view = View(feed.scene, feed.lock, f"{name}.mcap", player=player, missing=player.missing)
+        view = View(feed.scene, f"{name}.mcap", player=player, missing=player.missing)
         with ViewerServer(view, port=0) as server:
             browser.open(f"{server.url}#t={state.seconds}", *FIRST_SCREEN)
             browser.wait("the page", browser.ready)

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -47,7 +46,7 @@ from uwb_mitigation.types.measurement import (
 from uwb_mitigation.types.offsets import read_offsets
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.headline import recorded_cards
+from uwb_mitigation.viewer.headline import cards
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
@@ -60,7 +59,7 @@ BOX = Area((-20.0, -60.0, -2.0), (80.0, 60.0, 4.0))
 
 def indexed(bag: Path, settings: TrackSettings) -> tuple[BagPlayer, SceneUpdater]:
     """Return the player of a bag after its index is complete."""
-    feed, anchors = SceneUpdater(Scene(), threading.Lock()), read_anchors(bag)
+    feed, anchors = SceneUpdater(Scene()), read_anchors(bag)
     player = BagPlayer(bag, feed, lambda: mitigation(settings))
     feed.anchors(anchors)
     player.index(read_config(bag, anchors, settings), settings.stamp_offset_s).join()
@@ -114,13 +113,14 @@ def test_track_and_view_give_the_same_figures(
     player, feed = indexed(bag, settings)
     timeline = player.timeline
     (tag,) = result["tags"]
-    cards = {title: (value, text) for title, value, text in recorded_cards(timeline, tag["tag_id"])}
+    view = View(feed.scene, player=player)
+    figures = {title: (value, text) for title, value, text in cards(view, tag["tag_id"])}
     for title, key in (
         ("Position RMSE, whole recording", "horizontal_rmse_m"),
         ("95 % of position errors below, whole recording", "p95_m"),
     ):
         live, raw, smoothed = (f"{result[kind][key]:.3f} m" for kind in ("live", "raw_live", "smoothed"))
-        assert cards[title] == (live, f"raw + same filter: {raw}; smoothed: {smoothed}")
+        assert figures[title] == (live, f"raw + same filter: {raw}; smoothed: {smoothed}")
         if source is not None:
             assert live == raw, "nothing was corrected"
     shown = [notice.split(": ", 1)[1] for notice in timeline.notices]
@@ -131,7 +131,7 @@ def test_track_and_view_give_the_same_figures(
 
 def show_in_a_browser(browser: Browser, player: BagPlayer, feed: SceneUpdater) -> None:
     """Show a public recording without CIRs."""
-    with ViewerServer(View(feed.scene, feed.lock, player=player), port=0) as server:
+    with ViewerServer(View(feed.scene, player=player), port=0) as server:
         browser.open(f"{server.url}#t=20")
         browser.wait("the errors", lambda: "Position RMSE, whole recording" in browser.cards())
         value, text = browser.cards()["Ranges corrected, whole recording"]
@@ -232,7 +232,7 @@ def test_odometry_of_one_robot_is_not_used_for_several_tags(tmp_path: Path):
         bag, (Record(replace(record(number).measurement, tag_id=7 + number % 3)) for number in range(20))
     )
     config = EstimatorConfig(HALL, robot=RobotData())
-    player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(TrackSettings()))
+    player = BagPlayer(bag, SceneUpdater(Scene()), lambda: mitigation(TrackSettings()))
     player.index(config).join()
     assert player.timeline is not None
     assert "--odometry with the tags 7, 8, 9" in player.timeline.notices[-1]

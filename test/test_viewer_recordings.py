@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,11 +87,11 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def indexed(path: Path, anchors: AnchorMap = HALL, check: Check | None = None) -> View:
     """Return the view of an indexed bag, paused at its begin."""
-    feed = SceneUpdater(Scene(), threading.Lock())
+    feed = SceneUpdater(Scene())
     player = BagPlayer(path, feed, lambda: pytest.fail("the bag contains corrected ranges"))
     feed.anchors(anchors)
     player.index(EstimatorConfig(anchors), check=check).join()
-    return View(feed.scene, feed.lock, player=player)
+    return View(feed.scene, player=player)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, -2.0])
@@ -156,7 +155,7 @@ def test_anchor_that_is_not_where_the_file_says_is_named_first(bag: Path):
 def test_gaps_are_shown_as_gaps(tmp_path: Path):
     page = Drawn(indexed(write_drive(tmp_path / "gap.mcap", {7: -2.0}, gap_s=(10.0, 30.0))))
     page.send("seek", 25.0)
-    assert page.controls.tag_rows[0][3] == "no data for 15 s"
+    assert page.controls.tag_rows[0][4] == "no data for 15 s"
     assert np.isnan(page.column("positions", "error")).sum() == 1
     events = [(round(time_s, -1), text) for time_s, text in page.controls.incidents if "largest" not in text]
     assert sorted(events) == [
@@ -199,9 +198,9 @@ def test_radio_without_cirs_has_no_bad_ranges(tmp_path: Path):
 
 def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     path = corrected_bag(tmp_path / "long.mcap", range(9000), range_m=5.0, range_raw_m=5.3)
-    feed = SceneUpdater(Scene(), threading.Lock())
+    feed = SceneUpdater(Scene())
     player = BagPlayer(path, feed, lambda: None)
-    page = Drawn(View(feed.scene, feed.lock, player=player))
+    page = Drawn(View(feed.scene, player=player))
     assert page.controls.cards == [["Reading the recording ...", "", ""]]
     assert page.controls.verdict[:2] == ["no data yet", "the recording is being read"]
     player.index(None).join()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,12 +14,13 @@ from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import health
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.health import DEGRADED, HeldVerdict, Verdict
+from uwb_mitigation.viewer.health import POSITION_GOOD as GOOD
 from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.state import View
-from uwb_mitigation.viewer.verdict import DEGRADED, GOOD, HeldVerdict, Verdict
 
 CIRCLE = NodeStatus(1, "", math.nan, ("tag 7 determination: circle: R. Remedy: more anchors",))
 ANCHORS = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}
@@ -45,7 +45,7 @@ def driven(
 
 
 def shown(scene: Scene) -> Drawn:
-    return Drawn(View(scene, threading.Lock()))
+    return Drawn(View(scene))
 
 
 def controls(scene: Scene):
@@ -82,7 +82,12 @@ def test_anchor_to_check_is_named_below_a_good_position():
 def test_position_of_a_lost_tag_is_the_last_one_without_accuracy():
     scene, clock = driven()
     clock.now_s += 12.0
-    assert shown(scene).controls.tag_rows[0][1:4] == ["last: 4.00, 3.00, 0.00", "-", "no data for 12 s"]
+    assert shown(scene).controls.tag_rows[0][1:5] == [
+        "lost",
+        "last: 4.00, 3.00, 0.00",
+        "-",
+        "no data for 12 s",
+    ]
 
 
 @pytest.mark.parametrize(("error_m", "state"), [(0.2, health.CHECK), (0.4, health.BAD)])
@@ -168,7 +173,7 @@ def test_pairs_tags_and_nodes_without_data_are_marked():
     states = ((7, "circle: R"), (8, "unique: R"))
     entries = [SimpleNamespace(key=f"tag {n} determination", value=state) for n, state in states]
     diagnosis = SimpleNamespace(status=[SimpleNamespace(name="locator", level=1, message="", values=entries)])
-    SceneUpdater(scene, threading.Lock()).add("/diagnostics", diagnosis)
+    SceneUpdater(scene).add("/diagnostics", diagnosis)
     scene.set_node_status("driver", NodeStatus(0, "10.0 Hz", clock()))
     scene.set_node_status("recording", NodeStatus(2, "damaged"))
     page = shown(scene)
@@ -260,7 +265,7 @@ def test_clock_jump_dead_tag_and_old_stamps_are_reported():
     scene.add_sample((1, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
     assert (None, "5 s ago: tag 9: lost") in page.incidents
-    assert page.tag_rows[1][3:] == ["no position", "0.0", "16.9 s"]
+    assert page.tag_rows[1][4:] == ["no position", "0.0", "16.9 s"]
 
 
 @pytest.mark.parametrize(

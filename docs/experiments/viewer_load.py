@@ -48,7 +48,7 @@ def feed_ranges(feed: SceneUpdater, stop: threading.Event) -> None:
     while not stop.wait(PERIOD_S):
         for tag in range(1, TAGS + 1):
             angle = time.monotonic() / 10 + tag
-            with feed.lock:
+            with feed.scene.lock:
                 feed.scene.add_pose(
                     f"tag_{tag}",
                     Pose(
@@ -90,7 +90,7 @@ def load(browser: Browser, url: str) -> None:
 def main() -> None:
     scene = Scene()
     scene.set_anchors([Anchor(n, (4.0 * (n % 6), 4.5 * (n // 6), 2.0)) for n in range(1, ANCHORS + 1)])
-    view, stop = View(scene, threading.Lock()), threading.Event()
+    view, stop = View(scene), threading.Event()
     feed = SceneUpdater(scene, view.lock)
     with ViewerServer(view, port=0) as server, chromium() as browser:
         thread = threading.Thread(target=feed_ranges, args=(feed, stop))

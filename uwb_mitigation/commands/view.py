@@ -58,8 +58,6 @@ def view(
 
         uwb-mitigation view flat.mcap --height 0 --browser
     """
-    from threading import Lock
-
     from uwb_mitigation.commands.offline.track import displaced_anchor, mitigation, read_config
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
@@ -70,7 +68,7 @@ def view(
     from uwb_mitigation.viewer.state import View
 
     anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
-    feed = SceneUpdater(Scene(), Lock())
+    feed = SceneUpdater(Scene())
     player = BagPlayer(bag, feed, partial(mitigation, settings), namespace)
     config = None
     if anchor_map is not None:
@@ -79,8 +77,7 @@ def view(
     if player.corrects:
         console.err.print(f"{bag} contains raw ranges only: they are corrected for display.", style="yellow")
     thread = player.index(config, settings.stamp_offset_s, displaced_anchor)
-    name = bag.resolve().name
-    shown = View(feed.scene, feed.lock, title=name, player=player, missing=player.missing)
+    shown = View(feed.scene, title=bag.resolve().name, player=player)
     secret = secrets.token_urlsafe(16) if token else ""
     with ViewerServer(shown, host, port, tuple(origins or ()), secret) as server:
         if server.warning:

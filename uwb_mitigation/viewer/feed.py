@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -51,13 +50,10 @@ class SceneUpdater:
 
     Attributes:
         malformed: number of messages that could not be decoded.
-        lock: held while the scene is changed.
     """
 
-    def __init__(self, scene: Scene, lock: Lock) -> None:
-        self.malformed = 0
-        self.scene = scene
-        self.lock = lock
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.malformed = scene, 0
         self._adders: dict[str, Callable[[str, Any], None]] = {
             topics.RANGE_RAW: lambda _, measurement: self.measurement(measurement),
             topics.RANGE_TRUTH: lambda _, decoded: self.truth(*decoded),
@@ -74,7 +70,7 @@ class SceneUpdater:
     def clear(self) -> None:
         """Remove everything except the anchors."""
         self._forget()
-        with self.lock:
+        with self.scene.lock:
             self.scene.clear()
 
     def _forget(self) -> None:
@@ -84,7 +80,7 @@ class SceneUpdater:
         self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
     def report(self, name: str, report: NodeStatus) -> None:
-        with self.lock:
+        with self.scene.lock:
             self.scene.set_node_status(name, report)
 
     def add_encoded(self, topic: str, data: bytes) -> None:
@@ -100,7 +96,7 @@ class SceneUpdater:
         if message is None:
             self.malformed += 1
             return
-        with self.lock:
+        with self.scene.lock:
             self._adders[topic](tag, message)
 
     def measurement(self, measurement: RangeMeasurement) -> None:
@@ -145,7 +141,7 @@ class SceneUpdater:
         """Add a position that the viewer itself estimated from ranges to whose stamps an offset was added."""
         x, y, z = estimate.position.tolist()
         stamp_s, sd_m = estimate.stamp_ns / NS_PER_S - stamp_offset_s, _horizontal_sd_m(estimate.covariance)
-        with self.lock:
+        with self.scene.lock:
             pose = Pose(x, y, z, horizontal_ellipse(estimate.covariance), stamp_s=stamp_s, sd_m=sd_m)
             self.scene.add_pose(tag, pose, received_s)
 
@@ -162,7 +158,7 @@ class SceneUpdater:
 
     def anchors(self, anchors: AnchorMap) -> None:
         """Set the anchors of an anchors file."""
-        with self.lock:
+        with self.scene.lock:
             self.scene.set_anchors(anchors.anchors)
 
     def _diagnostics(self, message: Any) -> None:

@@ -129,9 +129,9 @@ class BagPlayer:
 
             timeline = index_recording(recording, config, backend, publish, stamp_offset_s, estimated)
             self.models = {} if backend is None else backend.used
-            with self._feed.lock:
-                self._feed.scene.is_indexed = True
-                self._feed.scene.revision += 1
+            with self.scene.lock:
+                self.scene.is_indexed = True
+                self.scene.revision += 1
             if check is None or config is None or not timeline.estimates:
                 return
             if len(timeline.log_s) > MAX_CHECKED:
@@ -140,8 +140,8 @@ class BagPlayer:
                 )
             else:
                 timeline.displaced = check(list(timeline.estimates.values()), config)
-            with self._feed.lock:
-                self._feed.scene.revision += 1
+            with self.scene.lock:
+                self.scene.revision += 1
 
         self._stamp_offset_s = stamp_offset_s
         thread = threading.Thread(target=run, name="index", daemon=True)
@@ -216,7 +216,7 @@ class BagPlayer:
             if self._shown.get(key) == count:
                 continue
             self._shown[key] = count
-            with self._feed.lock:
+            with self.scene.lock:
                 self.scene.set_track(*key, track[:count])
             if count and kind is TrackKind.CORRECTED and name in timeline.estimates:
                 estimate = next(iter(timeline.estimates[name].live.take(slice(count - 1, count))))

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +142,7 @@ class Scene:
     """All data that the page shows.
 
     Attributes:
+        lock: held while it is changed or drawn.
         clock: returns the time for ages, s: a steady clock live, the recording's time in a replay. Stamps are not
             compared with it, because they may come from another computer.
         stamp_clock: returns the time on the clock of the stamps, s, if it is that of this computer.
@@ -156,7 +158,7 @@ class Scene:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.clock, self.stamp_clock = clock, time.time
+        self.lock, self.clock, self.stamp_clock = Lock(), clock, time.time
         self.anchors: dict[int, Anchor] = {}
         self.is_indexed, self.received_s, self.revision = False, math.nan, 0
         self.clear()
@@ -203,6 +205,11 @@ class Scene:
     def age_s(self, entry: History | TagView | TrackView) -> float:
         """Return the time since the last data of a pair, tag or track."""
         return max(self.clock() - entry.received_s, 0.0)
+
+    def no_data(self, history: History) -> str:
+        """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
+        age_s = self.age_s(history)
+        return "" if age_s <= history.max_gap_s else f"no data for {age_s:.0f} s"
 
     def history(self, pair: Pair) -> History:
         """Return the history of a pair, a new one for a new pair."""

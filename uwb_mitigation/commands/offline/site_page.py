@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from datetime import datetime, timezone
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -54,7 +53,7 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         for (tag, anchor), values in calibration.pairs.items()
     }
     bars = {TrackKind.CORRECTED: {pair: offset_m + SDS * sd_m for pair, (offset_m, sd_m) in offsets.items()}}
-    figures = draw_scene(_view(calibration, errors_m[:, is_known])).figures
+    figures, _ = draw_scene(_view(calibration, errors_m[:, is_known]))
     reference = "the distance from the track that the other anchors give (not ground truth)"
     if solution.truth:
         reference = f"the range from {solution.truth}"
@@ -100,7 +99,7 @@ def _details(calibration: SiteCalibration) -> Iterable[str]:
 def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
     """Return anchors, tracks, stationary positions, and errors before and after, float64 (2, n), as the viewer draws them."""
     scene, solution = Scene(lambda: 0.0), calibration.solution
-    feed = SceneUpdater(scene, Lock())
+    feed = SceneUpdater(scene)
     feed.anchors(calibration.site.anchors)
     for segment in np.unique(solution.track_of):
         places = solution.track[(solution.track_of == segment) & np.isfinite(solution.track).all(axis=1)]
@@ -110,4 +109,4 @@ def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
         scene.add_pose(str(tag), Pose(x, y, z))
     scene.error_counts += count_errors(errors_m)
     scene.errors = errors_m.shape[1]
-    return View(scene, feed.lock)
+    return View(scene)
