@@ -26,10 +26,10 @@ from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import RangeColumns
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer, Check
+from uwb_mitigation.viewer.recording import Timeline, add_residuals
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
-from uwb_mitigation.viewer.timeline import Timeline, add_residuals
 
 BAD = 700
 """Row of the range whose status is not OK and whose error is the largest."""

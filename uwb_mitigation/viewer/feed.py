@@ -142,8 +142,9 @@ class SceneUpdater:
         x, y, z = estimate.position.tolist()
         stamp_s, sd_m = estimate.stamp_ns / NS_PER_S - stamp_offset_s, _horizontal_sd_m(estimate.covariance)
         with self.scene.lock:
-            pose = Pose(x, y, z, horizontal_ellipse(estimate.covariance), stamp_s=stamp_s, sd_m=sd_m)
-            self.scene.add_pose(tag, pose, received_s)
+            ellipse = horizontal_ellipse(estimate.covariance)
+            pose = Pose(x, y, z, ellipse, stamp_s=stamp_s, sd_m=sd_m, received_s=received_s)
+            self.scene.add_pose(tag, pose)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position

@@ -435,18 +435,17 @@ class Map:
     def _draw_tags(self, scene: Scene) -> None:
         rows: list[dict[str, Any]] = []
         plain_id, colours = plain_tag_id(scene.tags, scene.pairs), palette.tag_colours(scene.tags)
-        for name, tag in scene.tags.items():
-            if (pose := tag.pose) is not None:
-                age_s, label = scene.age_s(tag), tag_label(name, plain_id)
-                major, minor, angle = map(drawable, pose.ellipse)
-                half_height_m = math.hypot(major * math.sin(angle), minor * math.cos(angle))
-                is_late = age_s > NO_DATA_S
-                rows.append({
-                    "x": pose.x, "y": pose.y, "label_y": pose.y + finite_or_zero(half_height_m),
-                    "name": f"{label}: no data for {age_s:.0f} s" if is_late else label,
-                    "colour": GREY if is_late else colours[name],
-                    "width": 2 * major, "height": 2 * minor, "angle": angle, "heading": pose.heading_rad,
-                })  # fmt: skip
+        for name, pose in scene.tags.items():
+            age_s, label = scene.age_s(pose), tag_label(name, plain_id)
+            major, minor, angle = map(drawable, pose.ellipse)
+            half_height_m = math.hypot(major * math.sin(angle), minor * math.cos(angle))
+            is_late = age_s > NO_DATA_S
+            rows.append({
+                "x": pose.x, "y": pose.y, "label_y": pose.y + finite_or_zero(half_height_m),
+                "name": f"{label}: no data for {age_s:.0f} s" if is_late else label,
+                "colour": GREY if is_late else colours[name],
+                "width": 2 * major, "height": 2 * minor, "angle": angle, "heading": pose.heading_rad,
+            })  # fmt: skip
         set_rows(self._tags, rows)
 
     def _draw_tracks(self, scene: Scene) -> None:
@@ -480,22 +479,22 @@ class Map:
         """Draw rays with statuses from the anchors to the tag of the selected pair."""
         rows = []
         tag_id = self._page.tag_id
-        tag = None if tag_id is None else scene.tag_of(tag_id)
+        pose = None if tag_id is None else scene.tag_of(tag_id)
         for (anchor_id, of_tag), history, sample in scene.latest():
             place = scene.anchors.get(anchor_id)
-            if of_tag == tag_id and tag and tag.pose and place and not scene.no_data(history):
-                (x0, y0, _), x1, y1 = place.position, tag.pose.x, tag.pose.y
+            if of_tag == tag_id and pose and place and not scene.no_data(history):
+                (x0, y0, _), x1, y1 = place.position, pose.x, pose.y
                 values = (x0 + x1) / 2, (y0 + y1) / 2, x0, y0, x1, y1, sample.status.name
                 rows.append(dict(zip(self._rays.data, values, strict=True)))
         set_rows(self._rays, rows)
 
     def draw_accuracy(self, scene: Scene) -> None:
         """Draw the map of the predicted accuracy if it is visible."""
-        tag = next(iter(scene.tags.values()), None)
+        pose = next(iter(scene.tags.values()), None)
         if not self.coverage[0].visible or len(scene.anchors) < 2:
             return
         anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
-        height_m = finite_or_zero(tag.pose.z if tag and tag.pose else math.nan)
+        height_m = finite_or_zero(pose.z) if pose else 0.0
         sds_m = [sample.sigma_m for _, _, sample in scene.latest() if sample.sigma_m > 0.0]
         sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
         if self._page.changed("accuracy", (anchors.tobytes(), round(height_m, 1), sd_m)):
@@ -508,7 +507,7 @@ class Map:
     def fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
         places = [anchor.position[:2] for anchor in scene.anchors.values()]
-        places += [(tag.pose.x, tag.pose.y) for tag in scene.tags.values() if tag.pose is not None]
+        places += [(pose.x, pose.y) for pose in scene.tags.values()]
         timeline, live = self._page.view.complete, (view.columns() for view in scene.tracks.values())
         for track in live if timeline is None else timeline.tracks.values():
             places += np.percentile(track[:, 1:3], (2, 98), axis=0).tolist() if len(track) else []

@@ -172,7 +172,6 @@ def verdict(
         remedy: why the position is not unique, with the remedy; empty: it is, or unknown.
     """
     names = {anchor_id: place.name or format_id(anchor_id) for anchor_id, place in scene.anchors.items()}
-    tag = None if tag_id is None else scene.tag_of(tag_id)
     ages_s = [scene.age_s(history) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id]
     name = "" if tag_id is None else f"tag {format_id(tag_id)}"
     if tag_id is None and not scene.tags:
@@ -180,15 +179,14 @@ def verdict(
     if ages_s and min(ages_s) > NO_DATA_S:
         reason = f"no ranges of {name} for {min(ages_s):.0f} s"
         return Verdict(LOST, reason, "Check power of the tag, and the driver.")
-    if tag_id is None:
-        tag = next(iter(scene.tags.values()))
-    if tag is None or tag.pose is None:
+    pose = next(iter(scene.tags.values())) if tag_id is None else scene.tag_of(tag_id)
+    if pose is None:
         reason, action = _of_remedy(remedy)
         return _verdict(UNDETERMINED, reason or f"no position of {name}", action or "See the notices below.")
-    if scene.age_s(tag) > NO_DATA_S:
-        reason = f"no position of {name} for {scene.age_s(tag):.0f} s"
+    if scene.age_s(pose) > NO_DATA_S:
+        reason = f"no position of {name} for {scene.age_s(pose):.0f} s"
         return _verdict(LOST, reason, remedy or "Drive into the area of the anchors.")
-    sd_m = tag.pose.sd_m
+    sd_m = pose.sd_m
     accuracy = "" if math.isnan(sd_m) else f"horizontal sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
     common, texts = advice(anchors, names)
     # With a common cause, anchors that need attention are bad together.

@@ -26,9 +26,16 @@ from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import HISTORY_S
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording, corrected_events
+from uwb_mitigation.viewer.recording import (
+    POSITIONS,
+    RANGES,
+    Event,
+    Recording,
+    Timeline,
+    corrected_events,
+    index_recording,
+)
 from uwb_mitigation.viewer.scene import MissingData, NodeStatus
-from uwb_mitigation.viewer.timeline import Timeline, index_recording
 
 READ_S = 0.15
 """Maximum duration of one read, so that the page reacts to commands; playing continues at the position that was reached."""

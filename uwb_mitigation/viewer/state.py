@@ -15,7 +15,7 @@ from uwb_mitigation.viewer.scene import MissingData, Scene
 
 if TYPE_CHECKING:
     from uwb_mitigation.viewer.playback import BagPlayer
-    from uwb_mitigation.viewer.timeline import Timeline
+    from uwb_mitigation.viewer.recording import Timeline
 
 
 @dataclass(slots=True)

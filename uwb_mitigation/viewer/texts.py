@@ -200,13 +200,11 @@ class Texts:
 def _tag_rows(scene: Scene, pairs: dict[Pair, Means], verdicts: dict[int | None, Verdict]) -> list[list[str]]:
     """Return the texts of the table of tags; those with positions come first, in the order of their colours."""
     plain_id, rows = plain_tag_id(scene.tags, pairs), dict[str, list[str]]()
-    for name, view in sorted(scene.tags.items()):
-        label, place, sd_m, age = tag_label(name, plain_id), "-", math.nan, "no position"
-        if (pose := view.pose) is not None:
-            place, sd_m, age_s = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, scene.age_s(view)
-            age = f"{age_s:.1f} s"
-            if age_s > NO_DATA_S:
-                place, sd_m, age = f"last: {place}", math.nan, f"no data for {age_s:.0f} s"
+    for name, pose in sorted(scene.tags.items()):
+        label, age_s = tag_label(name, plain_id), scene.age_s(pose)
+        place, sd_m, age = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, f"{age_s:.1f} s"
+        if age_s > NO_DATA_S:
+            place, sd_m, age = f"last: {place}", math.nan, f"no data for {age_s:.0f} s"
         rows[label] = [label, "-", place, _number(sd_m, 2), age, "-", "-"]
     for tag_id in sorted({tag_id for _, tag_id in pairs}):
         label, name = f"tag {format_id(tag_id)}", tag_name(tag_id, scene.tags, pairs)
