@@ -76,9 +76,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def open_bag(path: Path, namespace: str | None = None) -> tuple[BagPlayer, Scene]:
-    scene = Scene()
-    feed = SceneUpdater(scene)
-    return BagPlayer(path, feed, lambda: Mitigation(load_bundle(default_model_path())), namespace), scene
+    player = BagPlayer(path, lambda: Mitigation(load_bundle(default_model_path())), namespace)
+    return player, player.scene
 
 
 def seek(player: BagPlayer, position_s: float) -> None:

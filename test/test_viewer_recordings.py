@@ -22,12 +22,10 @@ from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import RangeColumns
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer, Check
 from uwb_mitigation.viewer.recording import Timeline, add_residuals
-from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -87,11 +85,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def indexed(path: Path, anchors: AnchorMap = HALL, check: Check | None = None) -> View:
     """Return the view of an indexed bag, paused at its begin."""
-    feed = SceneUpdater(Scene())
-    player = BagPlayer(path, feed, lambda: pytest.fail("the bag contains corrected ranges"))
-    feed.anchors(anchors)
+    player = BagPlayer(path, lambda: pytest.fail("the bag contains corrected ranges"))
     player.index(EstimatorConfig(anchors), check=check).join()
-    return View(feed.scene, player=player)
+    return View(player.scene, player=player)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, -2.0])
@@ -198,9 +194,8 @@ def test_radio_without_cirs_has_no_bad_ranges(tmp_path: Path):
 
 def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     path = corrected_bag(tmp_path / "long.mcap", range(9000), range_m=5.0, range_raw_m=5.3)
-    feed = SceneUpdater(Scene())
-    player = BagPlayer(path, feed, lambda: None)
-    page = Drawn(View(feed.scene, player=player))
+    player = BagPlayer(path, lambda: None)
+    page = Drawn(View(player.scene, player=player))
     assert page.controls.cards == [["Reading the recording ...", "", ""]]
     assert page.controls.verdict[:2] == ["no data yet", "the recording is being read"]
     player.index(None).join()
@@ -208,6 +203,6 @@ def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     while player.is_behind:
         player.advance()
     page.send("draw")
-    assert feed.scene.ranges <= 3001
+    assert player.scene.ranges <= 3001
     assert np.nanmin(page.column("strip", "age")) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
     assert np.ptp(page.column("history", "age")) == pytest.approx(player.seconds, abs=1.0)

@@ -1,15 +1,18 @@
-"""Measure a page of the viewer in Chromium: transferred data, first paint, and processor time with 30 anchors and 5 tags.
+"""Measure a page of the viewer: data, first paint and processor time with 30 anchors and 5 tags; seeks in a long recording.
 
-    python docs/experiments/viewer_load.py
+    python docs/experiments/viewer_load.py [page] [seek]
 
-Every pair has the same share of 500 ranges per second. CIRs have 157 samples.
+`page`, in Chromium: every pair has the same share of 500 ranges per second. CIRs have 157 samples.
+`seek`, without a browser: a recording of 600,000 ranges whose tracks have been estimated.
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +20,13 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test"))
 
+from bag_material import START_NS, corrected, record
 from browser import Browser, chromium
+from drawn import Drawn
+from drives import HALL, drive
 
+from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import (
     Cir,
@@ -28,15 +36,18 @@ from uwb_mitigation.types.measurement import (
     RangeMeasurement,
     Status,
 )
-from uwb_mitigation.types.ros.codec import MeasurementKey
+from uwb_mitigation.types.ros.codec import MeasurementKey, encode_corrected
 from uwb_mitigation.types.ros.topics import RANGE_CORRECTED, RANGE_RAW
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.scene import Pose, Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
 ANCHORS, TAGS, RATE_HZ = 30, 5, 500
 MEASURED_S, PERIOD_S = 20.0, 0.1
+LONG, LONG_HZ, SEEKS = 600_000, 100.0, 15
+"""Numbers of ranges of the long recording and of seeks."""
 SCREENSHOT = Path("build") / "screens" / "viewer_30_anchors.png"
 
 
@@ -87,7 +98,47 @@ def load(browser: Browser, url: str) -> None:
     )
 
 
+def write_long(path: Path) -> None:
+    """Write a recording with one tag."""
+    ranges, _ = drive(seconds=LONG / LONG_HZ, rate_hz=LONG_HZ)
+    with BagWriter(path, {}) as out:
+        channel = out.corrected_channel()
+        for row in range(len(ranges)):
+            stamp_ns, range_m = START_NS + int(ranges.stamp_ns[row]), float(ranges.range_m[row])
+            anchor = HALL.anchors[ranges.anchor[row]].id
+            measured = replace(record(0).measurement, stamp_ns=stamp_ns, anchor_id=anchor, sequence=row)
+            result = replace(corrected(0), range_m=range_m, range_raw_m=range_m + 0.4)
+            out.write_serialized(channel, encode_corrected(measured, result), stamp_ns, stamp_ns, row)
+
+
+def seek() -> None:
+    """Print the processor time of seeks in the long recording, each with the update of one page."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "long.mcap")
+        write_long(path)
+        player = BagPlayer(path, lambda: None)
+        player.index(EstimatorConfig(HALL)).join()
+        page, used_s = Drawn(View(player.scene, player=player)), []
+        for position_s in np.random.default_rng(1).uniform(0.0, player.seconds, 1 + SEEKS):
+            before_s = time.process_time()
+            page.send("seek", position_s)
+            used_s.append(time.process_time() - before_s)
+    # The first one also draws the figures of the whole recording.
+    print(
+        f"{LONG} ranges: a seek needs {np.median(used_s[1:]):.3f} s of processor time, at most {max(used_s[1:]):.3f} s"
+    )
+
+
 def main() -> None:
+    parts = sys.argv[1:] or ["page", "seek"]
+    if "page" in parts:
+        show_page()
+    if "seek" in parts:
+        seek()
+
+
+def show_page() -> None:
+    """Print the figures of a page, and save its screenshot."""
     scene = Scene()
     scene.set_anchors([Anchor(n, (4.0 * (n % 6), 4.5 * (n // 6), 2.0)) for n in range(1, ANCHORS + 1)])
     view, stop = View(scene), threading.Event()

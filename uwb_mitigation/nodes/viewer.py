@@ -69,7 +69,7 @@ class Viewer(ManagedNode):
     def open(self) -> None:
         if path := self.value("anchors"):
             self._anchors = load_anchors(Path(path).expanduser())
-            self._feed.anchors(self._anchors)
+            self._scene.set_anchors(self._anchors.anchors)
             self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, endpoints.LATCHED)
         else:
             self._subscribe(MarkerArray, relative(topics.ANCHORS), topics.ANCHORS, qos=endpoints.LATCHED)

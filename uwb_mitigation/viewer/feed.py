@@ -16,7 +16,6 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.determination import UNIQUE
 from uwb_mitigation.positioning.geometry import horizontal_ellipse
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
-from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import (
@@ -156,11 +155,6 @@ class SceneUpdater:
         """Add the anchors of a visualization_msgs/MarkerArray."""
         if anchors := parse_markers(message):
             self.scene.set_anchors(anchors)
-
-    def anchors(self, anchors: AnchorMap) -> None:
-        """Set the anchors of an anchors file."""
-        with self.scene.lock:
-            self.scene.set_anchors(anchors.anchors)
 
     def _diagnostics(self, message: Any) -> None:
         """Add a diagnostic_msgs/DiagnosticArray."""

@@ -370,7 +370,7 @@ class Map:
             factors=list(looks), palette=[colour for _, colour in looks.values()]
         )
         text = {
-            "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "text_align": "center", "text_font_size": "12px", "text_color": NIGHT,
             "background_fill_color": PAPER, "background_fill_alpha": 0.8,
         }  # fmt: skip
         return [
@@ -389,8 +389,8 @@ class Map:
             ("selected anchor", "scatter", self._selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": NIGHT, "line_width": 3,
             }),
-            ("tag", "scatter", self._tags, {"marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT}),
             ("", "text", self._anchors, text | {"text": "label", "y_offset": -13}),
+            ("tag", "scatter", self._tags, {"marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT}),
             ("", "text", self._tags, text | {"text": "name", "y": "label_y", "y_offset": -4}),
         ]  # fmt: skip
 

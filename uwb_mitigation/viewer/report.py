@@ -17,12 +17,10 @@ from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
-from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.figures import HEADINGS, Figures, finish, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
 from uwb_mitigation.viewer.palette import TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import Controls, PageState, View
 from uwb_mitigation.viewer.texts import ANCHOR_TITLES, TAG_TITLES, Texts
 
@@ -106,14 +104,12 @@ def write_report(
     Raises:
         RecordingError: the bag cannot be read.
     """
-    feed = SceneUpdater(Scene())
-    player = BagPlayer(bag, feed, backend)
-    feed.anchors(config.anchors)
+    player = BagPlayer(bag, backend)
     player.index(config, stamp_offset_s, lambda *_: displaced, tracks).join()
     player.seek(player.seconds)
     while player.is_behind:
         player.advance()
-    figures, controls = draw_scene(View(feed.scene, player=player))
+    figures, controls = draw_scene(View(player.scene, player=player))
     state, reason, action, facts = controls.verdict
     lines = [
         f"Position {state}" + (f": {reason}" if reason else "") + (f". {action}" if action else ""),

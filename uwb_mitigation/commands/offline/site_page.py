@@ -13,7 +13,6 @@ from markupsafe import Markup
 from uwb_mitigation.calibration.site import SiteCalibration
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.report import draw_boxes, draw_scene, render_report
 from uwb_mitigation.viewer.scene import Pose, Scene, count_errors
@@ -99,8 +98,7 @@ def _details(calibration: SiteCalibration) -> Iterable[str]:
 def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
     """Return anchors, tracks, stationary positions, and errors before and after, float64 (2, n), as the viewer draws them."""
     scene, solution = Scene(lambda: 0.0), calibration.solution
-    feed = SceneUpdater(scene)
-    feed.anchors(calibration.site.anchors)
+    scene.set_anchors(calibration.site.anchors.anchors)
     for segment in np.unique(solution.track_of):
         places = solution.track[(solution.track_of == segment) & np.isfinite(solution.track).all(axis=1)]
         columns = np.column_stack([np.zeros(len(places)), places, np.full(len(places), math.nan)])
