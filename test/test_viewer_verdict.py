@@ -12,7 +12,7 @@ from drawn import Clock, Drawn
 from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.viewer import health
+from uwb_mitigation.viewer import health, palette
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.health import DEGRADED, HeldVerdict, Verdict
 from uwb_mitigation.viewer.health import POSITION_GOOD as GOOD
@@ -77,6 +77,22 @@ def test_anchor_to_check_is_named_below_a_good_position():
     state, reason, action, _ = controls(driven({2: 0.2})[0]).verdict
     assert (state, reason) == ("good", "")
     assert action == "Anchor door reads 0.20 m long: calibrate, or check its position."
+
+
+def test_each_tag_has_a_verdict_and_a_track_of_its_own_colour():
+    scene, clock = driven()
+    for stamp_s in (902.9, 903.0):
+        scene.add_pose("tag_9", Pose(1.0, 2.0, 0.0, stamp_s=stamp_s, sd_m=0.1))
+        scene.add_sample((1, 9), Sample(stamp_s, 5.0, 5.0, 0.1, Status.OK))
+    clock.now_s += 4.0
+    scene.add_pose("tag_7", Pose(4.0, 3.0, 0.0, stamp_s=907.0, sd_m=0.1))
+    for anchor in ANCHORS:
+        scene.add_sample((anchor, 7), Sample(907.0, 5.0, 5.0, 0.1, Status.OK))
+    page = shown(scene)
+    assert [row[:2] for row in page.controls.tag_rows] == [["tag 7", "good"], ["tag 9", "lost"]]
+    first, second = palette.TAG_COLOURS[:2]
+    assert page.columns("map", "colour")[-2:] == [palette.GREY, first], "tag 7 moved last"
+    assert {first, second} <= set(page.columns("map", "colour")), "the track of a lost tag keeps its colour"
 
 
 def test_position_of_a_lost_tag_is_the_last_one_without_accuracy():

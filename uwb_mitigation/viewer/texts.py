@@ -39,11 +39,7 @@ COLUMNS = {
     "correction": ("correction, m", _RANGES, "mean of raw minus corrected range"),
     "residual": ("residual, m", _RANGES, "mean of corrected range minus distance to the estimated position"),
     "not_ok": ("not OK, %", _RANGES, "share of ranges whose status is not OK"),
-    "nlos": (
-        "NLOS, %",
-        _CIRS,
-        "no line of sight: share of CIRs with the first path 6 dB or more below the total",
-    ),
+    "nlos": ("NLOS, %", _CIRS, "share of CIRs without line of sight: first path 6 dB below the total"),
     "rx": ("RX, dBm", _CIRS, "mean receive level"),
     "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
     "lost": ("lost, %", "all; in a recording: since the minute before", "share of missing sequence numbers"),
