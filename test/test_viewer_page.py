@@ -391,6 +391,18 @@ def test_pointer_shows_values_and_a_click_selects_an_anchor(browser: Browser, se
     assert browser.console_messages() == []
 
 
+def test_names_on_the_map_do_not_cover_each_other(browser: Browser, view: View, server: ViewerServer) -> None:
+    with view.scene.lock:
+        view.scene.set_anchors([Anchor(n, (0.2 * n, 0.0, 2.0), name=f"column {n}") for n in range(30)])
+    browser.open(server.url + "#anchor=17&tag=7")
+    browser.wait("names", lambda: browser.column("map", "text")[:2] == ["tag 7", "column 17"])
+    shown = browser.column("map", "text")
+    assert 3 < len(shown) < 15
+    for _ in range(8):
+        browser.driver.find_element("id", "map").send_keys("+")
+    browser.wait("others after zooming in", lambda: set(browser.column("map", "text")) - set(shown))
+
+
 def test_selected_pair_survives_a_restart(browser: Browser, view: View) -> None:
     with ViewerServer(view, port=0) as server:
         browser.open(server.url + "#anchor=3&tag=7")

@@ -329,6 +329,8 @@ class Map:
         # Glyphs with NaN are not drawn: without a heading, for example.
         self._tags = new_source("x", "y", "name", "colour", "label_y", "width", "height", "angle", "heading")
         self._tracks = {kind: new_source("xs", "ys", "colour") for kind in STROKES}
+        # The script of the page fills it with the names that do not cover each other.
+        self._labels = new_source("x", "y", "text", "offset", "shift")
         self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
         self._accuracy = new_source("image", "x", "y", "dw", "dh")
         # The map shows these corners until the user changes the view; it must not follow the data.
@@ -370,8 +372,8 @@ class Map:
             factors=list(looks), palette=[colour for _, colour in looks.values()]
         )
         text = {
-            "text_align": "center", "text_font_size": "12px", "text_color": NIGHT,
-            "background_fill_color": PAPER, "background_fill_alpha": 0.8,
+            "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset", "x_offset": "shift",
         }  # fmt: skip
         return [
             ("", "segment", self._rays, {"line_color": marks["color"], "line_alpha": 0.8}),
@@ -389,9 +391,8 @@ class Map:
             ("selected anchor", "scatter", self._selected, {
                 "marker": "circle", "size": 22, "fill_color": None, "line_color": NIGHT, "line_width": 3,
             }),
-            ("", "text", self._anchors, text | {"text": "label", "y_offset": -13}),
             ("tag", "scatter", self._tags, {"marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT}),
-            ("", "text", self._tags, text | {"text": "name", "y": "label_y", "y_offset": -4}),
+            ("", "text", self._labels, text),
         ]  # fmt: skip
 
     def draw(self, scene: Scene) -> None:
@@ -447,6 +448,13 @@ class Map:
                 "width": 2 * major, "height": 2 * minor, "angle": angle, "heading": pose.heading_rad,
             })  # fmt: skip
         set_rows(self._tags, rows)
+
+    def show_labels(self) -> None:
+        """Show all names, for a report, which has no script."""
+        anchors, tags = self._anchors.data, self._tags.data
+        labels = [(*row, -13, 0) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
+        labels += [(*row, -4, 0) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
+        set_rows(self._labels, [dict(zip(self._labels.data, row, strict=True)) for row in labels])
 
     def _draw_tracks(self, scene: Scene) -> None:
         colours = palette.tag_colours(scene.tags)
