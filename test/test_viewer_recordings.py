@@ -199,10 +199,7 @@ def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     assert page.controls.cards == [["Reading the recording ...", "", ""]]
     assert page.controls.verdict[:2] == ["no data yet", "the recording is being read"]
     player.index(None).join()
-    player.seek(player.seconds)
-    while player.is_behind:
-        player.advance()
-    page.send("draw")
+    page.send("seek", player.seconds)
     assert player.scene.ranges <= 3001
     assert np.nanmin(page.column("strip", "age")) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
     assert np.ptp(page.column("history", "age")) == pytest.approx(player.seconds, abs=1.0)

@@ -14,8 +14,7 @@ from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
 from uwb_mitigation.viewer import health, palette
 from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.health import DEGRADED, HeldVerdict, Verdict
-from uwb_mitigation.viewer.health import POSITION_GOOD as GOOD
+from uwb_mitigation.viewer.health import DEGRADED, POSITION_GOOD, HeldVerdict, Verdict
 from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
@@ -135,9 +134,9 @@ def test_verdict_names_the_reason(change, expected: tuple[str, str]):
 def test_better_verdict_is_held_back_and_a_seek_is_not():
     held = HeldVerdict()
     states = [held.update(Verdict(state), now_s).state
-              for state, now_s in ((DEGRADED, 0.0), (GOOD, 1.0), (DEGRADED, 1.5), (GOOD, 2.0), (GOOD, 3.0), (GOOD, 4.1),
-                                   (DEGRADED, 4.2), (GOOD, 90.0))]  # fmt: skip
-    assert states == [DEGRADED] * 5 + [GOOD, DEGRADED, GOOD]
+              for state, now_s in ((DEGRADED, 0.0), (POSITION_GOOD, 1.0), (DEGRADED, 1.5), (POSITION_GOOD, 2.0), (POSITION_GOOD, 3.0), (POSITION_GOOD, 4.1),
+                                   (DEGRADED, 4.2), (POSITION_GOOD, 90.0))]  # fmt: skip
+    assert states == [DEGRADED] * 5 + [POSITION_GOOD, DEGRADED, POSITION_GOOD]
 
 
 @pytest.mark.parametrize(
