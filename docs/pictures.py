@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Lock
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -45,10 +44,8 @@ from uwb_mitigation.types.measurement import Cir, Record  # noqa: E402
 from uwb_mitigation.types.offsets import Offsets  # noqa: E402
 from uwb_mitigation.types.stamps import NS_PER_S  # noqa: E402
 from uwb_mitigation.types.tracks import Track  # noqa: E402
-from uwb_mitigation.viewer.feed import SceneUpdater  # noqa: E402
 from uwb_mitigation.viewer.palette import BLUE, GREY, NIGHT, VERMILLION  # noqa: E402
 from uwb_mitigation.viewer.playback import BagPlayer  # noqa: E402
-from uwb_mitigation.viewer.scene import Scene  # noqa: E402
 from uwb_mitigation.viewer.server import ViewerServer  # noqa: E402
 from uwb_mitigation.viewer.state import View  # noqa: E402
 
@@ -189,12 +186,11 @@ def show_states(browser: Browser, folder: Path) -> None:
         source, bag = ChangedDrive(state), folder / f"{name}.mcap"
         write_simulated(source, DRIVE_RANGES, 1, bag, True, None)
         anchors = state.anchors(source.anchors)
-        feed = SceneUpdater(Scene(), Lock())
-        player = BagPlayer(bag, feed, lambda: mitigation(settings))
-        feed.anchors(anchors)
+        player = BagPlayer(bag, lambda: mitigation(settings))
+        player.scene.set_anchors(anchors.anchors)
         if state.is_indexed:
             player.index(settings.config(anchors), check=displaced_anchor).join()
-        view = View(feed.scene, feed.lock, f"{name}.mcap", player=player, missing=player.missing)
+        view = View(player.scene, f"{name}.mcap", player=player)
         with ViewerServer(view, port=0) as server:
             browser.open(f"{server.url}#t={state.seconds}", *FIRST_SCREEN)
             browser.wait("the page", browser.ready)

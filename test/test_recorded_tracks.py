@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -46,10 +45,8 @@ from uwb_mitigation.types.measurement import (
 )
 from uwb_mitigation.types.offsets import read_offsets
 from uwb_mitigation.types.ros.codec import measurement_key
-from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.headline import recorded_cards
+from uwb_mitigation.viewer.headline import cards
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
 
@@ -58,13 +55,11 @@ HANYANG, LABYRINTH = DATA / "hanyang_outdoor", DATA / "chemnitz_labyrinth"
 BOX = Area((-20.0, -60.0, -2.0), (80.0, 60.0, 4.0))
 
 
-def indexed(bag: Path, settings: TrackSettings) -> tuple[BagPlayer, SceneUpdater]:
+def indexed(bag: Path, settings: TrackSettings) -> BagPlayer:
     """Return the player of a bag after its index is complete."""
-    feed, anchors = SceneUpdater(Scene(), threading.Lock()), read_anchors(bag)
-    player = BagPlayer(bag, feed, lambda: mitigation(settings))
-    feed.anchors(anchors)
-    player.index(read_config(bag, anchors, settings), settings.stamp_offset_s).join()
-    return player, feed
+    player = BagPlayer(bag, lambda: mitigation(settings))
+    player.index(read_config(bag, read_anchors(bag), settings), settings.stamp_offset_s).join()
+    return player
 
 
 @pytest.fixture(scope="module")
@@ -111,27 +106,28 @@ def test_track_and_view_give_the_same_figures(
         bag = tmp_path / "processed.mcap"
     succeed("track", bag, "-o", "track.mcap", *options, "--json", "track.json", folder=tmp_path)
     result = json.loads((tmp_path / "track.json").read_text())
-    player, feed = indexed(bag, settings)
+    player = indexed(bag, settings)
     timeline = player.timeline
     (tag,) = result["tags"]
-    cards = {title: (value, text) for title, value, text in recorded_cards(timeline, tag["tag_id"])}
+    view = View(player.scene, player=player)
+    figures = {title: (value, text) for title, value, text in cards(view, tag["tag_id"])}
     for title, key in (
         ("Position RMSE, whole recording", "horizontal_rmse_m"),
         ("95 % of position errors below, whole recording", "p95_m"),
     ):
         live, raw, smoothed = (f"{result[kind][key]:.3f} m" for kind in ("live", "raw_live", "smoothed"))
-        assert cards[title] == (live, f"raw + same filter: {raw}; smoothed: {smoothed}")
+        assert figures[title] == (live, f"raw + same filter: {raw}; smoothed: {smoothed}")
         if source is not None:
             assert live == raw, "nothing was corrected"
     shown = [notice.split(": ", 1)[1] for notice in timeline.notices]
     assert [text for text in shown if text in tag["warnings"]] == tag["warnings"]
     if source is not None:
-        show_in_a_browser(request.getfixturevalue("browser"), player, feed)
+        show_in_a_browser(request.getfixturevalue("browser"), player)
 
 
-def show_in_a_browser(browser: Browser, player: BagPlayer, feed: SceneUpdater) -> None:
+def show_in_a_browser(browser: Browser, player: BagPlayer) -> None:
     """Show a public recording without CIRs."""
-    with ViewerServer(View(feed.scene, feed.lock, player=player), port=0) as server:
+    with ViewerServer(View(player.scene, player=player), port=0) as server:
         browser.open(f"{server.url}#t=20")
         browser.wait("the errors", lambda: "Position RMSE, whole recording" in browser.cards())
         value, text = browser.cards()["Ranges corrected, whole recording"]
@@ -146,7 +142,7 @@ def show_in_a_browser(browser: Browser, player: BagPlayer, feed: SceneUpdater) -
 def test_placements_have_no_positions_in_track_and_view(apartment_imported: Path, tmp_path: Path):
     bag = apartment_imported / "apartment.mcap"
     refused = run("track", bag, "-o", "track.mcap", folder=tmp_path).stderr
-    timeline = indexed(bag, TrackSettings())[0].timeline
+    timeline = indexed(bag, TrackSettings()).timeline
     assert timeline.notices
     assert timeline.notices[0] in refused.replace("\n", " ")
 
@@ -232,7 +228,7 @@ def test_odometry_of_one_robot_is_not_used_for_several_tags(tmp_path: Path):
         bag, (Record(replace(record(number).measurement, tag_id=7 + number % 3)) for number in range(20))
     )
     config = EstimatorConfig(HALL, robot=RobotData())
-    player = BagPlayer(bag, SceneUpdater(Scene(), threading.Lock()), lambda: mitigation(TrackSettings()))
+    player = BagPlayer(bag, lambda: mitigation(TrackSettings()))
     player.index(config).join()
     assert player.timeline is not None
     assert "--odometry with the tags 7, 8, 9" in player.timeline.notices[-1]

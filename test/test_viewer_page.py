@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from http.client import HTTPConnection, HTTPResponse
-from threading import Lock
 
 import numpy as np
 import pytest
@@ -42,7 +41,7 @@ def clock() -> Clock:
 @pytest.fixture
 def view(clock: Clock) -> View:
     """Two pairs of tag 7 at 10 Hz each; the ranges of anchor 2 are out of distribution and 0.5 m too long."""
-    view = View(scene := Scene(clock), Lock(), "UWB ranges")
+    view = View(scene := Scene(clock), "UWB ranges")
     scene.set_anchors([Anchor(1, (0, 0, 2), name=HOSTILE), Anchor(2, (8, 0, 2))])
     scene.set_node_status(HOSTILE, NodeStatus(1, HOSTILE))
     for step in range(50):
@@ -74,7 +73,7 @@ def open_page(browser: Browser, server: ViewerServer, width: int = 1280, height:
 
 
 def add_range(view: View, range_m: float, anchor: int = 1, status: Status = Status.OK) -> None:
-    with view.lock:
+    with view.scene.lock:
         view.scene.add_sample((anchor, 7), Sample(1005.0, 9.9, range_m, 0.1, status))
 
 
@@ -116,7 +115,7 @@ def test_map_view_is_fixed_until_changed(browser: Browser, view: View, server: V
         return seen
 
     def moved(x: float) -> None:
-        with view.lock:
+        with view.scene.lock:
             view.scene.add_pose("tag", Pose(x, 3, 0))
         browser.wait("the tag", lambda: x in browser.column("map", "x1"))
 
@@ -137,7 +136,7 @@ def test_map_view_is_fixed_until_changed(browser: Browser, view: View, server: V
     zoomed = browser.wait("it to zoom in", settled)
     assert zoomed[1] - zoomed[0] < 0.9 * (fitted[1] - fitted[0])
     moved(90.0)
-    with view.lock:
+    with view.scene.lock:
         view.scene.set_anchors([Anchor(5, (-70, 0, 2))])
     browser.wait("the new anchor", lambda: "5" in browser.column("map", "id"))
     assert view_of_map() == zoomed
@@ -165,7 +164,7 @@ def test_page_can_be_paused_and_resumed(
 
 def test_page_without_updates_shows_how_old_it_is(browser: Browser, view: View, server: ViewerServer) -> None:
     open_page(browser, server)
-    with view.lock:
+    with view.scene.lock:
         browser.wait("its age", lambda: "s behind" in browser.text())
     browser.wait("updates", lambda: "LIVE" in browser.text())
 
@@ -195,7 +194,7 @@ def test_pair_is_selected_by_click_and_key_during_updates(
 
 def test_implausible_values_do_not_break_the_page(browser: Browser, view: View, server: ViewerServer) -> None:
     nan, inf = math.nan, math.inf
-    with view.lock:
+    with view.scene.lock:
         view.scene.set_anchors([Anchor(1, (0, 0, 2)), Anchor(2, (8, 0, nan)), Anchor(3, (0, 1e300, nan))])
         for anchor, values in ((1, (3e38, -3e38, inf)), (2, (nan, nan, nan)), (3, (inf, -inf, 0.1))):
             view.scene.add_sample((anchor, 7), Sample(1005.0, *values, Status.BAD_CIR, 3e38))
@@ -227,7 +226,7 @@ def empty_figures(browser: Browser) -> dict[str, str]:
 
 
 def test_empty_page_has_axes_and_messages(browser: Browser) -> None:
-    with ViewerServer(View(Scene(Clock()), Lock()), port=0) as server:
+    with ViewerServer(View(Scene(Clock())), port=0) as server:
         open_page(browser, server)
         ends = axis_ends(browser, "cir", "strip", "errors")
         assert all(end is not None and math.isfinite(end) for end in ends)
@@ -294,7 +293,7 @@ def test_swipe_over_a_figure_scrolls_a_phone(browser: Browser, server: ViewerSer
 
 def test_long_names_and_ids_fit_the_screen(browser: Browser, view: View, server: ViewerServer) -> None:
     view.title = name = "warehouse_door_north_" * 20
-    with view.lock:
+    with view.scene.lock:
         pair = 0xDECA010203040506, 0xDECA0102030407F8
         view.scene.add_sample(pair, Sample(1005.0, -9.9, 123.456, 12.345, Status.OK))
         view.scene.set_anchors([Anchor(n, (4.0 * n, 0, 2), name=name) for n in (1, 2)])
@@ -393,7 +392,7 @@ def test_pointer_shows_values_and_a_click_selects_an_anchor(browser: Browser, se
 
 
 def test_names_on_the_map_do_not_cover_each_other(browser: Browser, view: View, server: ViewerServer) -> None:
-    with view.lock:
+    with view.scene.lock:
         view.scene.set_anchors([Anchor(n, (0.2 * n, 0.0, 2.0), name=f"column {n}") for n in range(30)])
     browser.open(server.url + "#anchor=17&tag=7")
     browser.wait("names", lambda: browser.column("map", "text")[:2] == ["tag 7", "column 17"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,14 +22,12 @@ from uwb_mitigation.types.ros import codec
 from uwb_mitigation.types.ros.poses import encode_true_position
 from uwb_mitigation.types.ros.topics import ODOMETRY_TRUTH, ODOMETRY_TYPE
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import RangeColumns
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer, Check
-from uwb_mitigation.viewer.scene import Scene
+from uwb_mitigation.viewer.recording import Timeline, add_residuals
 from uwb_mitigation.viewer.server import ViewerServer
 from uwb_mitigation.viewer.state import View
-from uwb_mitigation.viewer.timeline import Timeline, add_residuals
 
 BAD = 700
 """Row of the range whose status is not OK and whose error is the largest."""
@@ -88,11 +85,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def indexed(path: Path, anchors: AnchorMap = HALL, check: Check | None = None) -> View:
     """Return the view of an indexed bag, paused at its begin."""
-    feed = SceneUpdater(Scene(), threading.Lock())
-    player = BagPlayer(path, feed, lambda: pytest.fail("the bag contains corrected ranges"))
-    feed.anchors(anchors)
+    player = BagPlayer(path, lambda: pytest.fail("the bag contains corrected ranges"))
     player.index(EstimatorConfig(anchors), check=check).join()
-    return View(feed.scene, feed.lock, player=player)
+    return View(player.scene, player=player)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, -2.0])
@@ -156,7 +151,7 @@ def test_anchor_that_is_not_where_the_file_says_is_named_first(bag: Path):
 def test_gaps_are_shown_as_gaps(tmp_path: Path):
     page = Drawn(indexed(write_drive(tmp_path / "gap.mcap", {7: -2.0}, gap_s=(10.0, 30.0))))
     page.send("seek", 25.0)
-    assert page.controls.tag_rows[0][3] == "no data for 15 s"
+    assert page.controls.tag_rows[0][4] == "no data for 15 s"
     assert np.isnan(page.column("positions", "error")).sum() == 1
     events = [(round(time_s, -1), text) for time_s, text in page.controls.incidents if "largest" not in text]
     assert sorted(events) == [
@@ -199,16 +194,12 @@ def test_radio_without_cirs_has_no_bad_ranges(tmp_path: Path):
 
 def test_seek_reads_few_messages_and_the_strip_shows_the_minute(tmp_path: Path):
     path = corrected_bag(tmp_path / "long.mcap", range(9000), range_m=5.0, range_raw_m=5.3)
-    feed = SceneUpdater(Scene(), threading.Lock())
-    player = BagPlayer(path, feed, lambda: None)
-    page = Drawn(View(feed.scene, feed.lock, player=player))
+    player = BagPlayer(path, lambda: None)
+    page = Drawn(View(player.scene, player=player))
     assert page.controls.cards == [["Reading the recording ...", "", ""]]
     assert page.controls.verdict[:2] == ["no data yet", "the recording is being read"]
     player.index(None).join()
-    player.seek(player.seconds)
-    while player.is_behind:
-        player.advance()
-    page.send("draw")
-    assert feed.scene.ranges <= 3001
+    page.send("seek", player.seconds)
+    assert player.scene.ranges <= 3001
     assert np.nanmin(page.column("strip", "age")) == pytest.approx(-60.0, abs=60.0 * STEP_NS / 1e7)
     assert np.ptp(page.column("history", "age")) == pytest.approx(player.seconds, abs=1.0)

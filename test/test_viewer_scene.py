@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
-from uwb_mitigation.viewer.headline import live_cards
+from uwb_mitigation.viewer.headline import cards
 from uwb_mitigation.viewer.histories import Sample, Trace
 from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.scene import MAX_PAIRS, Pose, Scene
@@ -28,7 +27,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def view(clock: Clock) -> View:
-    return View(Scene(clock), threading.Lock())
+    return View(Scene(clock))
 
 
 def test_slow_pair_has_data_between_its_ranges(view: View, clock: Clock) -> None:
@@ -197,10 +196,10 @@ def test_figures_are_those_of_the_selected_tag() -> None:
             scene.add_position(f"tag_{tag}", TrackKind.TRUE, (time_s, step / 10, 0.0, 0.0, math.nan))
             scene.add_pose(name, Pose(step / 10, error_m, 0.0, stamp_s=time_s, sd_m=0.2))
     for tag, expected in ((7, "0.100 m"), (9, "0.500 m")):
-        assert live_cards(scene, tag)[0] == ["Position RMSE, last 60 s", expected, ""]
+        assert cards(View(scene), tag)[0] == ["Position RMSE, last 60 s", expected, ""]
     scene.add_sample((1, 5), Sample(1000.0, 5.3, 5.1, 0.1, Status.OK))
     for tag in (5, 7):
-        assert [card[0] for card in live_cards(scene, tag)] == ["Ranges corrected, since the start"], (
+        assert [card[0] for card in cards(View(scene), tag)] == ["Ranges corrected, since the start"], (
             "ambiguous"
         )
 

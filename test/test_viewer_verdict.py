@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,14 +12,14 @@ from drawn import Clock, Drawn
 from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.types.anchors import Anchor
 from uwb_mitigation.types.measurement import Status
-from uwb_mitigation.viewer import health
+from uwb_mitigation.viewer import health, palette
 from uwb_mitigation.viewer.feed import SceneUpdater
+from uwb_mitigation.viewer.health import DEGRADED, POSITION_GOOD, HeldVerdict, Verdict
 from uwb_mitigation.viewer.histories import Sample
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.scene import NodeStatus, Pose, Scene
 from uwb_mitigation.viewer.state import View
-from uwb_mitigation.viewer.verdict import DEGRADED, GOOD, HeldVerdict, Verdict
 
 CIRCLE = NodeStatus(1, "", math.nan, ("tag 7 determination: circle: R. Remedy: more anchors",))
 ANCHORS = {1: (0.0, 0.0), 2: (8.0, 0.0), 3: (0.0, 6.0), 4: (8.0, 6.0)}
@@ -45,7 +44,7 @@ def driven(
 
 
 def shown(scene: Scene) -> Drawn:
-    return Drawn(View(scene, threading.Lock()))
+    return Drawn(View(scene))
 
 
 def controls(scene: Scene):
@@ -79,10 +78,31 @@ def test_anchor_to_check_is_named_below_a_good_position():
     assert action == "Anchor door reads 0.20 m long: calibrate, or check its position."
 
 
+def test_each_tag_has_a_verdict_and_a_track_of_its_own_colour():
+    scene, clock = driven()
+    for stamp_s in (902.9, 903.0):
+        scene.add_pose("tag_9", Pose(1.0, 2.0, 0.0, stamp_s=stamp_s, sd_m=0.1))
+        scene.add_sample((1, 9), Sample(stamp_s, 5.0, 5.0, 0.1, Status.OK))
+    clock.now_s += 4.0
+    scene.add_pose("tag_7", Pose(4.0, 3.0, 0.0, stamp_s=907.0, sd_m=0.1))
+    for anchor in ANCHORS:
+        scene.add_sample((anchor, 7), Sample(907.0, 5.0, 5.0, 0.1, Status.OK))
+    page = shown(scene)
+    assert [row[:2] for row in page.controls.tag_rows] == [["tag 7", "good"], ["tag 9", "lost"]]
+    first, second = palette.TAG_COLOURS[:2]
+    assert page.columns("map", "colour")[-2:] == [palette.GREY, first], "tag 7 moved last"
+    assert {first, second} <= set(page.columns("map", "colour")), "the track of a lost tag keeps its colour"
+
+
 def test_position_of_a_lost_tag_is_the_last_one_without_accuracy():
     scene, clock = driven()
     clock.now_s += 12.0
-    assert shown(scene).controls.tag_rows[0][1:4] == ["last: 4.00, 3.00, 0.00", "-", "no data for 12 s"]
+    assert shown(scene).controls.tag_rows[0][1:5] == [
+        "lost",
+        "last: 4.00, 3.00, 0.00",
+        "-",
+        "no data for 12 s",
+    ]
 
 
 @pytest.mark.parametrize(("error_m", "state"), [(0.2, health.CHECK), (0.4, health.BAD)])
@@ -114,9 +134,9 @@ def test_verdict_names_the_reason(change, expected: tuple[str, str]):
 def test_better_verdict_is_held_back_and_a_seek_is_not():
     held = HeldVerdict()
     states = [held.update(Verdict(state), now_s).state
-              for state, now_s in ((DEGRADED, 0.0), (GOOD, 1.0), (DEGRADED, 1.5), (GOOD, 2.0), (GOOD, 3.0), (GOOD, 4.1),
-                                   (DEGRADED, 4.2), (GOOD, 90.0))]  # fmt: skip
-    assert states == [DEGRADED] * 5 + [GOOD, DEGRADED, GOOD]
+              for state, now_s in ((DEGRADED, 0.0), (POSITION_GOOD, 1.0), (DEGRADED, 1.5), (POSITION_GOOD, 2.0), (POSITION_GOOD, 3.0), (POSITION_GOOD, 4.1),
+                                   (DEGRADED, 4.2), (POSITION_GOOD, 90.0))]  # fmt: skip
+    assert states == [DEGRADED] * 5 + [POSITION_GOOD, DEGRADED, POSITION_GOOD]
 
 
 @pytest.mark.parametrize(
@@ -168,7 +188,7 @@ def test_pairs_tags_and_nodes_without_data_are_marked():
     states = ((7, "circle: R"), (8, "unique: R"))
     entries = [SimpleNamespace(key=f"tag {n} determination", value=state) for n, state in states]
     diagnosis = SimpleNamespace(status=[SimpleNamespace(name="locator", level=1, message="", values=entries)])
-    SceneUpdater(scene, threading.Lock()).add("/diagnostics", diagnosis)
+    SceneUpdater(scene).add("/diagnostics", diagnosis)
     scene.set_node_status("driver", NodeStatus(0, "10.0 Hz", clock()))
     scene.set_node_status("recording", NodeStatus(2, "damaged"))
     page = shown(scene)
@@ -260,7 +280,7 @@ def test_clock_jump_dead_tag_and_old_stamps_are_reported():
     scene.add_sample((1, 7), Sample(clock.now_s + 4500.0, 5.0, 5.0, 0.1, Status.OK))
     page = controls(scene)
     assert (None, "5 s ago: tag 9: lost") in page.incidents
-    assert page.tag_rows[1][3:] == ["no position", "0.0", "16.9 s"]
+    assert page.tag_rows[1][4:] == ["no position", "0.0", "16.9 s"]
 
 
 @pytest.mark.parametrize(

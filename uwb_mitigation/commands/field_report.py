@@ -18,7 +18,6 @@ from dataclasses import asdict
 from datetime import datetime, timezone
 from itertools import zip_longest
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -167,19 +166,19 @@ def _page(
     from uwb_mitigation.types.measurement import CorrectedBy, CorrectedRange, Status
     from uwb_mitigation.types.ros.codec import measurement_key
     from uwb_mitigation.viewer.feed import SceneUpdater
-    from uwb_mitigation.viewer.models import FIGURES
+    from uwb_mitigation.viewer.figures import HEADINGS
     from uwb_mitigation.viewer.report import draw_scene, render_report
     from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.state import View
 
-    feed = SceneUpdater(Scene(), Lock())
+    feed = SceneUpdater(Scene())
     for measured, corrected in zip_longest(observation.ranges, observation.corrected):
         key, raw_m = measurement_key(measured), measured.range_m
         shown = corrected or CorrectedRange(raw_m, raw_m, 0.0, math.nan, Status.NO_CIR, CorrectedBy.HOST, 0)
         feed.measurement(measured)
         feed.truth(key, truth)
         feed.corrected(key, shown)
-    figures = draw_scene(View(feed.scene, feed.lock)).figures
+    figures, _ = draw_scene(View(feed.scene))
     counts = Counter(check.verdict.value for check in checks)
     severity = ("fail", "warning", "pass")
     lines = [
@@ -196,7 +195,7 @@ def _page(
         for check in sorted(checks, key=lambda check: severity.index(check.verdict.value))
     ]
     sections: dict[str, Any] = {"Checks": [("check", "result", "value", "limit", "what to do"), *rows]}
-    sections |= {FIGURES[name]: figures[name] for name in ("strip", "errors", "cir")}
+    sections |= {HEADINGS[name]: figures[name] for name in ("strip", "errors", "cir")}
     for heading, name in (("System", "system"), ("Counters of the driver", "counters")):
         sections[heading] = [("name", "value"), *values[name].items()]
     return render_report(f"Field report: {title}", lines, sections)

@@ -58,29 +58,20 @@ def view(
 
         uwb-mitigation view flat.mcap --height 0 --browser
     """
-    from threading import Lock
-
     from uwb_mitigation.commands.offline.track import displaced_anchor, mitigation, read_config
     from uwb_mitigation.recordings.bag.anchor_markers import recorded_anchors
     from uwb_mitigation.types.anchors import load_anchors
-    from uwb_mitigation.viewer.feed import SceneUpdater
     from uwb_mitigation.viewer.playback import BagPlayer
-    from uwb_mitigation.viewer.scene import Scene
     from uwb_mitigation.viewer.server import ViewerServer
     from uwb_mitigation.viewer.state import View
 
     anchor_map = load_anchors(anchors) if anchors is not None else recorded_anchors(bag)
-    feed = SceneUpdater(Scene(), Lock())
-    player = BagPlayer(bag, feed, partial(mitigation, settings), namespace)
-    config = None
-    if anchor_map is not None:
-        feed.anchors(anchor_map)
-        config = read_config(bag, anchor_map, settings, console.warn)
+    player = BagPlayer(bag, partial(mitigation, settings), namespace)
+    config = None if anchor_map is None else read_config(bag, anchor_map, settings, console.warn)
     if player.corrects:
         console.err.print(f"{bag} contains raw ranges only: they are corrected for display.", style="yellow")
     thread = player.index(config, settings.stamp_offset_s, displaced_anchor)
-    name = bag.resolve().name
-    shown = View(feed.scene, feed.lock, title=name, player=player, missing=player.missing)
+    shown = View(player.scene, title=bag.resolve().name, player=player)
     secret = secrets.token_urlsafe(16) if token else ""
     with ViewerServer(shown, host, port, tuple(origins or ()), secret) as server:
         if server.warning:

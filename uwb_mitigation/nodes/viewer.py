@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import secrets
-import threading
 from functools import partial
 from pathlib import Path
 
@@ -60,8 +59,7 @@ class Viewer(ManagedNode):
         self._anchors_out: Publisher | None = None
         self._server: ViewerServer | None = None
         self._scene = Scene()
-        self._lock = threading.Lock()
-        self._feed = SceneUpdater(self._scene, self._lock)
+        self._feed = SceneUpdater(self._scene)
         pace = ReplayClock(self.get_clock())
         self._scene.clock = lambda: pace.now_ns() / NS_PER_S
         self._scene.stamp_clock = lambda: self.now_ns() / NS_PER_S
@@ -71,7 +69,7 @@ class Viewer(ManagedNode):
     def open(self) -> None:
         if path := self.value("anchors"):
             self._anchors = load_anchors(Path(path).expanduser())
-            self._feed.anchors(self._anchors)
+            self._scene.set_anchors(self._anchors.anchors)
             self._anchors_out = self.publisher(MarkerArray, topics.ANCHORS, endpoints.LATCHED)
         else:
             self._subscribe(MarkerArray, relative(topics.ANCHORS), topics.ANCHORS, qos=endpoints.LATCHED)
@@ -96,7 +94,6 @@ class Viewer(ManagedNode):
     def begin(self) -> None:
         self._view = View(
             self._scene,
-            self._lock,
             title=f"UWB ranges {self.get_namespace().strip('/')}".strip(),
             window=self.value("window"),
         )
@@ -158,7 +155,7 @@ class Viewer(ManagedNode):
             dropped = number - self._last_sequence - 1 if self._last_sequence else 0
             self._last_sequence = number
             if dropped > 0 and self._has_single_publisher:
-                with self._lock:
+                with self._scene.lock:
                     self._scene.count_dropped(dropped)
             self._feed.add_encoded(topics.RANGE_CORRECTED, data)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.positioning.determination import UNIQUE
 from uwb_mitigation.positioning.geometry import horizontal_ellipse
 from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
-from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.measurement import CorrectedRange, RangeMeasurement, Truth
 from uwb_mitigation.types.ros import topics
 from uwb_mitigation.types.ros.codec import (
@@ -51,13 +49,10 @@ class SceneUpdater:
 
     Attributes:
         malformed: number of messages that could not be decoded.
-        lock: held while the scene is changed.
     """
 
-    def __init__(self, scene: Scene, lock: Lock) -> None:
-        self.malformed = 0
-        self.scene = scene
-        self.lock = lock
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.malformed = scene, 0
         self._adders: dict[str, Callable[[str, Any], None]] = {
             topics.RANGE_RAW: lambda _, measurement: self.measurement(measurement),
             topics.RANGE_TRUTH: lambda _, decoded: self.truth(*decoded),
@@ -74,7 +69,7 @@ class SceneUpdater:
     def clear(self) -> None:
         """Remove everything except the anchors."""
         self._forget()
-        with self.lock:
+        with self.scene.lock:
             self.scene.clear()
 
     def _forget(self) -> None:
@@ -84,7 +79,7 @@ class SceneUpdater:
         self._without_truth: BoundedDict[MeasurementKey, Sample] = BoundedDict(MAX_WITHOUT_TRUTH)
 
     def report(self, name: str, report: NodeStatus) -> None:
-        with self.lock:
+        with self.scene.lock:
             self.scene.set_node_status(name, report)
 
     def add_encoded(self, topic: str, data: bytes) -> None:
@@ -100,7 +95,7 @@ class SceneUpdater:
         if message is None:
             self.malformed += 1
             return
-        with self.lock:
+        with self.scene.lock:
             self._adders[topic](tag, message)
 
     def measurement(self, measurement: RangeMeasurement) -> None:
@@ -145,9 +140,10 @@ class SceneUpdater:
         """Add a position that the viewer itself estimated from ranges to whose stamps an offset was added."""
         x, y, z = estimate.position.tolist()
         stamp_s, sd_m = estimate.stamp_ns / NS_PER_S - stamp_offset_s, _horizontal_sd_m(estimate.covariance)
-        with self.lock:
-            pose = Pose(x, y, z, horizontal_ellipse(estimate.covariance), stamp_s=stamp_s, sd_m=sd_m)
-            self.scene.add_pose(tag, pose, received_s)
+        with self.scene.lock:
+            ellipse = horizontal_ellipse(estimate.covariance)
+            pose = Pose(x, y, z, ellipse, stamp_s=stamp_s, sd_m=sd_m, received_s=received_s)
+            self.scene.add_pose(tag, pose)
 
     def _position(self, kind: TrackKind, tag: str, message: Any) -> None:
         position = message.pose.pose.position
@@ -159,11 +155,6 @@ class SceneUpdater:
         """Add the anchors of a visualization_msgs/MarkerArray."""
         if anchors := parse_markers(message):
             self.scene.set_anchors(anchors)
-
-    def anchors(self, anchors: AnchorMap) -> None:
-        """Set the anchors of an anchors file."""
-        with self.lock:
-            self.scene.set_anchors(anchors.anchors)
 
     def _diagnostics(self, message: Any) -> None:
         """Add a diagnostic_msgs/DiagnosticArray."""

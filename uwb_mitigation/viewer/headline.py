@@ -14,12 +14,12 @@ from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Track, TruePath
 from uwb_mitigation.viewer.histories import HISTORY_S, Pair
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, Counts, Scene, tag_label, tag_name
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, Counts, tag_label, tag_name
+from uwb_mitigation.viewer.state import View
 
 if TYPE_CHECKING:
     # A live page reads no recordings.
     from uwb_mitigation.positioning.recorded_tracks import TagTracks
-    from uwb_mitigation.viewer.timeline import Timeline
 
 WHOLE, RECENT, LIVE = "whole recording", f"last {HISTORY_S:.0f} s", "since the start"
 """Names of the intervals."""
@@ -28,41 +28,21 @@ Card = list[str]
 """Title, value and explanation of a figure."""
 
 
-def _track(columns: NDArray[np.float64]) -> Track:
-    """Return time (s), x, y, z, ..., float64 (n, 4 or more), as a track without covariances."""
-    n = len(columns)
-    stamp_ns = np.rint(columns[:, 0] * NS_PER_S).astype(np.int64)
-    return Track(stamp_ns, columns[:, 1:4], np.zeros((n, 3)), np.full((n, 6, 6), np.nan))
-
-
-def recorded_cards(timeline: Timeline, tag_id: int | None) -> list[Card]:
-    """Return the figures of a recording; `tag_id`: the selected tag, None: the recording has no ranges."""
-    cards = []
-    if timeline.is_complete:
+def cards(view: View, tag_id: int | None) -> list[Card]:
+    """Return the figures of a tag (None: without ranges) and of all ranges."""
+    positions, timeline, scene = positions_of(view, tag_id), view.timeline, view.scene
+    if timeline is not None:
         raw_name = "raw + same filter" if timeline.estimates else "raw + locator with default settings"
-        cards = recorded_positions(timeline, tag_id).cards(-math.inf, WHOLE, raw_name, timeline.counts)
-    return cards + _range_cards(timeline.counts, timeline.range_errors, WHOLE)
-
-
-def live_cards(scene: Scene, tag_id: int | None) -> list[Card]:
-    """Return the figures of live topics."""
-    positions = live_positions(scene, tag_id)
+        counts, errors_m = timeline.counts, timeline.range_errors
+        return positions.cards(-math.inf, WHOLE, raw_name, counts) + _range_cards(counts, errors_m, WHOLE)
+    if view.player is not None:
+        return [["Reading the recording ...", "", ""]]
     begin_s = -math.inf
-    if view := scene.tracks.get((positions.name, TrackKind.CORRECTED)):
-        begin_s = view.points[-1][0] + scene.age_s(view) - HISTORY_S
-    cards = positions.cards(begin_s, RECENT, "raw + locator", scene.counts)
-    return cards + _range_cards(scene.counts, scene.error_sums_m[:, None] / (scene.errors or math.nan), LIVE)
-
-
-def live_positions(scene: Scene, tag_id: int | None) -> Positions:
-    """Return the positions of a tag from topics."""
-    tracks = {key: view.columns() for key, view in scene.tracks.items() if len(view.points)}
-    return Positions(tracks, tag_id, scene.pairs)
-
-
-def recorded_positions(timeline: Timeline, tag_id: int | None) -> Positions:
-    """Return the positions of a tag in a recording whose index is complete."""
-    return Positions(timeline.tracks, tag_id, timeline.rows, timeline.estimates)
+    if track := scene.tracks.get((positions.name, TrackKind.CORRECTED)):
+        begin_s = track.points[-1][0] + scene.age_s(track) - HISTORY_S
+    errors_m = scene.error_sums_m[:, None] / (scene.errors or math.nan)
+    recent = positions.cards(begin_s, RECENT, "raw + locator", scene.counts)
+    return recent + _range_cards(scene.counts, errors_m, LIVE)
 
 
 def _range_cards(counts: Counts, errors_m: NDArray[np.float64], window: str) -> list[Card]:
@@ -72,11 +52,23 @@ def _range_cards(counts: Counts, errors_m: NDArray[np.float64], window: str) -> 
         return []
     percentage = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
     text = f"{corrected} of {count} ranges corrected" + ("" if corrected or faults else ": no CIRs")
-    cards = [
-        [f"Ranges corrected, {window}", percentage, text + (f"; {faults} need attention" if faults else "")]
+    share = [
+        f"Ranges corrected, {window}",
+        percentage,
+        text + (f"; {faults} need attention" if faults else ""),
     ]
     raw, mean = (_metres(np.abs(errors)) for errors in errors_m)
-    return cards if mean == "-" else [*cards, [f"Mean absolute range error, {window}", mean, f"raw: {raw}"]]
+    return [share] if mean == "-" else [share, [f"Mean absolute range error, {window}", mean, f"raw: {raw}"]]
+
+
+def positions_of(view: View, tag_id: int | None) -> Positions:
+    """Return the positions of a tag: from topics, or of a recording whose index is complete."""
+    if (timeline := view.complete) is not None:
+        return Positions(timeline.tracks, tag_id, timeline.rows, timeline.estimates)
+    tracks = view.scene.tracks.items() if view.player is None else ()
+    return Positions(
+        {key: track.columns() for key, track in tracks if len(track.points)}, tag_id, view.scene.pairs
+    )
 
 
 class Positions:
@@ -159,16 +151,21 @@ class Positions:
         errors = {
             name: self.errors(kind, begin_s) for kind, name in names.items() if self.track(kind) is not None
         }
-        corrected, cards = self.errors(TrackKind.CORRECTED, begin_s), []
+        corrected, shown = self.errors(TrackKind.CORRECTED, begin_s), []
         for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95")):
-            comparison = "; ".join(
-                f"{track_name}: {_metres(getattr(error, name))}" for track_name, error in errors.items()
-            )
-            cards.append([f"{title}, {window}", _metres(getattr(corrected, name)), comparison])
+            others = (f"{other}: {_metres(getattr(error, name))}" for other, error in errors.items())
+            shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(others)])
         # Without corrections, offsets make the difference.
         if counts[0] and raw_name in errors and corrected.rmse + errors[raw_name].rmse > 0.0:
-            cards.append([f"Correction, {window}", *_change(corrected.rmse, errors[raw_name].rmse, raw_name)])
-        return cards
+            shown.append([f"Correction, {window}", *_change(corrected.rmse, errors[raw_name].rmse, raw_name)])
+        return shown
+
+
+def _track(columns: NDArray[np.float64]) -> Track:
+    """Return time (s), x, y, z, ..., float64 (n, 4 or more), as a track without covariances."""
+    n = len(columns)
+    stamp_ns = np.rint(columns[:, 0] * NS_PER_S).astype(np.int64)
+    return Track(stamp_ns, columns[:, 1:4], np.zeros((n, 3)), np.full((n, 6, 6), np.nan))
 
 
 def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str]:

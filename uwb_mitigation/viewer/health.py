@@ -1,21 +1,24 @@
-"""State of pairs and anchors, with advice, and the accuracy that the positions of the anchors permit."""
+"""States of pairs and anchors with advice, the verdict on a position, and the accuracy that the anchors permit."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections import defaultdict
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.geometry import dop
-from uwb_mitigation.viewer.histories import Pair
+from uwb_mitigation.viewer.histories import NO_DATA_S, Pair
+from uwb_mitigation.viewer.scene import Scene
 
 LONG_M, VERY_LONG_M = 0.15, 0.3
 """Mean residuals that need attention, and that spoil positions."""
-LOST, NLOS, NOT_OK = 20.0, 50.0, 20.0
+MAX_LOST, MAX_NLOS, MAX_NOT_OK = 20.0, 50.0, 20.0
 """Shares of ranges that need attention, %."""
 EVIDENCE = 10
 """Number of ranges with a residual from which an anchor is good or bad."""
@@ -24,10 +27,22 @@ RELEASE = 0.8
 GOOD, CHECK, BAD, UNKNOWN = "\u2713 good", "! check", "\u2297 bad", "? unknown"
 STATES = (
     f"{BAD}: no ranges, or a mean residual over {VERY_LONG_M:.2f} m with line of sight. {CHECK}: a mean residual over {LONG_M:.2f} "
-    f"m, {LOST:.0f} % lost, {NOT_OK:.0f} % with a status that needs attention, or {NLOS:.0f} % NLOS. {UNKNOWN}: fewer than "
+    f"m, {MAX_LOST:.0f} % lost, {MAX_NOT_OK:.0f} % with a status that needs attention, or {MAX_NLOS:.0f} % NLOS. {UNKNOWN}: fewer than "
     f"{EVIDENCE} ranges can be compared with the position. The status of a pair shows only whether the network could correct the range."
 )
 """Definition of the states, for the page."""
+POSITION_GOOD, DEGRADED, LOST = "good", "degraded", "lost"
+UNDETERMINED, WAITING = "not determined", "no data yet"
+"""States of a position."""
+MAX_SD_M = 0.5
+"""A horizontal standard deviation from which the position is degraded: the limit of a reliable range."""
+MIN_ANCHORS = 3
+MAX_HEADLINE = 60
+"""Maximum number of characters of a reason with its explanation."""
+HOLD_S = 2.0
+"""Time for which a better verdict must hold before it is shown."""
+RADIUS95 = math.sqrt(5.991 / 2.0)
+"""Radius of 95 % of a circular normal distribution, relative to the root of the sum of its variances in x and y."""
 CELLS = 40
 """Width and height of the map of the predicted accuracy, cells."""
 STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
@@ -47,10 +62,10 @@ def state(means: Means, before: str = "") -> str:
         for limit_m, states in ((VERY_LONG_M, (BAD,)), (LONG_M, (BAD, CHECK)))
     )
     # Without line of sight, ranges may be long although anchor and offset are right.
-    is_long = residual_m > bad_m and not means["nlos"] > NLOS
+    is_long = residual_m > bad_m and not means["nlos"] > MAX_NLOS
     if means["stopped"] > 0.0 or means["displaced"] > 0.0 or is_long:
         return BAD
-    is_suspicious = means["lost"] > LOST or means["not_ok"] > NOT_OK or means["nlos"] > NLOS
+    is_suspicious = means["lost"] > MAX_LOST or means["not_ok"] > MAX_NOT_OK or means["nlos"] > MAX_NLOS
     if is_suspicious or residual_m > check_m:
         return CHECK
     return GOOD if means["rate"] > 0.0 and not math.isnan(residual_m) else UNKNOWN
@@ -90,7 +105,7 @@ def _common_advice(anchors: list[Means]) -> str:
         return "No anchor answers: check the tag, and the diagnostics of the driver."
     if not (np.abs(residuals_m) > LONG_M).all():
         return ""
-    if all(means["nlos"] > NLOS for means in anchors):
+    if all(means["nlos"] > MAX_NLOS for means in anchors):
         return "The ranges of all anchors contradict the position, and most are NLOS: something close to the tag covers it."
     if np.ptp(np.sign(residuals_m)) > 0.0:
         return "The ranges of all anchors contradict the position: check ids and coordinates in the anchors file, and the height."
@@ -111,19 +126,128 @@ def _anchor_advice(name: str, means: Means) -> str:
             f"{name} is not where the anchors file says: its ranges differ by {means['displaced']:.2f} m from the track of the "
             "others, and fit another position. Measure it again."
         )
-    if abs(residual_m) > LONG_M and means["nlos"] > NLOS:
+    if abs(residual_m) > LONG_M and means["nlos"] > MAX_NLOS:
         return f"{reads}, with {means['nlos']:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."
     if abs(residual_m) > LONG_M:
         return f"{reads}: calibrate, or check its position."
-    if means["lost"] > LOST:
+    if means["lost"] > MAX_LOST:
         return f"{name} loses {means['lost']:.0f} % of its ranges: check distance and antenna."
-    if means["not_ok"] > NOT_OK:
+    if means["not_ok"] > MAX_NOT_OK:
         return (
             f"{name} has {means['not_ok']:.0f} % of ranges with a status that needs attention: see the pairs."
         )
-    if means["nlos"] > NLOS:
+    if means["nlos"] > MAX_NLOS:
         return f"{name} has no line of sight in {means['nlos']:.0f} % of the CIRs: move it if possible."
     return ""
+
+
+class Verdict(NamedTuple):
+    """A statement on a position.
+
+    Attributes:
+        state: see above. reason: why; empty: nothing to report. action: what to do next.
+        accuracy: standard deviation, and radius of 95 % of the errors.
+    """
+
+    state: str
+    reason: str = ""
+    action: str = ""
+    accuracy: str = ""
+
+
+def verdict(
+    scene: Scene,
+    tag_id: int | None,
+    anchors: Mapping[int, Means],
+    states: Mapping[int, str],
+    remedy: str,
+) -> Verdict:
+    """Return the verdict on the latest position of a tag.
+
+    Args:
+        scene: its data.
+        tag_id: the tag; None: no ranges yet.
+        anchors: means of each anchor.
+        states: their states.
+        remedy: why the position is not unique, with the remedy; empty: it is, or unknown.
+    """
+    names = {anchor_id: place.name or format_id(anchor_id) for anchor_id, place in scene.anchors.items()}
+    ages_s = [scene.age_s(history) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id]
+    name = "" if tag_id is None else f"tag {format_id(tag_id)}"
+    if tag_id is None and not scene.tags:
+        return Verdict(WAITING)
+    if ages_s and min(ages_s) > NO_DATA_S:
+        reason = f"no ranges of {name} for {min(ages_s):.0f} s"
+        return Verdict(LOST, reason, "Check power of the tag, and the driver.")
+    pose = next(iter(scene.tags.values())) if tag_id is None else scene.tag_of(tag_id)
+    if pose is None:
+        reason, action = _of_remedy(remedy)
+        return _verdict(UNDETERMINED, reason or f"no position of {name}", action or "See the notices below.")
+    if scene.age_s(pose) > NO_DATA_S:
+        reason = f"no position of {name} for {scene.age_s(pose):.0f} s"
+        return _verdict(LOST, reason, remedy or "Drive into the area of the anchors.")
+    sd_m = pose.sd_m
+    accuracy = "" if math.isnan(sd_m) else f"horizontal sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
+    common, texts = advice(anchors, names)
+    # With a common cause, anchors that need attention are bad together.
+    wrong = {BAD, CHECK} if common else {BAD}
+    bad = [anchor_id for anchor_id, state in states.items() if state in wrong]
+    received = sum(means["stopped"] == 0.0 for means in anchors.values())
+    reason = action = ""
+    if remedy:
+        reason, action = _of_remedy(remedy)
+    elif bad:
+        names_of_worst = ("stopped", "displaced", "residual")
+        worst = max(bad, key=lambda key: [abs(anchors[key][name]) for name in names_of_worst])
+        reason, _, action = (common or texts[worst]).partition(": ")
+    elif anchors and received < MIN_ANCHORS:
+        reason, action = f"{received} anchors received", "Drive closer to the anchors, or add some."
+    elif math.isnan(sd_m):
+        reason, action = "its standard deviation is unknown", "Publish poses with a covariance."
+    elif sd_m > MAX_SD_M:
+        reason, action = f"uncertain by {sd_m:.2f} m", "Add an anchor, or set height and area of the locator."
+    if not reason:
+        action = next((texts[key] for key, state in states.items() if state == CHECK), "")
+    return _verdict(DEGRADED if reason else POSITION_GOOD, reason, action, accuracy)
+
+
+def _of_remedy(remedy: str) -> tuple[str, str]:
+    """Return a reason that fits a headline, and the explanation with the remedy, of a determination."""
+    statement = re.sub(r"^(from \d+ ranges: )?((unknown|contradicted): )?", "", remedy)
+    text, _, action = statement.partition(". Remedy: ")
+    if len(text) <= MAX_HEADLINE:
+        return text, action
+    reason, _, explanation = text.partition(": ")
+    return reason, f"{explanation}. Remedy: {action}"
+
+
+def _verdict(state: str, reason: str, action: str, accuracy: str = "") -> Verdict:
+    """Return a verdict whose action is a sentence."""
+    sentence = action[:1].upper() + action[1:]
+    return Verdict(state, reason, sentence + "." * (bool(sentence) and sentence[-1] not in ".!"), accuracy)
+
+
+class HeldVerdict:
+    """Delays improvements of the verdict, so that it does not flicker.
+
+    Attributes:
+        shown: the current verdict.
+    """
+
+    def __init__(self) -> None:
+        self.shown, self._since_s, self._now_s = Verdict(WAITING), math.nan, -math.inf
+
+    def update(self, new: Verdict, now_s: float) -> Verdict:
+        """Return the verdict to show at a time; after a jump of the time, it is the new one."""
+        continues, self._now_s = 0.0 <= now_s - self._now_s <= HOLD_S, now_s
+        if not (continues and new.state == POSITION_GOOD and self.shown.state in (DEGRADED, LOST)):
+            self._since_s = math.nan
+            self.shown = new
+        elif math.isnan(self._since_s):
+            self._since_s = now_s
+        elif now_s - self._since_s >= HOLD_S:
+            self.shown = new
+        return self.shown
 
 
 def predicted_accuracy(

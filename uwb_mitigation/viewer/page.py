@@ -14,13 +14,12 @@ from bokeh.events import Reset
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.drawing import Figures
+from uwb_mitigation.viewer.figures import HEADINGS, Figures
 from uwb_mitigation.viewer.histories import Pair
-from uwb_mitigation.viewer.models import COLUMNS, FIGURES, Models
-from uwb_mitigation.viewer.palette import STATUS_LOOKS
+from uwb_mitigation.viewer.palette import STATUS_LOOKS, TAG_COLOURS
 from uwb_mitigation.viewer.scene import Scene
 from uwb_mitigation.viewer.state import PageState, View
-from uwb_mitigation.viewer.texts import TAG_TITLES, Texts
+from uwb_mitigation.viewer.texts import COLUMNS, TAG_TITLES, Texts
 
 REFRESH_S = 0.1
 FAST_PAGES = 3
@@ -49,14 +48,13 @@ class Page:
         self._due_s = self._table_due_s = 0.0
         self._paused = False
         player = view.player
-        self._models = models = Models(None if player is None else player.seconds)
-        self._state = PageState(view, models)
-        self._figures, self._texts = Figures(self._state), Texts(self._state)
+        self._state = state = PageState(view)
+        self._controls, self._texts, self._figures = state.controls, Texts(state), Figures(state)
         # Register before the model is added to the document: later registrations have no effect.
-        models.figures["map"].on_event(Reset, self._on_reset)
+        self._figures.map.plot.on_event(Reset, self._on_reset)
         # Add all roots in one step: Bokeh searches for new models after each, half of the time to open a page.
         with document.models.freeze():
-            for model in models.roots:
+            for model in (*self._figures.plots.values(), self._texts.pairs, self._controls):
                 document.add_root(model)
         document.title = view.title
         document.template = TEMPLATES.get_template("page.html.j2")
@@ -67,13 +65,14 @@ class Page:
             columns=COLUMNS,
             states=health.STATES,
             tag_titles=TAG_TITLES,
-            figures=FIGURES,
+            figures=HEADINGS,
+            tag_colours=TAG_COLOURS,
             looks=STATUS_LOOKS,
             speeds=player and player.SPEEDS,
         )
         document.config.update(reconnect_session=False, notify_connection_status=False, notifications=None)
-        models.controls.on_change("command", self._on_command)
-        models.controls.on_change("acknowledged", self._on_acknowledged)
+        self._controls.on_change("command", self._on_command)
+        self._controls.on_change("acknowledged", self._on_acknowledged)
         document.add_periodic_callback(self.tick, int(1000 * REFRESH_S))
         self.draw()
         # Register last: a session that could not be opened does not report its end.
@@ -83,7 +82,7 @@ class Page:
     @property
     def _is_waiting(self) -> bool:
         """Whether the page has not drawn the last update: another one would queue behind it and show old data."""
-        return bool(self._sent != self._models.controls.acknowledged)
+        return bool(self._sent != self._controls.acknowledged)
 
     def tick(self) -> None:
         """Draw if it is time, the page is not paused, and it has drawn the last update."""
@@ -102,7 +101,7 @@ class Page:
         self._draw_player()
         player, scene = self._player, self._view.scene
         position = player and (player.shown_s, player.is_behind, player.timeline is None)
-        with self._view.lock:
+        with self._view.scene.lock:
             # Ages change without data; drawing them once a second is enough.
             state = scene.revision, self._state.selected, math.floor(scene.clock()), position
             is_changed = self._state.changed("scene", state)
@@ -116,7 +115,7 @@ class Page:
             stamp_s = math.nan if tag_id is None else scene.latest_stamp_s(tag_id)
             stamp_age_s = scene.stamp_clock() - stamp_s if math.isfinite(stamp_s) else age_s
             numbers = round(self._took_s, 3), round(age_s, 3), round(stamp_age_s, 3)
-            self._models.controls.update = [self._sent, *numbers]
+            self._controls.update = [self._sent, *numbers]
 
     def _draw_scene(self, scene: Scene) -> None:
         state = self._state
@@ -137,15 +136,14 @@ class Page:
             self._state.selected = pair
 
     def _draw_player(self) -> None:
-        player, models = self._player, self._models
+        player = self._player
         if player is None:
             self._state.set(player={"playing": not self._paused})
             return
         position_s = round(player.shown_s, 3)
         shown = {"playing": player.playing, "speed": player.speed, "behind": player.is_behind}
         self._state.set(player=shown | {"position": position_s, "seconds": player.seconds})
-        if self._state.changed("position", position_s):
-            models.position.data = {"time": [position_s]}
+        self._figures.show_position(position_s)
         if (timeline := player.timeline) is not None and self._state.changed("marks", timeline.is_complete):
             relative = timeline.log_s / max(player.seconds, 1e-9)
             bad = np.unique(relative[timeline.bad].round(3)).tolist()
@@ -159,7 +157,7 @@ class Page:
         try:
             name, arguments = str(command[0]), list(command[1])
             if name == "accuracy":
-                for renderer in self._models.coverage:
+                for renderer in self._figures.map.coverage:
                     renderer.visible = bool(arguments[0])
             elif name == "select":
                 self.select((int(str(arguments[0]), 0), int(str(arguments[1]), 0)))
@@ -182,8 +180,8 @@ class Page:
             self.draw()
 
     def _on_reset(self, _event: Reset) -> None:
-        with self._view.lock:
-            self._figures.fit(self._view.scene)
+        with self._view.scene.lock:
+            self._figures.map.fit(self._view.scene)
 
     def _on_closed(self, _context: Any) -> None:
         self._view.pages -= 1

@@ -6,6 +6,7 @@ and on `NIGHT` (RViz), as WCAG 2.1 level AA requires of graphics. Every status a
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import Enum
 from typing import NamedTuple
 
@@ -80,3 +81,11 @@ TRACK_COLOURS = {
     TrackKind.TRUE: None,
 }
 """None: the ink of the page."""
+
+TAG_COLOURS = BLUE, ORANGE, PURPLE, GREEN
+"""Colours of tags and their corrected tracks; further tags have them again."""
+
+
+def tag_colours(names: Iterable[str]) -> dict[str, str]:
+    """Return the colour of each tag, in the order of their names."""
+    return {name: TAG_COLOURS[row % len(TAG_COLOURS)] for row, name in enumerate(sorted(names))}

@@ -26,9 +26,16 @@ from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.histories import HISTORY_S
 from uwb_mitigation.viewer.palette import TrackKind
-from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Event, Recording, corrected_events
-from uwb_mitigation.viewer.scene import MissingData, NodeStatus
-from uwb_mitigation.viewer.timeline import Timeline, index_recording
+from uwb_mitigation.viewer.recording import (
+    POSITIONS,
+    RANGES,
+    Event,
+    Recording,
+    Timeline,
+    corrected_events,
+    index_recording,
+)
+from uwb_mitigation.viewer.scene import MissingData, NodeStatus, Scene
 
 READ_S = 0.15
 """Maximum duration of one read, so that the page reacts to commands; playing continues at the position that was reached."""
@@ -46,13 +53,12 @@ Check = Callable[[Sequence[TagTracks], EstimatorConfig], dict[int, float]]
 
 
 class BagPlayer:
-    """Player of the ranges or tracks of a bag; updates the scene of `feed`, which all pages show.
+    """Player of the ranges or tracks of a bag; updates a scene, which all pages show.
 
     If the bag contains raw ranges only, they are corrected for display.
 
     Args:
         path, namespace: see `Recording`, also for errors.
-        feed: adds messages to the scene.
         backend: returns the backend that corrects raw ranges; called only if the bag has no corrected ranges.
 
     Attributes:
@@ -63,7 +69,7 @@ class BagPlayer:
         corrects: whether the bag contains raw ranges only.
         timeline: index of the recording; None: not ready.
         is_behind: whether the messages up to the position have not been read yet.
-        scene: scene of `feed`.
+        scene: what is shown; `index` sets its anchors.
         missing: messages for the page on data that the bag does not contain.
         models: number of ranges that `index` corrected, by choice of the model.
     """
@@ -71,10 +77,9 @@ class BagPlayer:
     SPEEDS = 0.5, 1.0, 2.0, 5.0, 10.0, 50.0
     """Recorded seconds per second."""
 
-    def __init__(
-        self, path: Path, feed: SceneUpdater, backend: Callable[[], Corrector], namespace: str | None = None
-    ) -> None:
-        self._feed, self._new_backend, self.scene = feed, backend, feed.scene
+    def __init__(self, path: Path, backend: Callable[[], Corrector], namespace: str | None = None) -> None:
+        self.scene, self._new_backend = Scene(), backend
+        self._feed = SceneUpdater(self.scene)
         self._recording = recording = Recording(path, namespace)
         self.seconds, self.corrects = recording.seconds, recording.corrects
         self.position_s, self.speed, self.playing = 0.0, 1.0, False
@@ -91,12 +96,12 @@ class BagPlayer:
         self._backend = backend() if self.corrects else None
         self._next: Event | None = None
         self._advanced_s, self._clock_s = time.monotonic(), 0.0
-        feed.scene.clock = lambda: self._clock_s
-        feed.scene.stamp_clock = lambda: self._clock_s + recording.start_ns / NS_PER_S
+        self.scene.clock = lambda: self._clock_s
+        self.scene.stamp_clock = lambda: self._clock_s + recording.start_ns / NS_PER_S
         self._window_s = min(HISTORY_S, MAX_MESSAGES / max(recording.rate_hz, 1e-9))
         # Anchors are published once at the beginning.
         with contextlib.suppress(RecordingError, StopIteration):
-            feed.add(ANCHORS, next(recording.events([ANCHORS])).message)
+            self._feed.add(ANCHORS, next(recording.events([ANCHORS])).message)
         self.seek(0.0)
 
     @property
@@ -114,7 +119,7 @@ class BagPlayer:
         """Index the recording in a thread, which is returned.
 
         Args:
-            config: of the estimators, see `index_recording`.
+            config: of the estimators, see `index_recording`; its anchors are shown.
             stamp_offset_s: added to the stamps of the ranges.
             check: returns `Timeline.displaced` for estimated tracks.
             estimated: tracks that are known already.
@@ -129,9 +134,9 @@ class BagPlayer:
 
             timeline = index_recording(recording, config, backend, publish, stamp_offset_s, estimated)
             self.models = {} if backend is None else backend.used
-            with self._feed.lock:
-                self._feed.scene.is_indexed = True
-                self._feed.scene.revision += 1
+            with self.scene.lock:
+                self.scene.is_indexed = True
+                self.scene.revision += 1
             if check is None or config is None or not timeline.estimates:
                 return
             if len(timeline.log_s) > MAX_CHECKED:
@@ -140,9 +145,12 @@ class BagPlayer:
                 )
             else:
                 timeline.displaced = check(list(timeline.estimates.values()), config)
-            with self._feed.lock:
-                self._feed.scene.revision += 1
+            with self.scene.lock:
+                self.scene.revision += 1
 
+        if config is not None:
+            with self.scene.lock:
+                self.scene.set_anchors(config.anchors.anchors)
         self._stamp_offset_s = stamp_offset_s
         thread = threading.Thread(target=run, name="index", daemon=True)
         thread.start()
@@ -216,7 +224,7 @@ class BagPlayer:
             if self._shown.get(key) == count:
                 continue
             self._shown[key] = count
-            with self._feed.lock:
+            with self.scene.lock:
                 self.scene.set_track(*key, track[:count])
             if count and kind is TrackKind.CORRECTED and name in timeline.estimates:
                 estimate = next(iter(timeline.estimates[name].live.take(slice(count - 1, count))))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -18,15 +17,12 @@ from uwb_mitigation.files import write_atomically
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
-from uwb_mitigation.viewer.drawing import Figures
-from uwb_mitigation.viewer.feed import SceneUpdater
-from uwb_mitigation.viewer.models import FIGURES, Models, finished, new_figure
+from uwb_mitigation.viewer.figures import HEADINGS, Figures, finish, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
 from uwb_mitigation.viewer.palette import TRACK_COLOURS, TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
-from uwb_mitigation.viewer.scene import Scene
-from uwb_mitigation.viewer.state import PageState, View
-from uwb_mitigation.viewer.texts import TAG_TITLES, Texts
+from uwb_mitigation.viewer.state import Controls, PageState, View
+from uwb_mitigation.viewer.texts import ANCHOR_TITLES, TAG_TITLES, Texts
 
 SHOWN = "map", "positions", "errors", "distribution"
 """Figures of the report of a recording."""
@@ -51,20 +47,15 @@ def render_report(title: str, lines: Sequence[str], sections: Mapping[str, figur
     return str(file_html(figures, INLINE, title, template=template, template_variables=values))
 
 
-def draw_scene(view: View) -> Models:
+def draw_scene(view: View) -> tuple[dict[str, figure], Controls]:
     """Return the figures and texts of a scene, with complete tracks and for its first pair."""
-    models = Models(None if view.player is None else view.player.seconds)
-    state = PageState(view, models)
+    state = PageState(view)
     state.selected, state.trail_s = next((pair for pair, _, _ in view.scene.latest()), None), math.inf
+    figures = Figures(state)
     Texts(state).draw(view.scene)
-    Figures(state).draw(view.scene)
-    # On the page, its script selects the labels.
-    anchors, tags = models.anchors.data, models.tags.data
-    labels = [(*row, -13, 0) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
-    labels += [(*row, -4, 0) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
-    columns = zip(*labels, strict=True) if labels else ((),) * 5
-    models.labels.data = dict(zip(models.labels.data, columns, strict=True))
-    return models
+    figures.draw(view.scene)
+    figures.map.show_labels()
+    return figures.plots, state.controls
 
 
 def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Iterable[float]]]) -> figure:
@@ -76,9 +67,8 @@ def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Itera
         rows: {kind: {row: ends of the lower line and of the box, middle, ends of the box and of the upper line}}.
     """
     names = list(next(iter(rows.values())))
-    plot = new_figure(
-        90 + 20 * len(rows) * len(names), axis, "", y_range=FactorRange(*reversed(names)), name=name
-    )
+    height = 90 + 20 * len(rows) * len(names)
+    plot = new_figure(name, height, axis, "", y_range=FactorRange(*reversed(names)))
     for number, (kind, boxes) in enumerate(rows.items()):
         columns = np.array([list(box) for box in boxes.values()]).reshape(-1, len(_BOX))
         # Of each row, the first kind is the upper one.
@@ -88,7 +78,8 @@ def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Itera
         plot.segment("low", "row", "high", "row", **style)
         plot.hbar("row", right="end", left="begin", height=0.35, fill_alpha=0.35, **style)
         plot.scatter("middle", "row", marker="dash", angle=math.pi / 2, size=14, line_width=3, **style)
-    return finished(plot)
+    finish(plot)
+    return plot
 
 
 def write_report(
@@ -114,15 +105,12 @@ def write_report(
     Raises:
         RecordingError: the bag cannot be read.
     """
-    feed = SceneUpdater(Scene(), Lock())
-    player = BagPlayer(bag, feed, backend)
-    feed.anchors(config.anchors)
+    player = BagPlayer(bag, backend)
     player.index(config, stamp_offset_s, lambda *_: displaced, tracks).join()
     player.seek(player.seconds)
     while player.is_behind:
         player.advance()
-    models = draw_scene(View(feed.scene, feed.lock, player=player, missing=player.missing))
-    controls = models.controls
+    figures, controls = draw_scene(View(player.scene, player=player))
     state, reason, action, facts = controls.verdict
     lines = [
         f"Position {state}" + (f": {reason}" if reason else "") + (f". {action}" if action else ""),
@@ -130,8 +118,7 @@ def write_report(
         *controls.notice,
     ]
     sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
-    sections |= {FIGURES[name]: models.figures[name] for name in SHOWN}
-    titles: tuple[str, ...] = "state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"
-    sections["Anchors at the end"] = [titles, *controls.health]
+    sections |= {HEADINGS[name]: figures[name] for name in SHOWN}
+    sections["Anchors at the end"] = [ANCHOR_TITLES, *controls.health]
     sections["Tags at the end"] = [TAG_TITLES, *controls.tag_rows]
     write_atomically(path, render_report(bag.name, lines, sections))

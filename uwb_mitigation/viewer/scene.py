@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,7 @@ Counts = tuple[int, int, int]
 """Numbers of corrected ranges, of all ranges, and of those with a status that needs attention."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Pose:
     """Estimated position of a tag, m.
 
@@ -69,6 +70,8 @@ class Pose:
         ellipse: horizontal 95 % ellipse: half axes (m) and angle of the major axis (rad); NaN: unknown.
         heading_rad: NaN: unknown.
         stamp_s, sd_m: time of the estimate, s, and horizontal standard deviation; NaN: unknown.
+        received_s: time of reception on the scene's clock; NaN: now.
+        speed: m/s, from the pose before.
     """
 
     x: float
@@ -78,13 +81,6 @@ class Pose:
     heading_rad: float = math.nan
     stamp_s: float = math.nan
     sd_m: float = math.nan
-
-
-@dataclass(slots=True)
-class TagView:
-    """A tag's latest pose, its time of reception on the scene's clock, and its speed, m/s."""
-
-    pose: Pose | None = None
     received_s: float = math.nan
     speed: float = 0.0
 
@@ -141,6 +137,7 @@ class Scene:
     """All data that the page shows.
 
     Attributes:
+        lock: held while it is changed or drawn.
         clock: returns the time for ages, s: a steady clock live, the recording's time in a replay. Stamps are not
             compared with it, because they may come from another computer.
         stamp_clock: returns the time on the clock of the stamps, s, if it is that of this computer.
@@ -156,7 +153,7 @@ class Scene:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.clock, self.stamp_clock = clock, time.time
+        self.lock, self.clock, self.stamp_clock = Lock(), clock, time.time
         self.anchors: dict[int, Anchor] = {}
         self.is_indexed, self.received_s, self.revision = False, math.nan, 0
         self.clear()
@@ -168,7 +165,7 @@ class Scene:
         self._latest: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
-        self.tags: BoundedDict[str, TagView] = BoundedDict(MAX_TAGS)
+        self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
         self.tracks: BoundedDict[tuple[str, TrackKind], TrackView] = BoundedDict(4 * MAX_TAGS)
@@ -200,9 +197,14 @@ class Scene:
         latest, (tag_latest_s, _) = self.pairs[pair].latest, self._latest.get(pair[1], (-math.inf, 0.0))
         return 0.0 if latest is None else max(tag_latest_s - latest.time_s, 0.0)
 
-    def age_s(self, entry: History | TagView | TrackView) -> float:
+    def age_s(self, entry: History | Pose | TrackView) -> float:
         """Return the time since the last data of a pair, tag or track."""
         return max(self.clock() - entry.received_s, 0.0)
+
+    def no_data(self, history: History) -> str:
+        """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
+        age_s = self.age_s(history)
+        return "" if age_s <= history.max_gap_s else f"no data for {age_s:.0f} s"
 
     def history(self, pair: Pair) -> History:
         """Return the history of a pair, a new one for a new pair."""
@@ -248,15 +250,17 @@ class Scene:
     def add_trace(self, pair: Pair, trace: Trace) -> None:
         self.history(pair).traces.append(trace)
 
-    def add_pose(self, tag: str, pose: Pose, received_s: float | None = None) -> None:
-        """Set the pose of a tag; `received_s` is on the scene's clock, None: now."""
+    def add_pose(self, tag: str, pose: Pose) -> None:
+        """Set the pose of a tag."""
         if _is_plausible(pose.x, pose.y, pose.z):
-            entry = self.tags.add(tag[:MAX_TEXT], self.tags.get(tag[:MAX_TEXT]) or TagView())
-            if (before := entry.pose) is not None and pose.stamp_s > before.stamp_s:
+            if (before := self.tags.get(tag[:MAX_TEXT])) is not None:
+                passed_s = pose.stamp_s - before.stamp_s
                 moved_m = math.dist((pose.x, pose.y), (before.x, before.y))
-                entry.speed = moved_m / (pose.stamp_s - before.stamp_s)
-            entry.pose, entry.received_s = pose, self.clock() if received_s is None else received_s
-            self.incidents.add_position(tag_label(tag[:MAX_TEXT], None), entry.received_s, pose.x, pose.y)
+                pose.speed = moved_m / passed_s if passed_s > 0.0 else before.speed
+            if math.isnan(pose.received_s):
+                pose.received_s = self.clock()
+            self.tags.add(tag[:MAX_TEXT], pose)
+            self.incidents.add_position(tag_label(tag[:MAX_TEXT], None), pose.received_s, pose.x, pose.y)
             point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
             self.add_position(tag, TrackKind.CORRECTED, point)
 
@@ -285,12 +289,11 @@ class Scene:
 
     def _compare_with_position(self, pair: Pair, sample: Sample) -> None:
         """Compute what a range and the position of its tag yield together: residual, raw position."""
-        anchor, tag = self.anchors.get(pair[0]), self.tag_of(pair[1])
-        pose = None if tag is None else tag.pose
-        if tag is None or pose is None or anchor is None or self.age_s(tag) > NO_DATA_S:
+        anchor, pose = self.anchors.get(pair[0]), self.tag_of(pair[1])
+        if pose is None or anchor is None or self.age_s(pose) > NO_DATA_S:
             return
         # On a busy computer, positions arrive late.
-        if not abs(pose.stamp_s - sample.time_s) * tag.speed > MAX_MOVED_M:
+        if not abs(pose.stamp_s - sample.time_s) * pose.speed > MAX_MOVED_M:
             x, y, z = anchor.position
             distance_m = math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
             sample.residual_m = sample.range_m - distance_m
@@ -351,8 +354,8 @@ class Scene:
             if history.latest is not None:
                 yield pair, history, history.latest
 
-    def tag_of(self, tag_id: int) -> TagView | None:
-        """Return the tag of a range; None: it has no position."""
+    def tag_of(self, tag_id: int) -> Pose | None:
+        """Return the position of the tag of a range; None: it has none."""
         return self.tags.get(tag_name(tag_id, self.tags, self.pairs))
 
 

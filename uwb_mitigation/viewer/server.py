@@ -8,6 +8,7 @@ import logging
 import secrets
 import socket
 import threading
+from contextlib import AbstractContextManager
 from typing import Any
 from urllib.parse import quote, unquote
 
@@ -39,7 +40,7 @@ _NONCE, _COOKIE = "X-Nonce", "X-Set-Cookie"
 """Headers that pass the nonce and the cookie of a response; values from the client are replaced."""
 
 
-class ViewerServer:
+class ViewerServer(AbstractContextManager["ViewerServer"]):
     """A page at `url` until `close`.
 
     Args:
@@ -90,9 +91,6 @@ class ViewerServer:
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
-
-    def __enter__(self) -> ViewerServer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

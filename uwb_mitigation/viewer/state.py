@@ -1,22 +1,21 @@
-"""State of the pages of a server: what they share, and what the user of one page has chosen."""
+"""State of the pages of a server: what they share, and what one page shows."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from threading import Lock
 from typing import TYPE_CHECKING, Any
 
+from bokeh.core.properties import Any as AnyValue
+from bokeh.model import DataModel
 from bokeh.models import ColumnDataSource
 
-from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair
-from uwb_mitigation.viewer.models import Models
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair, RangeColumns
 from uwb_mitigation.viewer.scene import MissingData, Scene
-from uwb_mitigation.viewer.verdict import HeldVerdict
 
 if TYPE_CHECKING:
     from uwb_mitigation.viewer.playback import BagPlayer
-    from uwb_mitigation.viewer.timeline import Timeline
+    from uwb_mitigation.viewer.recording import Timeline
 
 
 @dataclass(slots=True)
@@ -24,7 +23,7 @@ class View:
     """State that all pages of a server share.
 
     Attributes:
-        lock: held while the scene is changed or drawn.
+        scene: what they show.
         window: number of samples that the network reads.
         player: player of a recording; None: live.
         missing: the reasons for an empty page.
@@ -32,12 +31,15 @@ class View:
     """
 
     scene: Scene
-    lock: Lock
     title: str = "UWB ranges"
     window: int = 157
     player: BagPlayer | None = None
     missing: MissingData = field(default_factory=MissingData)
     pages: int = 0
+
+    def __post_init__(self) -> None:
+        if self.player is not None:
+            self.missing = self.player.missing
 
     @property
     def timeline(self) -> Timeline | None:
@@ -50,32 +52,79 @@ class View:
         return self.timeline if self.timeline is not None and self.timeline.is_complete else None
 
 
+class Controls(DataModel):  # type: ignore[misc]
+    """State that the page's script shows, and its commands.
+
+    Attributes:
+        command: set by the script: name, arguments, and a number that makes it unique.
+        update: set by the server after each update: its number, how long the previous one took, and the age of the
+            latest range by its reception and by its stamp, s; the age is negative if there are no recent ranges.
+        acknowledged: set by the script to the number of the last update that it has drawn.
+        verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
+        available: set by the server: whether a control has an effect, {id: bool}.
+        empty: set by the server: messages of figures without data, {name: message}.
+    """
+
+    command = AnyValue(default=None)
+    update = AnyValue(default=None)
+    acknowledged = AnyValue(default=0)
+    health = AnyValue(default=[])
+    cards = AnyValue(default=[])
+    verdict = AnyValue(default=[])
+    tag_rows = AnyValue(default=[])
+    incidents = AnyValue(default=[])
+    available = AnyValue(default={})
+    empty = AnyValue(default={})
+    notice = AnyValue(default=[])
+    nodes = AnyValue(default=[])
+    player = AnyValue(default=None)
+    selected = AnyValue(default=None)
+    marks = AnyValue(default=None)
+
+
 class PageState:
     """State of one page.
 
     Args:
         view: the view.
-        models: models of the page.
 
     Attributes:
         selected: the selected pair; None: there are no ranges.
         trail_s: duration of the tracks.
-        health: state and mean residual (m) of each anchor. verdict: on the position of the selected tag.
+        health: state and mean residual (m) of each anchor.
         has_data: whether a pair has recent ranges.
     """
 
-    def __init__(self, view: View, models: Models) -> None:
-        self.view, self.models = view, models
+    def __init__(self, view: View) -> None:
+        self.view, self.controls = view, Controls(name="controls")
         self.selected: Pair | None = None
         self.trail_s = HISTORY_S
         self.health: dict[int, tuple[str, float]] = {}
-        self.verdict, self.has_data = HeldVerdict(), False
+        self.has_data = False
         self._drawn: dict[str, object] = {}
 
     @property
     def tag_id(self) -> int | None:
         """The selected tag."""
         return None if self.selected is None else self.selected[1]
+
+    @property
+    def history(self) -> History:
+        """The last minute of the selected pair; empty without one."""
+        return self.view.scene.pairs.get(self.selected or (-1, -1)) or History()
+
+    def now_s(self) -> float:
+        """Return the current time of `ranges`."""
+        player = self.view.player
+        is_indexed = player is not None and player.timeline is not None
+        return player.shown_s if player and is_indexed else self.view.scene.now_s(self.tag_id)
+
+    def ranges(self, begin_s: float = -math.inf, end_s: float = math.inf) -> RangeColumns:
+        """Return the ranges of the selected pair: in an interval of an indexed recording, else those of the scene."""
+        timeline = self.view.timeline
+        if timeline is None:
+            return self.history.columns()
+        return timeline.ranges(self.selected or (-1, -1), begin_s, end_s)
 
     def changed(self, name: str, value: object) -> bool:
         """Return whether a value differs from that of the last call."""
@@ -91,14 +140,13 @@ class PageState:
     def set(self, **values: object) -> None:
         """Set attributes of the controls that have changed."""
         for name, value in values.items():
-            if getattr(self.models.controls, name) != value:
-                setattr(self.models.controls, name, value)
+            if getattr(self.controls, name) != value:
+                setattr(self.controls, name, value)
 
 
-def no_data(scene: Scene, history: History) -> str:
-    """Return "no data for 12 s" for a pair that has stopped, else an empty string."""
-    age_s = scene.age_s(history)
-    return "" if age_s <= history.max_gap_s else f"no data for {age_s:.0f} s"
+def new_source(*columns: str, **options: Any) -> ColumnDataSource:
+    """Return a source with empty columns."""
+    return ColumnDataSource({column: [] for column in columns}, **options)
 
 
 def set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:

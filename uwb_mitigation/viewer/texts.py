@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -10,76 +11,102 @@ import numpy as np
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.determination import UNKNOWN_POSITION
 from uwb_mitigation.viewer import health
-from uwb_mitigation.viewer.headline import Card, live_cards, recorded_cards
-from uwb_mitigation.viewer.histories import HISTORY_S, NO_DATA_S, STATISTICS, Pair, residual_means
+from uwb_mitigation.viewer.headline import Card, cards
+from uwb_mitigation.viewer.health import HeldVerdict, Means, Verdict
+from uwb_mitigation.viewer.histories import (
+    HISTORY_S,
+    MAX_CIRS,
+    NO_DATA_S,
+    RATE_RANGES,
+    STATISTICS,
+    Pair,
+    residual_means,
+)
 from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
-from uwb_mitigation.viewer.state import PageState, no_data, set_rows
-from uwb_mitigation.viewer.verdict import UNDETERMINED, WAITING, Verdict, verdict
+from uwb_mitigation.viewer.state import PageState, new_source, set_rows
 
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
 
-TAG_TITLES = "tag", "x, y, z, m", "sd, m", "age", "ranges, Hz", "range age by stamp"
-"""Columns of the table of tags."""
+_RANGES, _CIRS = f"last {STATISTICS} ranges", f"last {MAX_CIRS} CIRs"
+
+COLUMNS = {
+    "state": ("state", "", health.STATES),
+    "status": ("status", "last range", "whether the network could correct the range"),
+    "raw": ("raw, m", "last range", "measured range"),
+    "corrected": ("corrected, m", "last range", "corrected range"),
+    "sigma": ("sd, m", "last range", "standard deviation of the corrected range"),
+    "correction": ("correction, m", _RANGES, "mean of raw minus corrected range"),
+    "residual": ("residual, m", _RANGES, "mean of corrected range minus distance to the estimated position"),
+    "not_ok": ("not OK, %", _RANGES, "share of ranges whose status is not OK"),
+    "nlos": ("NLOS, %", _CIRS, "share of CIRs without line of sight: first path 6 dB below the total"),
+    "rx": ("RX, dBm", _CIRS, "mean receive level"),
+    "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
+    "lost": ("lost, %", "all; in a recording: since the minute before", "share of missing sequence numbers"),
+}
+"""Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
+
+ANCHOR_TITLES = "state", "anchor", "rate, Hz", "NLOS, %", "residual, m", "lost, %", "advice"
+TAG_TITLES = "tag", "position", "x, y, z, m", "sd, m", "age", "ranges, Hz", "range age by stamp"
+"""Columns of the tables of anchors and of tags."""
 MAX_SHOWN_EVENTS = 8
 
 
 class Texts:
-    """Writes everything that consists of text; all of it is from the same time."""
+    """Writes everything that consists of text; all of it is from the same time.
 
-    def __init__(self, state: PageState) -> None:
-        self._state, self._view, self._models = state, state.view, state.models
-        self._player = state.view.player
+    Attributes:
+        pairs: source of the table of pairs.
+    """
+
+    def __init__(self, page: PageState) -> None:
+        self._page, self._view = page, page.view
+        self.pairs = new_source("anchor", "tag", "no_data", *COLUMNS, name="pairs")
         self._cards: list[Card] = []
         self._states: dict[Any, str] = {}
+        self._verdicts = defaultdict[int | None, HeldVerdict](HeldVerdict)
 
     def draw(self, scene: Scene) -> None:
         """Write the texts of a scene."""
-        self._update_cards(scene)
-        rows, pairs = self._pairs(scene)
-        self._state.has_data = any(not row["no_data"] for row in rows)
-        set_rows(self._models.pairs, rows)
+        page, timeline = self._page, self._view.timeline
+        if timeline is None or page.changed("cards", (page.tag_id, timeline.is_complete)):
+            self._cards = cards(self._view, page.tag_id)
+        pairs = self._pairs(scene)
         anchors = health.anchor_means(pairs)
         # If no anchor answers, the cause is not in each of them.
         is_lost = all(means["stopped"] > 0.0 for means in anchors.values())
         states = {
-            anchor_id: health.UNKNOWN if is_lost else self._health(anchor_id, means)
-            for anchor_id, means in anchors.items()
+            key: health.UNKNOWN if is_lost else self._health(key, means) for key, means in anchors.items()
         }
-        self._state.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
+        page.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
-        tag_id = self._state.tag_id
-        tag = f"tag {'' if tag_id is None else format_id(tag_id)}"
-        remedies = [line.partition(separator)[2] for separator in (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
-                    for line in notices if separator in line]  # fmt: skip
-        of_tag = {pair[0]: means for pair, means in pairs.items() if pair[1] == tag_id}
-        current = verdict(
-            scene, tag_id, of_tag, {key: states[key] for key in of_tag}, next(iter(remedies), "")
-        )
-        if current.state == UNDETERMINED and self._player is not None and self._view.complete is None:
-            current = Verdict(WAITING, "the recording is being read")
-        shown = self._state.verdict.update(current, scene.clock())
+        verdicts = {
+            tag_id: self._verdict(scene, tag_id, pairs, states, notices)
+            for tag_id in {page.tag_id, *(tag_id for _, tag_id in pairs)}
+        }
+        shown = verdicts[page.tag_id]
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
-        self._state.set(
+        page.set(
             verdict=[shown.state, shown.reason, shown.action, self._facts(scene, shown.accuracy)],
             health=_anchor_rows(anchors, states, names),
-            tag_rows=self._tags(scene, pairs),
+            tag_rows=_tag_rows(scene, pairs, verdicts),
             incidents=self._incidents(scene),
             cards=self._cards,
             nodes=[[name, LEVELS[min(report.level, 3)], report.message] for name, report in reports],
             notice=notices,
         )
 
-    def _health(self, key: Any, means: health.Means) -> str:
+    def _health(self, key: Any, means: Means) -> str:
         self._states[key] = health.state(means, self._states.get(key, ""))
         return self._states[key]
 
-    def _pairs(self, scene: Scene) -> tuple[list[dict[str, Any]], dict[Pair, health.Means]]:
-        timeline, now_s = self._view.timeline, math.nan if self._player is None else self._player.shown_s
-        rows, pairs = list[dict[str, Any]](), dict[Pair, health.Means]()
+    def _pairs(self, scene: Scene) -> dict[Pair, Means]:
+        """Write the table of pairs; return their means."""
+        timeline, now_s = self._view.timeline, self._page.now_s()
+        rows, pairs = list[dict[str, Any]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
-            missing, age_s = no_data(scene, history), scene.age_s(history)
+            missing, age_s = scene.no_data(history), scene.age_s(history)
             means = history.statistics() | {
                 "rate": 0.0 if missing else history.rate_hz(scene.stamp_age_s(pair)),
                 "stopped": age_s if missing else 0.0,
@@ -96,31 +123,33 @@ class Texts:
                 "status": missing or sample.status.name, "no_data": bool(missing), "raw": sample.raw_m,
                 "corrected": sample.range_m, "sigma": sample.sigma_m,
             })  # fmt: skip
-        return rows, pairs
+        self._page.has_data = any(not row["no_data"] for row in rows)
+        set_rows(self.pairs, rows)
+        return pairs
 
-    def _tags(self, scene: Scene, pairs: dict[Pair, health.Means]) -> list[list[str]]:
-        """Return label, position, standard deviation, age, rate and age of the last range by its stamp of each tag."""
-        plain_id, rows = plain_tag_id(scene.tags, pairs), dict[str, list[str]]()
-        for name, view in scene.tags.items():
-            label, place, sd_m, age = tag_label(name, plain_id), "-", math.nan, "no position"
-            if (pose := view.pose) is not None:
-                place, sd_m, age_s = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, scene.age_s(view)
-                age = f"{age_s:.1f} s"
-                if age_s > NO_DATA_S:
-                    place, sd_m, age = f"last: {place}", math.nan, f"no data for {age_s:.0f} s"
-            rows[label] = [label, place, _number(sd_m, 2), age, "-", "-"]
-        for tag_id in sorted({tag_id for _, tag_id in pairs}):
-            label, name = f"tag {format_id(tag_id)}", tag_name(tag_id, scene.tags, pairs)
-            row = rows.setdefault(
-                tag_label(name, plain_id) if name else label, [label, "-", "-", "no position", "", ""]
-            )
-            rate_hz = sum(np.nan_to_num(means["rate"]) for (_, tag), means in pairs.items() if tag == tag_id)
-            row[4:] = _number(rate_hz, 1), f"{scene.stamp_clock() - scene.latest_stamp_s(tag_id):.1f} s"
-        return list(rows.values())
+    def _verdict(
+        self,
+        scene: Scene,
+        tag_id: int | None,
+        pairs: dict[Pair, Means],
+        states: dict[int, str],
+        notices: list[str],
+    ) -> Verdict:
+        """Return the verdict on a tag, which is better only after a while."""
+        tag = f"tag {'' if tag_id is None else format_id(tag_id)}"
+        texts = (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
+        remedies = (line.partition(text)[2] for text in texts for line in notices if text in line)
+        of_tag = {anchor_id: means for (anchor_id, pair_tag), means in pairs.items() if pair_tag == tag_id}
+        states_of_tag = {key: states[key] for key in of_tag}
+        verdict = health.verdict(scene, tag_id, of_tag, states_of_tag, next(remedies, ""))
+        is_read = self._view.player is None or self._view.complete is not None
+        if verdict.state == health.UNDETERMINED and not is_read:
+            verdict = Verdict(health.WAITING, "the recording is being read")
+        return self._verdicts[tag_id].update(verdict, scene.clock())
 
     def _facts(self, scene: Scene, accuracy: str) -> str:
         """Return accuracy, age and share of corrected ranges."""
-        tag_id, texts = self._state.tag_id, [accuracy] if accuracy else []
+        tag_id, texts = self._page.tag_id, [accuracy] if accuracy else []
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
@@ -129,21 +158,14 @@ class Texts:
             texts.append(
                 f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else not_corrected
             )
-            cards = [card for card in self._cards if card[0].startswith("Correction")]
-            texts += [f"{title.lower()}: {value} ({text})" for title, value, text in cards]
+            texts += [
+                f"{title.lower()}: {value} ({text})"
+                for title, value, text in self._cards
+                if title.startswith("Correction")
+            ]
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
         return " \u00b7 ".join(texts)
-
-    def _update_cards(self, scene: Scene) -> None:
-        """Set the large figures."""
-        tag_id, timeline = self._state.tag_id, self._view.timeline
-        if self._player is None:
-            self._cards = live_cards(scene, tag_id)
-        elif timeline is None:
-            self._cards = [["Reading the recording ...", "", ""]]
-        elif self._state.changed("cards", (tag_id, timeline.is_complete)):
-            self._cards = recorded_cards(timeline, tag_id)
 
     def _notices(self, scene: Scene) -> list[str]:
         """Return the reasons for an empty page, and what needs attention."""
@@ -151,7 +173,7 @@ class Texts:
         missing, timeline, lines = self._view.missing, self._view.timeline, []
         if not histories:
             lines.append(missing.ranges)
-        elif not self._state.has_data:
+        elif not self._page.has_data:
             lines.append(f"No ranges for {min(map(scene.age_s, histories)):.0f} s.")
         lines.append("" if scene.anchors else missing.anchors)
         lines.append("" if scene.tags or scene.tracks else missing.positions)
@@ -164,16 +186,33 @@ class Texts:
 
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
-        if self._player is not None:
+        if self._view.player is not None:
             return [] if self._view.timeline is None else list(self._view.timeline.incidents)
         scene.incidents.check(now_s := scene.clock())
         latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
         return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
 
 
-def _anchor_rows(
-    anchors: dict[int, health.Means], states: dict[int, str], names: dict[int, str]
-) -> list[list[str]]:
+def _tag_rows(scene: Scene, pairs: dict[Pair, Means], verdicts: dict[int | None, Verdict]) -> list[list[str]]:
+    """Return the texts of the table of tags; those with positions come first, in the order of their colours."""
+    plain_id, rows = plain_tag_id(scene.tags, pairs), dict[str, list[str]]()
+    for name, pose in sorted(scene.tags.items()):
+        label, age_s = tag_label(name, plain_id), scene.age_s(pose)
+        place, sd_m, age = f"{pose.x:.2f}, {pose.y:.2f}, {pose.z:.2f}", pose.sd_m, f"{age_s:.1f} s"
+        if age_s > NO_DATA_S:
+            place, sd_m, age = f"last: {place}", math.nan, f"no data for {age_s:.0f} s"
+        rows[label] = [label, "-", place, _number(sd_m, 2), age, "-", "-"]
+    for tag_id in sorted({tag_id for _, tag_id in pairs}):
+        label, name = f"tag {format_id(tag_id)}", tag_name(tag_id, scene.tags, pairs)
+        label = tag_label(name, plain_id) if name else label
+        row = rows.setdefault(label, [label, "", "-", "-", "no position", "", ""])
+        rate_hz = sum(np.nan_to_num(means["rate"]) for (_, tag), means in pairs.items() if tag == tag_id)
+        row[1] = verdicts[tag_id].state
+        row[5:] = _number(rate_hz, 1), f"{scene.stamp_clock() - scene.latest_stamp_s(tag_id):.1f} s"
+    return list(rows.values())
+
+
+def _anchor_rows(anchors: dict[int, Means], states: dict[int, str], names: dict[int, str]) -> list[list[str]]:
     """Return the texts of the table of anchors; advice for all of them is in the first row."""
     common, advice = health.advice(anchors, names)
     worst = health.BAD if health.BAD in states.values() else health.CHECK

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from datetime import datetime, timezone
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from markupsafe import Markup
 from uwb_mitigation.calibration.site import SiteCalibration
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
-from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.report import draw_boxes, draw_scene, render_report
 from uwb_mitigation.viewer.scene import Pose, Scene, count_errors
@@ -54,7 +52,7 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         for (tag, anchor), values in calibration.pairs.items()
     }
     bars = {TrackKind.CORRECTED: {pair: offset_m + SDS * sd_m for pair, (offset_m, sd_m) in offsets.items()}}
-    figures = draw_scene(_view(calibration, errors_m[:, is_known])).figures
+    figures, _ = draw_scene(_view(calibration, errors_m[:, is_known]))
     reference = "the distance from the track that the other anchors give (not ground truth)"
     if solution.truth:
         reference = f"the range from {solution.truth}"
@@ -100,8 +98,7 @@ def _details(calibration: SiteCalibration) -> Iterable[str]:
 def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
     """Return anchors, tracks, stationary positions, and errors before and after, float64 (2, n), as the viewer draws them."""
     scene, solution = Scene(lambda: 0.0), calibration.solution
-    feed = SceneUpdater(scene, Lock())
-    feed.anchors(calibration.site.anchors)
+    scene.set_anchors(calibration.site.anchors.anchors)
     for segment in np.unique(solution.track_of):
         places = solution.track[(solution.track_of == segment) & np.isfinite(solution.track).all(axis=1)]
         columns = np.column_stack([np.zeros(len(places)), places, np.full(len(places), math.nan)])
@@ -110,4 +107,4 @@ def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
         scene.add_pose(str(tag), Pose(x, y, z))
     scene.error_counts += count_errors(errors_m)
     scene.errors = errors_m.shape[1]
-    return View(scene, feed.lock)
+    return View(scene)

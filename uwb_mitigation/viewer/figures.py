@@ -1,0 +1,584 @@
+"""The figures of one page: their Bokeh models, and what they show of a scene."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from bokeh import models
+from bokeh.models import ColumnDataSource, DataRange1d, Range1d
+from bokeh.palettes import cividis
+from bokeh.plotting import figure
+from bokeh.transform import factor_mark
+from numpy.typing import NDArray
+
+from uwb_mitigation.errors import format_id
+from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
+from uwb_mitigation.types.measurement import FAULTS, Status
+from uwb_mitigation.viewer import health, palette
+from uwb_mitigation.viewer.headline import positions_of
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, NO_DATA_S
+from uwb_mitigation.viewer.palette import BLUE, GREEN, GREY, NIGHT, PAPER, VERMILLION, TrackKind
+from uwb_mitigation.viewer.scene import (
+    ERROR_EDGES_M,
+    Scene,
+    count_errors,
+    finite_or_zero,
+    plain_tag_id,
+    tag_label,
+    with_gaps,
+)
+from uwb_mitigation.viewer.state import PageState, drawable, new_source, set_rows
+
+TRACE_BEFORE, TRACE_AFTER = 20, 180
+"""Number of samples shown before and after the first path."""
+MAX_POINTS = 1200
+"""Maximum number of displayed points of a line."""
+
+HEADINGS = {
+    "map": "Map",
+    "strip": f"Range, last {HISTORY_S:.0f} s",
+    "history": "Residual, rate and NLOS share",
+    "positions": "Position error over time",
+    "cir": "Last CIR",
+    "errors": "Range errors",
+    "distribution": "Cumulative distribution of the range errors",
+}
+"""Names and headings of the figures."""
+
+STROKES = {
+    TrackKind.RAW: (1.0, "solid"),
+    TrackKind.CORRECTED: (3.0, "solid"),
+    TrackKind.SMOOTHED: (2.0, "dotdash"),
+    TrackKind.TRUE: (2.0, "dashed"),
+}
+"""Width and dashes of the lines of each kind, in drawing order."""
+
+_COMPARED = TrackKind.RAW, TrackKind.CORRECTED
+_AGE = "time before now, s"
+HEALTH_LOOKS = {
+    health.GOOD: ("hex", GREEN),
+    health.CHECK: ("square_pin", palette.ORANGE),
+    health.BAD: ("circle_x", VERMILLION),
+    health.UNKNOWN: ("hex_dot", PAPER),
+}
+"""Marker and colour of an anchor for each state; statuses of ranges have other markers."""
+
+HEIGHT = 380
+"""So that the map is on the first screen, pixels."""
+HEADING_M = 1.0
+"""Length of the line that shows the heading of a tag."""
+MAX_LABEL = 20
+"""Maximum number of characters of a name."""
+MARGIN_M = 5.0
+"""Margin around a tag on a map without anchors."""
+RANGE_SD_M = 0.1
+"""Standard deviation for the predicted accuracy if the ranges have none."""
+
+_SIZES = {"95 % ellipse": "width", "heading": "heading"}
+"""Columns that are NaN if a tag has none."""
+
+
+class Figures:
+    """All figures of a page.
+
+    Attributes:
+        map: the map.
+        plots: {name: figure}, see `HEADINGS`.
+    """
+
+    def __init__(self, page: PageState) -> None:
+        self.map, errors = Map(page), RangeErrors(page)
+        over_time = Quality(page), PositionErrors(page)
+        self._parts = self.map, Strip(page), LastCir(page), *over_time, errors
+        self.plots = {part.plot.name: part.plot for part in (*self._parts, errors.distribution)}
+        self._position = new_source("time")
+        if page.view.player is not None:
+            for part in over_time:
+                part.plot.vspan("time", source=self._position, line_color=NIGHT, line_width=2)
+
+    def draw(self, scene: Scene) -> None:
+        """Draw what has changed."""
+        for part in self._parts:
+            part.draw(scene)
+
+    def show_position(self, position_s: float) -> None:
+        """Mark the position of the player."""
+        if self._position.data["time"] != [position_s]:
+            self._position.data = {"time": [position_s]}
+
+
+class Chart:
+    """A figure; without data, invisible corners define the ranges of its axes, and a message says what is missing.
+
+    Args:
+        page: state of its page.
+        name: see `HEADINGS`.
+        x, y: titles of the axes.
+        options: of `figure`.
+    """
+
+    def __init__(self, page: PageState, name: str, x: str, y: str, **options: Any) -> None:
+        self.page, self.name, self.plot = page, name, new_figure(name, 230, x, y, **options)
+        self._corners = self.plot.scatter([0.0, 10.0], [0.0, 10.0], size=0, alpha=0)
+        for axis in (self.plot.x_range, self.plot.y_range):
+            if isinstance(axis, DataRange1d):
+                axis.only_visible = True
+
+    def draw(self, scene: Scene) -> None:
+        """Draw what has changed."""
+        raise NotImplementedError
+
+    def show_empty(self, message: str) -> None:
+        """Set the message of a figure without data; empty: it has data."""
+        self._corners.visible = bool(message)
+        self.page.set(empty=self.page.controls.empty | {self.name: message})
+
+    def fill(self, source: ColumnDataSource, table: NDArray[np.float64], message: str = "") -> None:
+        """Set the columns of a source."""
+        source.data = dict(zip(source.data, table.T.astype(np.float32), strict=True))
+        self.show_empty(message)
+
+    def lines(self, source: ColumnDataSource, x: str, *kinds: TrackKind, suffix: str = "") -> list[str]:
+        """Add lines of a source; return their columns."""
+        names = [kind.name.lower() + suffix for kind in kinds]
+        for kind, name in zip(kinds, names, strict=True):
+            self.plot.line(x, name, source=source, legend_label=kind.value, **stroke(kind))
+        return names
+
+
+class Strip(Chart):
+    """Raw, corrected and true ranges of the selected pair in the last minute, and the statuses that need attention."""
+
+    def __init__(self, page: PageState) -> None:
+        super().__init__(page, "strip", _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
+        self._ranges = new_source("age", "raw", "corrected", "true")
+        self._bad = new_source("age", "corrected", "status")
+        names = self.lines(self._ranges, "age", *_COMPARED, TrackKind.TRUE)
+        self.plot.scatter(
+            "age", "corrected", source=self._bad, size=8, legend_field="status", **status_marks()
+        )
+        finish(self.plot, "age", *names)
+
+    def draw(self, scene: Scene) -> None:
+        page, now_s = self.page, self.page.now_s()
+        # Also draw a pair without new data, because its ranges age.
+        if not page.changed("strip", (page.selected, now_s, scene.ranges, page.view.timeline is None)):
+            return
+        ranges = page.ranges(now_s - HISTORY_S, now_s)
+        columns = ranges.time_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, ranges.status
+        table = np.column_stack(columns)[ranges.time_s >= now_s - HISTORY_S]
+        table[:, 1:][~(np.abs(table[:, 1:]) < MAX_RANGE_M)] = np.nan
+        message = "No range of this pair yet."
+        if page.history.samples:
+            message = f"No range of this pair in the last {HISTORY_S:.0f} s."
+        bad = table[np.isin(table[:, 4], FAULTS)]
+        rows = [
+            dict(zip(self._bad.data, (age_s, y, Status(int(s)).name), strict=True))
+            for age_s, _, y, _, s in bad
+        ]
+        set_rows(self._bad, rows)
+        has_data = np.isfinite(table[:, 1]).any()
+        self.fill(self._ranges, thinned(table[:, :4], page.history.max_gap_s), "" if has_data else message)
+
+
+class Quality(Chart):
+    """Residual, rate and NLOS share of the selected pair: in the recording, or in the last minute."""
+
+    def __init__(self, page: PageState) -> None:
+        super().__init__(page, "history", y="residual, m", **_time_axis(page))
+        plot, self._source = self.plot, new_source("age", "residual", "rate", "NLOS")
+        plot.extra_y_ranges = {"share": Range1d(0, 100)}
+        plot.add_layout(models.LinearAxis(y_range_name="share", axis_label="rate, Hz; NLOS, %"), "right")
+        for name, colour, dash, axis in (
+            ("residual", BLUE, "solid", "default"), ("rate", GREY, "dashed", "share"), ("NLOS", VERMILLION, "dotted", "share"),
+        ):  # fmt: skip
+            style = {"line_color": colour, "line_dash": dash, "line_width": 2, "y_range_name": axis}
+            plot.line("age", name, source=self._source, legend_label=name, **style)
+        plot.y_range.renderers = [line for line in plot.renderers if line.y_range_name == "default"]
+        finish(plot, "age", "residual", "rate", "NLOS")
+
+    def draw(self, scene: Scene) -> None:
+        page = self.page
+        now_s = finite_or_zero(scene.now_s(page.tag_id)) if page.view.player is None else 0.0
+        # All of it moves every second.
+        if page.changed("history", (page.selected, math.floor(now_s), page.view.complete is None)):
+            table = page.ranges().quality() - (now_s, 0.0, 0.0, 0.0)
+            message = "" if np.isfinite(table[:, 1]).any() else "No residuals of this pair yet."
+            self.fill(self._source, thinned(table, page.history.max_gap_s), message)
+
+
+class PositionErrors(Chart):
+    """Errors of the positions of the selected tag with and without correction, with two standard deviations."""
+
+    def __init__(self, page: PageState) -> None:
+        super().__init__(page, "positions", y="m", **_time_axis(page))
+        self._corrected, self._raw = new_source("time", "error", "bound"), new_source("time", "raw")
+        style = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
+        self.plot.varea("time", 0, "bound", source=self._corrected, **style)
+        corrected = stroke(TrackKind.CORRECTED) | {"legend_label": "corrected"}
+        self.plot.line("time", "error", source=self._corrected, **corrected)
+        self.lines(self._raw, "time", TrackKind.RAW)
+        finish(self.plot, "time", "error", "bound")
+
+    def draw(self, scene: Scene) -> None:
+        page, is_live = self.page, self.page.view.player is None
+        live_s = math.floor(scene.clock()) if is_live else -1
+        if not page.changed("positions", (page.tag_id, page.view.complete is None, live_s)):
+            return
+        positions = positions_of(page.view, page.tag_id)
+        table, raw = (positions.error_columns(kind) for kind in (TrackKind.CORRECTED, TrackKind.RAW))
+        now_s = table[-1, 0] if is_live and len(table) else 0.0
+        message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
+        self.fill(self._corrected, thinned(table - (now_s, 0.0, 0.0), NO_DATA_S), message)
+        self.fill(self._raw, thinned(raw[:, :2] - (now_s, 0.0), NO_DATA_S), message)
+
+
+class LastCir(Chart):
+    """The last CIR of the selected pair, with first path, noise and the input of the network."""
+
+    def __init__(self, page: PageState) -> None:
+        x_range = Range1d(-TRACE_BEFORE, TRACE_AFTER)
+        super().__init__(page, "cir", "samples (1 ns) from the first path", "magnitude", x_range=x_range)
+        plot, self._trace = self.plot, new_source("sample", "magnitude")
+        self._marks = new_source("noise", "first", "from", "to")
+        style = {"fill_color": GREEN, "fill_alpha": 0.15, "line_color": None, "legend_label": "network input"}
+        plot.vstrip("from", "to", source=self._marks, **style)
+        style = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
+        plot.line("sample", "magnitude", source=self._trace, **style)
+        plot.vspan(
+            "first", source=self._marks, line_color=VERMILLION, line_width=2, legend_label="first path"
+        )
+        plot.hspan("noise", source=self._marks, line_color=GREY, line_dash="dashed", legend_label="noise")
+        finish(plot, "sample", "magnitude")
+
+    def draw(self, scene: Scene) -> None:
+        page, message = self.page, ""
+        trace = page.history.traces[-1] if page.history.traces else None
+        if trace is None:
+            message = "No CIRs: the source sends none, or no raw ranges are received."
+            if any(other.traces for other in scene.pairs.values()):
+                message = "No CIR of this pair yet."
+        self.show_empty(message)
+        # Compare the trace instead of its stamp, because stamps may be equal.
+        if not page.changed("trace", (page.selected, trace)):
+            return
+        if trace is None:
+            set_rows(self._trace, [])
+            set_rows(self._marks, [])
+            return
+        cir, magnitude = trace.cir, trace.magnitude
+        sample = np.arange(len(magnitude)) + (cir.start_index - trace.origin)
+        shown = (sample >= -TRACE_BEFORE) & (sample < TRACE_AFTER)
+        self._trace.data = {"sample": sample[shown].astype(np.float32), "magnitude": magnitude[shown]}
+        levels = {"noise": cir.noise_threshold, "first": finite_or_zero(cir.first_path_index - trace.origin)}
+        set_rows(self._marks, [levels | {"from": -WINDOW_LEAD, "to": page.view.window - WINDOW_LEAD}])
+
+
+class RangeErrors(Chart):
+    """Histogram of the errors of the ranges with known truth; `distribution` has their cumulative shares."""
+
+    def __init__(self, page: PageState) -> None:
+        y_range = DataRange1d(start=0.0, min_interval=1.0)
+        super().__init__(page, "errors", "range error, m", "ranges", y_range=y_range)
+        self._source = new_source("left", "right", "raw", "corrected", "raw_share", "corrected_share")
+        low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
+        self.plot.xaxis.ticker = models.FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
+        self.plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
+        for kind, hatch in zip(_COMPARED, ("/", None), strict=True):
+            colour = palette.TRACK_COLOURS[kind]
+            self.plot.quad(
+                left="left", right="right", bottom=0, top=kind.name.lower(), source=self._source, color=colour, fill_alpha=0.35,
+                hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
+            )  # fmt: skip
+        finish(self.plot, "left", "right", "raw", "corrected")
+        self.distribution = Chart(
+            page, "distribution", "range error, m", "share of ranges, %",
+            x_range=Range1d(float(low), float(high)), y_range=Range1d(0, 100),
+        )  # fmt: skip
+        finish(
+            self.distribution.plot,
+            "right",
+            *self.distribution.lines(self._source, "right", *_COMPARED, suffix="_share"),
+        )
+
+    def draw(self, scene: Scene) -> None:
+        timeline = self.page.view.timeline
+        if not self.page.changed("errors", scene.errors if timeline is None else -1):
+            return
+        counts = scene.error_counts if timeline is None else count_errors(timeline.range_errors)
+        shares = 100.0 * np.cumsum(counts, axis=1) / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        table = np.stack([ERROR_EDGES_M[:-1], ERROR_EDGES_M[1:], *counts, *shares], axis=1)
+        self.fill(self._source, table, "" if counts.any() else "No true ranges.")
+
+
+class Map:
+    """The map; without an action of the user, its view changes only for the first content and the first anchors.
+
+    Attributes:
+        plot: the figure.
+        coverage: the predicted accuracy and its legend, which are shown on request.
+    """
+
+    def __init__(self, page: PageState) -> None:
+        self._page, self._fitted = page, (False, False, False)
+        self._anchors = new_source("x", "y", "name", "id", "health", "label")
+        self._selected = new_source("x", "y")
+        # Glyphs with NaN are not drawn: without a heading, for example.
+        self._tags = new_source("x", "y", "name", "colour", "label_y", "width", "height", "angle", "heading")
+        self._tracks = {kind: new_source("xs", "ys", "colour") for kind in STROKES}
+        # The script of the page fills it with the names that do not cover each other.
+        self._labels = new_source("x", "y", "text", "offset", "shift")
+        self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
+        self._accuracy = new_source("image", "x", "y", "dw", "dh")
+        # The map shows these corners until the user changes the view; it must not follow the data.
+        self._extent = new_source("x", "y")
+        self.plot = plot = new_figure(
+            "map", HEIGHT, "x, m", "y, m", "pan,wheel_zoom,reset,save", match_aspect=True
+        )
+        # Fixed borders: tick labels of another width would resize the frame and change the view.
+        plot.min_border_left, plot.min_border_right = 70, 20
+        extent = plot.scatter("x", "y", source=self._extent, size=0, alpha=0)
+        plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
+        clear, count = "#00000000", len(health.STEPS_M)
+        colours = models.LinearColorMapper(cividis(count), low=-0.5, high=count - 0.5, nan_color=clear)
+        labels = {step: f"\u2264 {limit_m:g}" for step, limit_m in enumerate(health.STEPS_M)}
+        bar = models.ColorBar(
+            color_mapper=colours, width=10, padding=4, title="predicted sd, m", visible=False,
+            ticker=models.FixedTicker(ticks=list(labels)), major_label_overrides=labels,
+        )  # fmt: skip
+        plot.add_layout(bar, "right")
+        image = plot.image("image", source=self._accuracy, color_mapper=colours, alpha=0.6, visible=False)
+        self.coverage = image, bar
+        items = defaultdict[str, list[Any]](list)
+        for name, glyph, source, style in self._layers():
+            items[name].append(getattr(plot, glyph)(source=source, **style))
+        del items[""]
+        named = items["anchor"] + items["tag"]
+        plot.add_tools(
+            models.HoverTool(tooltips=[("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")], renderers=named)
+        )
+        legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
+        self._legend = {name: models.LegendItem(label=legend[name], renderers=items[name]) for name in items}
+        plot.add_layout(models.Legend(items=list(self._legend.values())), "below")
+        finish(plot)
+
+    def _layers(self) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
+        """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
+        marks, looks = status_marks(), HEALTH_LOOKS
+        anchor = models.CategoricalColorMapper(
+            factors=list(looks), palette=[colour for _, colour in looks.values()]
+        )
+        text = {
+            "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset", "x_offset": "shift",
+        }  # fmt: skip
+        return [
+            ("", "segment", self._rays, {"line_color": marks["color"], "line_alpha": 0.8}),
+            *((kind.value, "multi_line", source, stroke(kind) | {"line_color": "colour"})
+              for kind, source in self._tracks.items()),
+            ("95 % ellipse", "ellipse", self._tags, {
+                "width": "width", "height": "height", "angle": "angle", "color": "colour", "fill_alpha": 0.25,
+            }),
+            ("heading", "ray", self._tags, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
+            ("status", "scatter", self._rays, marks | {"size": 10, "line_width": 2}),
+            ("anchor", "scatter", self._anchors, {
+                "marker": factor_mark("health", [marker for marker, _ in looks.values()], list(looks)),
+                "size": 15, "line_color": NIGHT, "fill_color": {"field": "health", "transform": anchor},
+            }),
+            ("selected anchor", "scatter", self._selected, {
+                "marker": "circle", "size": 22, "fill_color": None, "line_color": NIGHT, "line_width": 3,
+            }),
+            ("tag", "scatter", self._tags, {"marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT}),
+            ("", "text", self._labels, text),
+        ]  # fmt: skip
+
+    def draw(self, scene: Scene) -> None:
+        """Draw what has changed."""
+        self._draw_anchors(scene)
+        self._draw_tags(scene)
+        self._draw_tracks(scene)
+        self._draw_rays(scene)
+        self.draw_accuracy(scene)
+        fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
+        if fitted > self._fitted or not self._extent.data["x"]:
+            self._fitted = fitted
+            self.fit(scene)
+        # The legend shows only what the map contains.
+        for name, item in self._legend.items():
+            data = [r.data_source.data for r in item.renderers if r.visible]
+            columns = [
+                columns[_SIZES[name]] if name in _SIZES else next(iter(columns.values())) for columns in data
+            ]
+            item.visible = any(len(c) and not (name in _SIZES and np.isnan(c).all()) for c in columns)
+
+    def _draw_anchors(self, scene: Scene) -> None:
+        page, timeline, rows = self._page, self._page.view.timeline, []
+        for identity, anchor in scene.anchors.items():
+            state, residual_m = page.health.get(identity, (health.UNKNOWN, math.nan))
+            name = anchor.name or format_id(identity)
+            label = name[:MAX_LABEL] + (f" {state[0]}" if state != health.UNKNOWN else "")
+            if timeline is not None and identity in timeline.displaced:
+                label += " not here"
+            elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
+                # Rounded, so that the map is not drawn again for every range.
+                label += f" {residual_m:+.1f} m"
+            values = *anchor.position[:2], name, str(identity), state, label
+            rows.append(dict(zip(self._anchors.data, values, strict=True)))
+        if page.changed("anchors", rows):
+            set_rows(self._anchors, rows)
+        place = scene.anchors.get(page.selected[0]) if page.selected else None
+        if page.changed("selected", place):
+            set_rows(self._selected, [dict(zip("xy", place.position, strict=False))] if place else [])
+
+    def _draw_tags(self, scene: Scene) -> None:
+        rows: list[dict[str, Any]] = []
+        plain_id, colours = plain_tag_id(scene.tags, scene.pairs), palette.tag_colours(scene.tags)
+        for name, pose in scene.tags.items():
+            age_s, label = scene.age_s(pose), tag_label(name, plain_id)
+            major, minor, angle = map(drawable, pose.ellipse)
+            half_height_m = math.hypot(major * math.sin(angle), minor * math.cos(angle))
+            is_late = age_s > NO_DATA_S
+            rows.append({
+                "x": pose.x, "y": pose.y, "label_y": pose.y + finite_or_zero(half_height_m),
+                "name": f"{label}: no data for {age_s:.0f} s" if is_late else label,
+                "colour": GREY if is_late else colours[name],
+                "width": 2 * major, "height": 2 * minor, "angle": angle, "heading": pose.heading_rad,
+            })  # fmt: skip
+        set_rows(self._tags, rows)
+
+    def show_labels(self) -> None:
+        """Show all names, for a report, which has no script."""
+        anchors, tags = self._anchors.data, self._tags.data
+        labels = [(*row, -13, 0) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
+        labels += [(*row, -4, 0) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
+        set_rows(self._labels, [dict(zip(self._labels.data, row, strict=True)) for row in labels])
+
+    def _draw_tracks(self, scene: Scene) -> None:
+        colours = palette.tag_colours(scene.tags)
+        for kind, source in self._tracks.items():
+            tracks = {
+                name: view
+                for (name, track_kind), view in scene.tracks.items()
+                if track_kind is kind and len(view.points)
+            }
+            state = [
+                (name, len(view.points), view.points[-1][0], math.floor(scene.age_s(view)))
+                for name, view in tracks.items()
+            ]
+            if self._page.changed(kind.value, state):
+                lines = [self._trail(view.columns(), scene.age_s(view)).T for view in tracks.values()]
+                colour = palette.TRACK_COLOURS[kind] or NIGHT
+                is_own = kind is TrackKind.CORRECTED
+                source.data = {
+                    "xs": [x for x, _ in lines],
+                    "ys": [y for _, y in lines],
+                    "colour": [colours.get(name, BLUE) if is_own else colour for name in tracks],
+                }
+
+    def _trail(self, track: NDArray[np.float64], age_s: float) -> NDArray[np.float32]:
+        """Return x and y of the displayed time of a track whose last point has an age, float32 (k, 2)."""
+        begin = np.searchsorted(track[:, 0], track[-1, 0] + age_s - self._page.trail_s)
+        return thinned(track[begin:, :3], NO_DATA_S)[:, 1:].astype(np.float32)
+
+    def _draw_rays(self, scene: Scene) -> None:
+        """Draw rays with statuses from the anchors to the tag of the selected pair."""
+        rows = []
+        tag_id = self._page.tag_id
+        pose = None if tag_id is None else scene.tag_of(tag_id)
+        for (anchor_id, of_tag), history, sample in scene.latest():
+            place = scene.anchors.get(anchor_id)
+            if of_tag == tag_id and pose and place and not scene.no_data(history):
+                (x0, y0, _), x1, y1 = place.position, pose.x, pose.y
+                values = (x0 + x1) / 2, (y0 + y1) / 2, x0, y0, x1, y1, sample.status.name
+                rows.append(dict(zip(self._rays.data, values, strict=True)))
+        set_rows(self._rays, rows)
+
+    def draw_accuracy(self, scene: Scene) -> None:
+        """Draw the map of the predicted accuracy if it is visible."""
+        pose = next(iter(scene.tags.values()), None)
+        if not self.coverage[0].visible or len(scene.anchors) < 2:
+            return
+        anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
+        height_m = finite_or_zero(pose.z) if pose else 0.0
+        sds_m = [sample.sigma_m for _, _, sample in scene.latest() if sample.sigma_m > 0.0]
+        sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
+        if self._page.changed("accuracy", (anchors.tobytes(), round(height_m, 1), sd_m)):
+            image, low, size = health.predicted_accuracy(anchors, height_m, sd_m)
+            steps = np.searchsorted(health.STEPS_M, image).astype(np.float32)
+            steps[~(image <= health.STEPS_M[-1])] = np.nan
+            values = [steps], [low[0]], [low[1]], [size[0]], [size[1]]
+            self._accuracy.data = dict(zip(self._accuracy.data, values, strict=True))
+
+    def fit(self, scene: Scene) -> None:
+        """Fit the view of the map to its current content."""
+        places = [anchor.position[:2] for anchor in scene.anchors.values()]
+        places += [(pose.x, pose.y) for pose in scene.tags.values()]
+        timeline, live = self._page.view.complete, (view.columns() for view in scene.tracks.values())
+        for track in live if timeline is None else timeline.tracks.values():
+            places += np.percentile(track[:, 1:3], (2, 98), axis=0).tolist() if len(track) else []
+        corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        # A margin for ellipses and labels; without anchors, one in which the tag can move.
+        margin = 0.1 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
+        low, high = low - margin, high + margin
+        self._extent.data = {name: [float(low[i]), float(high[i])] for i, name in enumerate("xy")}
+
+
+def new_figure(
+    name: str, height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset,save", **options: Any
+) -> figure:
+    """Return an empty figure with the style of the page."""
+    plot = figure(
+        name=name, height=height, min_width=200, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, tools=tools,
+        **options,
+    )  # fmt: skip
+    plot.toolbar.update(logo=None, autohide=True)
+    return plot
+
+
+def finish(plot: figure, *columns: str) -> None:
+    """Put the legend next to the plot, where it covers no data; show values of columns next to the pointer."""
+    if columns:
+        tips = [(name.replace("_", " "), f"@{name}{{0.000}}") for name in columns]
+        first = [
+            renderer for renderer in plot.renderers if isinstance(renderer.glyph, (models.Line, models.Quad))
+        ][:1]
+        plot.add_tools(models.HoverTool(tooltips=tips, mode="vline", renderers=first))
+    for legend in plot.legend:
+        if legend in plot.center:
+            plot.add_layout(legend, "above")
+        legend.update(
+            orientation="horizontal", label_text_font_size="11px", padding=0, margin=0, spacing=8, location="left",
+            border_line_color=None, glyph_height=14, label_height=14,
+        )  # fmt: skip
+
+
+def _time_axis(page: PageState) -> dict[str, Any]:
+    """Return the options of a figure of the whole recording, or of the last minute of live topics."""
+    if (player := page.view.player) is None:
+        return {"x": _AGE, "x_range": Range1d(-HISTORY_S, 0)}
+    return {"x": "time in the recording, s", "x_range": Range1d(0.0, max(player.seconds, 0.1))}
+
+
+def stroke(kind: TrackKind) -> dict[str, Any]:
+    """Return the style of the lines of a kind."""
+    width, dash = STROKES[kind]
+    return {"line_color": palette.TRACK_COLOURS[kind] or NIGHT, "line_width": width, "line_dash": dash}
+
+
+def status_marks() -> dict[str, Any]:
+    """Return marker and colour of marks whose column `status` has the name of a status."""
+    names, looks = [status.name for status in palette.STATUS_LOOKS], palette.STATUS_LOOKS.values()
+    colours = models.CategoricalColorMapper(
+        factors=names, palette=[look.colour or NIGHT for look in looks], nan_color=GREY
+    )
+    marker = factor_mark("status", [look.marker for look in looks], names)
+    return {"marker": marker, "color": {"field": "status", "transform": colours}}
+
+
+def thinned(table: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:
+    """Return rows of a line whose first column is the time: about `MAX_POINTS`, at equal steps, interrupted by gaps."""
+    return with_gaps(table[:: -max(1, -(-len(table) // MAX_POINTS))][::-1], gap_s)
