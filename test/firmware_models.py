@@ -118,11 +118,10 @@ def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
 
 @dataclass(frozen=True)
 class Exported:
-    """A network of one shape and the folder of its export."""
+    """An exported network of one shape."""
 
     weights: Int8Weights
     subject: Network
-    folder: Path
 
     def windows(self, count: int = 500) -> NDArray[np.float32]:
         """Return windows that test every rounding: zero, saturating and random ones."""
@@ -134,6 +133,10 @@ SHAPES = [*itertools.product((3, 5), published.WINDOWS), (0, 157)]
 """First kernel and length of each tested network; 0: MLP."""
 
 
+SIZES = [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)]
+"""Lengths and numbers of modules that are not published."""
+
+
 def shape_name(shape: tuple[int, int]) -> str:
     return f"k0={shape[0]}, K={shape[1]}" if shape[0] else "MLP"
 
@@ -143,4 +146,4 @@ def exported(shape: tuple[int, int], folder: Path) -> Exported:
     weights = random_networks.remnet(samples, first_kernel) if first_kernel else random_networks.mlp(samples)
     write_model(folder, weights)
     subject = network_of(weights, None, MODEL_ID, graph.int8_model(weights))
-    return Exported(weights, subject, folder)
+    return Exported(weights, subject)
