@@ -46,18 +46,13 @@ def write_model(folder: Path, weights: Int8Weights, **changes: object) -> Path:
     return write_header(folder, network, card, MODEL_ID, golden)
 
 
-def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
-    """Return a bundle with random weights, exportable scales, and a linear bias model that needs levels."""
-    weights = random_networks.remnet(samples, 3)
+def exact_bundle(
+    folder: Path, samples: int = 32, weights: Int8Weights | None = None, **changes: object
+) -> Bundle:
+    """Return a bundle with exportable scales and a linear bias model that needs levels; by default a random REMNet."""
+    weights = weights or random_networks.remnet(samples, 3)
     card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), **changes)
     return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
-
-
-def mlp_bundle(folder: Path) -> Bundle:
-    """Return the MLP of the paper with random weights."""
-    weights = random_networks.mlp()
-    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), scale=SCALE)
-    return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
 
 
 def strict_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:

@@ -83,7 +83,9 @@ def test_library_properties_follow_the_rules_of_the_library_manager():
     """Rules LP of arduino-lint, of the fields that change. That `url` is reachable is not tested."""
     lines = (firmware_folder() / "library.properties").read_text().splitlines()
     fields = dict(line.split("=", 1) for line in lines)
-    assert {"name", "author", "maintainer", "sentence", "paragraph", "category", "architectures"} <= set(fields)
+    assert {"name", "author", "maintainer", "sentence", "paragraph", "category", "architectures"} <= set(
+        fields
+    )
     assert re.fullmatch(r"\d+\.\d+\.\d+", fields["version"])
     package = (firmware_folder().parent / "package.xml").read_text()
     assert f'<url type="repository">{fields["url"]}</url>' in package

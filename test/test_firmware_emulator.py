@@ -6,9 +6,6 @@ The emulator counts instructions exactly. It does not model wait states, caches 
 from __future__ import annotations
 
 import json
-import os
-import select
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +19,6 @@ from firmware_models import bits
 from numpy.typing import NDArray
 
 from benchmarks.equipment import emulator, random_networks
-from benchmarks.equipment.emulated_firmware import EmulatedFirmware, cut_to_window
 from benchmarks.firmware import CLOCK_HZ
 from benchmarks.paper import published
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -36,9 +32,6 @@ from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Scaling
-from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder
-from uwb_mitigation.radios.wire.layout import MessageType
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
@@ -154,33 +147,6 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(is_stri
 def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: Path, tmp_path: Path):
     measurements = firmware_models.real_measurements(apartment)
     assert 0 in check_corrections(load_bundle(shipped), measurements, tmp_path)
-
-
-def test_burst_into_the_serial_port_is_answered_completely(tmp_path: Path):
-    bundle = firmware_models.exact_bundle(tmp_path, 8)
-    measured = [cut_to_window(model_material.measurement(seed=seed), 8) for seed in range(50)]
-    encoder, decoder, answers = FrameEncoder(), FrameDecoder(), []
-    waiting = b"".join(encoder.encode(*messages.encode(asked)) for asked in measured)
-    with EmulatedFirmware(bundle) as board:
-        port = os.open(board.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        # The emulated UART accepts a byte after the board has read the previous one, so the pseudo-terminal
-        # fills up.
-        deadline = time.monotonic() + 240
-        while len(answers) < 50 and time.monotonic() < deadline:
-            readable, writable, _ = select.select([port], [port] if waiting else [], [], 0.1)
-            waiting = waiting[os.write(port, waiting) :] if writable else waiting
-            frames = decoder.feed(os.read(port, 4096)) if readable else []
-            answers += [f.payload for f in frames if f.type == MessageType.RANGE_CORRECTED]
-        os.close(port)
-    host = Mitigation(bundle)
-    for asked, answer in zip(measured, answers, strict=True):
-        correction = messages.decode(MessageType.RANGE_CORRECTED, answer)
-        assert isinstance(correction, messages.Correction)
-        expected = host.correct([asked])[0]
-        values = [expected.range_m, expected.correction_m, expected.variance_m2]
-        sent = correction.corrected
-        assert sent.status is expected.status
-        assert np.array_equal(bits([sent.range_m, sent.correction_m, sent.variance_m2]), bits(values))
 
 
 def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):

@@ -17,7 +17,6 @@ from uwb_mitigation.radios.settings import PREAMBLES, RadioSettings, Role
 pytestmark = NEEDS_CC
 
 WRAP = 1 << 40
-LOST = ("no_answer", "late", "timeout", "damaged", "implausible", "broken")
 
 
 def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np.ndarray:
@@ -51,17 +50,6 @@ def ranges_of(channel: Pair, seconds: float, **settings: object) -> tuple[np.nda
 
 def test_row_of_results_is_that_of_the_compiler():
     assert modelled._library().radio_air_result_bytes() == modelled.RANGE.itemsize
-
-
-@pytest.mark.parametrize("ppm", [(-20, 20), (0, 0), (20, -20)])
-@pytest.mark.parametrize("distance_m", [0.3, 5.01, 100.0])
-def test_ranges_are_exact_for_any_clock_error_and_across_the_wrap(ppm, distance_m: float):
-    rows, _ = ranges_of(Pair(distance_m), 0.5, ppm=ppm)
-    assert len(rows) > 100
-    assert rows["device_time"].min() < 1e9 < WRAP - 4e9 < rows["device_time"].max(), "the counter has wrapped"
-    errors_m = rows["range_m"] - distance_m
-    assert abs(errors_m.mean()) <= 0.005
-    assert errors_m.std() <= 0.005
 
 
 @pytest.mark.parametrize("window", [0, 157, 1016])
@@ -192,27 +180,3 @@ def test_power_dependent_bias_is_corrected_if_enabled():
     table = [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86]
     bias_m = np.interp(-true_dbm, np.arange(61, 97, 2), table) / 1000
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
-
-
-def test_reset_or_unreachable_chip_recovers_within_a_second_without_wrong_ranges():
-    random = np.random.default_rng(4)
-    channel = Pair(8, loss=0.1, damage=0.01)
-    with ModelledAir(7) as air:
-        tag, anchor = pair(air, channel, window=0)
-        air.run(1)
-        for step in range(30):
-            what = step % 3
-            if what == 2:
-                air.set_pair(tag, anchor, None)
-                air.run(random.uniform(0.05, 1))
-                air.set_pair(tag, anchor, channel)
-            else:
-                air.reset((tag, anchor)[what])
-            air.ranges()
-            air.run(1 + random.uniform(0, 0.01))
-            rows, _ = air.ranges()
-            assert len(rows), f"nothing within a second after {('tag', 'anchor', 'link')[what]}"
-            assert abs(rows["range_m"] - 8).max() < 0.1
-        counts = air.counts(tag)
-    assert counts["tried"] - counts["ranged"] - sum(counts[name] for name in LOST) in (0, 1)
-    assert counts["restarts"] >= 10
