@@ -155,6 +155,7 @@ class Robot:
     def errors(self, track: Track, after_s=0.0):
         """Return the errors of antenna and yaw after a time, and the standard deviations of the yaw."""
         late = track.take(track.stamp_ns >= after_s * NANOSECONDS)
+        np.testing.assert_allclose(late.covariance, late.covariance.transpose(0, 2, 1), rtol=1e-6, atol=1e-12)
         time_s = late.stamp_ns / NANOSECONDS
         error = late.position[:, :2] - self.antenna(time_s)[:, :2]
         known = np.isfinite(late.yaw[:, 0])

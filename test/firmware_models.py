@@ -46,18 +46,13 @@ def write_model(folder: Path, weights: Int8Weights, **changes: object) -> Path:
     return write_header(folder, network, card, MODEL_ID, golden)
 
 
-def exact_bundle(folder: Path, samples: int = 32, **changes: object) -> Bundle:
-    """Return a bundle with random weights, exportable scales, and a linear bias model that needs levels."""
-    weights = random_networks.remnet(samples, 3)
+def exact_bundle(
+    folder: Path, samples: int = 32, weights: Int8Weights | None = None, **changes: object
+) -> Bundle:
+    """Return a bundle with exportable scales and a linear bias model that needs levels; by default a random REMNet."""
+    weights = weights or random_networks.remnet(samples, 3)
     card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), **changes)
     return save_bundle(folder / "exact.onnx", graph.int8_model(weights), card)
-
-
-def mlp_bundle(folder: Path) -> Bundle:
-    """Return the MLP of the paper with random weights."""
-    weights = random_networks.mlp()
-    card = model_material.card(weights.architecture, correction_limits_m=(-500.0, 500.0), scale=SCALE)
-    return save_bundle(folder / "mlp.onnx", graph.int8_model(weights), card)
 
 
 def strict_bundle(folder: Path, samples: int = 32, scaling: Scaling = Scaling.PREAMBLE) -> Bundle:
@@ -118,11 +113,10 @@ def real_measurements(apartment: Path) -> tuple[RangeMeasurement, ...]:
 
 @dataclass(frozen=True)
 class Exported:
-    """A network of one shape and the folder of its export."""
+    """An exported network of one shape."""
 
     weights: Int8Weights
     subject: Network
-    folder: Path
 
     def windows(self, count: int = 500) -> NDArray[np.float32]:
         """Return windows that test every rounding: zero, saturating and random ones."""
@@ -134,6 +128,10 @@ SHAPES = [*itertools.product((3, 5), published.WINDOWS), (0, 157)]
 """First kernel and length of each tested network; 0: MLP."""
 
 
+SIZES = [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)]
+"""Lengths and numbers of modules that are not published."""
+
+
 def shape_name(shape: tuple[int, int]) -> str:
     return f"k0={shape[0]}, K={shape[1]}" if shape[0] else "MLP"
 
@@ -143,4 +141,4 @@ def exported(shape: tuple[int, int], folder: Path) -> Exported:
     weights = random_networks.remnet(samples, first_kernel) if first_kernel else random_networks.mlp(samples)
     write_model(folder, weights)
     subject = network_of(weights, None, MODEL_ID, graph.int8_model(weights))
-    return Exported(weights, subject, folder)
+    return Exported(weights, subject)

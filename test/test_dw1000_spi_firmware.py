@@ -181,26 +181,3 @@ def test_anchor_ranges_with_an_independent_tag(air: Air):
     air.run(1.0)
     assert len(found) >= 6
     assert sum(found) / len(found) == pytest.approx(12.5, abs=0.005)
-
-
-@pytest.mark.parametrize(
-    ("radio", "edge_loss", "count"),
-    [
-        ({}, 0.2, 6),
-        # The default delays grow with the length of the frames.
-        *(({"rate_kbps": 110, "preamble": preamble}, 0.0, 3) for preamble in (1024, 4096)),
-    ],
-)
-def test_frames_without_a_leading_edge_or_long_ones_yield_no_wrong_range(
-    air: Air, radio: dict[str, int], edge_loss: float, count: int
-):
-    tag, anchor = air.chip(ppm=5.0), air.chip(ppm=-5.0)
-    air.set_pair(tag, anchor, Pair(6.0))
-    for chip in (tag, anchor):
-        chip.set_edge_loss(edge_loss)
-    ranges: list[RangeMeasurement] = []
-    air.program(tag, ranging(RadioSettings(**radio), ranges, 0.6))
-    air.program(anchor, ranging(RadioSettings(role=Role.ANCHOR, **radio), [], 0.6))
-    air.run(1.0)
-    assert len(ranges) >= count
-    assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in ranges)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -34,8 +33,6 @@ ASSEMBLER = ("arm-none-eabi-g++", "-c", "-x", "assembler-with-cpp", "-mcpu=corte
 CXX = ("arm-none-eabi-g++", "-std=gnu++14", "-fno-rtti", "-Wvla", *COMMON, *SOFTFP)
 
 STUB = firmware_folder() / "test" / "arduino_stub"
-CATEGORIES = ("Display", "Communication", "Signal Input/Output", "Sensors", "Device Control", "Timing",
-              "Data Storage", "Data Processing", "Other")  # fmt: skip
 
 
 @functools.cache
@@ -54,20 +51,17 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("built")
 
 
+def symbols(kind: str, *objects: str) -> set[str]:
+    """Return the symbols of a kind: U undefined, T global functions."""
+    listed = run_tool(["arm-none-eabi-nm", *objects]).splitlines()
+    return {line.split()[-1] for line in listed if f" {kind} " in line}
+
+
 def undefined_symbols(objects: list[str], folder: Path) -> set[str]:
     """Link with `ld -r`; return the undefined symbols."""
-    linked = folder / "linked.o"
-    run_tool(["arm-none-eabi-ld", "-r", *objects, "-o", str(linked)])
-    listed = subprocess.run(
-        ["arm-none-eabi-nm", "-u", str(linked)], capture_output=True, text=True, check=True
-    )
-    return {line.split()[-1] for line in listed.stdout.splitlines() if line.strip()}
-
-
-def defined_symbols(objects: list[str]) -> set[str]:
-    """Names of the global functions in object files."""
-    listed = subprocess.run(["arm-none-eabi-nm", *objects], capture_output=True, text=True, check=True)
-    return {line.split()[-1] for line in listed.stdout.splitlines() if " T " in line}
+    linked = str(folder / "linked.o")
+    run_tool(["arm-none-eabi-ld", "-r", *objects, "-o", linked])
+    return symbols("U", linked)
 
 
 @pytest.mark.parametrize("name", ["UwbMitigation", "UwbRanger"])
@@ -86,26 +80,18 @@ def test_sketch_and_library_link_with_the_flags_of_the_core(tmp_path: Path, buil
 
 
 def test_library_properties_follow_the_rules_of_the_library_manager():
-    """Rules LP of arduino-lint. That `url` is reachable is not tested."""
+    """Rules LP of arduino-lint, of the fields that change. That `url` is reachable is not tested."""
     lines = (firmware_folder() / "library.properties").read_text().splitlines()
     fields = dict(line.split("=", 1) for line in lines)
-    required = {"name", "version", "author", "maintainer", "sentence", "paragraph", "category", "url"}
-    assert required | {"architectures", "includes"} <= set(fields)
-    assert re.fullmatch("[A-Za-z0-9][A-Za-z0-9 _.-]{0,62}", fields["name"])
-    assert "arduino" not in fields["name"].lower()
-    assert re.fullmatch(r"\d+\.\d+\.\d+", fields["version"])
-    assert fields["category"] in CATEGORIES
-    assert (
-        f'<url type="repository">{fields["url"]}</url>'
-        in (firmware_folder().parent / "package.xml").read_text()
+    assert {"name", "author", "maintainer", "sentence", "paragraph", "category", "architectures"} <= set(
+        fields
     )
-    assert "arduino" not in (fields["author"] + fields["maintainer"]).lower()
-    assert not fields["paragraph"].startswith(fields["sentence"])
+    assert re.fullmatch(r"\d+\.\d+\.\d+", fields["version"])
+    package = (firmware_folder().parent / "package.xml").read_text()
+    assert f'<url type="repository">{fields["url"]}</url>' in package
     assert all((SOURCES / header).is_file() for header in fields["includes"].split(","))
     licences = [folder / "LICENSE" for folder in (firmware_folder(), firmware_folder().parent)]
     assert licences[0].read_bytes() == licences[1].read_bytes()
-    # The sketches include only headers of the library, of the core and of the exported model.
-    assert "depends" not in fields or fields["depends"]
 
 
 C_VARIANTS = [SOFTFP, ("-mfloat-abi=hard", FPU), ("-mfloat-abi=soft",), (*SOFTFP, "-DUWB_PORTABLE")]
@@ -120,7 +106,7 @@ def test_c_and_assembler_agree_for_every_combination_of_flags(
     c = compile_each((*C, *c_flags), built)
     portable = "-DUWB_PORTABLE" in c_flags or "-mfloat-abi=soft" in c_flags
     # The portable kernels are in the C objects exactly if the assembler kernels are not used.
-    assert KERNELS & defined_symbols(c) == (KERNELS if portable else set())
+    assert KERNELS & symbols("T", *c) == (KERNELS if portable else set())
     for assembler_flags in ASSEMBLER_VARIANTS:
         undefined = undefined_symbols(
             c + compile_each((*ASSEMBLER, *assembler_flags), built, "*.S"), tmp_path

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
+from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import MissingDependencyError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded import compiling
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 def test_firmware_equals_the_ranges_of_onnx_runtime(options: dict | None, tmp_path: Path):
     """Without options: the MLP."""
     if options is None:
-        bundle = firmware_models.mlp_bundle(tmp_path)
+        mlp = random_networks.mlp()
+        bundle = firmware_models.exact_bundle(tmp_path, weights=mlp, scale=firmware_models.SCALE)
     else:
         bundle = firmware_models.strict_bundle(tmp_path, **options)
     random = np.random.default_rng(8)

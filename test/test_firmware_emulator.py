@@ -6,9 +6,6 @@ The emulator counts instructions exactly. It does not model wait states, caches 
 from __future__ import annotations
 
 import json
-import os
-import select
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +15,10 @@ import firmware_models
 import model_material
 import numpy as np
 import pytest
-from firmware_models import Exported, bits
+from firmware_models import bits
+from numpy.typing import NDArray
 
 from benchmarks.equipment import emulator, random_networks
-from benchmarks.equipment.emulated_firmware import EmulatedFirmware, cut_to_window
 from benchmarks.firmware import CLOCK_HZ
 from benchmarks.paper import published
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -33,10 +30,8 @@ from uwb_mitigation.mitigation.model import requantisation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
+from uwb_mitigation.mitigation.model.weights import Int8Weights
 from uwb_mitigation.mitigation.preprocessing import Scaling
-from uwb_mitigation.radios.wire import messages
-from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder
-from uwb_mitigation.radios.wire.layout import MessageType
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
@@ -47,19 +42,11 @@ TIMES_THE_PAPER = {157: 9.0, 128: 9.0, 64: 9.0, 32: 9.0, 16: 8.5}
 """Minimum rate at 64 MHz, estimated, k0 = 3."""
 
 
-@pytest.fixture(scope="module", params=firmware_models.SHAPES, ids=firmware_models.shape_name)
-def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
-    return firmware_models.exported(request.param, tmp_path_factory.mktemp("exported"))
-
-
-@pytest.fixture(scope="module")
-def image(exported: Exported) -> toolchain.Image:
-    return toolchain.compile_image(exported.folder, exported.folder, Target.QEMU_MPS2)
-
-
-def test_kernels_equal_onnx_runtime_within_the_budgets(exported: Exported, image: toolchain.Image):
-    subject = exported.subject
-    windows = exported.windows()
+@pytest.mark.parametrize("shape", firmware_models.SHAPES, ids=firmware_models.shape_name)
+def test_kernels_equal_onnx_runtime_within_the_budgets(shape: tuple[int, int], tmp_path: Path):
+    exported = firmware_models.exported(shape, tmp_path)
+    subject, windows = exported.subject, exported.windows()
+    image = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2)
     result = emulator.run_windows(image, windows)
     assert not result.records["status"].any()
     assert np.array_equal(bits(result.records["output_m"]), bits(subject.expect(windows)))
@@ -68,13 +55,24 @@ def test_kernels_equal_onnx_runtime_within_the_budgets(exported: Exported, image
         assert result.instructions <= 75_000
         return
     assert result.arena_bytes <= 10_600
-    assert emulator.measure_size(exported.folder, exported.folder).flash_bytes <= 27_000
+    assert emulator.measure_size(tmp_path, tmp_path).flash_bytes <= 27_000
     samples = exported.weights.architecture.samples
     if samples in TIMES_THE_PAPER:
         cycles = emulator.estimate_cycles(image, emulator.count_executed(image, windows[0]))
         paper_hz = published.MODELS["remnet", samples].board[0]
         slower = 0.98 if subject.first_kernel == 5 else 1.0
         assert CLOCK_HZ / cycles >= slower * TIMES_THE_PAPER[samples] * paper_hz
+
+
+def run_compared(
+    folder: Path, weights: Int8Weights, windows: NDArray[np.float32], *options: object
+) -> tuple[toolchain.Image, emulator.Emulation]:
+    """Run a network in the emulator, and compare its outputs with the reference."""
+    firmware_models.write_model(folder, weights)
+    image = toolchain.compile_image(folder, folder, Target.QEMU_MPS2, *options)
+    result = emulator.run_windows(image, windows)
+    assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
+    return image, result
 
 
 @pytest.mark.parametrize("kernels", list(Kernels))
@@ -87,38 +85,25 @@ def test_packed_sums_do_not_overflow_with_the_largest_weights_and_inputs(tmp_pat
     extreme = {**weights.weight, "module1.residual": largest, "module2.residual": -largest}
     bias = {**weights.bias, "first": np.full(16, 100_000, np.int32)}
     weights = requantisation.nudge(replace(weights, weight=extreme, bias=bias))
-    firmware_models.write_model(tmp_path, weights)
     windows = np.full((1, 32), 1e4, np.float32)
-    assert (IntegerNetwork(weights).tensors(windows)["first"] == 255).all(), (
-        "the test needs the largest inputs"
-    )
-    image = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2, kernels)
-    result = emulator.run_windows(image, windows)
-    assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
+    inputs = IntegerNetwork(weights).tensors(windows)["first"]
+    assert (inputs == 255).all(), "the test needs the largest inputs"
+    run_compared(tmp_path, weights, windows, kernels)
 
 
-@pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
+@pytest.mark.parametrize(("samples", "modules"), firmware_models.SIZES)
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
     weights = random_networks.remnet(samples, 3, modules)
-    firmware_models.write_model(tmp_path, weights)
     windows = random_networks.rounding_windows(samples, weights.activation_scale["input"], 200)
-    image = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2)
-    result = emulator.run_windows(image, windows)
-    assert np.array_equal(bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows)))
+    run_compared(tmp_path, weights, windows)
 
 
 def test_trace_and_counter_agree_and_portable_c_takes_four_times_the_instructions(tmp_path: Path):
     weights = random_networks.remnet(8, 3)
-    firmware_models.write_model(tmp_path, weights)
     windows = random_networks.rounding_windows(8, weights.activation_scale["input"], 200)
-    kernels = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2)
-    portable = toolchain.compile_image(tmp_path, tmp_path, Target.QEMU_MPS2, Kernels.PORTABLE, "-O3")
-    results = [emulator.run_windows(image, windows) for image in (kernels, portable)]
-    for result in results:
-        assert np.array_equal(
-            bits(result.records["output_m"]), bits(IntegerNetwork(weights).predict_m(windows))
-        )
-    assert results[1].instructions > 4 * results[0].instructions
+    kernels, result = run_compared(tmp_path, weights, windows)
+    _, portable = run_compared(tmp_path, weights, windows, Kernels.PORTABLE, "-O3")
+    assert portable.instructions > 4 * result.instructions
     # The counter also sees the instructions that set up the call.
     counted = emulator.run_windows(kernels, windows[:1]).instructions
     assert abs(counted - emulator.count_executed(kernels, windows[0]).total()) <= 10
@@ -162,33 +147,6 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(is_stri
 def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: Path, tmp_path: Path):
     measurements = firmware_models.real_measurements(apartment)
     assert 0 in check_corrections(load_bundle(shipped), measurements, tmp_path)
-
-
-def test_burst_into_the_serial_port_is_answered_completely(tmp_path: Path):
-    bundle = firmware_models.exact_bundle(tmp_path, 8)
-    measured = [cut_to_window(model_material.measurement(seed=seed), 8) for seed in range(50)]
-    encoder, decoder, answers = FrameEncoder(), FrameDecoder(), []
-    waiting = b"".join(encoder.encode(*messages.encode(asked)) for asked in measured)
-    with EmulatedFirmware(bundle) as board:
-        port = os.open(board.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        # The emulated UART accepts a byte after the board has read the previous one, so the pseudo-terminal
-        # fills up.
-        deadline = time.monotonic() + 240
-        while len(answers) < 50 and time.monotonic() < deadline:
-            readable, writable, _ = select.select([port], [port] if waiting else [], [], 0.1)
-            waiting = waiting[os.write(port, waiting) :] if writable else waiting
-            frames = decoder.feed(os.read(port, 4096)) if readable else []
-            answers += [f.payload for f in frames if f.type == MessageType.RANGE_CORRECTED]
-        os.close(port)
-    host = Mitigation(bundle)
-    for asked, answer in zip(measured, answers, strict=True):
-        correction = messages.decode(MessageType.RANGE_CORRECTED, answer)
-        assert isinstance(correction, messages.Correction)
-        expected = host.correct([asked])[0]
-        values = [expected.range_m, expected.correction_m, expected.variance_m2]
-        sent = correction.corrected
-        assert sent.status is expected.status
-        assert np.array_equal(bits([sent.range_m, sent.correction_m, sent.variance_m2]), bits(values))
 
 
 def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):

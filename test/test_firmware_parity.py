@@ -13,7 +13,7 @@ import model_material
 import numpy as np
 import pytest
 from compilers import NEEDS_CC
-from firmware_models import Exported, bits
+from firmware_models import bits
 
 from benchmarks.equipment import random_networks
 from uwb_mitigation.errors import UwbMitigationError
@@ -35,24 +35,16 @@ pytestmark = NEEDS_CC
 SANITIZED = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all")
 
 
-@pytest.fixture(scope="module", params=firmware_models.SHAPES, ids=firmware_models.shape_name)
-def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
-    return firmware_models.exported(request.param, tmp_path_factory.mktemp("exported"))
-
-
-@pytest.fixture(scope="module")
-def compiled(exported: Exported) -> CompiledFirmware:
-    return CompiledFirmware(exported.folder, exported.folder)
-
-
-def test_c_and_reference_equal_onnx_runtime(exported: Exported, compiled: CompiledFirmware):
+@pytest.mark.parametrize("shape", firmware_models.SHAPES, ids=firmware_models.shape_name)
+def test_c_and_reference_equal_onnx_runtime(shape: tuple[int, int], tmp_path: Path):
+    exported = firmware_models.exported(shape, tmp_path)
     windows = exported.windows()
     expected = bits(exported.subject.expect(windows))
     assert np.array_equal(bits(IntegerNetwork(exported.weights).predict_m(windows)), expected)
-    assert np.array_equal(bits(compiled.predict_m(windows)), expected)
+    assert np.array_equal(bits(CompiledFirmware(tmp_path, tmp_path).predict_m(windows)), expected)
 
 
-@pytest.mark.parametrize(("samples", "modules"), [(9, 1), (12, 2), (23, 3), (40, 2), (81, 3), (156, 1)])
+@pytest.mark.parametrize(("samples", "modules"), firmware_models.SIZES)
 def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: Path):
     weights = random_networks.remnet(samples, 3, modules)
     firmware_models.write_model(tmp_path, weights)

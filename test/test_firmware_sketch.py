@@ -26,6 +26,8 @@ from uwb_mitigation.radios.wire.messages import BoardStatus, Correction, Hello, 
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import RangeMeasurement
 
+pytestmark = NEEDS_CXX
+
 T = TypeVar("T")
 
 EXAMPLES = Path(__file__).parent.parent / "firmware" / "examples"
@@ -111,7 +113,6 @@ def of_type(kind: type[T], received: list[object]) -> list[T]:
     return [message for message in received if isinstance(message, kind)]
 
 
-@NEEDS_CXX
 def test_sketch_corrects_each_measurement_that_arrives_back_to_back(
     tmp_path: Path, mitigation_sketch: Path, measurements: list[RangeMeasurement]
 ):
@@ -132,7 +133,6 @@ def test_sketch_corrects_each_measurement_that_arrives_back_to_back(
         assert messages.encode(correction) == messages.encode(replace(correction, corrected=expected))
 
 
-@NEEDS_CXX
 def test_sketch_counts_what_it_drops_if_the_radio_is_faster(
     tmp_path: Path, mitigation_sketch: Path, measurements: list[RangeMeasurement]
 ):
@@ -146,13 +146,11 @@ def test_sketch_counts_what_it_drops_if_the_radio_is_faster(
     assert not of_type(Log, received), "complete frames are dropped: none is damaged"
 
 
-@NEEDS_CXX
 def test_next_sketch_can_be_uploaded_while_the_watchdog_runs(tmp_path: Path, mitigation_sketch: Path):
     """A started watchdog runs on during the reset into the boot loader, which does not feed it."""
     run_mitigation(mitigation_sketch, tmp_path, [], 0, "reads", 0, 0, 0, 0, 0.2, upload_s=45)
 
 
-@NEEDS_CXX
 @pytest.mark.parametrize("host", ["silent", "closed"])
 def test_sketch_survives_a_host_that_does_not_read_for_10_s(
     tmp_path: Path, mitigation_sketch: Path, measurements: list[RangeMeasurement], host: str
@@ -183,7 +181,6 @@ def radio_sketch(
     return compile_sketch("UwbRanger", folder, "gnu++17", *files), request.param
 
 
-@NEEDS_CXX
 @pytest.mark.parametrize("host", ["reads", "silent", "closed"])
 def test_sketch_with_a_radio_ranges_on_a_modelled_chip(
     tmp_path: Path, radio_sketch: tuple[Path, bool], host: str

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import itertools
 import math
 from pathlib import Path
@@ -39,28 +38,25 @@ class Buffer:
 
     def __init__(self) -> None:
         self.parents: dict[str, str] = {}
-        self.rows: dict[str, list[tuple[int, float, float, float]]] = {}
+        self.poses: dict[str, dict[int, tuple[float, float, float]]] = {}
 
     def add(self, transform: TransformStamped) -> None:
         child, parent = transform.child_frame_id, transform.header.frame_id
         assert self.parents.setdefault(child, parent) == parent, f"{child} has two parents"
         stamp, at = transform.header.stamp, transform.transform.translation
-        row = (stamp.sec * 10**9 + stamp.nanosec, at.x, at.y, yaw_of(transform.transform.rotation))
-        bisect.insort(self.rows.setdefault(child, []), row)
+        pose = at.x, at.y, yaw_of(transform.transform.rotation)
+        self.poses.setdefault(child, {})[stamp.sec * 10**9 + stamp.nanosec] = pose
 
     def lookup(self, target: str, source: str, stamp: int) -> np.ndarray | None:
         """Return x, y and yaw of the source frame in the target frame; None: the lookup fails."""
         pose = np.zeros(3)
         while source != target:
-            rows = self.rows.get(source, [])
-            after = bisect.bisect_left(rows, (stamp,))
-            if after == len(rows) or (after == 0 and rows[0][0] != stamp):
+            stamps = sorted(self.poses.get(source, ()))
+            if not stamps or not stamps[0] <= stamp <= stamps[-1]:
                 return None
-            first, last = np.array(rows[max(after - 1, 0)][1:]), np.array(rows[after][1:])
-            passed, step = stamp - rows[after - 1][0], rows[after][0] - rows[after - 1][0]
-            change = last - first
-            change[2] = np.angle(np.exp(1j * change[2]))
-            x, y, yaw = first + change * (passed / step if after else 0.0)
+            x, y, yaw = np.array([self.poses[source][at] for at in stamps]).T
+            passed = np.array(stamps) - stamp
+            x, y, yaw = (np.interp(0.0, passed, values) for values in (x, y, np.unwrap(yaw)))
             cosine, sine = np.cos(yaw), np.sin(yaw)
             turned = cosine * pose[0] - sine * pose[1], sine * pose[0] + cosine * pose[1]
             pose = np.array([x + turned[0], y + turned[1], yaw + pose[2]])
@@ -101,7 +97,7 @@ def test_no_lookup_fails_and_the_yaw_error_fits_its_variance(ros: Ros, anchors: 
         while transforms:
             for transform in transforms.pop(0).transforms:
                 buffer.add(transform)
-        return buffer.rows[frame][-1][0] if frame in buffer.rows else 0
+        return max(buffer.poses.get(frame, (0,)))
 
     for step in range(round(SECONDS * RATE_HZ) // 5):
         rows = range(5 * step, 5 * step + 5)

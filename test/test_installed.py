@@ -248,9 +248,6 @@ def test_every_ros_package_that_is_imported_is_declared_and_no_other():
     assert tested <= declared | {entry.name for entry in manifest.test_depends}
 
 
-# rosdep keys that are not `python3-` and the name of the distribution; None: no key, or the version is too old.
-
-
 def test_every_interface_that_the_messages_use_is_declared():
     package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
     manifest = package.parse_package(str(REPOSITORY / "msg_defs"))

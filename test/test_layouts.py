@@ -130,20 +130,6 @@ def test_layouts_show_several_tags(path: str):
     assert all(topic in text for topic in TAGS)
 
 
-def test_layouts_use_the_colours_of_the_page():
-    known = {look.colour for look in palette.STATUS_LOOKS.values()} | set(palette.TRACK_COLOURS.values())
-    known |= {palette.PAPER, palette.NIGHT, palette.GREY}
-    texts = [(REPOSITORY / path).read_text() for path in ("foxglove/uwb.json", "plotjuggler/uwb.xml")]
-    used = {colour[:7] for text in texts for colour in re.findall(r"#[0-9a-f]{6}", text)}
-    rviz = (REPOSITORY / "rviz" / "uwb.rviz").read_text()
-    used |= {
-        "#" + "".join(f"{int(part):02x}" for part in parts)
-        for parts in re.findall(r"Color: (\d+); (\d+); (\d+)", rviz)
-    }
-    assert len(used) > 4
-    assert used <= known
-
-
 def test_plotjuggler_shows_fields_of_the_topics():
     root = ElementTree.parse(REPOSITORY / "plotjuggler" / "uwb.xml").getroot()
     functions = {snippet.get("name") for snippet in root.iter("snippet")}

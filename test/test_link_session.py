@@ -293,6 +293,7 @@ def test_reopening_the_port_ends_the_connection_and_discards_a_partial_frame():
 
     assert bench.session.opened(bench.now) == [Disconnected(Loss.CLOSED)]
     assert bench.host_hears(data[100:]) == []
+    assert bench.session.counts["withheld"] == 0
 
 
 def test_clock_is_synchronised_quickly_and_then_every_second():

@@ -91,9 +91,6 @@ def test_tag_and_anchor_on_usb_recover_from_unplugging(boards: tuple[EmulatedEvb
         assert anchor.openings > openings
         wait_until(lambda: not tag.report().warning)
 
-        tag.apply(settings(f"{prefix}0", window=16))
-        events.wait_for(lambda event: isinstance(event, RangeMeasurement) and len(event.cir) == 16)
-
 
 def test_board_that_modem_manager_has_written_to_is_opened(boards: tuple[EmulatedEvb1000s, Path]):
     _, prefix = boards

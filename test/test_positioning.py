@@ -171,8 +171,9 @@ def test_covariances_of_live_estimates_are_consistent():
     assert np.mean([e.exceeded for e in found]) < 0.01
 
 
-def test_ambiguous_position_is_not_published_until_an_area_resolves_it():
-    wall = AnchorMap([Anchor(1, (0, 0, 1)), Anchor(2, (10, 0, 1)), Anchor(3, (5, 0, 1.0))])
+@pytest.mark.parametrize("anchors", [2, 3])
+def test_ambiguous_position_is_not_published_until_an_area_resolves_it(anchors: int):
+    wall = AnchorMap([Anchor(number, (5 * number, 0, 1)) for number in range(anchors)])
     ranges, truth = drive(wall, seconds=8)
     locator = TagEstimator(EstimatorConfig(wall, height=Height(1.0)))
     assert len(locator.run(ranges)) == 0

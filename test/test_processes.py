@@ -16,10 +16,6 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 TIMEOUT_S = 240.0
-RUNS = {
-    "bench": ["-m", "benchmarks", "nodes"],
-    "demo": ["-m", "benchmarks", "demo"],
-}
 
 
 def nodes_of(pid: int) -> list[psutil.Process]:
@@ -34,16 +30,15 @@ def nodes_of(pid: int) -> list[psutil.Process]:
 
 @pytest.mark.ros
 @pytest.mark.parametrize(
-    ("run", "number", "code"),
-    [("bench", signal.SIGKILL, -9), ("demo", signal.SIGTERM, 143), ("demo", signal.SIGINT, 130)],
+    ("program", "number", "code"),
+    [("nodes", signal.SIGKILL, -9), ("demo", signal.SIGTERM, 143), ("demo", signal.SIGINT, 130)],
 )
-def test_nodes_end_with_their_parent_process(run: str, number: signal.Signals, code: int, tmp_path: Path):
+def test_nodes_end_with_their_parent_process(program: str, number: signal.Signals, code: int, tmp_path: Path):
     # Each process isolates itself.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("ROS_")}
     with (tmp_path / "said").open("wb") as said:
-        running = subprocess.Popen(
-            [sys.executable, *RUNS[run]], env=environment, stdout=said, stderr=subprocess.STDOUT
-        )
+        command = [sys.executable, "-m", "benchmarks", program]
+        running = subprocess.Popen(command, env=environment, stdout=said, stderr=subprocess.STDOUT)
     try:
         deadline = time.monotonic() + TIMEOUT_S
         while len(nodes := nodes_of(running.pid)) < 2:

@@ -17,7 +17,6 @@ from uwb_mitigation.radios.settings import PREAMBLES, RadioSettings, Role
 pytestmark = NEEDS_CC
 
 WRAP = 1 << 40
-LOST = ("no_answer", "late", "timeout", "damaged", "implausible", "broken")
 
 
 def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np.ndarray:
@@ -31,12 +30,14 @@ def accumulator(samples: int = 1016, first_path: int = 745, seed: int = 0) -> np
 
 
 def pair(
-    air: ModelledAir, channel: Pair, /, ppm: tuple[float, float] = (20, -20), **settings: object
+    air: ModelledAir, channel: Pair, /, ppm: tuple[float, float] = (20, -20), anchor=None, **settings: object
 ) -> tuple[int, int]:
+    """Add a tag, and an anchor with the same settings except for those in `anchor`."""
     tag = air.add(RadioSettings(**settings), ppm=ppm[0], clock_ticks=WRAP - 3 * 10**9)
-    anchor = air.add(RadioSettings(**settings | {"role": Role.ANCHOR}), ppm=ppm[1], clock_ticks=12345)
-    air.set_pair(tag, anchor, channel)
-    return tag, anchor
+    of_anchor = RadioSettings(**settings | {"role": Role.ANCHOR} | (anchor or {}))
+    boards = tag, air.add(of_anchor, ppm=ppm[1], clock_ticks=12345)
+    air.set_pair(*boards, channel)
+    return boards
 
 
 def ranges_of(channel: Pair, seconds: float, **settings: object) -> tuple[np.ndarray, np.ndarray]:
@@ -49,17 +50,6 @@ def ranges_of(channel: Pair, seconds: float, **settings: object) -> tuple[np.nda
 
 def test_row_of_results_is_that_of_the_compiler():
     assert modelled._library().radio_air_result_bytes() == modelled.RANGE.itemsize
-
-
-@pytest.mark.parametrize("ppm", [(-20, 20), (0, 0), (20, -20)])
-@pytest.mark.parametrize("distance_m", [0.3, 5.01, 100.0])
-def test_ranges_are_exact_for_any_clock_error_and_across_the_wrap(ppm, distance_m: float):
-    rows, _ = ranges_of(Pair(distance_m), 0.5, ppm=ppm)
-    assert len(rows) > 100
-    assert rows["device_time"].min() < 1e9 < WRAP - 4e9 < rows["device_time"].max(), "the counter has wrapped"
-    errors_m = rows["range_m"] - distance_m
-    assert abs(errors_m.mean()) <= 0.005
-    assert errors_m.std() <= 0.005
 
 
 @pytest.mark.parametrize("window", [0, 157, 1016])
@@ -116,9 +106,7 @@ def test_every_channel_rate_and_preamble_ranges(radio: dict[str, object]):
 def test_radios_that_differ_in_the_channel_or_the_network_do_not_range():
     for peer in ({"channel": 2}, {"prf_mhz": 16}, {"pan": 1}, {"preamble_code": 10}):
         with ModelledAir() as air:
-            tag = air.add(RadioSettings())
-            anchor = air.add(RadioSettings(role=Role.ANCHOR, **peer))
-            air.set_pair(tag, anchor, Pair(3))
+            tag, _ = pair(air, Pair(3), anchor=peer)
             air.run(0.3)
             assert air.counts(tag)["tried"] == 0
             assert air.counts(tag)["restarts"] <= 1
@@ -168,13 +156,11 @@ def test_tags_share_the_channel_without_mixing_ranges():
 def test_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
     iq = accumulator(seed=3)
     with ModelledAir() as air:
-        tag = air.add(RadioSettings(window=0))
-        anchor = air.add(RadioSettings(role=Role.ANCHOR, report=True))
-        air.set_pair(tag, anchor, Pair(9, samples=iq, first_path_index=745.0))
+        boards = pair(air, Pair(9, samples=iq, first_path_index=745.0), anchor={"report": True})
         air.run(0.2)
         rows, store = air.ranges()
-        addresses = air.address(tag), air.address(anchor)
-    excerpt = rows[rows["board"] == anchor]
+        addresses = tuple(map(air.address, boards))
+    excerpt = rows[rows["board"] == boards[1]]
     assert len(excerpt) > 20
     assert abs(excerpt["range_m"] - 9).max() < 0.02
     assert {(row["tag"], row["anchor"]) for row in excerpt} == {addresses}
@@ -182,12 +168,7 @@ def test_anchor_with_a_host_reports_the_range_with_the_cir_of_final():
 
 
 def test_missing_antenna_delay_appears_in_the_range():
-    with ModelledAir() as air:
-        tag = air.add(RadioSettings(antenna_delay=2 * 16436 - 400))
-        anchor = air.add(RadioSettings(role=Role.ANCHOR))
-        air.set_pair(tag, anchor, Pair(5))
-        air.run(0.1)
-        rows, _ = air.ranges()
+    rows, _ = ranges_of(Pair(5), 0.1, antenna_delay=2 * 16436 - 400, anchor={"antenna_delay": 0})
     # Half of the missing delay of one device, as distance: 2.346 mm per tick.
     assert abs(rows["range_m"].mean() - 5 - 400 * 0.0046917639 / 2) < 0.005
 
@@ -199,27 +180,3 @@ def test_power_dependent_bias_is_corrected_if_enabled():
     table = [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86]
     bias_m = np.interp(-true_dbm, np.arange(61, 97, 2), table) / 1000
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
-
-
-def test_reset_or_unreachable_chip_recovers_within_a_second_without_wrong_ranges():
-    random = np.random.default_rng(4)
-    channel = Pair(8, loss=0.1, damage=0.01)
-    with ModelledAir(7) as air:
-        tag, anchor = pair(air, channel, window=0)
-        air.run(1)
-        for step in range(30):
-            what = step % 3
-            if what == 2:
-                air.set_pair(tag, anchor, None)
-                air.run(random.uniform(0.05, 1))
-                air.set_pair(tag, anchor, channel)
-            else:
-                air.reset((tag, anchor)[what])
-            air.ranges()
-            air.run(1 + random.uniform(0, 0.01))
-            rows, _ = air.ranges()
-            assert len(rows), f"nothing within a second after {('tag', 'anchor', 'link')[what]}"
-            assert abs(rows["range_m"] - 8).max() < 0.1
-        counts = air.counts(tag)
-    assert counts["tried"] - counts["ranged"] - sum(counts[name] for name in LOST) in (0, 1)
-    assert counts["restarts"] >= 10

@@ -23,8 +23,7 @@ from uwb_mitigation.types.measurement import RangeMeasurement
 pytestmark = NEEDS_CC
 
 ANCHOR_ADDRESS = 0xA000000000000001
-SYS_CFG, SYS_CTRL, SYS_STATUS, TX_POWER = 0x04, 0x0D, 0x0F, 0x1E
-CPLOCK = 0x02
+SYS_CTRL, SYS_STATUS, CPLOCK = 0x0D, 0x0F, 0x02
 DEFAULT = RadioSettings()
 
 
@@ -244,6 +243,22 @@ class StickyStatusBus(ModelBus):
 def test_driver_clears_the_reception_status(air: Air):
     run = Run(air, bus=StickyStatusBus)
     assert len(run.ranges) > 10
+    assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in run.ranges)
+
+
+@pytest.mark.parametrize(
+    ("radio", "edge_loss", "count"),
+    [
+        ({}, 0.2, 6),
+        # The default delays grow with the length of the frames.
+        *(({"rate_kbps": 110, "preamble": preamble}, 0.0, 3) for preamble in (1024, 4096)),
+    ],
+)
+def test_frames_without_a_leading_edge_or_long_ones_yield_no_wrong_range(
+    air: Air, radio: dict[str, int], edge_loss: float, count: int
+):
+    run = Run(air, RadioSettings(**radio), seconds=0.6, prepare=lambda chip: chip.set_edge_loss(edge_loss))
+    assert len(run.ranges) >= count
     assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in run.ranges)
 
 

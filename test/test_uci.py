@@ -162,6 +162,9 @@ def test_a_range_notification_of_a_real_board_is_parsed():
     (record,) = message.content.records
     assert (message.content.handle, message.content.sequence) == (1, 7)
     assert (record.peer, record.status, record.range_m, record.rssi_dbm) == (2, 0, 2.10, -78.0)
+    messages.parse_ranges(RANGE + b"\0")
+    with pytest.raises(LinkError):
+        messages.parse_ranges(RANGE + RANGE_PACKET)
 
 
 @pytest.mark.parametrize(("position", "value"), [(27, b"\x21\xff"), (29, b"\xff\xff")])
@@ -359,6 +362,9 @@ def test_a_range_of_another_session_or_peer_is_ignored():
     run.step(ms=500)
     assert not run.measured_ranges
     assert run.session.counts["unknown_session"] >= 2
+    port = UciPort(UciPortSettings(PortAddress("/dev/no"), run.session.settings), (0, None, print, lambda: 0))
+    port.session = run.session
+    assert port.report().warning.startswith("the only ranges are of other addresses")
 
 
 def test_ranges_are_published_in_order_and_soon_after_a_lost_cir():

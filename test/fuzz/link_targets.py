@@ -1,6 +1,6 @@
 """Fuzz targets of the link: whatever bytes a board or a channel makes up, nothing fails, hangs or grows.
 
-`test_link_fuzz.py` runs them briefly with Hypothesis, `fuzz_link.py` for long and guided by coverage.
+`test_link_framing.py` runs them briefly with Hypothesis, `fuzz_link.py` for long and guided by coverage.
 """
 
 from __future__ import annotations
