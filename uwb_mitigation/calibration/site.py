@@ -24,7 +24,6 @@ from uwb_mitigation.calibration.held_out import (
 )
 from uwb_mitigation.calibration.site_data import SiteData, read_site
 from uwb_mitigation.calibration.solution import (
-    MAX_OFFSET_SD_M,
     NONE,
     ONE,
     PAIR,
@@ -64,10 +63,8 @@ error of another drive by 4 % (simulated site 219)."""
 HEIGHT_SD_M = 0.1
 """Standard deviation of measured heights for the locator of a test."""
 
-COMMON, OFFSETS = "common offset", "offsets"
-"""What is subtracted: one offset from all ranges, or one from the ranges of each pair."""
-
-_LEVELS = {COMMON: ONE, OFFSETS: PAIR}
+COMMON = "common offset"
+"""The correction that subtracts one offset from all ranges."""
 
 SHIPPED = "shipped model alone"
 """The universal network without offsets: what is used without a calibration."""
@@ -79,7 +76,7 @@ class SiteCalibration:
 
     Attributes:
         site: recorded data. solution: true ranges and offsets.
-        data: the ranges of `solution.rows`, with the offsets subtracted. raw_error_m: their errors as measured, (n,).
+        data: the ranges of `solution.rows`, with the offsets subtracted.
         held_out: errors of `raw` and of each correction on the halves of the drive, each corrected by the other half, and on
             each drive of the check.
         baseline: what is used without a calibration: `SHIPPED` if it applies, otherwise `raw`.
@@ -90,7 +87,6 @@ class SiteCalibration:
     site: SiteData
     solution: SiteSolution
     data: Dataset
-    raw_error_m: NDArray[np.float64]
     held_out: tuple[HeldOut, ...]
     baseline: str
     chosen: str
@@ -113,6 +109,12 @@ class SiteCalibration:
             pair: (common_m, math.hypot(sd, value - common_m))
             for pair, (value, sd) in self.solution.pairs.items()
         }
+
+    @property
+    def raw_error_m(self) -> NDArray[np.float64]:
+        """Return the errors of the ranges of `data` as measured, (n,), m."""
+        error_m: NDArray[np.float64] = self.site.ranges.range_m[self.solution.rows] - self.solution.true_m
+        return error_m
 
     @property
     def held_out_error_m(self) -> NDArray[np.float64]:
@@ -138,27 +140,21 @@ class SiteCalibration:
     def live_position_change(self) -> float:
         """Return the promised change of the live position error on another drive, relative to the baseline; NaN: unknown.
 
-        It is the upper end of an interval. The locator estimates the common offset itself, so that the promise without ground
-        truth is that of the other corrections.
+        It is the upper end of an interval. The locator estimates the common offset itself, so that without ground truth only
+        offsets of single anchors promise a change.
         """
         if self.solution.truth is not None:
             return -min(
                 errors.live_gain(self.chosen, self.baseline).low for errors in decisive(self.held_out)
             )
-        common = COMMON if self.baseline == RAW else _name(COMMON, models.NETWORK)
-        gain = min(errors.range_gain(self.chosen, common).low for errors in self.held_out)
+        if self.level == ONE:
+            return 0.0
+        gain = min(errors.range_gain(self.chosen, COMMON).low for errors in self.held_out)
         return -PROMISED_SHARE * max(gain, 0.0)
 
     @property
     def refusal(self) -> str:
         """Return why the calibration does not help; empty: it does."""
-        for (tag, anchor), (value, sd) in self.pairs.items():
-            # The common offset is not that of an anchor that differs from it.
-            if self.solution.truth is None and sd > MAX_OFFSET_SD_M:
-                return (
-                    f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is unknown: {value:.2f} m with a standard "
-                    f"deviation of {sd:.2f} m"
-                )
         for errors in self.held_out:
             drive = "on the drive of the check " if errors is not self.held_out[0] else ""
             if errors.live_gain(self.chosen, self.baseline).mean < -MAX_INCREASE:
@@ -343,41 +339,32 @@ def calibrate_site(
     folds = _Fold(*first, second), _Fold(*second, first)
     checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
 
-    notes, kinds = list(solution.notes), [models.NO_MODEL, models.LINE]
-    without = {RAW: (NONE, models.NO_MODEL)}
+    notes = list(solution.notes)
+    corrections = {RAW: (NONE, models.NO_MODEL)}
     if site.has_cirs:
-        without[SHIPPED] = NONE, models.NETWORK
-        kinds = [models.NETWORK]
+        corrections[SHIPPED] = NONE, models.NETWORK
         if without_cir := int((~site.is_usable).sum()):
             notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
     else:
         notes.append("no networks: the recording has no CIRs that the universal model was trained for")
-    if solution.truth is None:
-        # A line in the received power does not transfer to other drives.
-        kinds = kinds[:1]
-    with_model = {_name(level, kind): (_LEVELS[level], kind) for kind in kinds for level in _LEVELS}
-    corrections = without | {COMMON: (ONE, models.NO_MODEL)} | with_model
+    baseline = list(corrections)[-1]
+    candidates = {_name(level, kind): (level, kind) for level, kind in _candidates(site, solution)}
+    corrections |= candidates
     first_half, second_half = (
         fold.evaluate(universal, corrections, is_separate=is_separate) for fold in folds
     )
     drives = (fold.evaluate(universal, corrections, is_separate=True) for fold in checks)
     held_out = [first_half.merged(second_half, is_first), *drives]
-    names = [COMMON, *with_model]
-    if solution.truth is None:
-        # What the network leaves behind walls looks like offsets of anchors, on each drive the same.
-        is_common_only = site.has_cirs or bool(solution.offsets_refused)
-        names = list(with_model)[: 1 if is_common_only else None]
-    chosen = select(held_out, list(dict.fromkeys(names)))
-    level, kind = corrections[chosen]
-    data, raw_error_m = _labelled(site, solution, level)
+    chosen = select(held_out, list(candidates))
+    level, kind = candidates[chosen]
+    data = _labelled(site, solution, level)
     on_test(1.0)
     return SiteCalibration(
         site=site,
         solution=solution,
         data=data,
-        raw_error_m=raw_error_m,
         held_out=tuple(held_out),
-        baseline=list(without)[-1],
+        baseline=baseline,
         chosen=chosen,
         level=level,
         model=models.fit_model(kind, data),
@@ -405,8 +392,7 @@ class _Fold:
         block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         for name, (level, kind) in corrections.items():
-            data, _ = _labelled(training_site, solution, level)
-            model = models.fit_model(kind, data)
+            model = models.fit_model(kind, _labelled(training_site, solution, level))
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
             range_m = site.ranges.range_m - predicted_m
             # Without ground truth the reference of ranges without offsets contains no common offset, because the locator
@@ -453,8 +439,22 @@ class _Fold:
         return error_m
 
 
-def _name(offsets: str, kind: str) -> str:
+def _candidates(site: SiteData, solution: SiteSolution) -> list[tuple[str, str]]:
+    """Return (level of the offsets, kind of the model) of the corrections that can be selected, in order of complexity."""
+    if solution.truth is not None:
+        levels = (ONE,) if site.has_cirs else (ONE, PAIR)
+        model = models.NETWORK if site.has_cirs else models.LINE
+        return [*((level, models.NO_MODEL) for level in levels), (ONE, model), (PAIR, model)]
+    if site.has_cirs:
+        # What the network leaves behind walls looks like offsets of anchors, on each drive the same.
+        return [(ONE, models.NETWORK)]
+    # A line in the received power does not transfer to other drives.
+    return [(ONE, models.NO_MODEL), *([] if solution.offsets_refused else [(PAIR, models.NO_MODEL)])]
+
+
+def _name(level: str, kind: str) -> str:
     """Return the name of a correction: what is subtracted, and the kind of the model."""
+    offsets = COMMON if level == ONE else "offsets"
     return f"{offsets} + {kind}" if kind else offsets
 
 
@@ -482,10 +482,9 @@ def _offsets_m(site: SiteData, offsets: Offsets) -> NDArray[np.float64]:
     return offsets.lookup(tag_ids, anchor_ids).astype(np.float64)
 
 
-def _labelled(site: SiteData, solution: SiteSolution, level: str) -> tuple[Dataset, NDArray[np.float64]]:
-    """Return the ranges of `solution.rows` with the offsets subtracted, and their errors as measured, (n,), m."""
+def _labelled(site: SiteData, solution: SiteSolution, level: str) -> Dataset:
+    """Return the ranges of `solution.rows` with the offsets subtracted."""
     raw = site.to_dataset(
         solution.rows, solution.true_m, solution.segment, solution.stationary[solution.segment]
     )
-    offsets_m = _offsets_m(site, solution.offsets(level))[solution.rows]
-    return raw.shifted(-offsets_m), raw.error_m
+    return raw.shifted(-_offsets_m(site, solution.offsets(level))[solution.rows])

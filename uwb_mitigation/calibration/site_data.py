@@ -155,6 +155,7 @@ class SiteData:
             anchors=anchor_ids[ranges.anchor],
             radios=self.sources.radios,
             segments=self.sources.segments,
+            channels=self.sources.channels,
         )
 
 

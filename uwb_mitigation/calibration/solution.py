@@ -226,7 +226,8 @@ class _RangesOnly:
                 valid=remedy,
             )
         for (tag, anchor), (value, sd) in self._pairs.items():
-            if sd > MAX_OFFSET_SD_M:
+            # With CIRs, only the common offset is subtracted.
+            if sd > MAX_OFFSET_SD_M and not self._site.has_cirs:
                 raise DatasetError(
                     f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is not observable: {value:.2f} m with a "
                     f"standard deviation of {sd:.2f} m",
