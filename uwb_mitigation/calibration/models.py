@@ -39,18 +39,12 @@ class SiteModel:
         return np.where(np.isfinite(predicted_m), predicted_m, 0.0)
 
 
-def fit_model(kind: str, data: Dataset) -> SiteModel:
-    """Fit a model.
-
-    Args:
-        kind: one of the names above.
-        data: ranges with the offsets subtracted.
+def fit_line(data: Dataset) -> SiteModel:
+    """Fit a line to ranges with the offsets subtracted.
 
     Raises:
         DatasetError: the fit fails.
     """
-    if kind != LINE:
-        return SiteModel(LinearBiasModel(0.0), has_network=kind == NETWORK)
     has_gap = bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
     first_path_dbm = data.first_path_power_dbm if has_gap else None
     return SiteModel(

@@ -38,6 +38,7 @@ from uwb_mitigation.mitigation.correction import CorrectionRule
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
@@ -76,7 +77,6 @@ class SiteCalibration:
 
     Attributes:
         site: recorded data. solution: true ranges and offsets.
-        data: the ranges of `solution.rows`, with the offsets subtracted.
         held_out: errors of `raw` and of each correction on the halves of the drive, each corrected by the other half, and on
             each drive of the check.
         baseline: what is used without a calibration: `SHIPPED` if it applies, otherwise `raw`.
@@ -86,7 +86,6 @@ class SiteCalibration:
 
     site: SiteData
     solution: SiteSolution
-    data: Dataset
     held_out: tuple[HeldOut, ...]
     baseline: str
     chosen: str
@@ -112,13 +111,13 @@ class SiteCalibration:
 
     @property
     def raw_error_m(self) -> NDArray[np.float64]:
-        """Return the errors of the ranges of `data` as measured, (n,), m."""
+        """Return the errors of the ranges of `solution.rows` as measured, (n,), m."""
         error_m: NDArray[np.float64] = self.site.ranges.range_m[self.solution.rows] - self.solution.true_m
         return error_m
 
     @property
     def held_out_error_m(self) -> NDArray[np.float64]:
-        """Return the held-out errors of the ranges of `data`, corrected by the chosen correction, (n,), m; NaN: unknown."""
+        """Return the held-out errors of these ranges, corrected by the chosen correction, (n,), m; NaN: unknown."""
         return self.held_out[0].residual_m[self.chosen][self.solution.rows]
 
     @property
@@ -208,10 +207,9 @@ class SiteCalibration:
             "chosen": self.chosen,
             "candidates": {name: mae_m for name, mae_m in self.mae_m.items() if name != RAW},
             "ranges": sum(map(len, self.site.tags)),
-            "labelled": len(self.data),
+            "labelled": len(solution.rows),
             "outliers": solution.outliers,
             "line": model.linear_bias,
-            "positions": solution.stationary_positions,
             "notes": self.notes,
             "skipped": self.site.skipped,
             "localisation": solution.alignment,
@@ -234,8 +232,7 @@ class SiteCalibration:
             "data": f"{name}, calibrated {method}",
             "calibrated": method,
             "chosen": self.chosen,
-            "measurements": len(self.data),
-            "configurations": len(self.data.names),
+            "measurements": len(self.solution.rows),
             "split": "held out: halves of the drive",
             "started_from": f"{universal.model_id:08x}",
             "recipe": {"line": model.linear_bias.needs_power, "network": model.has_network},
@@ -250,9 +247,10 @@ class SiteCalibration:
         network = universal.model
         if model.is_line:
             network = graph.float_model(scaled(float_network(universal), 0.0))
-            fitted = output.stem, universal.architecture, self.data, model.linear_bias
+            data = _labelled(self.site, self.solution, self.level)
+            fitted = output.stem, universal.architecture, data, model.linear_bias
             card = replace(
-                card_of(*fitted, self.data, self.held_out_error_m, training), needs_cir=False, quantised=False
+                card_of(*fitted, data, self.held_out_error_m, training), needs_cir=False, quantised=False
             )
         bundle, content = build_bundle(output, network, card)
         offsets_path = offsets_file(output)
@@ -357,17 +355,15 @@ def calibrate_site(
     held_out = [first_half.merged(second_half, is_first), *drives]
     chosen = select(held_out, list(candidates))
     level, kind = candidates[chosen]
-    data = _labelled(site, solution, level)
     on_test(1.0)
     return SiteCalibration(
         site=site,
         solution=solution,
-        data=data,
         held_out=tuple(held_out),
         baseline=baseline,
         chosen=chosen,
         level=level,
-        model=models.fit_model(kind, data),
+        model=_fit(kind, site, solution, level),
         notes=tuple(notes),
     )
 
@@ -392,7 +388,7 @@ class _Fold:
         block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         for name, (level, kind) in corrections.items():
-            model = models.fit_model(kind, _labelled(training_site, solution, level))
+            model = _fit(kind, training_site, solution, level)
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
             range_m = site.ranges.range_m - predicted_m
             # Without ground truth the reference of ranges without offsets contains no common offset, because the locator
@@ -482,9 +478,15 @@ def _offsets_m(site: SiteData, offsets: Offsets) -> NDArray[np.float64]:
     return offsets.lookup(tag_ids, anchor_ids).astype(np.float64)
 
 
+def _fit(kind: str, site: SiteData, solution: SiteSolution, level: str) -> models.SiteModel:
+    """Return a model of this kind for ranges with the offsets subtracted."""
+    if kind == models.LINE:
+        return models.fit_line(_labelled(site, solution, level))
+    return models.SiteModel(LinearBiasModel(0.0), has_network=kind == models.NETWORK)
+
+
 def _labelled(site: SiteData, solution: SiteSolution, level: str) -> Dataset:
     """Return the ranges of `solution.rows` with the offsets subtracted."""
-    raw = site.to_dataset(
-        solution.rows, solution.true_m, solution.segment, solution.stationary[solution.segment]
-    )
-    return raw.shifted(-_offsets_m(site, solution.offsets(level))[solution.rows])
+    rows, segment = solution.rows, solution.segment
+    offset_m = _offsets_m(site, solution.offsets(level))[rows]
+    return site.to_dataset(rows, solution.true_m, offset_m, segment, solution.stationary[segment])

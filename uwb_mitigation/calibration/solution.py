@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -84,8 +83,6 @@ class SiteSolution:
         height: height with which the locator runs at this site, if it is constant.
         antenna_position: with ground truth the true position of the antenna at each range, (r, 3), m; NaN: unknown.
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
-        stationary_positions: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several
-            positions.
     """
 
     rows: NDArray[np.intp]
@@ -104,7 +101,6 @@ class SiteSolution:
     antenna_position: NDArray[np.float64]
     track: NDArray[np.float64]
     track_of: NDArray[np.intp]
-    stationary_positions: Mapping[str, tuple[float, float, float]]
     offsets_refused: str = ""
     offset_share: float = 1.0
 
@@ -266,7 +262,6 @@ class _RangesOnly:
             antenna_position=np.full((len(self._site.is_usable), 3), np.nan),
             track=calibration.fit.position,
             track_of=observations.knot_segment,
-            stationary_positions=_stationary_positions(calibration),
         )
 
     def _offsets_refused(self, has_truth: NDArray[np.bool_]) -> str:
@@ -364,7 +359,6 @@ def solve_with_truth(
         antenna_position=alignment.position,
         track=alignment.position[rows],
         track_of=segment,
-        stationary_positions={},
     )
 
 
@@ -436,24 +430,6 @@ def regressors(site: SiteData, *, has_truth: bool) -> Regressors:
             centred = np.where(is_known, value - np.median(value[is_known]), 0.0)
             columns.append(Regressors.single(name, centred, 0.0, SLOPE_SD))
     return functools.reduce(Regressors.concat, columns)
-
-
-def _stationary_positions(calibration: SelfCalibration) -> dict[str, tuple[float, float, float]]:
-    """Return the positions of stationary tags, see `SiteSolution.stationary_positions`."""
-    stationary = np.flatnonzero(calibration.fit.observations.is_stationary).tolist()
-    tag_of_segment = dict(
-        zip(calibration.segments.segment.tolist(), calibration.segments.tag.tolist(), strict=True)
-    )
-    positions = Counter(tag_of_segment[segment] for segment in stationary)
-    number: Counter[int] = Counter()
-    named = {}
-    for segment in stationary:
-        tag = tag_of_segment[segment]
-        number[tag] += 1
-        suffix = f" #{number[tag]}" if positions[tag] > 1 else ""
-        x, y, z = calibration.fit.position[calibration.fit.observations.knot_segment == segment][0].tolist()
-        named[f"{calibration.tag_ids[tag]}{suffix}"] = (x, y, z)
-    return named
 
 
 def _without_outliers(
