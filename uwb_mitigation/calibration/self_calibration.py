@@ -80,13 +80,6 @@ class SelfCalibration:
         anchors = len(np.unique(self.fit.observations.anchor))
         return anchors >= self.fit.config.dims + MIN_REDUNDANT
 
-    def value(self, name: str) -> tuple[float, float]:
-        """Return a parameter and its standard deviation; (0, 0): it was not estimated."""
-        if name not in self.fit.prior.names:
-            return 0.0, 0.0
-        column = self.fit.prior.names.index(name)
-        return float(self.fit.parameters[column]), float(np.sqrt(self.fit.covariance[column, column]))
-
     def pairs(self) -> list[tuple[int, int]]:
         """Return (tag number, anchor row) of all pairs with ranges."""
         pairs = np.unique(np.stack([self.segments.tag, self.segments.ranges.anchor]), axis=1).T

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +27,6 @@ from uwb_mitigation.calibration.solution import (
     ONE,
     PAIR,
     Pairs,
-    Progress,
     SiteSolution,
     solve_without_truth,
 )
@@ -171,20 +169,11 @@ class SiteCalibration:
         return "raw ranges" if self.baseline == RAW else f"the {SHIPPED}"
 
     def summary(self) -> str:
-        """Return the result in a few sentences."""
-        truth, change, halves = self.solution.truth, self.live_position_change, self.held_out[0]
+        """Return the result in a sentence."""
+        change = self.live_position_change
         text = f"Compared with {self._baseline_text}, the live position error on another drive "
-        text += f"decreases by at least {-change:.0%}. " if change < 0.0 else "is not expected to change. "
-        compared = list(dict.fromkeys((RAW, self.baseline, self.chosen)))
-        if truth is not None:
-            errors = ", ".join(f"{halves.live_rmse_m(name):.3f} m {name}" for name in compared)
-            text += f"Live position error on held-out halves (against {truth}): {errors}. "
-        kind = "residual against the other anchors" if truth is None else f"error against {truth}"
-        errors = ", ".join(f"{halves.mae_m(name):.3f} m {name}" for name in compared)
-        text += f"Mean absolute range {kind}: {errors}."
-        if self.refusal:
-            text = f"Calibration does not help: {self.refusal}. " + text
-        return text
+        text += f"decreases by at least {-change:.0%}." if change < 0.0 else "is not expected to change."
+        return f"Calibration does not help: {self.refusal}. {text}" if self.refusal else text
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation calibrate`."""
@@ -304,7 +293,6 @@ def calibrate_site(
     solution: SiteSolution,
     *,
     check: Sequence[SiteData] = (),
-    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteCalibration:
     """Select a correction for the ranges of a solution, see `held_out.select`.
 
@@ -313,7 +301,6 @@ def calibrate_site(
         universal: bundle that the models start from.
         solution: true ranges and offsets.
         check: other drives at the site, on which the correction must not be worse, either.
-        on_progress: called with the stage and the finished share of it, 0 to 1.
 
     Raises:
         DatasetError: too few ranges have a known true range, an offset is implausible, or a half of the drive does not
@@ -325,8 +312,6 @@ def calibrate_site(
             valid=f"at least {MIN_LABELLED}",
         )
     _check_offsets(solution.pairs)
-    on_test = functools.partial(on_progress, "testing on held-out ranges")
-    on_test(0.1)
     is_first, is_separate = site.halves()
     halves = [site.select(mask) for mask in (is_first, ~is_first)]
     try:
@@ -355,7 +340,6 @@ def calibrate_site(
     held_out = [first_half.merged(second_half, is_first), *drives]
     chosen = select(held_out, list(candidates))
     level, kind = candidates[chosen]
-    on_test(1.0)
     return SiteCalibration(
         site=site,
         solution=solution,

@@ -59,9 +59,6 @@ LEVEL_M = 0.3
 Pairs = Mapping[tuple[int, int], tuple[float, float]]
 """{(tag id, anchor id): (offset, standard deviation)}, m."""
 
-Progress = Callable[[str, float], None]
-"""Called with the current stage and the finished share of it, 0 to 1."""
-
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SiteSolution:
@@ -157,7 +154,6 @@ def solve_without_truth(
     height: Height | None,
     area: Area | None,
     height_sd_m: float = 0.1,
-    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteSolution:
     """Solve for true ranges and offsets from ranges only, without ground truth.
 
@@ -166,7 +162,6 @@ def solve_without_truth(
         height: height of all tags, if constant.
         area: area of the tags.
         height_sd_m: standard deviation of measured heights, m.
-        on_progress: see `Progress`.
 
     Raises:
         DatasetError: the solution is not observable, or an anchor position in the file is wrong.
@@ -188,11 +183,8 @@ def solve_without_truth(
     def solve_part(data: SiteData) -> SiteSolution:
         return solve(data, offset_m).solution(solve_part)
 
-    stage = "estimating track and offsets"
-    on_progress(stage, 0.1)
     complete = solve(site, None)
     offset_m = complete.checked_offset_m()
-    on_progress(stage, 1.0)
     return complete.solution(solve_part)
 
 
@@ -294,7 +286,6 @@ def solve_with_truth(
     *,
     height: Height | None = None,
     is_part: bool = False,
-    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteSolution:
     """Solve for true ranges and offsets with the poses of a localisation.
 
@@ -303,15 +294,11 @@ def solve_with_truth(
         localisation: poses of the robot.
         height: height of the tags, if constant, with which the locator will run.
         is_part: the site was already solved for more ranges.
-        on_progress: see `Progress`.
 
     Raises:
         DatasetError: another lever arm, or other anchor positions, explain the ranges much better; or too few ranges are
             within the times of the localisation.
     """
-    stage = "estimating time offset and lever arm"
-    if not is_part:
-        on_progress(stage, 0.1)
     localisation = localisation.select([tag.tag_id for tag in site.tags])
     paths = [
         PosePath.joined([path.shifted(by_ns) for path, by_ns in zip(paths, site.shift_ns, strict=True)])
@@ -331,7 +318,6 @@ def solve_with_truth(
         # With outliers: many ranges of swapped anchors are some.
         hypotheses = AnchorHypotheses(site.anchors, site.ranges, alignment.position, site.tag)
         hypotheses.check("the localisation", is_independent=True)
-        on_progress(stage, 1.0)
     aligned = replace(
         localisation,
         time_offset_s=alignment.time_offset_s,

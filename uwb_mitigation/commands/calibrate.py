@@ -126,21 +126,20 @@ def calibrate(
     try:
         gather = functools.partial(_gather, anchors=anchor_map, source=source, settings=settings)
         site, drives = gather(bags), [gather([bag]) for bag in check or []]
-        with console.stage_bars() as on_progress:
+        with console.stage_bars() as show_stage:
+            show_stage("estimating tracks and offsets", 0.0)
             if pose_options.topic is not None:
                 localisation = _localisation(bags, site, pose_options.topic, pose_options)
-                solution = solve_with_truth(
-                    site, localisation, height=settings.height, on_progress=on_progress
-                )
+                solution = solve_with_truth(site, localisation, height=settings.height)
             else:
                 solution = solve_without_truth(
                     site,
                     height=settings.height,
                     area=settings.area,
                     height_sd_m=settings.height_sd_m,
-                    on_progress=on_progress,
                 )
-            calibration = calibrate_site(site, source, solution, check=drives, on_progress=on_progress)
+            show_stage("testing on held-out ranges", 0.0)
+            calibration = calibrate_site(site, source, solution, check=drives)
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
         refused: dict[str, object] = {
