@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.calibration import models
 from uwb_mitigation.calibration.held_out import (
     BLOCK_S,
     MAX_INCREASE,
@@ -42,6 +41,7 @@ from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
 from uwb_mitigation.training.fit.model_card import card_of
 from uwb_mitigation.types.anchors import AnyAnchors, as_anchors
 from uwb_mitigation.types.measurement import Record
@@ -65,8 +65,34 @@ HEIGHT_SD_M = 0.1
 COMMON = "common offset"
 """The correction that subtracts one offset from all ranges."""
 
+NO_MODEL, LINE, NETWORK = "", "line", "universal network"
+"""Offsets only; a line in the received power and, if it is known, the power gap; the universal network."""
+
 SHIPPED = "shipped model alone"
 """The universal network without offsets: what is used without a calibration."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteModel:
+    """A linear bias model, or if it `has_network` the universal network."""
+
+    linear_bias: LinearBiasModel
+    has_network: bool = False
+
+    @property
+    def is_line(self) -> bool:
+        """Whether it is a line in the received power."""
+        return self.linear_bias.needs_power
+
+    def correction_m(self, site: SiteData) -> NDArray[np.float64]:
+        """Return the predicted errors of all ranges, float64 (r,), m; 0 where a power that the line needs is unknown."""
+        if self.has_network:
+            return site.universal_m
+        line = self.linear_bias
+        # Without a power gap, the first-path power is not needed.
+        first_path_dbm = site.first_path_power_dbm if line.per_power_gap else site.rx_power_dbm
+        predicted_m = line.predict_m(site.rx_power_dbm, first_path_dbm).astype(np.float64)
+        return np.where(np.isfinite(predicted_m), predicted_m, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -88,7 +114,7 @@ class SiteCalibration:
     baseline: str
     chosen: str
     level: str
-    model: models.SiteModel
+    model: SiteModel
     notes: tuple[str, ...]
 
     @property
@@ -323,9 +349,9 @@ def calibrate_site(
     checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
 
     notes = list(solution.notes)
-    corrections = {RAW: (NONE, models.NO_MODEL)}
+    corrections = {RAW: (NONE, NO_MODEL)}
     if site.has_cirs:
-        corrections[SHIPPED] = NONE, models.NETWORK
+        corrections[SHIPPED] = NONE, NETWORK
         if without_cir := int((~site.is_usable).sum()):
             notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
     else:
@@ -423,13 +449,13 @@ def _candidates(site: SiteData, solution: SiteSolution) -> list[tuple[str, str]]
     """Return (level of the offsets, kind of the model) of the corrections that can be selected, in order of complexity."""
     if solution.truth is not None:
         levels = (ONE,) if site.has_cirs else (ONE, PAIR)
-        model = models.NETWORK if site.has_cirs else models.LINE
-        return [*((level, models.NO_MODEL) for level in levels), (ONE, model), (PAIR, model)]
+        model = NETWORK if site.has_cirs else LINE
+        return [*((level, NO_MODEL) for level in levels), (ONE, model), (PAIR, model)]
     if site.has_cirs:
         # What the network leaves behind walls looks like offsets of anchors, on each drive the same.
-        return [(ONE, models.NETWORK)]
+        return [(ONE, NETWORK)]
     # A line in the received power does not transfer to other drives.
-    return [(ONE, models.NO_MODEL), *([] if solution.offsets_refused else [(PAIR, models.NO_MODEL)])]
+    return [(ONE, NO_MODEL), *([] if solution.offsets_refused else [(PAIR, NO_MODEL)])]
 
 
 def _name(level: str, kind: str) -> str:
@@ -462,11 +488,14 @@ def _offsets_m(site: SiteData, offsets: Offsets) -> NDArray[np.float64]:
     return offsets.lookup(tag_ids, anchor_ids).astype(np.float64)
 
 
-def _fit(kind: str, site: SiteData, solution: SiteSolution, level: str) -> models.SiteModel:
+def _fit(kind: str, site: SiteData, solution: SiteSolution, level: str) -> SiteModel:
     """Return a model of this kind for ranges with the offsets subtracted."""
-    if kind == models.LINE:
-        return models.fit_line(_labelled(site, solution, level))
-    return models.SiteModel(LinearBiasModel(0.0), has_network=kind == models.NETWORK)
+    if kind != LINE:
+        return SiteModel(LinearBiasModel(0.0), has_network=kind == NETWORK)
+    data = _labelled(site, solution, level)
+    has_gap = bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
+    first_path_dbm = data.first_path_power_dbm if has_gap else None
+    return SiteModel(fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, data.error_m))
 
 
 def _labelled(site: SiteData, solution: SiteSolution, level: str) -> Dataset:
