@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -125,13 +124,7 @@ class SiteCalibration:
     @property
     def pairs(self) -> Pairs:
         """The offset of each pair that is subtracted, and its standard deviation, m."""
-        if self.level == PAIR:
-            return self.solution.subtracted
-        common_m = self.solution.common[0]
-        return {
-            pair: (common_m, math.hypot(sd, value - common_m))
-            for pair, (value, sd) in self.solution.pairs.items()
-        }
+        return self.solution.subtracted(self.level)
 
     @property
     def raw_error_m(self) -> NDArray[np.float64]:

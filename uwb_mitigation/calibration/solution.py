@@ -101,10 +101,13 @@ class SiteSolution:
     offsets_refused: str = ""
     offset_share: float = 1.0
 
-    @property
-    def subtracted(self) -> Pairs:
-        """What is subtracted from the ranges of each pair, and the standard deviation of its offset."""
+    def subtracted(self, level: str) -> Pairs:
+        """Return what is subtracted from the ranges of each pair with the level `ONE` or `PAIR`, and its standard deviation, m."""
         common_m = self.common[0]
+        if level == ONE:
+            return {
+                pair: (common_m, math.hypot(sd, value - common_m)) for pair, (value, sd) in self.pairs.items()
+            }
         return {
             pair: (common_m + self.offset_share * (value - common_m), sd)
             for pair, (value, sd) in self.pairs.items()
@@ -115,7 +118,7 @@ class SiteSolution:
         if level != PAIR:
             return Offsets(self.common[0] if level == ONE else 0.0)
         sds = {pair: sd for pair, (_, sd) in self.pairs.items() if math.isfinite(sd)}
-        values = {pair: value for pair, (value, _) in self.subtracted.items()}
+        values = {pair: value for pair, (value, _) in self.subtracted(PAIR).items()}
         return Offsets(self.common[0], pairs=values, pair_sd=sds)
 
 
