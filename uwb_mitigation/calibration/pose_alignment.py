@@ -77,13 +77,6 @@ class PoseAlignment:
     position: NDArray[np.float64]
     distance_m: NDArray[np.float64]
 
-    def pair(self, tag: int, row: int, anchor_sd_m: float) -> tuple[float, float]:
-        """Return the offset of a pair, m, and its standard deviation, which includes the anchor's position error."""
-        number = self.pairs.index((tag, row))
-        return float(self.offset_m[number]), math.hypot(
-            float(self.offset_sd_m[number]), anchor_sd_m / math.sqrt(2.0)
-        )
-
     def as_json(self) -> dict[str, object]:
         """Return values for JSON; null = not observable. Lever arm of the first tag, and of all tags by their ids."""
         arms = self.lever_arm_m.tolist()

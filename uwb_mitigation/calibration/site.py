@@ -196,11 +196,10 @@ class SiteCalibration:
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation calibrate`."""
-        solution, model, halves = self.solution, self.model, self.held_out[0]
+        solution, halves = self.solution, self.held_out[0]
         return {
             "offsets_m": {pair: value for pair, (value, _) in self.pairs.items()},
             "offset_sd_m": {pair: sd for pair, (_, sd) in self.pairs.items()},
-            "offsets_of": self.level,
             "live_position_change": self.live_position_change,
             "live_position_m": {name: halves.live_rmse_m(name) for name in halves.residual_m},
             "compared_with": self.baseline,
@@ -217,7 +216,6 @@ class SiteCalibration:
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(solution.rows),
             "outliers": solution.outliers,
-            "line": model.linear_bias,
             "notes": self.notes,
             "skipped": self.site.skipped,
             "localisation": solution.alignment,

@@ -375,12 +375,12 @@ def _check_lever_arm(site: SiteData, align: Callable[..., PoseAlignment], alignm
 
 
 def _aligned_offsets(site: SiteData, alignment: PoseAlignment) -> tuple[float, Pairs]:
-    """Return the common offset, m, and the offset of each pair."""
+    """Return the common offset, m, and the offset of each pair; its standard deviation includes the anchor's position error."""
+    offsets = zip(alignment.pairs, alignment.offset_m.tolist(), alignment.offset_sd_m.tolist(), strict=True)
+    placed_m = site.anchors.sd / math.sqrt(2.0)
     pairs = {
-        (site.tags[tag].tag_id, site.anchors.anchors[row].id): alignment.pair(
-            tag, row, float(site.anchors.sd[row])
-        )
-        for tag, row in alignment.pairs
+        (site.tags[tag].tag_id, site.anchors.anchors[row].id): (offset_m, math.hypot(sd_m, placed_m[row]))
+        for (tag, row), offset_m, sd_m in offsets
     }
     common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
     scatter_m = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
