@@ -352,16 +352,24 @@ def worse_live_position(held_out, chosen):
     return replace(held_out, live_m=held_out.live_m | {chosen: 2.0 * held_out.live_m["raw"]})
 
 
+def no_live_position(held_out, chosen):
+    return replace(held_out, live_m=held_out.live_m | {chosen: np.nan * held_out.live_m["raw"]})
+
+
 @pytest.mark.parametrize(
     ("change", "refusal"),
-    [(no_range_gain, "the ranges are not better"), (worse_live_position, "the live position is worse")],
+    [
+        (no_range_gain, "the ranges are not better than with raw ranges"),
+        (worse_live_position, "the live position is worse than with raw ranges"),
+        (no_live_position, "there are too few live positions to compare"),
+    ],
 )
 def test_calibration_is_refused_without_gain(located, change, refusal):
     calibration = located[1]
     assert not calibration.refusal
     held_out = calibration.held_out[0]
     worse = replace(calibration, held_out=(held_out, change(held_out, calibration.chosen)))
-    assert worse.refusal == f"on the drive of the check {refusal} than with raw ranges"
+    assert worse.refusal == f"on the drive of the check {refusal}"
 
 
 @pytest.mark.parametrize(("wrong", "match"), [(range(1, 8), "check the unit"), ([1], "and anchor 1;")])

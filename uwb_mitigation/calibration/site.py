@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -173,7 +174,10 @@ class SiteCalibration:
         """Return why the calibration does not help; empty: it does."""
         for errors in self.held_out:
             drive = "on the drive of the check " if errors is not self.held_out[0] else ""
-            if errors.live_gain(self.chosen, self.baseline).mean < -MAX_INCREASE:
+            live_gain = errors.live_gain(self.chosen, self.baseline).mean
+            if self.solution.truth is not None and math.isnan(live_gain):
+                return f"{drive}there are too few live positions to compare"
+            if live_gain < -MAX_INCREASE:
                 return f"{drive}the live position is worse than with {self._baseline_text}"
             if not errors.range_gain(self.chosen, self.baseline).mean >= MIN_GAIN:
                 return f"{drive}the ranges are not better than with {self._baseline_text}"
