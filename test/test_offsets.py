@@ -230,22 +230,15 @@ def test_board_subtracts_the_offsets_of_the_host_also_after_a_restart():
     assert not [event for event in pair.events if isinstance(event, Refused)]
 
 
-def test_older_board_is_reported_and_its_corrections_are_ignored():
-    pair = Pair(Offsets(0.25), OlderBoard)
+@pytest.mark.parametrize(("offsets", "refusals", "ranges"), [(Offsets(0.25), 1, []), (NO_OFFSETS, 0, [3.0])])
+def test_older_board_is_accepted_only_without_offsets(offsets: Offsets, refusals: int, ranges: list[float]):
+    pair = Pair(offsets, OlderBoard)
     for _ in range(MAX_TRIES + 3):
         pair.turn()
-    (refused,) = [event for event in pair.events if isinstance(event, Refused)]
-    assert "flash a newer" in refused.text
-    assert pair.range() == []
-
-
-def test_older_board_is_accepted_without_offsets():
-    pair = Pair(NO_OFFSETS, OlderBoard)
-    assert pair.range() == [3.0]
-    for _ in range(MAX_TRIES + 3):
-        pair.turn()
-    assert not [event for event in pair.events if isinstance(event, Refused)]
-    assert pair.range() == [3.0]
+    refused = [event for event in pair.events if isinstance(event, Refused)]
+    assert len(refused) == refusals
+    assert all("flash a newer" in event.text for event in refused)
+    assert pair.range() == ranges
 
 
 def test_too_many_offsets_for_a_board_are_refused_with_both_numbers():

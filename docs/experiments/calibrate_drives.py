@@ -3,7 +3,8 @@
 Sets: `cirs`, simulated buildings that the universal model was not trained on, whose radios have offsets of their own; `levels`,
 the same ranges without CIRs; `bare`, also without powers; `flat` and `flat_levels`, a simulated flat whose radios have none;
 `geometry`, layouts of real deployments in two and three dimensions; `hanyang`, every ordered pair of real drives with the same anchors; `labyrinth`, the
-halves of a short real drive. With `--check`, a third drive is the check of the calibration.
+halves of a short real drive. With `--check`, a third drive is the check of the calibration. With `--truth`, the true positions of the
+first drive are the ground truth of the calibration.
 
 Printed for each pair: the correction, the promised change of the live position error, its change on the other drive, RMSE without
 and with the calibration; or the reason of the refusal. Without a calibration, the ranges are corrected by the shipped model if they
@@ -11,6 +12,7 @@ have CIRs, otherwise raw. Seeds below 200 were used for development; results are
 
     PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 200 --seeds 2
     PYTHONPATH=. python docs/experiments/calibrate_drives.py levels hanyang --check -o drives.jsonl
+    PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs levels --truth --first 200 --seeds 2
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from benchmarks import position_data
 from benchmarks.position_data import Run, RunSource, load_geometry, real_runs
 from uwb_mitigation.calibration.site import SiteCalibration, calibrate_site
 from uwb_mitigation.calibration.site_data import SiteData, read_site
-from uwb_mitigation.calibration.solution import solve_without_truth
+from uwb_mitigation.calibration.solution import Localisation, solve_with_truth, solve_without_truth
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
@@ -41,7 +43,7 @@ from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.track_errors import track_errors
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
-from uwb_mitigation.types.tracks import Ranges
+from uwb_mitigation.types.tracks import PosePath, Ranges
 
 EMPTY = np.zeros(0, np.int16)
 UNIVERSAL = load_bundle(default_model_path())
@@ -159,26 +161,36 @@ def live_rmse_m(run: Run, ranges: Ranges) -> float:
     return track_errors(track, run.truth).rmse if len(track) else np.nan
 
 
-def calibrated(drive: Run, check: Run | None) -> SiteCalibration:
-    """Return the calibration of a drive without ground truth."""
+def calibrated(drive: Run, check: Run | None, *, has_truth: bool = False) -> SiteCalibration:
+    """Return the calibration of a drive."""
 
     def read(run: Run) -> SiteData:
         heights = None if run.heights is None else [run.heights]
         return read_site([run.read_records()], run.anchors, UNIVERSAL, heights=heights)
 
     site = read(drive)
-    solution = solve_without_truth(site, height=drive.height, area=drive.area)
+    if has_truth:
+        poses = PosePath(
+            drive.truth.stamp_ns,
+            drive.truth.position,
+            np.tile([0.0, 0.0, 0.0, 1.0], (len(drive.truth.stamp_ns), 1)),
+        )
+        tag_ids = [tag.tag_id for tag in site.tags]
+        localisation = Localisation("/truth", tag_ids, [[poses]] * len(tag_ids), time_offset_s=0.0)
+        solution = solve_with_truth(site, localisation, height=drive.height)
+    else:
+        solution = solve_without_truth(site, height=drive.height, area=drive.area)
     return calibrate_site(site, UNIVERSAL, solution, check=[] if check is None else [read(check)])
 
 
-def evaluate(case: Case, has_check: bool) -> dict[str, Any]:
+def evaluate(case: Case, *, has_check: bool, has_truth: bool) -> dict[str, Any]:
     """Calibrate and test one case."""
     drive, check, test = case.load()
     row: dict[str, Any] = {"kind": case.kind, "case": case.name, "raw_m": live_rmse_m(test, test.ranges)}
     row["without_m"] = live_rmse_m(test, test.corrected()) if test.has_cirs else row["raw_m"]
     began = time.process_time()
     try:
-        found = calibrated(drive, check if has_check else None)
+        found = calibrated(drive, check if has_check else None, has_truth=has_truth)
     except DatasetError as error:
         return row | {"refused": str(error), "seconds": time.process_time() - began}
     row |= {
@@ -212,7 +224,9 @@ def main() -> None:
     parser.add_argument("kinds", nargs="+", metavar="SET")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--check", action="store_true")
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument("--check", action="store_true")
+    choice.add_argument("--truth", action="store_true")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
@@ -221,7 +235,7 @@ def main() -> None:
     for case in cases(
         arguments.kinds, range(arguments.first, arguments.first + arguments.seeds), arguments.data
     ):
-        row = evaluate(case, arguments.check)
+        row = evaluate(case, has_check=arguments.check, has_truth=arguments.truth)
         show(row)
         counts[case.kind] += 1
         accepted[case.kind] += [] if row["refused"] else [row]

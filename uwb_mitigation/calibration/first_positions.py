@@ -1,4 +1,4 @@
-"""Where a fit without ground truth starts: first positions of tags, the likely offset, and suspicious anchors."""
+"""Where a fit without ground truth starts: first positions of tags, and the likely offset."""
 
 from __future__ import annotations
 
@@ -134,22 +134,6 @@ def _moments(config: EstimatorConfig, segments: Segments, expected_m: NDArray[np
         if len(moments) == MAX_WINDOWS:
             break
     return moments
-
-
-def suspects(
-    config: EstimatorConfig, segments: Segments, expected_m: NDArray[np.float64]
-) -> NDArray[np.intp]:
-    """Return the rows of the received anchors, those with the largest residuals at a few moments first."""
-    loss = np.zeros(len(config.anchors))
-    for row, value in _moments(config, segments, expected_m):
-        possible = _candidate_positions(config, row, value)
-        if possible:
-            distance = np.linalg.norm(config.anchors.position[row] - possible[0].position, axis=1)
-            loss[row] += config.model.loss((value - distance) / START_SD_M)
-        else:
-            loss[row] += NO_POSITION_LOSS / len(row)
-    received = np.unique(segments.ranges.anchor)
-    return received[np.argsort(-loss[received], kind="stable")]
 
 
 def _moment_losses(config: EstimatorConfig, moments: _Moments) -> NDArray[np.float64]:

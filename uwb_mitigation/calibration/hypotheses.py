@@ -268,7 +268,10 @@ def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64
     if ratio_of_misfits > LIMITS.misfit_share:
         loss = fit.config.model.loss(fit.residual_m / fit.scale_m[observations.noise_group])
         by_anchor = np.bincount(observations.anchor, loss * independent)
-        check_swapped(fit.config, segments, fit.prior, fit.scale_m, np.argsort(by_anchor)[::-1])
+        suspects = np.argsort(by_anchor)[::-1]
+        pair = find_swapped(fit.config, segments, fit.prior, fit.scale_m, suspects)
+        if pair is not None:
+            raise _swapped(fit.config.anchors, pair, "the others")
     if ratio_of_misfits > LIMITS.max_misfit_share:
         raise DatasetError(
             f"{ratio_of_misfits:.0%} of the ranges contradict the estimated track by more than {LIMITS.misfit_m:g} m",
@@ -281,23 +284,6 @@ def check_anchors(segments: Segments, fit: JointFit, antenna: NDArray[np.float64
     ranges = replace(segments.ranges, range_m=segments.ranges.range_m - correction_m)
     hypotheses = AnchorHypotheses(fit.config.anchors, ranges, antenna, segments.tag)
     hypotheses.check("the others", is_independent=False)
-
-
-def check_swapped(
-    config: EstimatorConfig,
-    segments: Segments,
-    prior: Regressors,
-    scale_m: NDArray[np.float64],
-    suspects: NDArray[np.intp],
-) -> None:
-    """Refuse two anchors whose exchange explains the ranges much better, see `find_swapped`.
-
-    Raises:
-        DatasetError: names them.
-    """
-    pair = find_swapped(config, segments, prior, scale_m, suspects)
-    if pair is not None:
-        raise _swapped(config.anchors, pair, "the others")
 
 
 def _swapped(anchors: AnchorMap, pair: tuple[int, int], reference: str) -> DatasetError:

@@ -7,7 +7,6 @@ clocks and delays. Both, and the offset of each pair, are estimated from the ran
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -47,15 +46,11 @@ BLOCK_S, SD_INFLATION = 10.0, 1.5
 """Errors of blocks of this duration count as independent. The factor accounts for errors that
 recur with each lap, which are not in their scatter."""
 
-LEVER_STEPS = 5
-"""Iterations for the lever arm at each time offset of the search; the fit continues from there."""
-
 MIN_SD_M = 0.01
 """Minimum standard deviation of white noise and of persisting errors."""
 
-_ITERATIONS, _CONVERGED, _FIXED_SD, _SMALL_M = 40, 1e-5, 1e-9, 0.02
-"""Maximum number of iterations and the change that ends them, m or s; standard deviation of given values; residuals below `_SMALL_M`, the
-noise of a DW1000, have the same weight."""
+_ITERATIONS, _CONVERGED, _FIXED_SD = 40, 1e-5, 1e-9
+"""Maximum number of iterations and the change that ends them, m or s; standard deviation of given values."""
 
 _MODEL = NoiseModel(long=1.5, short=1.5)
 
@@ -81,13 +76,6 @@ class PoseAlignment:
     offset_sd_m: NDArray[np.float64]
     position: NDArray[np.float64]
     distance_m: NDArray[np.float64]
-
-    def pair(self, tag: int, row: int, anchor_sd_m: float) -> tuple[float, float]:
-        """Return the offset of a pair, m, and its standard deviation, which includes the anchor's position error."""
-        number = self.pairs.index((tag, row))
-        return float(self.offset_m[number]), math.hypot(
-            float(self.offset_sd_m[number]), anchor_sd_m / math.sqrt(2.0)
-        )
 
     def as_json(self) -> dict[str, object]:
         """Return values for JSON; null = not observable. Lever arm of the first tag, and of all tags by their ids."""
@@ -244,8 +232,7 @@ class _AlignmentProblem:
             chosen = np.random.default_rng(1).choice(len(self.ranges), MAX_RANGES, replace=False)
             problem = self.take(np.sort(chosen))
         if start.is_free_time:
-            time_offset_s, arms = problem.likely(given_arms, estimates_arm)
-            start = replace(start, time_offset_s=time_offset_s, lever_arm_m=arms)
+            start = replace(start, time_offset_s=problem.likely_time_offset(given_arms))
         alignment = problem.solve(start, given_arms)
         if not estimates_arm:
             return alignment
@@ -262,48 +249,27 @@ class _AlignmentProblem:
         arms = np.where(is_observable, alignment.lever_arm_m, given_arms)
         return problem.solve(replace(alignment, lever_arm_m=arms, is_free_arm=is_observable), given_arms)
 
-    def likely(self, lever: NDArray[np.float64], free_lever: bool) -> tuple[float, NDArray[np.float64]]:
-        """Return the time offset with which the ranges agree best, and its lever arms.
-
-        The lever arms are estimated for each time offset again, because with a wrong one turns look like outliers.
+    def likely_time_offset(self, lever: NDArray[np.float64]) -> float:
+        """Return the time offset with which the ranges agree best, for given lever arms.
 
         Raises:
             DatasetError: too few ranges are within the localisation's times.
         """
         count = min(len(self.ranges), SEARCHED)
         subset = self.take(np.linspace(0, len(self.ranges) - 1, count).astype(int))
-        best = (math.inf, 0.0, lever)
+        best = (math.inf, 0.0)
         for time_offsets in (COARSE_OFFSETS_S, FINE_OFFSETS_S):
             for time_offset in (best[1] + time_offsets).tolist():
-                arm = subset._lever_arm(time_offset, lever) if free_lever else lever
-                residual = np.abs(subset._centred(time_offset, arm)[0])
+                error, _ = subset.errors(time_offset, lever)
+                residual = np.abs(error - subset.medians(error)[subset.pair])
                 if np.isfinite(residual).sum() >= MIN_RANGES:
-                    best = min(
-                        best, (float(np.nanmedian(residual)), time_offset, arm), key=operator.itemgetter(0)
-                    )
+                    best = min(best, (float(np.nanmedian(residual)), time_offset))
         if not math.isfinite(best[0]):
             raise DatasetError(
                 "too few ranges are within the time span of the localisation",
                 valid=f"clocks that agree to {MAX_TIME_OFFSET_S:g} s, or --time-offset",
             )
-        return best[1], best[2]
-
-    def _lever_arm(self, time_offset: float, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the lever arms for a time offset: least absolute deviations, by reweighting."""
-        for _ in range(LEVER_STEPS):
-            residual, rows = self._centred(time_offset, lever)
-            is_used = np.isfinite(residual) & np.isfinite(rows).all(axis=1)
-            if int(is_used.sum()) < MIN_RANGES:
-                return lever
-            lever = lever.copy()
-            for tag in np.unique(self.tag[is_used]):
-                is_of_tag = is_used & (self.tag == tag)
-                weight = 1.0 / np.maximum(np.abs(residual[is_of_tag]), _SMALL_M)
-                information = float(weight.sum()) * _SMALL_M**2 / LEVER_SD_M**2
-                normal = rows[is_of_tag].T @ (weight[:, None] * rows[is_of_tag]) + information * np.eye(3)
-                right = rows[is_of_tag].T @ (weight * residual[is_of_tag]) - information * lever[tag]
-                lever[tag] += np.linalg.solve(normal, right)
-        return lever
+        return best[1]
 
     def medians(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the median of each pair, of errors (n,)."""
@@ -322,13 +288,6 @@ class _AlignmentProblem:
         )
         error = self.ranges.range_m - self.regressors.rows @ self.regressors.mean - distance
         return error, np.einsum("ni,nij->nj", unit, rotation)
-
-    def _centred(
-        self, time_offset: float, lever: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return `errors` minus the median error of each pair."""
-        error, rows = self.errors(time_offset, lever)
-        return error - self.medians(error)[self.pair], rows
 
     def solve(self, start: _Alignment, given_arms: NDArray[np.float64]) -> _Alignment:
         """Fit by Gauss-Newton; `given_arms` (T, 3) is the prior of the lever arms."""

@@ -21,6 +21,7 @@ from uwb_mitigation.mitigation.model.choice import CirKind
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.ood import FIRST_PATH_TAPS
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
+from uwb_mitigation.positioning.noise_model import MAD_TO_SD
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     CorrectedRange,
@@ -40,7 +41,6 @@ predicts less for 89 % of the LOS ranges whose power gap is small. The second li
 
 MIN_RANGES = 10
 _BATCH = 256
-_MAD_TO_SD = 1.4826
 _MEDIAN_SD_FACTOR = math.sqrt(math.pi / 2.0)
 
 _Sample = tuple[float, float, float, float, float, str]
@@ -228,13 +228,9 @@ def _placement_offset(
     tag_id: int, anchor_id: int, placement: str, samples: list[_Sample], limit_m: float
 ) -> PlacementOffset:
     offset, predicted, gap, level, los = np.array([sample[:5] for sample in samples], np.float64).T
-    has_gap, is_predicted, is_labelled = (np.isfinite(values) for values in (gap, predicted, los))
-    has_level = np.isfinite(level)
-    is_los = los == 1.0
+    is_predicted, is_labelled, is_los = np.isfinite(predicted), np.isfinite(los), los == 1.0
     used, n = offset[is_los & is_predicted], len(offset)
-    median_gap = float(np.median(gap[has_gap])) if has_gap.any() else math.nan
-    median_level = float(np.median(level[has_level])) if has_level.any() else math.nan
-    median_predicted = float(np.median(predicted[is_predicted])) if is_predicted.any() else math.nan
+    median_gap, median_level, median_predicted = (_median(values) for values in (gap, level, predicted))
     median_offset, noise, refused = math.nan, math.nan, ""
     if 2 * is_labelled.sum() < n:
         refused = "the first-path power is unknown, so that line of sight cannot be checked"
@@ -256,10 +252,8 @@ def _placement_offset(
             f"an offset of {np.median(used):.1f} m: check the distance (in metres) and the antenna delay"
         )
     else:
-        median_offset, noise = (
-            float(np.median(used)),
-            _MEDIAN_SD_FACTOR * _spread(used) / math.sqrt(len(used)),
-        )
+        median_offset = float(np.median(used))
+        noise = _MEDIAN_SD_FACTOR * _spread(used) / math.sqrt(len(used))
     sd, count = math.hypot(noise, PLACEMENT_SD_M), 0 if refused else len(used)
     levels = median_gap, median_level, median_predicted
     return PlacementOffset(tag_id, anchor_id, placement, count, median_offset, sd, noise, *levels, refused)
@@ -286,6 +280,12 @@ def _combined(placements: tuple[PlacementOffset, ...], model_id: int) -> OffsetE
     return OffsetEstimate(float(np.median(offset)), sd, ranges, placements, model_id)
 
 
+def _median(values: NDArray[np.float64]) -> float:
+    """Return the median of the known values; NaN: there is none."""
+    is_known = np.isfinite(values)
+    return float(np.median(values[is_known])) if is_known.any() else math.nan
+
+
 def _spread(values: NDArray[np.float64]) -> float:
     """Return a robust standard deviation."""
-    return _MAD_TO_SD * float(np.median(np.abs(values - np.median(values))))
+    return MAD_TO_SD * float(np.median(np.abs(values - np.median(values))))

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.calibration.first_positions import START_SD_M, first_positions, likely_offset, suspects
-from uwb_mitigation.calibration.hypotheses import check_anchors, check_swapped
+from uwb_mitigation.calibration.first_positions import first_positions, likely_offset
+from uwb_mitigation.calibration.hypotheses import check_anchors
 from uwb_mitigation.calibration.joint_fit import SD_INFLATION, JointFit, Start, fit_segments
 from uwb_mitigation.calibration.motion_segments import Segments, find_segments
 from uwb_mitigation.calibration.observability import check_height, check_layout, check_motion, mirrored
@@ -42,9 +42,6 @@ COMMON_SD_M, OWN_SD_M = 1.0, 0.3
 SCATTERS_M = np.geomspace(0.01, 0.5, 12)
 """Standard deviations of own offsets that are compared: radios of one kind have 0.1 m (0.3 m at three sigma, Decawave APS014),
 and real deployments up to 0.3 m."""
-
-MIN_POSITION_SHARE = 0.5
-"""If fewer ranges have a position, swapped anchors are examined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -79,13 +76,6 @@ class SelfCalibration:
         """Whether there are enough anchors for offsets of single ones."""
         anchors = len(np.unique(self.fit.observations.anchor))
         return anchors >= self.fit.config.dims + MIN_REDUNDANT
-
-    def value(self, name: str) -> tuple[float, float]:
-        """Return a parameter and its standard deviation; (0, 0): it was not estimated."""
-        if name not in self.fit.prior.names:
-            return 0.0, 0.0
-        column = self.fit.prior.names.index(name)
-        return float(self.fit.parameters[column]), float(np.sqrt(self.fit.covariance[column, column]))
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return (tag number, anchor row) of all pairs with ranges."""
@@ -214,11 +204,6 @@ class _Solver:
         self._position, has_position = first_positions(config, self.segments, expected + offset)
         common = Regressors.single("offset", np.ones(len(expected)), offset, COMMON_SD_M)
         self.common = replace(common.concat(extra), noise_group=extra.noise_group)
-        used = float(has_position[self.segments.segment].mean())
-        if used < MIN_POSITION_SHARE:
-            scale_m = np.full(int(extra.noise_group.max(initial=0)) + 1, START_SD_M)
-            rows = suspects(config, self.segments, expected + offset)
-            check_swapped(config, self.segments, self.common, scale_m, rows)
         if not has_position.any():
             raise DatasetError(
                 "no position of a tag can be determined",

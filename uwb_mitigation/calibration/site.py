@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.calibration import models
 from uwb_mitigation.calibration.held_out import (
     BLOCK_S,
     MAX_INCREASE,
@@ -24,12 +22,10 @@ from uwb_mitigation.calibration.held_out import (
 )
 from uwb_mitigation.calibration.site_data import SiteData, read_site
 from uwb_mitigation.calibration.solution import (
-    MAX_OFFSET_SD_M,
     NONE,
     ONE,
     PAIR,
     Pairs,
-    Progress,
     SiteSolution,
     solve_without_truth,
 )
@@ -39,11 +35,13 @@ from uwb_mitigation.mitigation.correction import CorrectionRule
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, build_bundle
 from uwb_mitigation.mitigation.model.floating import float_network, scaled
+from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.geometry import Height
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.intervals import fit_intervals
+from uwb_mitigation.training.fit.linear_fit import fit_linear_bias
 from uwb_mitigation.training.fit.model_card import card_of
 from uwb_mitigation.types.anchors import AnyAnchors, as_anchors
 from uwb_mitigation.types.measurement import Record
@@ -64,13 +62,37 @@ error of another drive by 4 % (simulated site 219)."""
 HEIGHT_SD_M = 0.1
 """Standard deviation of measured heights for the locator of a test."""
 
-COMMON, OFFSETS = "common offset", "offsets"
-"""What is subtracted: one offset from all ranges, or one from the ranges of each pair."""
+COMMON = "common offset"
+"""The correction that subtracts one offset from all ranges."""
 
-_LEVELS = {COMMON: ONE, OFFSETS: PAIR}
+NO_MODEL, LINE, NETWORK = "", "line", "universal network"
+"""Offsets only; a line in the received power and, if it is known, the power gap; the universal network."""
 
 SHIPPED = "shipped model alone"
 """The universal network without offsets: what is used without a calibration."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SiteModel:
+    """A linear bias model, or if it `has_network` the universal network."""
+
+    linear_bias: LinearBiasModel
+    has_network: bool = False
+
+    @property
+    def is_line(self) -> bool:
+        """Whether it is a line in the received power."""
+        return self.linear_bias.needs_power
+
+    def correction_m(self, site: SiteData) -> NDArray[np.float64]:
+        """Return the predicted errors of all ranges, float64 (r,), m; 0 where a power that the line needs is unknown."""
+        if self.has_network:
+            return site.universal_m
+        line = self.linear_bias
+        # Without a power gap, the first-path power is not needed.
+        first_path_dbm = site.first_path_power_dbm if line.per_power_gap else site.rx_power_dbm
+        predicted_m = line.predict_m(site.rx_power_dbm, first_path_dbm).astype(np.float64)
+        return np.where(np.isfinite(predicted_m), predicted_m, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -79,7 +101,6 @@ class SiteCalibration:
 
     Attributes:
         site: recorded data. solution: true ranges and offsets.
-        data: the ranges of `solution.rows`, with the offsets subtracted. raw_error_m: their errors as measured, (n,).
         held_out: errors of `raw` and of each correction on the halves of the drive, each corrected by the other half, and on
             each drive of the check.
         baseline: what is used without a calibration: `SHIPPED` if it applies, otherwise `raw`.
@@ -89,13 +110,11 @@ class SiteCalibration:
 
     site: SiteData
     solution: SiteSolution
-    data: Dataset
-    raw_error_m: NDArray[np.float64]
     held_out: tuple[HeldOut, ...]
     baseline: str
     chosen: str
     level: str
-    model: models.SiteModel
+    model: SiteModel
     notes: tuple[str, ...]
 
     @property
@@ -106,17 +125,17 @@ class SiteCalibration:
     @property
     def pairs(self) -> Pairs:
         """The offset of each pair that is subtracted, and its standard deviation, m."""
-        if self.level == PAIR:
-            return self.solution.subtracted
-        common_m = self.solution.common[0]
-        return {
-            pair: (common_m, math.hypot(sd, value - common_m))
-            for pair, (value, sd) in self.solution.pairs.items()
-        }
+        return self.solution.subtracted(self.level)
+
+    @property
+    def raw_error_m(self) -> NDArray[np.float64]:
+        """Return the errors of the ranges of `solution.rows` as measured, (n,), m."""
+        error_m: NDArray[np.float64] = self.site.ranges.range_m[self.solution.rows] - self.solution.true_m
+        return error_m
 
     @property
     def held_out_error_m(self) -> NDArray[np.float64]:
-        """Return the held-out errors of the ranges of `data`, corrected by the chosen correction, (n,), m; NaN: unknown."""
+        """Return the held-out errors of these ranges, corrected by the chosen correction, (n,), m; NaN: unknown."""
         return self.held_out[0].residual_m[self.chosen][self.solution.rows]
 
     @property
@@ -138,30 +157,27 @@ class SiteCalibration:
     def live_position_change(self) -> float:
         """Return the promised change of the live position error on another drive, relative to the baseline; NaN: unknown.
 
-        It is the upper end of an interval. The locator estimates the common offset itself, so that the promise without ground
-        truth is that of the other corrections.
+        It is the upper end of an interval. The locator estimates the common offset itself, so that without ground truth only
+        offsets of single anchors promise a change.
         """
         if self.solution.truth is not None:
             return -min(
                 errors.live_gain(self.chosen, self.baseline).low for errors in decisive(self.held_out)
             )
-        common = COMMON if self.baseline == RAW else _name(COMMON, models.NETWORK)
-        gain = min(errors.range_gain(self.chosen, common).low for errors in self.held_out)
+        if self.level == ONE:
+            return 0.0
+        gain = min(errors.range_gain(self.chosen, COMMON).low for errors in self.held_out)
         return -PROMISED_SHARE * max(gain, 0.0)
 
     @property
     def refusal(self) -> str:
         """Return why the calibration does not help; empty: it does."""
-        for (tag, anchor), (value, sd) in self.pairs.items():
-            # The common offset is not that of an anchor that differs from it.
-            if self.solution.truth is None and sd > MAX_OFFSET_SD_M:
-                return (
-                    f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is unknown: {value:.2f} m with a standard "
-                    f"deviation of {sd:.2f} m"
-                )
         for errors in self.held_out:
             drive = "on the drive of the check " if errors is not self.held_out[0] else ""
-            if errors.live_gain(self.chosen, self.baseline).mean < -MAX_INCREASE:
+            live_gain = errors.live_gain(self.chosen, self.baseline).mean
+            if self.solution.truth is not None and math.isnan(live_gain):
+                return f"{drive}there are too few live positions to compare"
+            if live_gain < -MAX_INCREASE:
                 return f"{drive}the live position is worse than with {self._baseline_text}"
             if not errors.range_gain(self.chosen, self.baseline).mean >= MIN_GAIN:
                 return f"{drive}the ranges are not better than with {self._baseline_text}"
@@ -176,28 +192,18 @@ class SiteCalibration:
         return "raw ranges" if self.baseline == RAW else f"the {SHIPPED}"
 
     def summary(self) -> str:
-        """Return the result in a few sentences."""
-        truth, change, halves = self.solution.truth, self.live_position_change, self.held_out[0]
+        """Return the result in a sentence."""
+        change = self.live_position_change
         text = f"Compared with {self._baseline_text}, the live position error on another drive "
-        text += f"decreases by at least {-change:.0%}. " if change < 0.0 else "is not expected to change. "
-        compared = list(dict.fromkeys((RAW, self.baseline, self.chosen)))
-        if truth is not None:
-            errors = ", ".join(f"{halves.live_rmse_m(name):.3f} m {name}" for name in compared)
-            text += f"Live position error on held-out halves (against {truth}): {errors}. "
-        kind = "residual against the other anchors" if truth is None else f"error against {truth}"
-        errors = ", ".join(f"{halves.mae_m(name):.3f} m {name}" for name in compared)
-        text += f"Mean absolute range {kind}: {errors}."
-        if self.refusal:
-            text = f"Calibration does not help: {self.refusal}. " + text
-        return text
+        text += f"decreases by at least {-change:.0%}." if change < 0.0 else "is not expected to change."
+        return f"Calibration does not help: {self.refusal}. {text}" if self.refusal else text
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation calibrate`."""
-        solution, model, halves = self.solution, self.model, self.held_out[0]
+        solution, halves = self.solution, self.held_out[0]
         return {
             "offsets_m": {pair: value for pair, (value, _) in self.pairs.items()},
             "offset_sd_m": {pair: sd for pair, (_, sd) in self.pairs.items()},
-            "offsets_of": self.level,
             "live_position_change": self.live_position_change,
             "live_position_m": {name: halves.live_rmse_m(name) for name in halves.residual_m},
             "compared_with": self.baseline,
@@ -212,10 +218,8 @@ class SiteCalibration:
             "chosen": self.chosen,
             "candidates": {name: mae_m for name, mae_m in self.mae_m.items() if name != RAW},
             "ranges": sum(map(len, self.site.tags)),
-            "labelled": len(self.data),
+            "labelled": len(solution.rows),
             "outliers": solution.outliers,
-            "line": model.linear_bias,
-            "positions": solution.stationary_positions,
             "notes": self.notes,
             "skipped": self.site.skipped,
             "localisation": solution.alignment,
@@ -238,8 +242,7 @@ class SiteCalibration:
             "data": f"{name}, calibrated {method}",
             "calibrated": method,
             "chosen": self.chosen,
-            "measurements": len(self.data),
-            "configurations": len(self.data.names),
+            "measurements": len(self.solution.rows),
             "split": "held out: halves of the drive",
             "started_from": f"{universal.model_id:08x}",
             "recipe": {"line": model.linear_bias.needs_power, "network": model.has_network},
@@ -254,9 +257,10 @@ class SiteCalibration:
         network = universal.model
         if model.is_line:
             network = graph.float_model(scaled(float_network(universal), 0.0))
-            fitted = output.stem, universal.architecture, self.data, model.linear_bias
+            data = _labelled(self.site, self.solution, self.level)
+            fitted = output.stem, universal.architecture, data, model.linear_bias
             card = replace(
-                card_of(*fitted, self.data, self.held_out_error_m, training), needs_cir=False, quantised=False
+                card_of(*fitted, data, self.held_out_error_m, training), needs_cir=False, quantised=False
             )
         bundle, content = build_bundle(output, network, card)
         offsets_path = offsets_file(output)
@@ -310,7 +314,6 @@ def calibrate_site(
     solution: SiteSolution,
     *,
     check: Sequence[SiteData] = (),
-    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteCalibration:
     """Select a correction for the ranges of a solution, see `held_out.select`.
 
@@ -319,7 +322,6 @@ def calibrate_site(
         universal: bundle that the models start from.
         solution: true ranges and offsets.
         check: other drives at the site, on which the correction must not be worse, either.
-        on_progress: called with the stage and the finished share of it, 0 to 1.
 
     Raises:
         DatasetError: too few ranges have a known true range, an offset is implausible, or a half of the drive does not
@@ -331,8 +333,6 @@ def calibrate_site(
             valid=f"at least {MIN_LABELLED}",
         )
     _check_offsets(solution.pairs)
-    on_test = functools.partial(on_progress, "testing on held-out ranges")
-    on_test(0.1)
     is_first, is_separate = site.halves()
     halves = [site.select(mask) for mask in (is_first, ~is_first)]
     try:
@@ -343,44 +343,32 @@ def calibrate_site(
     folds = _Fold(*first, second), _Fold(*second, first)
     checks = [_Fold(drive, solution.solve_part(drive), (site, solution)) for drive in check]
 
-    notes, kinds = list(solution.notes), [models.NO_MODEL, models.LINE]
-    without = {RAW: (NONE, models.NO_MODEL)}
+    notes = list(solution.notes)
+    corrections = {RAW: (NONE, NO_MODEL)}
     if site.has_cirs:
-        without[SHIPPED] = NONE, models.NETWORK
-        kinds = [models.NETWORK]
+        corrections[SHIPPED] = NONE, NETWORK
         if without_cir := int((~site.is_usable).sum()):
             notes.append(f"{without_cir} ranges without a usable CIR are only used for track and offsets")
     else:
         notes.append("no networks: the recording has no CIRs that the universal model was trained for")
-    if solution.truth is None:
-        # A line in the received power does not transfer to other drives.
-        kinds = kinds[:1]
-    with_model = {_name(level, kind): (_LEVELS[level], kind) for kind in kinds for level in _LEVELS}
-    corrections = without | {COMMON: (ONE, models.NO_MODEL)} | with_model
+    baseline = list(corrections)[-1]
+    candidates = {_name(level, kind): (level, kind) for level, kind in _candidates(site, solution)}
+    corrections |= candidates
     first_half, second_half = (
         fold.evaluate(universal, corrections, is_separate=is_separate) for fold in folds
     )
     drives = (fold.evaluate(universal, corrections, is_separate=True) for fold in checks)
     held_out = [first_half.merged(second_half, is_first), *drives]
-    names = [COMMON, *with_model]
-    if solution.truth is None:
-        # What the network leaves behind walls looks like offsets of anchors, on each drive the same.
-        is_common_only = site.has_cirs or bool(solution.offsets_refused)
-        names = list(with_model)[: 1 if is_common_only else None]
-    chosen = select(held_out, list(dict.fromkeys(names)))
-    level, kind = corrections[chosen]
-    data, raw_error_m = _labelled(site, solution, level)
-    on_test(1.0)
+    chosen = select(held_out, list(candidates))
+    level, kind = candidates[chosen]
     return SiteCalibration(
         site=site,
         solution=solution,
-        data=data,
-        raw_error_m=raw_error_m,
         held_out=tuple(held_out),
-        baseline=list(without)[-1],
+        baseline=baseline,
         chosen=chosen,
         level=level,
-        model=models.fit_model(kind, data),
+        model=_fit(kind, site, solution, level),
         notes=tuple(notes),
     )
 
@@ -405,8 +393,7 @@ class _Fold:
         block = site.ranges.stamp_ns // round(BLOCK_S * NS_PER_S)
         residual_m, live_m = dict[str, NDArray[np.float64]](), dict[str, NDArray[np.float64]]()
         for name, (level, kind) in corrections.items():
-            data, _ = _labelled(training_site, solution, level)
-            model = models.fit_model(kind, data)
+            model = _fit(kind, training_site, solution, level)
             predicted_m = np.where(site.is_usable, model.correction_m(site), 0.0)
             range_m = site.ranges.range_m - predicted_m
             # Without ground truth the reference of ranges without offsets contains no common offset, because the locator
@@ -453,8 +440,22 @@ class _Fold:
         return error_m
 
 
-def _name(offsets: str, kind: str) -> str:
+def _candidates(site: SiteData, solution: SiteSolution) -> list[tuple[str, str]]:
+    """Return (level of the offsets, kind of the model) of the corrections that can be selected, in order of complexity."""
+    if solution.truth is not None:
+        levels = (ONE,) if site.has_cirs else (ONE, PAIR)
+        model = NETWORK if site.has_cirs else LINE
+        return [*((level, NO_MODEL) for level in levels), (ONE, model), (PAIR, model)]
+    if site.has_cirs:
+        # What the network leaves behind walls looks like offsets of anchors, on each drive the same.
+        return [(ONE, NETWORK)]
+    # A line in the received power does not transfer to other drives.
+    return [(ONE, NO_MODEL), *([] if solution.offsets_refused else [(PAIR, NO_MODEL)])]
+
+
+def _name(level: str, kind: str) -> str:
     """Return the name of a correction: what is subtracted, and the kind of the model."""
+    offsets = COMMON if level == ONE else "offsets"
     return f"{offsets} + {kind}" if kind else offsets
 
 
@@ -482,10 +483,18 @@ def _offsets_m(site: SiteData, offsets: Offsets) -> NDArray[np.float64]:
     return offsets.lookup(tag_ids, anchor_ids).astype(np.float64)
 
 
-def _labelled(site: SiteData, solution: SiteSolution, level: str) -> tuple[Dataset, NDArray[np.float64]]:
-    """Return the ranges of `solution.rows` with the offsets subtracted, and their errors as measured, (n,), m."""
-    raw = site.to_dataset(
-        solution.rows, solution.true_m, solution.segment, solution.stationary[solution.segment]
-    )
-    offsets_m = _offsets_m(site, solution.offsets(level))[solution.rows]
-    return raw.shifted(-offsets_m), raw.error_m
+def _fit(kind: str, site: SiteData, solution: SiteSolution, level: str) -> SiteModel:
+    """Return a model of this kind for ranges with the offsets subtracted."""
+    if kind != LINE:
+        return SiteModel(LinearBiasModel(0.0), has_network=kind == NETWORK)
+    data = _labelled(site, solution, level)
+    has_gap = bool(np.isfinite(data.rx_power_dbm - data.first_path_power_dbm).mean() > 0.5)
+    first_path_dbm = data.first_path_power_dbm if has_gap else None
+    return SiteModel(fit_linear_bias(data.configurations, data.rx_power_dbm, first_path_dbm, data.error_m))
+
+
+def _labelled(site: SiteData, solution: SiteSolution, level: str) -> Dataset:
+    """Return the ranges of `solution.rows` with the offsets subtracted."""
+    rows, segment = solution.rows, solution.segment
+    offset_m = _offsets_m(site, solution.offsets(level))[rows]
+    return site.to_dataset(rows, solution.true_m, offset_m, segment, solution.stationary[segment])

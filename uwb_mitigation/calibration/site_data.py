@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +42,7 @@ class SiteData:
     Attributes:
         anchors: anchors of the site.
         tags: data of each tag, in the order of time.
-        preprocessing: preprocessing of the inputs.
-        inputs: float32 (r, K), zeros if there is no CIR.
+        preprocessing: preprocessing of the universal model.
         rx_power_dbm, first_path_power_dbm: float32 (r,), NaN = unknown.
         has_cirs: whether CIRs are used.
         is_usable: bool (r,), ranges to which a model can be fitted; the others only affect track and offsets.
@@ -60,7 +58,6 @@ class SiteData:
     anchors: AnchorMap
     tags: tuple[Ranges, ...]
     preprocessing: Preprocessing
-    inputs: NDArray[np.float32]
     rx_power_dbm: NDArray[np.float32]
     first_path_power_dbm: NDArray[np.float32]
     has_cirs: bool
@@ -90,7 +87,7 @@ class SiteData:
 
     def select(self, is_selected: NDArray[np.bool_]) -> SiteData:
         """Return only these ranges, bool (r,), and the tags that have any."""
-        columns = ("inputs", "rx_power_dbm", "first_path_power_dbm", "is_usable", "universal_m", "recording")
+        columns = ("rx_power_dbm", "first_path_power_dbm", "is_usable", "universal_m", "recording")
         tags = [tag.take(is_selected[self.tag == number]) for number, tag in enumerate(self.tags)]
         return replace(
             self,
@@ -119,42 +116,41 @@ class SiteData:
         self,
         rows: NDArray[np.intp],
         true_m: NDArray[np.float64],
+        offset_m: NDArray[np.float64],
         segment: NDArray[np.intp],
         is_stationary: NDArray[np.bool_],
     ) -> Dataset:
-        """Return a dataset of selected ranges.
+        """Return a dataset of selected ranges, without CIRs.
 
         Args:
             rows: indices, (k,), into the ranges of all tags.
             true_m: (k,), their true ranges.
+            offset_m: (k,), subtracted from the ranges.
             segment: int (k,), segment of the track.
             is_stationary: bool (k,), whether the tag is stationary. A configuration is a
                 pair while the tag is stationary, or for `CONFIGURATION_S` of motion.
         """
         ranges = self.ranges.take(rows)
-        tag = np.array([tag.tag_id for tag in self.tags], np.uint64)[self.tag[rows]]
         segment_start_ns = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
         np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
         elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / NS_PER_S
         interval = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
         names = [
             f"segment {s}/{c}/tag {t}/anchor {a}"
-            for s, c, t, a in zip(segment, interval, tag, ranges.anchor, strict=True)
+            for s, c, t, a in zip(segment, interval, self.tag[rows], ranges.anchor, strict=True)
         ]
-        anchor_ids = np.array([anchor.id for anchor in self.anchors.anchors], np.uint64)
         return Dataset(
             self.preprocessing,
-            self.inputs[rows],
+            np.zeros((len(rows), self.preprocessing.samples), np.float32),
             self.rx_power_dbm[rows],
             self.first_path_power_dbm[rows],
-            ranges.range_m,
-            ranges.range_m - true_m,
+            ranges.range_m - offset_m,
+            ranges.range_m - true_m - offset_m,
             np.array(names),
             np.full(len(rows), ""),
-            tags=tag,
-            anchors=anchor_ids[ranges.anchor],
             radios=self.sources.radios,
             segments=self.sources.segments,
+            channels=self.sources.channels,
         )
 
 
@@ -181,7 +177,7 @@ def read_site(
     Raises:
         DatasetError: no range belongs to an anchor in the map.
     """
-    table = _RangeTable(anchors, universal, has_heights=heights is not None)
+    table = _RangeTable(anchors, universal)
     shifts: list[int] = []
     for number, recording in enumerate(recordings):
         shift_ns: int | None = None
@@ -194,12 +190,27 @@ def read_site(
                 shift_ns = 0
                 if end_of_previous is not None and stamp_ns <= end_of_previous:
                     shift_ns = end_of_previous - stamp_ns + RECORDING_GAP_NS
-            height_m = math.nan
+            height_m = None
             if heights_of_recording is not None:
                 height_m = float(heights_of_recording.height_at(np.array([stamp_ns]))[0][0])
             table.add(record.measurement, stamp_ns + shift_ns, height_m, number)
         shifts.append(shift_ns or 0)
     return table.to_site(tuple(shifts))
+
+
+_COLUMNS = np.dtype(
+    [
+        ("tag", np.uint64),
+        ("stamp_ns", np.int64),
+        ("anchor", np.intp),
+        ("range_m", np.float64),
+        ("rx_power_dbm", np.float64),
+        ("first_path_power_dbm", np.float64),
+        ("height_m", np.float64),
+        ("is_usable", np.bool_),
+        ("recording", np.intp),
+    ]
+)
 
 
 class _RangeTable:
@@ -209,23 +220,23 @@ class _RangeTable:
         last_stamp_ns: latest stamp; None: no range yet.
     """
 
-    def __init__(self, anchors: AnchorMap, universal: Bundle, *, has_heights: bool) -> None:
+    def __init__(self, anchors: AnchorMap, universal: Bundle) -> None:
         self.last_stamp_ns: int | None = None
-        self._anchors, self._universal, self._has_heights = anchors, universal, has_heights
+        self._anchors, self._universal = anchors, universal
         self._skipped, self._unknown_anchors = Counter[str](), Counter[int]()
-        self._rows: list[tuple[int, int, int, float, float, float, float, bool, int]] = []
+        self._rows: list[tuple[object, ...]] = []
         self._windows: list[NDArray[np.float32]] = []
         self._sources = CirSources()
         self._frame_ids: dict[int, dict[str, None]] = {}
 
-    def add(self, measured: RangeMeasurement, stamp_ns: int, height_m: float, recording: int) -> None:
+    def add(self, measured: RangeMeasurement, stamp_ns: int, height_m: float | None, recording: int) -> None:
         """Add a range, or count why it is skipped."""
         row = self._anchors.index.get(measured.anchor_id)
         if row is None:
             self._unknown_anchors[measured.anchor_id] += 1
         elif not (math.isfinite(measured.range_m) and 0 <= measured.range_m <= MAX_RANGE_M):
             self._skipped["no valid range"] += 1
-        elif self._has_heights and math.isnan(height_m):
+        elif height_m is not None and math.isnan(height_m):
             self._skipped["no height at that time"] += 1
         else:
             self._frame_ids.setdefault(measured.tag_id, {}).setdefault(measured.frame_id)
@@ -233,7 +244,10 @@ class _RangeTable:
             (fault,), (window,) = card.preprocessing.windows_of([measured])
             self.last_stamp_ns = max(stamp_ns, self.last_stamp_ns or stamp_ns)
             cir = measured.cir
-            powers = cir.rx_power_dbm, cir.first_path_power_dbm
+            powers = (
+                dbm if math.isfinite(dbm) else math.nan
+                for dbm in (cir.rx_power_dbm, cir.first_path_power_dbm)
+            )
             is_usable = fault == 0 and is_trained_for(card, CirKind.of(cir))
             self._rows.append(
                 (measured.tag_id, stamp_ns, row, measured.range_m, *powers, height_m, is_usable, recording)
@@ -249,49 +263,41 @@ class _RangeTable:
         """
         for anchor_id, count in self._unknown_anchors.items():
             self._skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
-        if not self._rows:
-            received_ids = ", ".join(map(format_id, sorted(self._unknown_anchors))) or "none"
-            raise DatasetError(
-                f"no ranges of the anchors {', '.join(map(format_id, sorted(self._anchors.index)))}",
-                valid=f"anchors of the recording: {received_ids}",
-            )
-        if (num_unknown := self._unknown_anchors.total()) > len(self._rows):
-            unknown_ids = ", ".join(map(format_id, sorted(self._unknown_anchors)))
+        if (num_unknown := self._unknown_anchors.total()) > len(self._rows) or not self._rows:
+            unknown_ids = ", ".join(map(format_id, sorted(self._unknown_anchors))) or "none"
             raise DatasetError(
                 f"{num_unknown} of {num_unknown + len(self._rows)} ranges are from anchors that are not in the anchors file: "
                 f"{unknown_ids}",
                 valid=f"anchors of the file: {', '.join(map(format_id, sorted(self._anchors.index)))}",
             )
-        types: list[type] = [np.uint64, np.int64, np.intp, *[np.float64] * 4, np.bool_, np.intp]
-        columns: list[NDArray[Any]] = [
-            np.array(column, kind) for column, kind in zip(zip(*self._rows, strict=True), types, strict=True)
-        ]
-        order = np.lexsort((columns[1], columns[0]))
-        tag, stamp, anchor, range_m, rx, first_path, height_m, has_usable_cir, recording = (
-            column[order] for column in columns
+        table = np.array(self._rows, _COLUMNS)
+        order = np.lexsort((table["stamp_ns"], table["tag"]))
+        column = {name: np.ascontiguousarray(table[name][order]) for name in _COLUMNS.names or ()}
+        unknown = np.full(len(table), np.nan)
+        ranges = Ranges(
+            column["stamp_ns"], column["anchor"], column["range_m"], unknown, column["rx_power_dbm"]
         )
-        rx, first_path = (np.where(np.isfinite(powers), powers, np.nan) for powers in (rx, first_path))
         tags = tuple(
-            Ranges(stamp[i], anchor[i], range_m[i], np.full(len(i), np.nan), rx[i], int(tag[i[0]]))
-            for i in np.split(np.arange(len(tag)), np.flatnonzero(np.diff(tag)) + 1)
+            replace(ranges.take(rows), tag_id=int(column["tag"][rows[0]]))
+            for rows in np.split(np.arange(len(table)), np.flatnonzero(np.diff(column["tag"])) + 1)
         )
-        inputs = np.stack([self._windows[index] for index in order])
-        has_cirs = bool(has_usable_cir.mean() >= MIN_CIR_SHARE)
-        universal_m = np.zeros(len(inputs))
+        is_usable = column["is_usable"]
+        has_cirs = bool(is_usable.mean() >= MIN_CIR_SHARE)
+        universal_m = np.zeros(len(table))
         if has_cirs:
-            universal_m[has_usable_cir] = predict_m(float_network(self._universal), inputs[has_usable_cir])
+            inputs = np.stack([self._windows[index] for index in order[is_usable]])
+            universal_m[is_usable] = predict_m(float_network(self._universal), inputs)
         return SiteData(
             anchors=self._anchors,
             tags=tags,
             preprocessing=self._universal.preprocessing,
-            inputs=inputs,
-            rx_power_dbm=rx.astype(np.float32),
-            first_path_power_dbm=first_path.astype(np.float32),
+            rx_power_dbm=column["rx_power_dbm"].astype(np.float32),
+            first_path_power_dbm=column["first_path_power_dbm"].astype(np.float32),
             has_cirs=has_cirs,
-            is_usable=has_usable_cir if has_cirs else np.ones(len(inputs), np.bool_),
+            is_usable=is_usable if has_cirs else np.ones(len(table), np.bool_),
             universal_m=np.nan_to_num(universal_m, nan=0.0, posinf=0.0, neginf=0.0),
-            recording=recording,
-            height_m=height_m if self._has_heights else None,
+            recording=column["recording"],
+            height_m=None if np.isnan(column["height_m"]).all() else column["height_m"],
             frame_ids={tag_id: tuple(names) for tag_id, names in self._frame_ids.items()},
             skipped=self._skipped,
             shift_ns=shift_ns,

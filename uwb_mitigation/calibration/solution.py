@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -60,9 +59,6 @@ LEVEL_M = 0.3
 Pairs = Mapping[tuple[int, int], tuple[float, float]]
 """{(tag id, anchor id): (offset, standard deviation)}, m."""
 
-Progress = Callable[[str, float], None]
-"""Called with the current stage and the finished share of it, 0 to 1."""
-
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SiteSolution:
@@ -84,8 +80,6 @@ class SiteSolution:
         height: height with which the locator runs at this site, if it is constant.
         antenna_position: with ground truth the true position of the antenna at each range, (r, 3), m; NaN: unknown.
         track: (k, 3), positions of the tags. track_of: (k,), their segments.
-        stationary_positions: {tag id: position} of stationary tags; {`tag id #number`: position} of a tag with several
-            positions.
     """
 
     rows: NDArray[np.intp]
@@ -104,14 +98,16 @@ class SiteSolution:
     antenna_position: NDArray[np.float64]
     track: NDArray[np.float64]
     track_of: NDArray[np.intp]
-    stationary_positions: Mapping[str, tuple[float, float, float]]
     offsets_refused: str = ""
     offset_share: float = 1.0
 
-    @property
-    def subtracted(self) -> Pairs:
-        """What is subtracted from the ranges of each pair, and the standard deviation of its offset."""
+    def subtracted(self, level: str) -> Pairs:
+        """Return what is subtracted from the ranges of each pair with the level `ONE` or `PAIR`, and its standard deviation, m."""
         common_m = self.common[0]
+        if level == ONE:
+            return {
+                pair: (common_m, math.hypot(sd, value - common_m)) for pair, (value, sd) in self.pairs.items()
+            }
         return {
             pair: (common_m + self.offset_share * (value - common_m), sd)
             for pair, (value, sd) in self.pairs.items()
@@ -122,7 +118,7 @@ class SiteSolution:
         if level != PAIR:
             return Offsets(self.common[0] if level == ONE else 0.0)
         sds = {pair: sd for pair, (_, sd) in self.pairs.items() if math.isfinite(sd)}
-        values = {pair: value for pair, (value, _) in self.subtracted.items()}
+        values = {pair: value for pair, (value, _) in self.subtracted(PAIR).items()}
         return Offsets(self.common[0], pairs=values, pair_sd=sds)
 
 
@@ -161,7 +157,6 @@ def solve_without_truth(
     height: Height | None,
     area: Area | None,
     height_sd_m: float = 0.1,
-    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteSolution:
     """Solve for true ranges and offsets from ranges only, without ground truth.
 
@@ -170,7 +165,6 @@ def solve_without_truth(
         height: height of all tags, if constant.
         area: area of the tags.
         height_sd_m: standard deviation of measured heights, m.
-        on_progress: see `Progress`.
 
     Raises:
         DatasetError: the solution is not observable, or an anchor position in the file is wrong.
@@ -192,11 +186,8 @@ def solve_without_truth(
     def solve_part(data: SiteData) -> SiteSolution:
         return solve(data, offset_m).solution(solve_part)
 
-    stage = "estimating track and offsets"
-    on_progress(stage, 0.1)
     complete = solve(site, None)
     offset_m = complete.checked_offset_m()
-    on_progress(stage, 1.0)
     return complete.solution(solve_part)
 
 
@@ -226,7 +217,8 @@ class _RangesOnly:
                 valid=remedy,
             )
         for (tag, anchor), (value, sd) in self._pairs.items():
-            if sd > MAX_OFFSET_SD_M:
+            # With CIRs, only the common offset is subtracted.
+            if sd > MAX_OFFSET_SD_M and not self._site.has_cirs:
                 raise DatasetError(
                     f"the offset of tag {format_id(tag)} and anchor {format_id(anchor)} is not observable: {value:.2f} m with a "
                     f"standard deviation of {sd:.2f} m",
@@ -265,7 +257,6 @@ class _RangesOnly:
             antenna_position=np.full((len(self._site.is_usable), 3), np.nan),
             track=calibration.fit.position,
             track_of=observations.knot_segment,
-            stationary_positions=_stationary_positions(calibration),
         )
 
     def _offsets_refused(self, has_truth: NDArray[np.bool_]) -> str:
@@ -298,7 +289,6 @@ def solve_with_truth(
     *,
     height: Height | None = None,
     is_part: bool = False,
-    on_progress: Progress = lambda stage, fraction: None,
 ) -> SiteSolution:
     """Solve for true ranges and offsets with the poses of a localisation.
 
@@ -307,15 +297,11 @@ def solve_with_truth(
         localisation: poses of the robot.
         height: height of the tags, if constant, with which the locator will run.
         is_part: the site was already solved for more ranges.
-        on_progress: see `Progress`.
 
     Raises:
         DatasetError: another lever arm, or other anchor positions, explain the ranges much better; or too few ranges are
             within the times of the localisation.
     """
-    stage = "estimating time offset and lever arm"
-    if not is_part:
-        on_progress(stage, 0.1)
     localisation = localisation.select([tag.tag_id for tag in site.tags])
     paths = [
         PosePath.joined([path.shifted(by_ns) for path, by_ns in zip(paths, site.shift_ns, strict=True)])
@@ -335,7 +321,6 @@ def solve_with_truth(
         # With outliers: many ranges of swapped anchors are some.
         hypotheses = AnchorHypotheses(site.anchors, site.ranges, alignment.position, site.tag)
         hypotheses.check("the localisation", is_independent=True)
-        on_progress(stage, 1.0)
     aligned = replace(
         localisation,
         time_offset_s=alignment.time_offset_s,
@@ -363,7 +348,6 @@ def solve_with_truth(
         antenna_position=alignment.position,
         track=alignment.position[rows],
         track_of=segment,
-        stationary_positions={},
     )
 
 
@@ -391,12 +375,12 @@ def _check_lever_arm(site: SiteData, align: Callable[..., PoseAlignment], alignm
 
 
 def _aligned_offsets(site: SiteData, alignment: PoseAlignment) -> tuple[float, Pairs]:
-    """Return the common offset, m, and the offset of each pair."""
+    """Return the common offset, m, and the offset of each pair; its standard deviation includes the anchor's position error."""
+    offsets = zip(alignment.pairs, alignment.offset_m.tolist(), alignment.offset_sd_m.tolist(), strict=True)
+    placed_m = site.anchors.sd / math.sqrt(2.0)
     pairs = {
-        (site.tags[tag].tag_id, site.anchors.anchors[row].id): alignment.pair(
-            tag, row, float(site.anchors.sd[row])
-        )
-        for tag, row in alignment.pairs
+        (site.tags[tag].tag_id, site.anchors.anchors[row].id): (offset_m, math.hypot(sd_m, placed_m[row]))
+        for (tag, row), offset_m, sd_m in offsets
     }
     common = float(np.median([value for value, sd in pairs.values() if sd <= MAX_TRUTH_SD_M] or [0.0]))
     scatter_m = MAD_TO_SD * float(np.median([abs(value - common) for value, _ in pairs.values()]))
@@ -435,24 +419,6 @@ def regressors(site: SiteData, *, has_truth: bool) -> Regressors:
             centred = np.where(is_known, value - np.median(value[is_known]), 0.0)
             columns.append(Regressors.single(name, centred, 0.0, SLOPE_SD))
     return functools.reduce(Regressors.concat, columns)
-
-
-def _stationary_positions(calibration: SelfCalibration) -> dict[str, tuple[float, float, float]]:
-    """Return the positions of stationary tags, see `SiteSolution.stationary_positions`."""
-    stationary = np.flatnonzero(calibration.fit.observations.is_stationary).tolist()
-    tag_of_segment = dict(
-        zip(calibration.segments.segment.tolist(), calibration.segments.tag.tolist(), strict=True)
-    )
-    positions = Counter(tag_of_segment[segment] for segment in stationary)
-    number: Counter[int] = Counter()
-    named = {}
-    for segment in stationary:
-        tag = tag_of_segment[segment]
-        number[tag] += 1
-        suffix = f" #{number[tag]}" if positions[tag] > 1 else ""
-        x, y, z = calibration.fit.position[calibration.fit.observations.knot_segment == segment][0].tolist()
-        named[f"{calibration.tag_ids[tag]}{suffix}"] = (x, y, z)
-    return named
 
 
 def _without_outliers(

@@ -6,7 +6,6 @@ import functools
 import importlib
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,12 +18,15 @@ from uwb_mitigation.commands.support.console import JsonOption, print_line, show
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from uwb_mitigation.calibration.site import SiteCalibration
     from uwb_mitigation.calibration.site_data import SiteData
-    from uwb_mitigation.calibration.solution import Localisation
     from uwb_mitigation.mitigation.model.bundle import Bundle
     from uwb_mitigation.positioning.track_settings import TrackSettings
     from uwb_mitigation.types.anchors import AnchorMap
+    from uwb_mitigation.types.tracks import PosePath
 
 MAX_LEVER_ARM_DIFFERENCE_M = 0.01
 BASE_FRAME = "base_link"
@@ -107,17 +109,28 @@ def calibrate(
 
         uwb-mitigation process other.mcap --model site.onnx --offsets site.offsets.yaml -o corrected.mcap
     """
-    from uwb_mitigation.calibration.site import calibrate_site
-    from uwb_mitigation.calibration.solution import solve_with_truth, solve_without_truth
+    from uwb_mitigation.calibration.site import calibrate_site, offsets_file
+    from uwb_mitigation.calibration.solution import Localisation, solve_with_truth, solve_without_truth
     from uwb_mitigation.commands.support.bundles import bundle_for
     from uwb_mitigation.positioning.geometry import parse_lever_arm
+    from uwb_mitigation.positioning.track_settings import MAX_STAMP_OFFSET_S
     from uwb_mitigation.recordings.bag.anchor_markers import read_anchors
 
-    _check_files(output, report, force)
-    pose_options = _PoseOptions(
-        truth_topic, frames, time_offset, parse_lever_arm(lever_arm), estimate_lever_arm
-    )
-    pose_options.check()
+    check_output(output)
+    check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
+    given_arm_m = parse_lever_arm(lever_arm)
+    if truth_topic is None and (frames, time_offset, given_arm_m, estimate_lever_arm) != (
+        None,
+        None,
+        None,
+        False,
+    ):
+        raise ParameterError(
+            "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
+            valid="with --truth-topic",
+        )
+    if time_offset is not None and not abs(time_offset) <= MAX_STAMP_OFFSET_S:
+        raise ParameterError(f"time offset {time_offset}", valid="-3600 to 3600 s")
     if check and truth_topic is not None:
         raise ParameterError("--check with --truth-topic", valid="either of them")
     anchor_map = read_anchors(bags[0], anchors)
@@ -126,21 +139,24 @@ def calibrate(
     try:
         gather = functools.partial(_gather, anchors=anchor_map, source=source, settings=settings)
         site, drives = gather(bags), [gather([bag]) for bag in check or []]
-        with console.stage_bars() as on_progress:
-            if pose_options.topic is not None:
-                localisation = _localisation(bags, site, pose_options.topic, pose_options)
-                solution = solve_with_truth(
-                    site, localisation, height=settings.height, on_progress=on_progress
+        with console.stage_bars() as show_stage:
+            show_stage("estimating tracks and offsets", 0.0)
+            if truth_topic is not None:
+                paths, lever_arms_m = _poses_of_tags(bags, site, truth_topic, frames, given_arm_m)
+                ids = [tag.tag_id for tag in site.tags]
+                localisation = Localisation(
+                    truth_topic, ids, paths, time_offset, lever_arms_m, estimate_lever_arm
                 )
+                solution = solve_with_truth(site, localisation, height=settings.height)
             else:
                 solution = solve_without_truth(
                     site,
                     height=settings.height,
                     area=settings.area,
                     height_sd_m=settings.height_sd_m,
-                    on_progress=on_progress,
                 )
-            calibration = calibrate_site(site, source, solution, check=drives, on_progress=on_progress)
+            show_stage("testing on held-out ranges", 0.0)
+            calibration = calibrate_site(site, source, solution, check=drives)
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.
         refused: dict[str, object] = {
@@ -160,37 +176,6 @@ def calibrate(
         console.write_json(json, calibration, {"refused": no_gain})
         raise no_gain
     console.write_json(json, calibration, _write(calibration, bags, source, output, report))
-
-
-@dataclass(frozen=True)
-class _PoseOptions:
-    """Options of a localisation that is used as ground truth."""
-
-    topic: str | None
-    frames: tuple[str, str] | None
-    time_offset_s: float | None
-    lever_arm_m: tuple[float, float, float] | None
-    estimate_lever_arm: bool
-
-    def check(self) -> None:
-        """Raise a ParameterError if the options contradict each other."""
-        values = (self.frames, self.time_offset_s, self.lever_arm_m, self.estimate_lever_arm or None)
-        if self.topic is None and any(value is not None for value in values):
-            raise ParameterError(
-                "--frames, --time-offset, --lever-arm or --estimate-lever-arm without --truth-topic",
-                valid="with --truth-topic",
-            )
-        from uwb_mitigation.positioning.track_settings import MAX_STAMP_OFFSET_S
-
-        if self.time_offset_s is not None and not abs(self.time_offset_s) <= MAX_STAMP_OFFSET_S:
-            raise ParameterError(f"time offset {self.time_offset_s}", valid="-3600 to 3600 s")
-
-
-def _check_files(output: Path, report: Path | None, force: bool) -> None:
-    from uwb_mitigation.calibration.site import offsets_file
-
-    check_output(output)
-    check_replaceable((output, offsets_file(output), *([report] if report else [])), force)
 
 
 def _write(
@@ -235,22 +220,25 @@ def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle, settings: Trac
     return site
 
 
-def _localisation(bags: list[Path], site: SiteData, topic: str, pose: _PoseOptions) -> Localisation:
-    """Read for each tag the poses of its body in each bag, and its lever arm."""
+def _poses_of_tags(
+    bags: list[Path],
+    site: SiteData,
+    topic: str,
+    frames: tuple[str, str] | None,
+    lever_arm_m: tuple[float, float, float] | None,
+) -> tuple[list[list[PosePath]], NDArray[np.float64]]:
+    """Return for each of T tags the poses of its body in each bag, and the lever arms (T, 3), m, by default those of the bags."""
     import numpy as np
 
-    from uwb_mitigation.calibration.solution import Localisation
     from uwb_mitigation.recordings.bag.pose_paths import read_bodies
     from uwb_mitigation.types.ros.poses import UWB_TAG, tag_of_frame
-
-    lever_arm_m = pose.lever_arm_m
 
     if lever_arm_m is not None and len(site.tags) > 1:
         raise ParameterError(
             f"one --lever-arm for {len(site.tags)} tags",
             valid="transforms to the frames of the tags in the bag",
         )
-    bodies = [read_bodies(bag, topic, pose.frames) for bag in bags]
+    bodies = [read_bodies(bag, topic, frames) for bag in bags]
     paths, lever_arms_m = [], np.zeros((len(site.tags), 3))
     for number, tag in enumerate(site.tags):
         names = [
@@ -268,8 +256,7 @@ def _localisation(bags: list[Path], site: SiteData, topic: str, pose: _PoseOptio
                     f"tag {format_id(tag.tag_id)}: the bag contains no transform from {names[0] or BASE_FRAME} to the "
                     "antenna; the lever arm is 0. Set --lever-arm"
                 )
-    ids = [tag.tag_id for tag in site.tags]
-    return Localisation(topic, ids, paths, pose.time_offset_s, lever_arms_m, pose.estimate_lever_arm)
+    return paths, lever_arms_m
 
 
 def _body_of_tag(tag_id: int, bodies: Iterable[str], where: str) -> str:

@@ -31,16 +31,16 @@ def site_page(calibration: SiteCalibration, name: str, bundle: Bundle, files: tu
         bundle: the model that was written.
         files: names of the files of the model and of the offsets.
     """
-    solution, data = calibration.solution, calibration.data
-    assert data.anchors is not None
+    solution, site = calibration.solution, calibration.site
+    anchor_row = site.ranges.anchor[solution.rows]
     errors_m = np.stack([calibration.raw_error_m, calibration.held_out_error_m])
     is_known = np.isfinite(errors_m).all(axis=0)
     table: list[tuple[object, ...]] = [
         ("anchor", "ranges", "raw, mean |residual|, m", "calibrated, mean |residual|, m")
     ]
     boxes = dict[TrackKind, dict[str, Iterable[float]]]({TrackKind.RAW: {}, TrackKind.CORRECTED: {}})
-    for anchor in calibration.site.anchors.anchors:
-        of_anchor = errors_m[:, (data.anchors == anchor.id) & is_known]
+    for row_number, anchor in enumerate(site.anchors.anchors):
+        of_anchor = errors_m[:, (anchor_row == row_number) & is_known]
         if of_anchor.size:
             table.append(
                 (anchor, of_anchor.shape[1], *(f"{mean:.3f}" for mean in np.abs(of_anchor).mean(axis=1)))
@@ -103,8 +103,9 @@ def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
         places = solution.track[(solution.track_of == segment) & np.isfinite(solution.track).all(axis=1)]
         columns = np.column_stack([np.zeros(len(places)), places, np.full(len(places), math.nan)])
         scene.set_track(f"segment {segment}", TrackKind.CORRECTED, columns)
-    for tag, (x, y, z) in solution.stationary_positions.items():
-        scene.add_pose(str(tag), Pose(x, y, z))
+        if len(places) == 1:
+            # A stationary tag.
+            scene.add_pose(f"segment {segment}", Pose(*places[0].tolist()))
     scene.error_counts += count_errors(errors_m)
     scene.errors = errors_m.shape[1]
     return View(scene)

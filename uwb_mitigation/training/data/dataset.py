@@ -88,10 +88,6 @@ class Dataset:
         }
         return replace(self, skipped={}, **selected_columns)
 
-    def shifted(self, by_m: NDArray[np.float64]) -> Dataset:
-        """Return a copy with `by_m`, shape (n,), added to ranges and errors."""
-        return replace(self, range_m=self.range_m + by_m, error_m=self.error_m + by_m)
-
     @classmethod
     def joined(cls, datasets: Sequence[Dataset]) -> Dataset:
         """Concatenate parts with the same preprocessing; columns that a part does not have are left out."""
