@@ -7,43 +7,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_material import damage_after_first_chunk
+from bag_material import damage_after_first_chunk, write_bag
 from command_line import run, start, succeed
 
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.mcap import McapRecording
-from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record, Truth
+from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros import codec
 
 
-def write_bag(path: Path, count: int = 6) -> Path:
-    with BagWriter(path, {"source": "a test", "simulated": "true"}) as bag:
-        for number in range(count):
-            samples = np.arange(-20, 20, dtype=np.int16)
-            measurement = RangeMeasurement(
-                10**18 + number * 10**8, 5, 2 + number % 2, number, 0, 4.5, Cir(samples)
-            )
-            bag.write(Record(measurement, Truth(4.0 + 0.25 * (number // 2), "NLOS", "by the door")))
-    return path
-
-
 def test_info_shows_the_contents_of_a_bag(tmp_path: Path) -> None:
-    write_bag(tmp_path / "bag.mcap")
+    write_bag(tmp_path / "bag.mcap", 6, simulated="true")
     done = start("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    for shown in ("simulated", "6 ranges", "2 pairs", "NLOS", "4.500", "4.250", "5.0"):
+    for shown in ("simulated", "6 ranges", "2 pairs", "NDP NLOS", "6.500", "7.000", "50.0"):
         assert shown in done.stdout
     result = json.loads((tmp_path / "info.json").read_text())
     assert (result["messages"], result["ranges"], result["pairs"]) == (12, 6, 2)
-    assert result["duration_s"] == pytest.approx(0.5)
+    assert result["duration_s"] == pytest.approx(0.05)
     assert result["skipped"] == {}
     assert result["simulated"] is True
 
 
 def test_import_joins_recordings_and_keeps_the_simulated_mark(tmp_path: Path) -> None:
-    write_bag(tmp_path / "one.mcap")
-    write_bag(tmp_path / "two", 3)
+    write_bag(tmp_path / "one.mcap", 6, simulated="true")
+    write_bag(tmp_path / "two", 3, simulated="true")
     done = start("data", "import", "one.mcap", "two", "-o", "out", "--json", "import.json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     bag = BagReader(tmp_path / "out")
@@ -53,7 +42,7 @@ def test_import_joins_recordings_and_keeps_the_simulated_mark(tmp_path: Path) ->
 
 
 def test_damaged_bag_is_shown_up_to_the_damage_and_exits_1(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "bag.mcap")
+    path = write_bag(tmp_path / "bag.mcap", 6)
     end = damage_after_first_chunk(path)
     done = run("data", "info", "bag.mcap", "--json", "info.json", folder=tmp_path)
     assert done.returncode == 1

@@ -17,7 +17,6 @@ import generated
 import pytest
 import typer
 import yaml
-from browser import Browser
 from conftest import REPOSITORY
 from test_launch import generate as generate
 from test_launch import launch, settings
@@ -108,20 +107,18 @@ def lines_of(*start: str) -> list:
     ]
 
 
-COMMANDS = typer.main.get_command(cli.app)
+COMMANDS: dict[str, Any] = {
+    "uwb-mitigation": typer.main.get_command(cli.app),
+    "python -m benchmarks": typer.main.get_command(benchmarks.app),
+}
 
 
-@pytest.mark.parametrize("words", lines_of("uwb-mitigation"))
-def test_commands_on_pages_exist_with_their_options(words: list[str]):
-    check_options(COMMANDS, words)
-
-
-@pytest.mark.parametrize("words", lines_of("python", "-m", "benchmarks"))
-def test_benchmarks_on_pages_exist_with_their_options(words: list[str]):
-    check_options(typer.main.get_command(benchmarks.app), words)
-
-
-def check_options(command: Any, words: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [pytest.param(start, *one.values, id=one.id) for start in COMMANDS for one in lines_of(*start.split())],
+)
+def test_commands_on_pages_exist_with_their_options(start: str, words: list[str]):
+    command = COMMANDS[start]
     while hasattr(command, "commands"):
         assert words[0] in command.commands
         command, words = command.commands[words[0]], words[1:]
@@ -253,25 +250,3 @@ def test_templates_use_everything_that_can_be_generated():
     templates = "\n".join(page.read_text(encoding="utf-8") for page in generated.TEMPLATES.glob("*.md"))
     assert set(re.findall(r"^<!-- generated: (\w+) -->$", templates, re.M)) == set(generated.PARTS)
     assert not [path.name for path, text in GENERATED.items() if "<!-- generated" in text]
-
-
-# The built site.
-
-
-@pytest.fixture
-def site() -> Path:
-    folder = REPOSITORY / "build" / "site"
-    if not (folder / "docs" / "index.html").is_file():
-        pytest.skip("no site: run make docs")
-    return folder / "docs"
-
-
-def test_code_blocks_fit_on_a_screen_of_1280_pixels(browser: Browser, site: Path):
-    wide = "return [...document.querySelectorAll('pre')].filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.textContent)"
-    wide_blocks = {}
-    for folder in ("tutorials", "guides", "background"):
-        for page in sorted((site / folder).glob("*.html")):
-            browser.open(page.as_uri(), 1280)
-            if blocks := browser.run(wide):
-                wide_blocks[page.name] = blocks
-    assert wide_blocks == {}

@@ -15,6 +15,7 @@ from uwb_mitigation.mitigation.model.shipped import model_path
 from uwb_mitigation.nodes.support import launching
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.recordings.bag.pose_paths import check_topic
+from uwb_mitigation.recordings.mapping.mapping import load_mapping
 from uwb_mitigation.types.anchors import parse_anchors
 from uwb_mitigation.types.offsets import parse_offsets
 
@@ -23,6 +24,7 @@ from uwb_mitigation.types.offsets import parse_offsets
     ("call", "name"),
     [
         (partial(model_path, "Universl"), "universal"),
+        (partial(load_mapping, "starlok"), "starloc"),
         (partial(launching.check_names, ["raet:=1"], ["rate", "seed"]), "rate"),
         (partial(DRIVER[0].check, "decarangin"), "decaranging"),
         (partial(parse_offsets, "ancors: {1: 0.2}", "file"), "anchors"),

@@ -65,20 +65,22 @@ DAMAGED = {
 LATE = {f"shifted by {taps}": shifted(taps) for taps in (5, 10)}
 
 
-LOUDER = {
-    f"{decibels} dB louder": louder(decibels) for decibels in (-25, -20, -16, -15, -10, -9, -5, 5, 10, 20)
-}
-PERTURBED = DAMAGED | LATE | LOUDER
-
-
 def accuracy(mitigation: Mitigation, records: list[Record], change: Callable[[Cir], Cir]) -> Accuracy:
     """Return the accuracy on records with changed CIRs."""
     return evaluate_accuracy(mitigation, [changed(one, change(one.measurement.cir)) for one in records])
 
 
-@pytest.mark.parametrize("name", PERTURBED)
-def test_site_model_does_not_worsen_out_of_distribution_measurements(name, mitigation, records):
-    outcome = accuracy(mitigation, records, PERTURBED[name])
+@pytest.mark.parametrize("name", DAMAGED | LATE)
+def test_changed_cirs_do_not_worsen_ranges(name, mitigation, records, universal, calibrated):
+    change = (DAMAGED | LATE)[name]
+    for model, measured in ((mitigation, records), (universal, calibrated)):
+        outcome = accuracy(model, measured, change)
+        assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
+
+
+@pytest.mark.parametrize("decibels", [-25, -20, -16, -15, -10, -9, -5, 5, 10, 20])
+def test_site_model_does_not_worsen_ranges_of_other_levels(decibels, mitigation, records):
+    outcome = accuracy(mitigation, records, louder(decibels))
     assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
@@ -121,12 +123,6 @@ def calibrated(records) -> list[Record]:
         np.median([data.error_m[los][placements == name].mean() for name in np.unique(placements)])
     )
     return [changed(record, range_m=record.measurement.range_m - offset) for record in records]
-
-
-@pytest.mark.parametrize("name", DAMAGED | LATE)
-def test_out_of_distribution_measurements_do_not_get_worse(name, universal, calibrated):
-    outcome = accuracy(universal, calibrated, PERTURBED[name])
-    assert outcome.corrected.mae <= 1.02 * outcome.raw.mae
 
 
 @pytest.mark.parametrize(("name", "most"), [("shifted by 5", 1.6), ("shifted by 10", 1.02)])

@@ -166,21 +166,29 @@ def test_node_runs_without_optional_packages(tmp_path: Path, name: str, needed: 
 
 
 @pytest.mark.parametrize(
-    ("name", "absent", "excerpt"),
+    ("words", "absent", "excerpt"),
     [
         ("mitigator", "onnxruntime", "onnxruntime is not installed (run uwb-mitigation doctor)"),
         ("driver", "serial", "pyserial is not installed (run uwb-mitigation doctor)"),
         ("monitor", "rich", "rich is not installed (run uwb-mitigation doctor)"),
         ("mitigator", "rclpy", "ROS 2 is not set up: rclpy is missing"),
         ("mitigator", "uwb_mitigation_msgs", "ROS 2 is not set up: uwb_mitigation_msgs is missing"),
+        (
+            "command_line process in.mcap -o out.mcap",
+            "numpy",
+            "numpy is not installed (run uwb-mitigation doctor)",
+        ),
+        ("command_line board export-c -o c", "onnx", "onnx is not installed (run uwb-mitigation doctor)"),
+        ("command_line train --data simulated:ranges=60 -o x.onnx", "torch", "run `make setup-training`"),
     ],
 )
-def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, name: str, absent: str, excerpt: str):
-    command = without([absent], name)
+def test_missing_dependency_is_reported_in_one_line(tmp_path: Path, words: str, absent: str, excerpt: str):
+    name, *arguments = words.split()
+    command = [*without([absent], name), *arguments]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"error: {excerpt}")
+    assert excerpt in line
 
 
 CORRECT_WITH_THE_FIRMWARE = """
@@ -208,25 +216,10 @@ def test_models_and_firmware_backend_need_no_checkout(tmp_path: Path, layout: st
     assert all(Path(place).is_relative_to(tmp_path) for place in done.stdout.split()), done.stdout
 
 
-@pytest.mark.parametrize("folder", ["", "msg_defs"])
-def test_manifest_is_valid(folder: str):
-    package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
-    warnings: list[str] = []
-    manifest = package.parse_package(str(REPOSITORY / folder), warnings=warnings)
-    manifest.validate(warnings)
-    assert warnings == []
-    assert manifest.package_format == 3
-    assert manifest.licenses == ["Apache-2.0"]
-    assert manifest.get_build_type() == ("ament_cmake" if folder else "ament_python")
-    groups = [group.name for group in manifest.member_of_groups]
-    assert groups == (["rosidl_interface_packages"] if folder else [])
-
-
-def imported(paths: Iterable[Path], at_start: bool = False) -> Iterator[str]:
-    """Return the top-level packages that files import; `at_start`: only at import time."""
+def imported(paths: Iterable[Path]) -> Iterator[str]:
+    """Return the top-level packages that files import."""
     for path in paths:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in tree.body if at_start else ast.walk(tree):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 yield from (alias.name.partition(".")[0] for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module:
@@ -246,16 +239,3 @@ def test_every_ros_package_that_is_imported_is_declared_and_no_other():
     assert used == {name for name in declared if not name.startswith(("python-", "python3-"))}
     tested = set(imported((REPOSITORY / "test").glob("*.py"))) & ros
     assert tested <= declared | {entry.name for entry in manifest.test_depends}
-
-
-def test_every_interface_that_the_messages_use_is_declared():
-    package = pytest.importorskip("catkin_pkg.package", reason="run make setup-training")
-    manifest = package.parse_package(str(REPOSITORY / "msg_defs"))
-    lines = "\n".join(path.read_text() for path in (REPOSITORY / "msg_defs" / "msg").iterdir()).splitlines()
-    used = {line.split("/")[0] for line in lines if "/" in line.split(" ")[0]}
-    for depends in (manifest.build_depends, manifest.exec_depends):
-        assert used <= {entry.name for entry in depends}
-    cmake = (REPOSITORY / "msg_defs" / "CMakeLists.txt").read_text()
-    assert all(f"find_package({name} REQUIRED)" in cmake for name in used)
-    files = {path.name for path in (REPOSITORY / "msg_defs" / "msg").iterdir()}
-    assert all(f'"msg/{name}"' in cmake for name in files)

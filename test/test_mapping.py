@@ -197,8 +197,8 @@ def test_ids_are_read_from_texts_hexadecimal_numbers_and_names(tmp_path: Path):
 
 
 def test_rows_without_an_id_are_dropped_and_counted(tmp_path: Path):
-    source = of("t,a,r\n0,1,2\n1,,3\n2,-,4\n3,2.0,5\n", tmp_path / "x.csv")
-    assert ranges_of(source) == [2.0, 5.0]
+    source = of("t,a,r\n0,9007199254740993,2\n1,,3\n2,-,4\n3,2.0,5\n", tmp_path / "x.csv")
+    assert values_of(source) == [(0.0, 1, 9007199254740993, 2.0), (3.0, 1, 2, 5.0)]
     assert source.dropped == {"tag or anchor is unknown": 2}
 
 
@@ -381,152 +381,155 @@ def test_every_shipped_mapping_is_valid_and_names_its_source():
         load_mapping("util")
 
 
-def test_ewine(tmp_path: Path):
-    head = (
-        "NLOS,RANGE,FP_IDX,FP_AMP1,FP_AMP2,FP_AMP3,STDEV_NOISE,CIR_PWR,MAX_NOISE,RXPACC,CH,FRAME_LEN,PREAM_LEN,"
-        "BITRATE,PRFR," + ",".join(f"CIR{n}" for n in range(1016))
+CIR = ",".join(str(float(n**3)) for n in range(1016))
+EWINE = (
+    "NLOS,RANGE,FP_IDX,FP_AMP1,FP_AMP2,FP_AMP3,STDEV_NOISE,CIR_PWR,MAX_NOISE,RXPACC,CH,FRAME_LEN,PREAM_LEN,"
+    "BITRATE,PRFR," + ",".join(f"CIR{n}" for n in range(1016)) + "\n"
+    f"1.0,6.18,749.0,4889.0,13876.0,10464.0,240.0,9048.0,1668.0,1024.0,2.0,39.0,1024.0,110.0,64.0,{CIR}\n"
+)
+LEVELS = "7,9,745,-78,-80,1,2,3,4,5,6,1010,4,39,1024,110,64,17"
+GHENT = (
+    ",channel,prf,x_tag,y_tag,z_tag,x_anchor,y_anchor,z_anchor,anchorNumber,LOS,RXPACC,fpindex,RX_power,FP_power,"
+    "timestamp,estimated_range,actual_range,error,loc_tag,NLOS\n"
+    "0,1,64,13259,6100,1498,12324,1611,2549,10.0,-,1518.0,46350.0,-91.274,-111.719,2707697285.0,4485.0,4704.247,-219,"
+    "10-10,NLOS\n"
+    "1,1,64,13259,6100,1498,13259,2696,5697,12.0,-,-,46350.0,-,-,105933948.0,5485.0,5404.0,81,10-12,LOS\n"
+)
+OF_GHENT = {
+    "ranges": [4.485, 5.485], "errors": (-0.219, 0.081), "truth": [("NLOS", "10-10"), ("LOS", "10-12")],
+    "cir": (0, 1, 1518, 724.219), "levels": [(-91.274, -111.719), (None, None)],
+}  # fmt: skip
+POSE = [f"pose.position.{axis}" for axis in "xyz"] + [f"pose.orientation.{axis}" for axis in "xyzw"]
+TURN = "Orientation X,Orientation Y,Orientation Z,Orientation W"
+
+
+RCV = {1: (5.1, [3.0, 4.0, 0.0]), 2: (2.1, [0.0, 2.0, 0.0])}
+"""Range and position of each anchor of RCV."""
+
+
+def rcv_anchor(number: int) -> str:
+    return (
+        f"Time,Address,Range,Rxpower,Position X,Position Y,Position Z,{TURN}\n"
+        f"2024-06-09 19:39:13.4387{number},8{number},{RCV[number][0]},-62.67,0,0,0,0,0,0,1\n"
+        f"2024-06-09 19:39:14.43874,8{number},-12.6,-69.7,0,0,0,0,0,0,1\n"
     )
-    row = "{},6.18,749.0,4889.0,13876.0,10464.0,240.0,9048.0,1668.0,1024.0,2.0,39.0,1024.0,110.0,64.0,"
-    row += ",".join(str(float(n**3)) for n in range(1016))
-    for part in (1, 2):
-        lines = [head, row.format("1.0"), row.format("0.0")]
-        write(tmp_path / f"dataset/uwb_dataset_part{part}.csv", "\n".join(lines))
-    source = open_mapped(tmp_path, "ewine")
+
+
+def rcv_position(number: int) -> str:
+    return (
+        f"anchor{number}:\n  - position:\n      data: {RCV[number][1]}\n"
+        "  - orientation:\n      data: [0, 0, 0, 1]\n"
+    )
+
+
+def rounded(*values: float) -> tuple[float | None, ...]:
+    """Return numbers to three decimals, and None for unknown ones."""
+    return tuple(None if np.isnan(value) else round(float(value), 3) for value in values)
+
+
+def summary(source: MappedRecording) -> dict[str, Any]:
+    """Return what a recording contains."""
     records = list(source)
-    assert [record.truth.label for record in records if record.truth] == ["NLOS", "LOS", "NLOS", "LOS"]
-    assert not source.warnings
-    cir = records[0].measurement.cir
-    assert (len(cir), cir.first_path_index, cir.preamble_count, cir.channel) == (1016, 749.0, 1024, 2)
-    # DW1000 user manual, section 4.7, with A = 121.74.
-    assert cir.rx_power_dbm == pytest.approx(10 * np.log10(9048 * 2**17 / 1024**2) - 121.74)
-    squares = 4889.0**2 + 13876.0**2 + 10464.0**2
-    assert cir.first_path_power_dbm == pytest.approx(10 * np.log10(squares / 1024**2) - 121.74)
-    assert source.errors_m.size == 0
-
-
-def test_miluv(tmp_path: Path):
-    folder = tmp_path / "data" / "default_3_random_0"
-    anchors = {"0": {str(n): f"[{3.0 + n}, 0.5, 1.8]" for n in range(6)}}
-    write(tmp_path / "config/uwb/anchors.yaml", yaml.safe_dump(anchors))
-    write(
-        folder / "ifo001/uwb_range.csv",
-        "from_id,to_id,range,gt_range,fpp1,fpp2,range_raw,timestamp\n"
-        "10,2,4.9,4.8,-82,-84,5.1,0.50\n10,21,1.9,1.8,-80,-80,2.0,0.55\n10,2,4.9,4.8,-82,-84,5.2,0.60\n",
-    )
-    pose = [f"pose.position.{axis}" for axis in "xyz"] + [f"pose.orientation.{axis}" for axis in "xyzw"]
-    rows = "0,0,0.6,1.8,0,0,0,1\n1,0,0.6,1.8,0,0,0,1\n"
-    write(folder / "ifo001/mocap.csv", f"timestamp,{','.join(pose)}\n{rows}")
-    samples = [n**3 // 10**5 for n in range(1016)]
-    write(
-        folder / "ifo001/uwb_cir.csv",
-        # The CIR of the second row belongs to a receiver on another drone.
-        f'timestamp,my_id,from_id,to_id,idx,cir\n0.625,10,2,2,747.2,"{samples}"\n0.73,20,10,2,9,"[1]"\n',
-    )
-    source = open_mapped(folder, "miluv")
-    first, second = list(source)
-    assert values_of(source)[0][1:] == (10, 2, 5.1)
-    assert first.measurement.cir.first_path_power_dbm == -83.0
-    assert first.measurement.cir.first_path_index == 747.2
-    assert (len(first.measurement.cir), len(second.measurement.cir)) == (1016, 0)
-    assert first.tag_position == pytest.approx((0.13189, 0.6 - 0.17245, 1.8 - 0.05249))
-    assert source.dropped == {"to_id above 9.0": 1}
-    assert source.warnings == ["5 anchors have a position but no range: 0, 1, 3, 4, 5"]
-    assert source.notes == ["CIRs attached: 1 of 1 (1 of other pairs); typical delay +0.00 s"]
-    assert source.anchors.position[2].tolist() == [5.0, 0.5, 1.8]
-
-
-def test_rcv(tmp_path: Path):
-    turn = "Orientation X,Orientation Y,Orientation Z,Orientation W"
-    site = ""
-    for anchor, place in ((1, [3.0, 4.0, 0.0]), (2, [0.0, 2.0, 0.0])):
-        write(
-            tmp_path / f"sequence1/anchor_{anchor}.csv",
-            f"Time,Address,Range,Rxpower,Position X,Position Y,Position Z,{turn}\n"
-            f"2024-06-09 19:39:13.4387{anchor},8{anchor},{np.linalg.norm(place) + 0.1},-62.67,0,0,0,0,0,0,1\n"
-            f"2024-06-09 19:39:14.43874,8{anchor},-12.6,-69.7,0,0,0,0,0,0,1\n",
-        )
-        site += f"anchor{anchor}:\n  - position:\n      data: {place}\n  - orientation:\n      data: [0, 0, 0, 1]\n"
-    write(tmp_path / "sequence1/anchor.yaml", site)
-    source = open_mapped(tmp_path / "sequence1", "rcv")
-    assert set(source.values["anchor"].tolist()) == {81, 82}
-    assert source.dropped == {"Range below 0.0": 2}
-    assert source.errors_m.tolist() == pytest.approx([0.1, 0.1])
-    assert next(iter(source)).measurement.stamp_ns == 1_717_961_953_438_710_000
+    first, cirs = records[0], [one.measurement.cir for one in records]
+    has_anchors = hasattr(source, "anchors")
+    return {
+        "ids": [(one.measurement.tag_id, one.measurement.anchor_id) for one in records],
+        "ranges": ranges_of(source),
+        "errors": rounded(*source.errors_m),
+        "stamp": first.measurement.stamp_ns,
+        "truth": [(one.truth.label, one.truth.configuration) for one in records if one.truth],
+        "position": first.tag_position and rounded(*first.tag_position),
+        "anchors": [rounded(*one.position) for one in source.anchors.anchors] if has_anchors else [],
+        "levels": [rounded(cir.rx_power_dbm, cir.first_path_power_dbm) for cir in cirs],
+        "cir": (len(cirs[0]), cirs[0].channel, cirs[0].preamble_count, *rounded(cirs[0].first_path_index)),
+        "dropped": source.dropped,
+        "warnings": source.warnings,
+        "notes": source.notes,
+    }
 
 
 @pytest.mark.parametrize(
-    ("mapping", "file"), [("ghent_industrial", "meta_IIoT_19.csv"), ("ghent_office", "meta_Office.csv")]
-)
-def test_ghent_industrial_and_office(mapping: str, file: str, tmp_path: Path):
-    write(
-        tmp_path / file,
-        ",channel,prf,x_tag,y_tag,z_tag,x_anchor,y_anchor,z_anchor,anchorNumber,LOS,RXPACC,fpindex,RX_power,FP_power,"
-        "timestamp,estimated_range,actual_range,error,loc_tag,NLOS\n"
-        "0,1,64,13259,6100,1498,12324,1611,2549,10.0,-,1518.0,46350.0,-91.274,-111.719,2707697285.0,4485.0,4704.247,-219,"
-        "10-10,NLOS\n"
-        "1,1,64,13259,6100,1498,13259,2696,5697,12.0,-,-,46350.0,-,-,105933948.0,5485.0,5404.0,81,10-12,LOS\n",
-    )
-    source = open_mapped(tmp_path, mapping)
-    first, second = source
-    if mapping == "ghent_industrial":
-        assert source.anchors.position[0] == pytest.approx([12.324, 1.611, 2.549])
-        assert first.tag_position == pytest.approx((13.259, 6.1, 1.498))
-        assert not source.warnings
-    assert first.truth is not None
-    assert second.truth is not None
-    assert (first.measurement.range_m, first.truth.range_m) == pytest.approx((4.485, 4.704247))
-    assert (first.truth.label, first.truth.configuration, second.truth.label) == ("NLOS", "10-10", "LOS")
-    cir = first.measurement.cir
-    assert (cir.first_path_index, cir.preamble_count) == (46350 / 64, 1518)
-    assert (cir.rx_power_dbm, cir.first_path_power_dbm) == (-91.274, -111.719)
-    assert np.isnan(second.measurement.cir.rx_power_dbm)
-    assert second.measurement.cir.preamble_count == 0
-
-
-def test_ghent_industrial_2020(tmp_path: Path):
-    write(
-        tmp_path / "meta_IIoT_20.csv",
-        ",channel,fpindex_tag,rxpower_tag,fppower_tag,rxpacc_tag,loc_tag,tag_ID,anchor_ID,distance_UWB,distance_GT,error,NLOS\n"
-        "1,3,747.704,-79.948,-81.873,1048,1-3,1,3,10786,10969.411424502228,-183.41142450222833,LOS\n",
-    )
-    source = open_mapped(tmp_path, "ghent_industrial_2020")
-    (record,) = source
-    assert source.errors_m.tolist() == pytest.approx([-0.18341142])
-    assert record.measurement.cir.first_path_index == 747.704
-    assert record.measurement.cir.power_gap_db == pytest.approx(1.925)
-
-
-def test_ghent_university(tmp_path: Path):
-    write(
-        tmp_path / "meta_University.csv",
-        ",real_rng,rng,rssi,fp_idx,fp_power,pacc_cnt,condition,location_from,location_to,error,env\n"
-        "1,6.269,8.045,-80.136,743,-93.968,101,nlos,hw,hw,1.7639,hwhw\n"
-        "2,2.707,2.545,-79.895,751,-82.755,101,los,3edvl,1_hw,-0.0852,3edvl1_hw\n",
-    )
-    source = open_mapped(tmp_path, "ghent_university")
-    first, _ = source
-    assert first.truth is not None
-    assert first.truth.configuration == "hwhw"
-    assert first.truth.label == "NLOS"
-    assert source.errors_m.tolist() == pytest.approx([1.776, -0.162])
-    # The tag `hw` and the anchor `hw` are the same radio.
-    assert [(one.measurement.tag_id, one.measurement.anchor_id) for one in source] == [(1, 1), (2, 3)]
-
-
-def test_starloc(tmp_path: Path):
-    write(tmp_path / "mocap/uwb_markers_v3.csv", ",x,y,z\n9,3.0,4.0,0.0\n12,0.0,2.0,0.0\n")
-    write(tmp_path / "mocap/uwb_markers_v1.csv", ",x,y,z\n9,9.0,9.0,9.0\n")
-    session = tmp_path / "data/loop-2d_s5"
-    write(
-        session / "uwb.csv",
-        "time_s,to_id,range,from_id,x,y,z,tag_pos_x,tag_pos_y,tag_pos_z,bias,gt_range\n"
-        "0.0209,9,5.11,1,0,0,0,0,0,0,0.11,5.0\n0.0214,12,2.1,1,0,0,0,0,0,0,0.1,2.0\n",
-    )
-    source = open_mapped(session, "starloc")
-    assert source.anchors.position.tolist() == [[3.0, 4.0, 0.0], [0.0, 2.0, 0.0]]
-    assert source.errors_m.tolist() == pytest.approx([0.11, 0.1])
-    assert not source.warnings
-    assert open_mapped(session / "uwb.csv", "starloc").anchors.index == {9: 0, 12: 1}
+    ("mapping", "place", "files", "expected"),
+    [
+        (
+            "ewine", ".", {f"dataset/uwb_dataset_part{part}.csv": EWINE for part in (1, 2)},
+            # DW1000 user manual, section 4.7, with A = 121.74.
+            {"truth": [("NLOS", "")] * 2, "levels": [(-91.205, -96.815)] * 2, "cir": (1016, 2, 1024, 749.0), "errors": (),
+             "warnings": []},
+        ),
+        (
+            "ewine_localization", "tag_room0.csv",
+            {"tag_room0.csv": f"1.0,2.0,3.0,4.0,2.928,0,{LEVELS},{CIR}\n1.0,2.0,4.0,4.0,3.706,1,{LEVELS},{CIR}\n"},
+            {"errors": (0.1, 0.1), "ids": [(1, 0)] * 2, "cir": (1016, 4, 1010, 745.0), "anchors": [(1.0, 2.0, 0.0)]},
+        ),
+        (
+            "miluv", "data/default_3_random_0",
+            {
+                "config/uwb/anchors.yaml": yaml.safe_dump({"0": {str(n): f"[{3.0 + n}, 0.5, 1.8]" for n in range(6)}}),
+                "data/default_3_random_0/ifo001/uwb_range.csv":
+                    "from_id,to_id,range,gt_range,fpp1,fpp2,range_raw,timestamp\n10,2,4.9,4.8,-82,-84,5.1,0.50\n"
+                    "10,21,1.9,1.8,-80,-80,2.0,0.55\n10,2,4.9,4.8,-82,-84,5.2,0.60\n",
+                "data/default_3_random_0/ifo001/mocap.csv":
+                    f"timestamp,{','.join(POSE)}\n0,0,0.6,1.8,0,0,0,1\n1,0,0.6,1.8,0,0,0,1\n",
+                # The CIR of the second row belongs to a receiver on another drone.
+                "data/default_3_random_0/ifo001/uwb_cir.csv":
+                    f'timestamp,my_id,from_id,to_id,idx,cir\n0.625,10,2,2,747.2,"{list(range(1016))}"\n'
+                    '0.73,20,10,2,9,"[1]"\n',
+            },
+            {"ids": [(10, 2)] * 2, "ranges": [5.1, 5.2], "cir": (1016, 0, 0, 747.2), "levels": [(None, -83.0)] * 2,
+             "position": (0.132, 0.428, 1.748), "dropped": {"to_id above 9.0": 1},
+             "anchors": [(3.0 + n, 0.5, 1.8) for n in range(6)],
+             "warnings": ["5 anchors have a position but no range: 0, 1, 3, 4, 5"],
+             "notes": ["CIRs attached: 1 of 1 (1 of other pairs); typical delay +0.00 s"]},
+        ),
+        (
+            "rcv", "sequence1",
+            {**{f"sequence1/anchor_{n}.csv": rcv_anchor(n) for n in (1, 2)},
+             "sequence1/anchor.yaml": rcv_position(1) + rcv_position(2)},
+            {"ids": [(1, 81), (1, 82)], "dropped": {"Range below 0.0": 2}, "errors": (0.1, 0.1),
+             "stamp": 1_717_961_953_438_710_000},
+        ),
+        (
+            "starloc", "data/loop-2d_s5/uwb.csv",
+            {"mocap/uwb_markers_v3.csv": ",x,y,z\n9,3.0,4.0,0.0\n12,0.0,2.0,0.0\n",
+             "mocap/uwb_markers_v1.csv": ",x,y,z\n9,9.0,9.0,9.0\n",
+             "data/loop-2d_s5/uwb.csv":
+                "time_s,to_id,range,from_id,x,y,z,tag_pos_x,tag_pos_y,tag_pos_z,bias,gt_range\n"
+                "0.0209,9,5.11,1,0,0,0,0,0,0,0.11,5.0\n0.0214,12,2.1,1,0,0,0,0,0,0,0.1,2.0\n"},
+            {"errors": (0.11, 0.1), "anchors": [(3.0, 4.0, 0.0), (0.0, 2.0, 0.0)], "warnings": []},
+        ),
+        ("ghent_office", ".", {"meta_Office.csv": GHENT}, OF_GHENT),
+        (
+            "ghent_industrial", ".", {"meta_IIoT_19.csv": GHENT},
+            OF_GHENT | {"position": (13.259, 6.1, 1.498), "warnings": [],
+                        "anchors": [(12.324, 1.611, 2.549), (13.259, 2.696, 5.697)]},
+        ),
+        (
+            "ghent_industrial_2020", ".",
+            {"meta_IIoT_20.csv":
+                ",channel,fpindex_tag,rxpower_tag,fppower_tag,rxpacc_tag,loc_tag,tag_ID,anchor_ID,distance_UWB,distance_GT,"
+                "error,NLOS\n1,3,747.704,-79.948,-81.873,1048,1-3,1,3,10786,10969.411424502228,-183.41142450222833,LOS\n"},
+            {"errors": (-0.183,), "cir": (0, 3, 1048, 747.704), "levels": [(-79.948, -81.873)]},
+        ),
+        (
+            # The tag `hw` and the anchor `hw` are the same radio.
+            "ghent_university", ".",
+            {"meta_University.csv":
+                ",real_rng,rng,rssi,fp_idx,fp_power,pacc_cnt,condition,location_from,location_to,error,env\n"
+                "1,6.269,8.045,-80.136,743,-93.968,101,nlos,hw,hw,1.7639,hwhw\n"
+                "2,2.707,2.545,-79.895,751,-82.755,101,los,3edvl,1_hw,-0.0852,3edvl1_hw\n"},
+            {"ids": [(1, 1), (2, 3)], "errors": (1.776, -0.162),
+             "truth": [("NLOS", "hwhw"), ("LOS", "3edvl1_hw")]},
+        ),
+    ],
+)  # fmt: skip
+def test_shipped_mapping_reads_the_files_of_its_data_set(
+    mapping: str, place: str, files: dict[str, str], expected: dict[str, Any], tmp_path: Path
+):
+    for name, text in files.items():
+        write(tmp_path / name, text)
+    found = summary(open_mapped(tmp_path / place, mapping))
+    assert {name: found[name] for name in expected} == expected
 
 
 def test_librsf_simulation(tmp_path: Path):
@@ -710,7 +713,7 @@ def test_columns_are_found_with_other_case_index_and_byte_order_mark(tmp_path: P
         ("fields: {anchor: {column: a, pattern: 'a'}, range: r}", "has no group"),
         ("fields: {anchor: a, range: r}\ndrop: [{column: a}]", "drop.0: a rule needs equals"),
         ("fields: !!python/object/apply:os.system ['true']", "not YAML"),
-        ("fields: " + "[" * 5000, "not YAML"),
+        ("fields: " + "[" * 1000, "not YAML"),
         ("fields: 7", "valid dictionary|should be"),
     ],
 )
@@ -719,15 +722,10 @@ def test_an_invalid_mapping_is_an_error_that_names_the_field(text: str, message:
         load_mapping(str(write(tmp_path / "map.yaml", f"name: x\n{text}\n")))
 
 
-def test_an_unknown_mapping_is_answered_with_a_similar_one():
-    with pytest.raises(ParameterError, match="did you mean 'starloc'"):
-        load_mapping("starlok")
-
-
 @pytest.mark.parametrize(
     "text",
     [
-        "[" * 5000,
+        "[" * 1000,
         "~",
         "7",
         "a: &a [x, x, x]\nb: &b [*a, *a, *a]\n" + "".join(f"{n}: &{n} [*b, *b]\n" for n in range(9)),

@@ -7,28 +7,12 @@ import pytest
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.types.measurement import CorrectedBy, Encoding, Status
 from uwb_mitigation.types.ros.poses import tag_frame, tag_of_frame
-from uwb_mitigation.types.source import Source
 
 
 def test_constants_equal_those_of_the_messages():
     assert [status.value for status in Status] == [0, 1, 2, 3, 4, 5]
     assert (CorrectedBy.HOST, CorrectedBy.DEVICE) == (0, 1)
     assert (Encoding.COMPLEX_INT16, Encoding.MAGNITUDE) == (0, 1)
-
-
-def test_source_is_closed_at_the_end_of_its_block():
-    class Recording(Source):
-        closed = False
-
-        def __iter__(self):
-            return iter(())
-
-        def close(self):
-            self.closed = True
-
-    with Recording() as source:
-        assert not source.closed
-    assert source.closed
 
 
 @pytest.mark.parametrize("number", [0, 7, 65535, 65536, 2**64 - 1])

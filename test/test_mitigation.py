@@ -1,4 +1,4 @@
-"""Correction of valid and invalid measurements."""
+"""Correction of valid and invalid measurements, variance, and out-of-distribution measurements."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from model_material import LINE, bundle, measurement, window_of
 
+from uwb_mitigation.errors import ModelError
 from uwb_mitigation.mitigation.correction import OTHER_CHANNEL_FACTOR, UNRELIABLE_VARIANCE_M2, Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.preprocessing import Preprocessing
+from uwb_mitigation.mitigation.model.ood import Band, OodBands, OodDetector, ood_features
+from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.types.measurement import CorrectedBy, Encoding, RadioType, Segment, Status
 from uwb_mitigation.types.offsets import Offsets
 
@@ -30,26 +32,44 @@ def _no_warnings():
         yield
 
 
+SHAPE = Remnet(samples=157)
+EMPTY = {"samples": np.zeros(0, np.int16)}
+IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 BAD = [
-    ({"samples": np.zeros(0, np.int16)}, 3.0, Status.NO_CIR),
-    ({"samples": np.zeros(2032, np.int16)}, 3.0, Status.BAD_CIR),
-    ({"samples": np.full(2032, -32768, np.int16)}, 3.0, Status.BAD_CIR),
-    ({"samples": np.ones(20, np.int16)}, 3.0, Status.BAD_CIR),
-    ({"encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR),
-    ({"first_path_index": math.nan}, 3.0, Status.BAD_CIR),
-    ({"preamble_count": 0}, 3.0, Status.BAD_CIR),
-    ({"rx_power_dbm": math.nan}, 3.0, Status.BAD_CIR),
-    ({"rx_power_dbm": -math.inf}, 3.0, Status.BAD_CIR),
-    ({"first_path_power_dbm": math.nan}, 3.0, Status.BAD_CIR),
-    ({"first_path_power_dbm": 1e300}, 3.0, Status.BAD_CIR),
-    ({"rx_power_dbm": 300.0}, 3.0, Status.OUT_OF_DISTRIBUTION),
-    ({}, math.nan, Status.OUT_OF_DISTRIBUTION),
-    ({}, math.inf, Status.OUT_OF_DISTRIBUTION),
-    ({}, -math.inf, Status.OUT_OF_DISTRIBUTION),
-    ({}, -0.5, Status.OUT_OF_DISTRIBUTION),
-    ({}, 1e300, Status.OUT_OF_DISTRIBUTION),
-    ({"samples": np.zeros(0, np.int16)}, math.nan, Status.NO_CIR),
+    (EMPTY, 3.0, Status.NO_CIR, "no samples"),
+    ({"samples": np.zeros(2032, np.int16)}, 3.0, Status.BAD_CIR, "only zeros"),
+    ({"samples": np.full(2032, -32768, np.int16)}, 3.0, Status.BAD_CIR, "saturated"),
+    ({"samples": np.ones(20, np.int16)}, 3.0, Status.BAD_CIR, "the first-path index is outside the CIR"),
+    ({"samples": IN_DB, "encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR, "in dB"),
+    ({"encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR, "negative"),
+    ({"first_path_index": math.nan}, 3.0, Status.BAD_CIR, "index is not finite"),
+    ({"first_path_index": 1010.0}, 3.0, Status.BAD_CIR, "too short"),
+    ({"scale": math.nan}, 3.0, Status.BAD_CIR, "NaN"),
+    ({"preamble_count": 0}, 3.0, Status.BAD_CIR, "is unknown, and the model"),
+    ({"rx_power_dbm": math.nan}, 3.0, Status.BAD_CIR, "power is unknown"),
+    ({"rx_power_dbm": -math.inf}, 3.0, Status.BAD_CIR, "power is unknown"),
+    ({"first_path_power_dbm": math.nan}, 3.0, Status.BAD_CIR, "power is unknown"),
+    ({"first_path_power_dbm": 1e300}, 3.0, Status.BAD_CIR, "power is unknown"),
+    ({"rx_power_dbm": 300.0}, 3.0, Status.OUT_OF_DISTRIBUTION, "unlike the training data"),
+    ({}, math.nan, Status.OUT_OF_DISTRIBUTION, "range of nan m"),
+    ({}, math.inf, Status.OUT_OF_DISTRIBUTION, "range of inf m"),
+    ({}, -math.inf, Status.OUT_OF_DISTRIBUTION, "range of -inf m"),
+    ({}, -0.5, Status.OUT_OF_DISTRIBUTION, "range of -0.50 m"),
+    ({}, 1e300, Status.OUT_OF_DISTRIBUTION, "range of"),
+    (EMPTY, math.nan, Status.NO_CIR, "range of nan m"),
 ]
+
+
+WIDE = Band(-1000.0, 1000.0, 1.0)
+SCALE = ((0.0, 0.25), (0.5, 0.375), (1.0, 0.75), (4.0, 4.5))
+
+
+def bands(**changes: Band) -> OodBands:
+    return replace(OodBands(0.25, *[WIDE] * 6), **changes)
+
+
+def with_bands(folder, scale=((0.0, 0.25),), **changes: Band) -> Mitigation:
+    return Mitigation(bundle(folder, SHAPE, ood_bands=bands(**changes), scale=scale))
 
 
 def test_cir_of_another_radio_is_passed_through_minus_the_offset(mitigation):
@@ -82,17 +102,18 @@ def test_correction_is_linear_bias_plus_network_in_float32(mitigation):
 @pytest.mark.parametrize("uncorrected_m2", [1 / 32, 0.5])
 def test_variance_of_a_range_without_cir_does_not_depend_on_the_offset(tmp_path, uncorrected_m2):
     saved = bundle(tmp_path, variance_uncorrected_m2=uncorrected_m2)
-    without = replace(measurement(samples=np.zeros(0, np.int16)), tag_id=7, anchor_id=1)
+    without = replace(measurement(**EMPTY), tag_id=7, anchor_id=1)
     for offsets in (Offsets(), Offsets(pairs={(7, 1): 0.2}, pair_sd={(7, 1): 0.03})):
         result = Mitigation(saved, offsets).correct([without])[0]
         assert result.status is Status.NO_CIR
         assert result.variance_m2 == max(uncorrected_m2, UNRELIABLE_VARIANCE_M2)
 
 
-@pytest.mark.parametrize(("changes", "range_m", "status"), BAD)
-def test_invalid_measurement_passes_through(mitigation, changes, range_m, status):
+@pytest.mark.parametrize(("changes", "range_m", "status", "reason"), BAD)
+def test_invalid_measurement_passes_through_with_its_reason(mitigation, changes, range_m, status, reason):
     result = mitigation.correct([measurement(range_m, **changes)])[0]
     assert result.status is status
+    assert reason in result.reason
     assert result.range_m == range_m or math.isnan(range_m)
     assert math.isnan(result.range_m) == math.isnan(range_m)
     assert result.correction_m == 0.0
@@ -100,17 +121,17 @@ def test_invalid_measurement_passes_through(mitigation, changes, range_m, status
 
 
 def test_constant_bias_model_needs_no_level(tmp_path):
-    subject = Mitigation(bundle(tmp_path, Remnet(samples=157), linear_bias=LinearBiasModel(0.25)))
+    subject = Mitigation(bundle(tmp_path, SHAPE, linear_bias=LinearBiasModel(0.25)))
     result = subject.correct([measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan)])[0]
     assert result.status is Status.OK
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{"samples": np.zeros(0, np.int16)}, {"preamble_count": 0}, {"first_path_power_dbm": math.nan}, {}],
+    [EMPTY, {"preamble_count": 0}, {"first_path_power_dbm": math.nan}, {}],
 )
 def test_bundle_without_network_ignores_the_cir(tmp_path, changes):
-    made = bundle(tmp_path, Remnet(samples=157), linear_bias=LinearBiasModel(0.25), needs_cir=False)
+    made = bundle(tmp_path, SHAPE, linear_bias=LinearBiasModel(0.25), needs_cir=False)
     result = Mitigation(made).correct([measurement(3.0, **changes)])[0]
     assert result.status is Status.OK
     if changes.get("first_path_power_dbm") is None and changes:
@@ -124,7 +145,7 @@ def test_standard_deviation_is_larger_on_other_channels(tmp_path):
         ((2, 5), 0, 1),
         ((), 4, 1),
     ):
-        subject = Mitigation(bundle(tmp_path, Remnet(samples=157), scale=((0.0, 0.375),), channels=trained))
+        subject = Mitigation(bundle(tmp_path, SHAPE, scale=((0.0, 0.375),), channels=trained))
         invalid = measurement(samples=np.zeros(2032, np.int16), channel=channel)
         result, passed_through = subject.correct([measurement(channel=channel), invalid])
         assert result.variance_m2 == (0.375 * factor) ** 2
@@ -133,27 +154,32 @@ def test_standard_deviation_is_larger_on_other_channels(tmp_path):
 
 
 def test_prediction_beyond_the_limits_is_out_of_distribution(tmp_path):
-    subject = Mitigation(bundle(tmp_path, Remnet(samples=157), correction_limits_m=(50.0, 60.0)))
+    subject = Mitigation(bundle(tmp_path, SHAPE, correction_limits_m=(50.0, 60.0)))
     result = subject.correct([measurement(3.0)])[0]
     assert (result.status, result.range_m) == (Status.OUT_OF_DISTRIBUTION, 3.0)
 
 
 @pytest.mark.parametrize(
-    "linear_bias",
-    [None, LinearBiasModel(0.25), LinearBiasModel(-1.0, -0.015625), LinearBiasModel(0.125, 0.0, 0.03125)],
+    ("changes", "offset_m"),
+    [
+        ({}, 0.0),
+        ({"linear_bias": LinearBiasModel(0.25), "needs_cir": False}, 0.125),
+        ({"linear_bias": LinearBiasModel(-1.0, -0.015625), "needs_cir": False}, 0.125),
+        ({"linear_bias": LinearBiasModel(0.125, 0.0, 0.03125), "needs_cir": False}, 0.125),
+        ({"ood_bands": bands(range_m=Band(1.0, 2.0, 4.0), power_at_1m_dbm=Band(-85.0, -70.0, 5.0))}, 0.0),
+    ],
 )
-def test_batch_has_the_bits_of_single_measurements(mitigation, tmp_path, linear_bias):
-    if linear_bias is not None:
-        made = bundle(tmp_path, Remnet(samples=157), linear_bias=linear_bias, needs_cir=False)
-        mitigation = Mitigation(made, Offsets(0.125))
-    subjects = [measurement(2 + 0.01 * seed, seed) for seed in range(60)]
-    subjects[5:5] = [measurement(range_m, **changes) for changes, range_m, _ in BAD]
-    subjects += [measurement(2.0, samples=np.zeros(0, np.int16), rx_power_dbm=-60.0 - n) for n in range(9)]
+def test_batch_has_the_bits_of_single_measurements(tmp_path, changes, offset_m):
+    subject = Mitigation(bundle(tmp_path, SHAPE, **changes), Offsets(offset_m))
+    subjects = [measurement(2 + 0.01 * seed, seed, rx_power_dbm=-75.0 - seed / 2) for seed in range(60)]
+    subjects[5:5] = [measurement(range_m, **changes) for changes, range_m, *_ in BAD]
+    subjects += [measurement(2.0, **EMPTY, rx_power_dbm=-60.0 - n) for n in range(9)]
     subjects += [measurement(2.0, first_path_power_dbm=math.nan), measurement(2.0, rx_power_dbm=math.nan)] * 4
-    single = [mitigation.correct([subject])[0] for subject in subjects]
-    if linear_bias is not None:
-        assert sum(result.status is Status.OK for result in single) > 70
-    assert [repr(result) for result in mitigation.correct(subjects)] == [repr(r) for r in single]
+    # At the edges of the bands, rounding decides whether the score of a live range is computed exactly.
+    subjects += [measurement(high + n * 1e-7) for high in (1.96, 2.0, 6.0) for n in range(-20, 20)]
+    single = [subject.correct([each])[0] for each in subjects]
+    assert sum(result.status is Status.OK for result in single) > 70
+    assert [repr(result) for result in subject.correct(subjects)] == [repr(r) for r in single]
 
 
 class FailingSession:
@@ -168,7 +194,76 @@ class FailingSession:
 
 @pytest.mark.parametrize("session", [FailingSession(), FailingSession(math.nan)])
 def test_failing_network_passes_the_range_through(tmp_path, session):
-    subject = Mitigation(bundle(tmp_path, Remnet(samples=157)))
+    subject = Mitigation(bundle(tmp_path, SHAPE))
     subject._backends[0]._session = session
     results = subject.correct([measurement(3.0)] * 2)
     assert [(result.status, result.range_m) for result in results] == [(Status.MODEL_ERROR, 3.0)] * 2
+
+
+# --- variance, and out-of-distribution measurements ---
+
+
+@pytest.mark.parametrize("scaling", Scaling)
+def test_energy_before_the_first_path_needs_no_level(scaling):
+    amplitude = np.zeros((1, 157), np.float32)
+    amplitude[0, :3], amplitude[0, 6:9] = 0.125, 0.25
+    window = np.sqrt(amplitude) if scaling is Scaling.PREAMBLE else amplitude
+    unknown = np.float32([math.nan])
+    found = ood_features(window, scaling, np.float32([3.0]), unknown, unknown)
+    assert found[5] == pytest.approx(10 * math.log10(0.2), abs=0.06)
+    only = OodBands(0.0, None, lead_level_db=Band(-50.0, -10.0, 6.0))
+    assert OodDetector(only.bands).score(found) == pytest.approx(0.5, abs=0.02)
+
+
+def test_weaker_radio_is_out_of_distribution_but_a_larger_distance_is_not(tmp_path):
+    one = with_bands(tmp_path, power_at_1m_dbm=Band(-74.0, -70.0, 2.0))
+    near, far, weak = (
+        one.correct([measurement(range_m, rx_power_dbm=power, first_path_power_dbm=power - 6.0)])[0].status
+        for range_m, power in ((1.0, -72.0), (10.0, -92.0), (1.0, -92.0))
+    )
+    assert (near, far, weak) == (Status.OK, Status.OK, Status.OUT_OF_DISTRIBUTION)
+
+
+def test_scale_gives_variance_and_status(tmp_path):
+    one = with_bands(tmp_path, SCALE)
+    for result in one.correct([measurement(seed=seed, rx_power_dbm=-82.0 - seed) for seed in range(20)]):
+        deviation_m = np.interp(abs(result.correction_m), *np.transpose(SCALE))
+        assert result.variance_m2 == pytest.approx(deviation_m**2, rel=1e-6)
+        assert result.status is (Status.UNRELIABLE if deviation_m > 0.5 else Status.OK)
+        assert result.range_m == pytest.approx(3.0 - result.correction_m)
+
+
+def test_out_of_distribution_measurement_is_corrected_less_with_larger_variance(tmp_path):
+    in_distribution = with_bands(tmp_path).correct([measurement(3.0)])[0]
+    out_of_distribution = with_bands(tmp_path, range_m=Band(1.0, 2.0, 4.0)).correct([measurement(3.0)])[0]
+    assert out_of_distribution.status is Status.OK
+    assert out_of_distribution.correction_m == pytest.approx(
+        0.25 + 0.75 * (in_distribution.correction_m - 0.25), abs=1e-6
+    )
+    assert out_of_distribution.variance_m2 == pytest.approx(
+        in_distribution.variance_m2 + 0.25 * 0.5, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", ["range_m", "power_at_1m_dbm", "power_gap_db", "cir_level_db"])
+def test_fully_out_of_distribution_measurement_passes_through(tmp_path, name):
+    result = with_bands(tmp_path, **{name: Band(500.0, 501.0, 1.0)}).correct([measurement(3.0)])[0]
+    assert (result.status, result.range_m, result.correction_m) == (Status.OUT_OF_DISTRIBUTION, 3.0, 0.0)
+    assert result.variance_m2 == 0.5
+
+
+@pytest.mark.parametrize("band", [(2.0, 1.0, 1.0), (0.0, 1.0, 0.0), (math.nan, 1.0, 1.0), (0.1, 1.0, 1.0)])
+def test_invalid_band_is_refused(band):
+    with pytest.raises(ModelError, match="band"):
+        Band(*band)
+
+
+def test_bands_contain_the_measurements_they_are_computed_from():
+    windows = np.random.default_rng(0).uniform(0.1, 1, (50, 157)).astype(np.float32)
+    power = np.linspace(-95, -80, 50, dtype=np.float32)
+    range_m = np.linspace(1, 6, 50, dtype=np.float32)
+    windows[:, :3] /= 16
+    values = ood_features(windows, Scaling.PREAMBLE, range_m, power, power - np.float32(5))
+    found = OodBands.of(0.3, np.column_stack(values))
+    assert (OodDetector(found.bands).score(values) <= 0).all()
+    assert replace(found, known_offset_m=0.0).bands == found.bands

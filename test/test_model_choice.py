@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from bag_material import write_records
 from command_line import succeed
 from compilers import NEEDS_CC
 from model_material import bundle, measurement
-from ros_harness import PAUSED, Process, Ros, diagnostic_values
+from ros_harness import Process, Ros, diagnostic_values
 from uwb_mitigation_msgs.msg import RangeCorrected
 
-from benchmarks.paper.simulated import SimulatedDeepUwb
 from uwb_mitigation.calibration.site import calibrate
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -177,71 +171,17 @@ def test_track_corrects_a_recording_of_raw_ranges_as_process_does(tmp_path: Path
     assert first["live"]["horizontal_rmse_m"] != first["raw_live"]["horizontal_rmse_m"]
 
 
-@pytest.fixture
-def deepuwb(tmp_path: Path) -> Path:
-    """Import a pickle of the published format, with simulated ranges, as the guide does."""
-    records = list(SimulatedDeepUwb(seed=3, ranges=300, exchanges=4))
-    rows = [
-        (
-            record.measurement.cir.samples * record.measurement.cir.scale,
-            record.measurement.range_m - record.truth.range_m,
-            number * 5 // len(records),
-            "0000000000" if record.truth.label == "LOS" else "1000000000",
-        )
-        for number, record in enumerate(records)
-    ]
-    with pd.option_context("mode.string_storage", "python"):
-        frame = pd.DataFrame(rows, columns=["CIR", "Error", "Room", "Obstacles"])
-        frame.to_pickle(tmp_path / "deepuwb.pkl", protocol=4)
-    succeed("data import deepuwb.pkl -o deepuwb.mcap", folder=tmp_path)
-    return tmp_path / "deepuwb.mcap"
-
-
-def replayed(ros: Ros, bag: Path, count: int, node: str = "mitigator") -> tuple[list[tuple], Process]:
-    """Replay a bag through driver and mitigator, or through the pipeline, without an option; see `corrected_in`."""
+def replayed(ros: Ros, bag: Path, count: int) -> tuple[list[tuple], Process]:
+    """Replay a bag through driver and mitigator without an option; see `corrected_in`."""
     received = ros.collect(RangeCorrected, "/uwb/range_corrected")
-    source = ("source:=mcap", f"path:={bag}", "rate:=20.0")
-    mitigator = ros.start(node, *((*source, *PAUSED) if node == "pipeline" else ()))
+    mitigator = ros.start("mitigator")
     mitigator.wait_for_output("correcting with model")
-    if node == "pipeline":
-        ros.play()
-    else:
-        # When the mitigator answers, it has discovered the subscription of this client.
-        ros.spin_until(lambda: ros.state_of(node) == "active")
-        ros.start("driver", *source, "wait_for_subscribers:=1")
+    # When the mitigator answers, it has discovered the subscription of this client.
+    ros.spin_until(lambda: ros.state_of("mitigator") == "active")
+    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=20.0", "wait_for_subscribers:=1")
     ros.spin_until(lambda: len(received) == count)
     received.sort(key=lambda each: (to_ns(each.header.stamp), each.anchor_id))
     return [(each.range, each.variance, each.status, each.model_id) for each in received], mitigator
-
-
-@pytest.mark.ros
-def test_deepuwb_is_corrected_live_and_offline_without_an_option(ros: Ros, deepuwb: Path):
-    done = succeed("process deepuwb.mcap -o out.mcap", folder=deepuwb.parent)
-    assert "without preamble count and levels: model universal_amplitude" in done.stdout
-    offline = corrected_in(deepuwb.parent / "out.mcap")
-    assert sum(status == Status.OK for *_, status, _ in offline) >= 0.95 * len(offline) > 280
-    live, pipeline = replayed(ros, deepuwb, len(offline), "pipeline")
-    assert live == offline
-    assert pipeline.output.count("DW1000 IPATOV (assumed) without preamble count and levels: model") == 1
-
-
-@pytest.mark.ros
-def test_demo_corrects_deepuwb(deepuwb: Path):
-    command = [sys.executable, "-m", "benchmarks", "demo", "--recording", str(deepuwb)]
-    environment = {k: v for k, v in os.environ.items() if k != "ROS_DOMAIN_ID"}
-    run = subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
-    assert run.returncode == 0, run.stdout + run.stderr
-    ((received, ok),) = re.findall(r"(\d+) ranges received, \d+ corrected \((\d+) OK", run.stdout)
-    assert int(ok) >= 0.95 * int(received) > 280
-
-
-@pytest.mark.ros
-def test_view_states_the_models_of_raw_ranges(ros: Ros, mixed_bag: Path):
-    program = "from uwb_mitigation.commands.entry import command_line; command_line()"
-    shown = ros.run([sys.executable, "-c", program, "view", str(mixed_bag), "--port", "0"])
-    for model in ("universal,", "dw3000_sts (experimental),"):
-        shown.wait_for_output(f"levels: model {model}")
-    shown.send(signal.SIGKILL)
 
 
 @pytest.mark.ros
@@ -270,9 +210,12 @@ def test_ranges_without_a_model_are_reported_once(ros: Ros, tmp_path: Path):
 
 
 @pytest.mark.ros
-def test_a_named_model_that_rejects_every_range_names_the_one_that_fits(ros: Ros, deepuwb: Path):
+def test_a_named_model_that_rejects_every_range_names_the_one_that_fits(ros: Ros, tmp_path: Path):
+    unknown = {"preamble_count": 0, "rx_power_dbm": NAN, "first_path_power_dbm": NAN}
+    unknown |= {"radio": RadioType.UNKNOWN, "segment": Segment.UNKNOWN}
+    path = bag_of(tmp_path / "amplitudes.mcap", [without(each, **unknown) for each in mixed(400)[::2]])
     mitigator = ros.start("mitigator", "model:=universal")
-    ros.start("driver", "source:=mcap", f"path:={deepuwb}", "rate:=0.2")
+    ros.start("driver", "source:=mcap", f"path:={path}", "rate:=0.5")
     mitigator.wait_for_output("with model:=auto: DW1000 IPATOV (assumed) without preamble count and levels")
     status = ros.diagnosis("mitigator", lambda status: "model universal_amplitude, id" in status.message)
     assert "the model is universal" in status.message

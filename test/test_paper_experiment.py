@@ -1,27 +1,28 @@
-"""Experiment, search, range test and pruning on small data, through functions and commands."""
+"""Experiment of the paper on small data, and the report of its results, through functions and commands."""
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import run, succeed
-from model_material import dataset, integer_network, windows
+from model_material import dataset, integer_network
 
 pytest.importorskip("torch", reason="training is not set up: run make setup-training")
 
-import torch
 
-from benchmarks.paper import experiment, training
+from benchmarks.paper import experiment, report, tables, training
 from benchmarks.paper.data import Parts, shorten_windows
-from benchmarks.paper.results import RESULTS, ExperimentResults, read
-from benchmarks.paper.search import CHOICE, SPACE, search
+from benchmarks.paper.report import Report, Study, build_report
+from benchmarks.paper.results import RESULTS, ExperimentResults, FirmwareRow, read
+from benchmarks.paper.search import CHOICE, SPACE
 from benchmarks.paper.training import NetworkStack
 from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
-from uwb_mitigation.mitigation.model import floating
 from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
@@ -33,27 +34,20 @@ SHAPES = [Remnet(13, 3, 3, 4, 3), Remnet(16, 5, 5, 4, 2), Mlp(16, (8, 4))]
 
 
 def parts(seed: int = 0) -> Parts:
-    return Parts("made up", "by seed", dataset(6, 20, seed=seed), dataset(3, 20, seed=seed + 1))
+    train, test = (dataset(count, 20, 157, seed + row) for row, count in enumerate((6, 3)))
+    return Parts("made up", "by seed", train, test)
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory) -> tuple[Path, ExperimentResults]:
     folder = tmp_path_factory.mktemp("protocol")
-    wanted = experiment.list_tasks(["remnet", "remnet_k5", "remnet_attention", "mlp"], [32], seeds=2)
-    return folder, experiment.run_experiment(parts(), folder, wanted, QUICK)
+    wanted = experiment.list_tasks(["remnet", "remnet_k5", "remnet_attention", "mlp"], [157], seeds=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "RANGE_TEST_RATES", np.geomspace(1e-6, 10.0, 300))
+        return folder, experiment.run_experiment(parts(), folder, wanted, QUICK, trials=3)
 
 
 # --- networks that are trained together ---
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_stack_computes_each_of_its_networks(shape):
-    stack = NetworkStack(shape, 3, 0.5)
-    stack.fit(dataset(2, 20, samples=shape.samples), QUICK)
-    inputs = windows(20, shape.samples)
-    outputs = [floating.predict_m(stack.weights_of(seed), inputs) for seed in range(3)]
-    assert np.allclose(stack.predict_m(inputs), outputs, atol=1e-6)
-    assert len({output.tobytes() for output in outputs}) == 3
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -71,27 +65,6 @@ def test_stack_is_trained_like_single_networks(shape):
         for name, weight in stack.weights_of(seed).weight.items():
             assert weight == pytest.approx(expected.weight[name], abs=1e-4)
     assert (losses[-1] < losses[0]).all()
-
-
-def test_weights_of_a_seed_do_not_depend_on_the_number_of_seeds():
-    one, three = (NetworkStack(SHAPES[0], seeds, 0.5).weights_of(0).weight for seeds in (1, 3))
-    for name, weight in one.items():
-        assert np.array_equal(weight, three[name])
-
-
-def test_self_attention_scales_channels_by_a_function_of_their_means():
-    plain, stack = (NetworkStack(SHAPES[0], 1, 0.0, attention=attention) for attention in (False, True))
-    inputs = windows(20, 13)
-    for network in (plain, stack):
-        torch.nn.init.constant_(network.head.weight, 0.1)
-    for block in stack.attention.values():
-        # A sigmoid of a large number is 1, which changes nothing; of 0, it is a half.
-        torch.nn.init.constant_(block[3].bias, 40.0)
-    assert stack.predict_m(inputs) == pytest.approx(plain.predict_m(inputs), abs=1e-5)
-    for block in stack.attention.values():
-        torch.nn.init.zeros_(block[3].weight)
-        torch.nn.init.zeros_(block[3].bias)
-    assert np.abs(stack.predict_m(inputs) - plain.predict_m(inputs)).max() > 0.01
 
 
 def test_pruned_weights_stay_zero_and_each_network_has_the_share():
@@ -112,17 +85,15 @@ def test_pruned_weights_stay_zero_and_each_network_has_the_share():
 # --- before the training ---
 
 
-def test_range_test_finds_the_rates_that_train(monkeypatch):
-    monkeypatch.setattr(training, "RANGE_TEST_RATES", np.geomspace(1e-6, 10.0, 300))
-    result = training.range_test(dataset(6, 20, samples=13), QUICK, seeds=2)
+def test_range_test_finds_the_rates_that_train(finished):
+    result = finished[1].range_test
     assert 1e-6 < result.falls_from < result.falls_to < 1.0
     assert max(result.losses_m) > 2 * min(result.losses_m)  # the highest rates diverge
     assert len(result.rates) == len(result.losses_m)
 
 
-def test_search_is_random_then_a_grid_around_the_best_network():
-    data = dataset(10, 10, samples=16)
-    found = search(data, 3, QUICK)
+def test_search_is_random_then_a_grid_around_the_best_network(finished):
+    found = finished[1].trials
     assert [trial.stage for trial in found] == ["random"] * 3 + ["grid"] * 3
     assert found[0].shape == CHOICE
     best = min(found[:3], key=lambda trial: trial.mae).shape
@@ -134,7 +105,6 @@ def test_search_is_random_then_a_grid_around_the_best_network():
     for trial, cost in zip(found, costs, strict=True):
         is_better = (costs <= cost).all(axis=1) & (costs < cost).any(axis=1)
         assert trial.is_on_front == (not is_better.any())
-    assert search(data, 3, QUICK) == found
 
 
 # --- the experiment ---
@@ -161,6 +131,13 @@ def test_every_form_of_a_network_is_measured(finished):
     networks = ["remnet", *(f"remnet_pruned_{share}" for share in (25, 50, 75))]
     networks += ["remnet_k5", "remnet_attention", "mlp"]
     assert [model.network for model in result.models] == [name for name in networks for _ in range(2)]
+    train, test = parts().train, parts().test
+    assert result.median.all.mae == pytest.approx(np.abs(test.error_m - np.median(train.error_m)).mean())
+    # Squeeze and excitation: two dense layers with 2 hidden units in three modules.
+    attention = result.of("remnet_attention", 157)[0].parameters
+    assert attention == 5905 + 3 * (16 * 2 + 2 + 2 * 16 + 16)
+    zipped = [result.of(network, 157)[0].bytes["zipped"] for network in networks[:4]]
+    assert zipped == sorted(zipped, reverse=True)
     for model in result.models:
         errors = model.errors
         assert errors["float"].all.n == errors["float"].los.n + errors["float"].nlos.n
@@ -169,37 +146,12 @@ def test_every_form_of_a_network_is_measured(finished):
             continue
         assert errors["optimised"].all.mae == pytest.approx(errors["float"].all.mae, abs=1e-6)
         assert errors["int8"].all.mae == pytest.approx(errors["float"].all.mae, abs=0.02)
-        name = folder / f"{model.network}_32_seed{model.seed}"
+        name = folder / f"{model.network}_157_seed{model.seed}"
         assert Path(f"{name}_int8.onnx").stat().st_size == model.bytes["int8"] < model.bytes["float"]
         assert Path(f"{name}_optimised.onnx").stat().st_size == model.bytes["optimised"]
-        test = parts().test
         left = test.error_m - integer_network(load_bundle(Path(f"{name}_int8.onnx"))).predict_m(test.inputs)
         assert np.abs(left).mean() == pytest.approx(errors["int8"].all.mae, abs=1e-9)
         assert errors["int8"].all.box == pytest.approx(np.percentile(left, (5, 25, 50, 75, 95)))
-
-
-def test_pruned_networks_have_fewer_parameters_and_smaller_compressed_files(finished):
-    _, result = finished
-    networks = ["remnet", *(f"remnet_pruned_{share}" for share in (25, 50, 75))]
-    rows = [result.of(network, 32)[0] for network in networks]
-    weights = 5649 - 161  # without the biases of ten layers and the head
-    assert [row.parameters for row in rows] == pytest.approx(
-        [5649 - weights * n / 4 for n in range(4)], abs=2
-    )
-    assert np.diff([row.bytes["zipped"] for row in rows]).max() < 0
-
-
-def test_self_attention_of_the_paper_has_squeeze_and_excitation_in_each_module(finished):
-    _, result = finished
-    # Two dense layers with 2 hidden units in three modules.
-    assert result.of("remnet_attention", 32)[0].parameters == 5649 + 3 * (16 * 2 + 2 + 2 * 16 + 16)
-
-
-def test_median_of_the_training_part_is_the_baseline(finished):
-    _, result = finished
-    train, test = parts().train, parts().test
-    expected = np.abs(test.error_m - np.median(train.error_m)).mean()
-    assert result.median.all.mae == pytest.approx(expected)
 
 
 def test_finished_tasks_are_not_repeated_unless_of_other_data(tmp_path):
@@ -212,15 +164,14 @@ def test_finished_tasks_are_not_repeated_unless_of_other_data(tmp_path):
     assert other.models[0].errors != first.models[0].errors
 
 
-def test_two_processes_give_the_same_models(tmp_path):
-    wanted = experiment.list_tasks(["remnet", "mlp"], [32], seeds=1)
+def test_two_processes_give_the_models_of_one(finished, tmp_path):
     shares: list[float] = []
-    one_worker, together = (
-        experiment.run_experiment(parts(), tmp_path / str(workers), wanted, QUICK, 0, workers, shares.append)
-        for workers in (1, 2)
-    )
-    assert [model.errors for model in one_worker.models] == [model.errors for model in together.models]
-    assert shares == [0.5, 1.0, 0.5, 1.0]
+    wanted = experiment.list_tasks(["remnet_k5", "mlp"], [157], seeds=2)
+    result = experiment.run_experiment(parts(), tmp_path, wanted, QUICK, 0, 2, shares.append)
+    for name in ("remnet_k5", "mlp"):
+        one, two = ([model.errors for model in found.of(name, 157)] for found in (finished[1], result))
+        assert one == two
+    assert shares == [0.5, 1.0]
 
 
 def test_loss_that_diverges_ends_the_run(tmp_path):
@@ -239,6 +190,129 @@ def test_shorter_windows_are_scaled_by_their_own_maximum():
     assert short.preprocessing.samples == 8
     with pytest.raises(ParameterError):
         shorten_windows(data, 64)
+
+
+# --- the report ---
+
+PARTS = ["method", "data", "table1", "table2", "search", "table3", "fig3", "fig4a", "fig4b", "fig5", "lr"]
+HOSTILE = "<script>alert(1)</script>_$\\frac{$"
+
+
+def text_of(html: str, section: str) -> str:
+    """Return the text of a section of a page."""
+    content = html.partition(f'id="{section}"')[2].partition("</section>")[0]
+    return " ".join(re.sub(r"<[^>]*>", " ", content).split())
+
+
+def study(name: str = "logs", simulated: bool = False) -> Study:
+    data = parts().test
+    named = replace(data, configurations=np.char.add(name, data.configurations))
+    return Study(Path(name), name, simulated, named, "python -m benchmarks paper report")
+
+
+def firmware_row() -> FirmwareRow:
+    which = {"model": "remnet", "k": 157, "k0": 3, "kernels": "cortex_m4", "mismatches": 0, "inputs": 5000}
+    memory = {"instructions": 389_000, "ram_bytes": 10_700, "flash_bytes": 17_600}
+    return FirmwareRow.model_validate(which | memory | {"hz": 142.2, "energy_mj": 0.375})
+
+
+def row_of(made: Report, table: str, *heads: str) -> tuple[tables.Cell, ...]:
+    (found,) = (one for one in made.tables if one.id == table)
+    return next(row for row in found.rows if [cell.text for cell in row[: len(heads)]] == list(heads))
+
+
+@pytest.fixture(scope="module")
+def full(finished) -> Report:
+    return build_report(study(simulated=True), finished[1], [firmware_row()])
+
+
+@pytest.fixture(scope="module")
+def html(full) -> str:
+    return full.html()
+
+
+@pytest.fixture
+def no_cloud(monkeypatch):
+    """Without Fig. 4, which takes most of the time."""
+    monkeypatch.setattr(report.figures, "scatter", lambda *_: "data:image/png;base64,")
+
+
+def test_page_contains_all_tables_and_figures_and_no_external_references(full, html):
+    assert sorted(re.findall(r'<section id="(\w+)"', html)) == sorted(PARTS)
+    assert full.lacking == {}
+    for part in PARTS[1:]:
+        assert {"Data", "Split", "Seeds", "Command"} <= set(text_of(html, part).split())
+    assert not re.search(r"<(script|link|iframe|object|base)\b|url\(|@import|https?:", html)
+    targets = re.findall(r'(?:src|href)="([^"]*)"', html)
+    assert all(target.startswith(("data:image/", "#")) for target in targets)
+    drawings = re.findall(r"data:image/svg\+xml;base64,([^\"]*)", html)
+    assert drawings
+    for drawing in drawings:
+        text = re.sub(
+            r'xmlns(:\w+)?="[^"]*"|<!DOCTYPE.*?>', "", base64.b64decode(drawing).decode(), flags=re.S
+        )
+        assert not re.search(r'href="(?!#)|url\((?!#)|<script', text)
+    assert "simulated data" in html.partition("<section")[0]
+
+
+def test_missing_measurements_and_estimates_are_marked(full):
+    for table in (table for table in full.tables if table.id.startswith("table")):
+        assert table.has_gaps
+        assert table.missing
+    kinds = [cell.kind for cell in row_of(full, "table3", "REMNet", "157", "Cortex-M4")[8:11]]
+    assert kinds == ["estimated", "estimated", "measured"]
+
+
+def test_raw_errors_are_next_to_those_of_the_paper(html, finished):
+    raw, rates = finished[1].models[0].errors["float"].all, finished[1].range_test
+    text = text_of(html, "method")
+    assert f"0.1242, 0.1642 {raw.mae_raw:.4f}, {raw.sigma_raw:.4f}" in text
+    assert f"{rates.falls_from:.1g} to {rates.falls_to:.1g}: the loss falls" in text
+
+
+def test_simulated_results_are_marked_as_not_comparable(html, finished, no_cloud):
+    for table in ("data", "table1", "search"):
+        assert "Simulated data, not comparable" in text_of(html, table)
+    assert "Simulated data" not in build_report(study(), finished[1]).html()
+
+
+def test_search_shows_the_front_and_the_choice_of_the_paper(full, finished):
+    (table,) = (table for table in full.tables if table.id == "search")
+    front = [trial.mae for trial in finished[1].trials if trial.is_on_front]
+    assert {row[-1].value for row in table.rows} == {*front, finished[1].trials[0].mae}
+    assert "paper's choice" in " ".join(row[0].text for row in table.rows)
+
+
+@pytest.mark.parametrize(
+    ("heads", "values"),
+    [
+        (("table1", "REMNet", "157"), [5905, 0.0687, 0.0687, 0.0690]),
+        (("table1", "MLP", "157"), [54401, 0.0769, 0.0777, 0.0775]),
+        (("table2", "MLP", "157"), [216.047, 125.885, 60.320]),
+        (("table3", "REMNet", "16", "Cortex-M4"), [140.0, 3.3, 15.6, 51.6, 0.37]),
+    ],
+)
+def test_published_numbers_are_in_their_own_columns(full, heads, values):
+    assert [cell.value for cell in row_of(full, *heads) if cell.kind == "paper"] == values
+
+
+def test_measured_numbers_are_means_over_seeds_next_to_baselines(full, finished):
+    result, row = finished[1], row_of(full, "table1", "REMNet", "157")
+    maes = [model.errors["float"].all.mae for model in result.of("remnet", 157)]
+    assert (row[7].kind, row[7].n) == ("measured", 2)
+    assert row[7].text == f"{np.mean(maes):.4f} ± {np.std(maes, ddof=1):.4f}"
+    sizes = [model.bytes["int8"] for model in result.of("remnet", 157)]
+    assert row_of(full, "table2", "REMNet", "157")[-2].value == pytest.approx(np.mean(sizes) / 1000)
+    median, raw = (
+        row_of(full, "table1", name)[7].value
+        for name in ("Median error of the training part", "No correction")
+    )
+    assert (median, raw) == (result.median.all.mae, result.median.all.mae_raw)
+
+
+def test_hostile_names_are_only_text(finished, no_cloud):
+    named = finished[1].model_copy(update={"data": HOSTILE, "split": HOSTILE})
+    assert "<script" not in build_report(study(HOSTILE), named).html()
 
 
 # --- commands ---
@@ -281,3 +355,18 @@ def test_missing_or_damaged_results_are_rejected_by_name(tmp_path):
         with pytest.raises(UwbMitigationError) as caught:
             read(ExperimentResults, path)
         assert caught.value.where == str(path)
+
+
+def test_command_writes_the_page_and_rejects_wrong_files(apartment, tmp_path):
+    log = sorted((apartment / "logs").glob("*.log*"))[0]
+    words = ("paper", "report", "--data", log, "-o", "out", "--json", "out.json")
+    succeed(*words, folder=tmp_path)
+    assert "<img" in (tmp_path / "out" / "report.html").read_text()
+    values = json.loads((tmp_path / "out.json").read_text())
+    assert [one["id"] for one in values["figures"]] == ["fig3", "fig4a", "fig4b"]
+    (tmp_path / "bench.json").write_text("{}")
+    for option in (("--firmware", "bench.json"), ("--models", "nowhere")):
+        refused = run("paper", "report", "--data", log, "-o", "other", *option, folder=tmp_path)
+        assert refused.returncode == 1
+        assert option[1] in refused.stderr
+        assert not (tmp_path / "other").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import pickle
 import re
@@ -21,13 +20,11 @@ import uwb_mitigation
 from uwb_mitigation import (
     AnchorMap,
     Cir,
-    Encoding,
     Mitigation,
     RangeMeasurement,
     Record,
     SiteCalibration,
     Status,
-    TagLocator,
     UwbMitigationError,
     load_anchors,
     load_model,
@@ -42,7 +39,6 @@ from uwb_mitigation.types.measurement import is_logarithmic
 
 os.environ["MPLBACKEND"] = "agg"
 PAGE = REPOSITORY / "docs" / "guides" / "python.md"
-IN_DB = np.rint(20 * np.log10(np.random.default_rng(1).rayleigh(20.0, 1016) + 1)).astype(np.int16)
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
 
 
@@ -206,30 +202,6 @@ def test_pickled_correction_has_the_same_result(mitigation: Mitigation, records:
 
 
 @pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"first_path_index": 1e4}, "the first-path index is outside the CIR"),
-        ({"first_path_index": 1010.0}, "too short"),
-        ({"first_path_index": math.nan}, "index is not finite"),
-        ({"samples": np.zeros(2032, np.int16)}, "only zeros"),
-        ({"samples": np.full(2032, 32767, np.int16)}, "saturated"),
-        ({"scale": math.nan}, "NaN"),
-        ({"samples": np.zeros(0, np.int16)}, "no samples"),
-        ({"samples": IN_DB, "encoding": Encoding.MAGNITUDE}, "in dB"),
-        ({"rx_power_dbm": 10.0}, "unlike the training data"),
-        ({"range_m": 5299.78}, "range of 5,299.78 m"),
-    ],
-)
-def test_ranges_that_are_not_corrected_have_a_reason(records: list[Record], changes: dict, text: str):
-    record = records[0]
-    other = changed(record, **changes) if "range_m" in changes else changed(record, changes)
-    mitigation = Mitigation(load_model("universal"))
-    good, bad = mitigation.correct([record.measurement, other.measurement])
-    assert (good.reason, bad.status.is_corrected) == ("", False)
-    assert text in bad.reason
-
-
-@pytest.mark.parametrize(
     ("fields", "status"), [({}, Status.BAD_CIR), ({"preamble_count": 100}, Status.OUT_OF_DISTRIBUTION)]
 )
 def test_universal_without_count_or_levels_says_what_it_needs(
@@ -307,16 +279,3 @@ def test_data_frame_has_raw_and_corrected_ranges(mitigation: Mitigation, records
     assert corrected < 0.5 * raw
     assert list(to_dataframe(records)) == list(frame)[:-3]
     assert to_dataframe([]).empty
-
-
-def test_locator_follows_a_simulated_tag(mitigation: Mitigation):
-    source = SimulatedSource(seed=2, count=400)
-    locator = TagLocator(source.anchors, height_m=0.4)
-    errors = [
-        np.hypot(*(estimate.position - record.tag_position)[:2])
-        for record, corrected in mitigation.correct_records(source)
-        if (estimate := locator.add(record.measurement, corrected)) is not None
-    ]
-    assert len(errors) > 200
-    assert np.median(errors) < 0.3
-    assert isinstance(locator.warnings(), list)

@@ -18,15 +18,6 @@ from uwb_mitigation.training.fit.linear_fit import fit_linear_bias, least_absolu
 SHAPE = Remnet(samples=32)
 
 
-def test_least_absolute_deviations_recovers_a_line_under_outliers():
-    generator = np.random.default_rng(0)
-    design = np.column_stack([np.ones(40), generator.uniform(-95, -75, 40), generator.uniform(2, 15, 40)])
-    truth = np.array([-5.0, -0.07, -0.01])
-    target = design @ truth
-    target[:12] += generator.uniform(2, 9, 12)
-    assert np.allclose(least_absolute_deviations(design, target), truth, atol=1e-6)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_least_absolute_deviations_is_no_worse_than_any_line_through_points(seed):
     generator = np.random.default_rng(seed)

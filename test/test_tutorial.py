@@ -1,7 +1,8 @@
-"""The commands of the tutorials that need no nodes, and the output that pages quote."""
+"""The commands and the notebook of the tutorials, and the output that pages quote."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -120,3 +121,24 @@ def test_tables_on_pages_are_covered():
     assert len(tables) >= len(QUOTES) - 1
     # The figures of `monitor` differ with the time; test_monitor.py compares its header.
     assert [block for block in tables if block not in texts and "rate" not in block] == []
+
+
+NOTEBOOK = REPOSITORY / "docs" / "tutorials" / "own_ranges.ipynb"
+
+
+@pytest.mark.slow
+def test_cells_run_and_the_correction_reduces_the_error(tmp_path: Path):
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    assert not any(cell.get("outputs") for cell in cells), "the notebook is committed without outputs"
+    script = tmp_path / "own_ranges.py"
+    script.write_text("\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"))
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"MPLBACKEND": "agg", "PATH": path}
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    raw, corrected = (
+        float(line.split()[-2]) for line in done.stdout.splitlines() if "mean absolute error" in line
+    )
+    assert corrected < 0.5 * raw
