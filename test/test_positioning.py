@@ -423,6 +423,15 @@ def test_kidnapped_tag_is_found_within_two_seconds():
     assert track_errors(late, truth).nees_per_dof < 2
 
 
+def test_obstacles_in_front_of_half_of_the_anchors_do_not_make_a_tag_lost():
+    ranges, truth = drive(SQUARE, path=around, seconds=30)
+    blocked = (ranges.anchor < 2) & (np.abs(ranges.stamp_ns / NANOSECONDS - 20) < 0.8)
+    ranges.range_m[blocked] += 4.0
+    locator = TagEstimator(EstimatorConfig(SQUARE, height=Height(2.5)))
+    assert track_errors(locator.run(ranges), truth).rmse < 0.2
+    assert locator.counts["lost"] == 0
+
+
 def test_invalid_input_is_skipped_and_a_restarted_replay_resets_the_tag():
     ranges, truth = drive(seconds=10)
     locator = TagEstimator(EstimatorConfig(HALL))

@@ -40,6 +40,9 @@ CONTRADICTED_S = 60.0
 """Two losses within this time happen in one of the drives of `benchmarks positions` with anchors that are not on a line (outdoors,
 with errors of 1.8 m); with the first two anchors swapped, in 70 % of them."""
 
+OBSTACLE_S = 1.5
+"""If these ranges are too long, and those of the other half of the anchors are not, obstacles are the reason unless it lasts longer."""
+
 DISAGREES = 1.5
 """An anchor contradicts the others if the mean of its normalised innovations is larger: persisting errors average out."""
 
@@ -65,7 +68,7 @@ class _AnchorState:
 
     Attributes:
         received_s: time of the latest; -inf: none.
-        outliers: share of the latest ranges (about twenty) that contradicted the filter.
+        outliers: share of the latest ranges (about twenty) that contradicted the filter; negative: they were too short.
         mean_z: running mean of the normalised innovation over about fifty ranges, each limited to 5.
     """
 
@@ -99,6 +102,7 @@ class TagEstimator:
     _origin_ns: int | None
     _time_s: float
     _found_s: float
+    _contradicted_s: float
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.anchors = config.anchors
@@ -250,13 +254,12 @@ class TagEstimator:
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
         state = self._states[measurement.anchor]
-        state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
+        state.outliers += 0.1 * ((z > OUTLIER) - (z < -OUTLIER) - state.outliers)
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
         if self._time_s >= self._next_check_s:
             self._next_check_s = self._time_s + _RETRY_S
             received, was_ambiguous = self.received_anchors(), self.is_ambiguous
-            num_contradicting = sum(self._states[row].outliers > LOST_SHARE for row in received)
-            if 2 * num_contradicting >= len(received):
+            if self._is_lost(received):
                 self.counts["lost"] += 1
                 self._losses_s.append(self._time_s)
                 self.counts["contradicted"] += self.is_contradicted
@@ -267,6 +270,17 @@ class TagEstimator:
                 self._ambiguous_s = self._time_s
             if was_ambiguous and not self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
                 self._restart_search(self._time_s - WINDOW_S)
+
+    def _is_lost(self, received: list[int]) -> bool:
+        """Whether the ranges of at least half of the received anchors contradict the filter, and obstacles are not the reason."""
+        outliers = [self._states[row].outliers for row in received]
+        contradicting = [share for share in outliers if abs(share) > LOST_SHARE]
+        if 2 * len(contradicting) < len(received):
+            self._contradicted_s = math.inf
+            return False
+        self._contradicted_s = min(self._contradicted_s, self._time_s)
+        is_most = 2 * len(contradicting) > len(received)
+        return is_most or min(contradicting) < 0.0 or self._time_s > self._contradicted_s + OBSTACLE_S
 
     def _estimate(self, filter_: RangeFilter, stamp_ns: int) -> Estimate:
         """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
@@ -305,7 +319,8 @@ class TagEstimator:
             state.outliers = 0.0
         self.images.reset()
         self.undetermined = False
-        self._search_began_s, self._next_check_s, self._found_s = time_s, -math.inf, math.inf
+        self._search_began_s, self._next_check_s = time_s, -math.inf
+        self._found_s = self._contradicted_s = math.inf
 
     def _search(self, measurement: TagRange) -> None:
         time_s = self._time_s
