@@ -246,6 +246,17 @@ def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, f
 
 
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float) -> PathPoint:
-    segment, *values, source = point
-    moved = (value + rate * dt for value, rate in zip(values, rates, strict=True))
-    return PathPoint._make((segment, *moved, source))
+    segment, x, y, yaw, distance, drift, turn, position_variance, yaw_variance, source = point
+    vx, vy, yaw_rate, speed, drifting, turning, position_density, yaw_density = rates
+    return PathPoint(
+        segment,
+        x + vx * dt,
+        y + vy * dt,
+        yaw + yaw_rate * dt,
+        distance + speed * dt,
+        drift + drifting * dt,
+        turn + turning * dt,
+        position_variance + position_density * dt,
+        yaw_variance + yaw_density * dt,
+        source,
+    )

@@ -19,9 +19,8 @@ from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, Path
 from uwb_mitigation.positioning.online.filter import RangeFilter
 from uwb_mitigation.positioning.online.robust_update import SHORTEST_M
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.tracks import Estimate, Heading
 
-YAW, SCALE, DRIFT, TURN = 3, 4, 5, 6
+YAW, SCALE, DRIFT, TURN, MOTION = 3, 4, 5, 6, 7
 
 SCALE_SD = 0.05
 """Standard deviation of the constant relative error of distances: wheel diameters."""
@@ -62,14 +61,14 @@ class OdometryFilter:
     ) -> None:
         self._anchors, self._model, self._level = anchors.position, model, start.is_level
         self.time_s, self.point, self._lever_arm = start.time_s, point, lever_arm
-        motion = np.zeros(7)
+        motion = np.zeros(MOTION)
         motion[:3], motion[YAW] = start.position, yaw[0]
         self.state = start.state.replace_motion(motion)
         self.state.estimates_errors = True
         x, P = self.state.x, self.state.P
-        P[range(YAW, 7), range(YAW, 7)] = yaw[1] ** 2, SCALE_SD**2, 1.0, 1.0
+        P[range(YAW, MOTION), range(YAW, MOTION)] = yaw[1] ** 2, SCALE_SD**2, 1.0, 1.0
         # The range filter knows the antenna, and the base is at antenna - arm(yaw).
-        arm_x, arm_y = self._arm()
+        arm_x, arm_y = self._arm(yaw[0])
         x[:3] -= arm_x, arm_y, lever_arm[2]
         P[:2] += np.multiply.outer((arm_y, -arm_x), P[YAW])
         P[:, :2] += np.multiply.outer(P[:, YAW], (arm_y, -arm_x))
@@ -92,23 +91,28 @@ class OdometryFilter:
             for index in (DRIFT, TURN):
                 x[index] = P[index] = P[:, index] = 0.0
                 P[index, index] = 1.0
-        relative = float(x[YAW]) - before.yaw
+        _, _, _, yaw, scale, yaw_drift, yaw_turn = x[:MOTION].tolist()
+        relative = yaw - before.yaw
         cosine, sine = math.cos(relative), math.sin(relative)
         east, north = point.x - before.x, point.y - before.y
         dx, dy = cosine * east - sine * north, sine * east + cosine * north
         distance = max(point.distance_m - before.distance_m, 0.0)
         drift, turn = point.drift - before.drift, point.turn - before.turn
-        scale = 1.0 + float(x[SCALE])
+        scale += 1.0
         x[0] += scale * dx
         x[1] += scale * dy
-        x[YAW] += point.yaw - before.yaw + drift * float(x[DRIFT]) + turn * float(x[TURN])
+        x[YAW] += point.yaw - before.yaw + drift * yaw_drift + turn * yaw_turn
         if distance or drift or turn:
-            # The transition matrix is the identity with these elements.
-            F = np.array([[-scale * dy, dx], [scale * dx, dy]])
-            P[:2] += F @ P[YAW:DRIFT]
-            P[YAW] += drift * P[DRIFT] + turn * P[TURN]
-            P[:, :2] += P[:, YAW:DRIFT] @ F.T
-            P[:, YAW] += drift * P[:, DRIFT] + turn * P[:, TURN]
+            F = np.array(
+                [
+                    [1.0, 0.0, 0.0, -scale * dy, dx, 0.0, 0.0],
+                    [0.0, 1.0, 0.0, scale * dx, dy, 0.0, 0.0],
+                    [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+                    [0.0, 0.0, 0.0, 1.0, 0.0, drift, turn],
+                ]
+            )
+            P[:SCALE] = F @ P[:MOTION]
+            P[:, :SCALE] = P[:, :MOTION] @ F.T
         q = max(point.position_variance - before.position_variance, 0.0)
         P[0, 0] += q
         P[1, 1] += q
@@ -119,14 +123,16 @@ class OdometryFilter:
         self, anchor: int, range_m: float, variance_m2: float, is_corrected: bool
     ) -> tuple[float, float]:
         """Update with a finite range at the time of the state; see `RobustUpdate.update_range`."""
-        arm_x, arm_y = self._arm()
-        vector = self.state.x[:3] - self._anchors[anchor]
-        vector += (arm_x, arm_y, self._lever_arm[2])
-        distance = math.sqrt(vector @ vector)
-        H = self.state.H
-        H[:3] = vector / max(distance, SHORTEST_M)
-        H[YAW] = H[1] * arm_x - H[0] * arm_y
-        return self.state.update_range(anchor, range_m, distance, variance_m2, is_corrected)
+        # Python numbers are faster here than NumPy.
+        state, (u, v, w) = self.state, self._anchors[anchor].tolist()
+        x, y, z, yaw = state.x[:SCALE].tolist()
+        arm_x, arm_y = self._arm(yaw)
+        x, y, z = x + arm_x - u, y + arm_y - v, z + self._lever_arm[2] - w
+        distance = math.sqrt(x * x + y * y + z * z)
+        divisor, H = max(distance, SHORTEST_M), state.H
+        H[0], H[1], H[2] = x / divisor, y / divisor, z / divisor
+        H[YAW] = (y * arm_x - x * arm_y) / divisor
+        return state.update_range(anchor, range_m, distance, variance_m2, is_corrected)
 
     def set_height(self, height_m: float, variance_m2: float) -> None:
         """Set the height of the antenna: the odometry is horizontal, so that ranges only determine it, unless it is constant."""
@@ -146,49 +152,52 @@ class OdometryFilter:
         # The projection has turned the lever arm.
         self.state.x[:3] += area.clip(np.array(self.antenna)) - self.antenna
 
-    def estimate(self, stamp_ns: int, odometry: DeadReckoning) -> Estimate:
-        """Return position and velocity of the antenna and the heading, with the latest twist of the odometry."""
-        x, P = self.state.x, self.state.P
-        arm_x, arm_y = self._arm()
-        to_antenna = np.eye(4)
-        to_antenna[:2, YAW] = -arm_y, arm_x
-        # Only the position: the heading depends on the odometry more than on errors of ranges.
-        to_antenna[:3] *= math.sqrt(self.state.covariance_scale())
-        pose = to_antenna @ P[:4, :4] @ to_antenna.T
-        yaw = math.remainder(float(x[YAW]), math.tau)
+    def velocity(self, odometry: DeadReckoning) -> tuple[float, float, float]:
+        """Return the velocity of the antenna (m/s) and its variance in each axis (m^2/s^2), with the latest twist of the odometry."""
         vx, vy, yaw_rate = odometry.twist or (0.0, 0.0, 0.0)
+        yaw = self.yaw
+        arm_x, arm_y = self._arm(yaw)
         cosine, sine = math.cos(yaw), math.sin(yaw)
-        velocity = np.array(
-            [cosine * vx - sine * vy - yaw_rate * arm_y, sine * vx + cosine * vy + yaw_rate * arm_x, 0.0]
+        variance = odometry.twist_variance[0] + self.yaw_variance * (vx * vx + vy * vy)
+        return cosine * vx - sine * vy - yaw_rate * arm_y, sine * vx + cosine * vy + yaw_rate * arm_x, variance
+
+    def published_covariance(self) -> tuple[float, ...]:
+        """Return the covariance of x and y of the antenna and of the yaw: xx, xy, yy, x yaw, y yaw, yaw yaw (m^2, m rad, rad^2)."""
+        (xx, xy, _, x_yaw), (_, yy, _, y_yaw), _, (_, _, _, yaw_yaw) = self.state.P[:SCALE, :SCALE].tolist()
+        arm_x, arm_y = self._arm(self.yaw)
+        # Only the position: the heading depends on the odometry more than on errors of ranges.
+        scale = self.state.covariance_scale()
+        root = math.sqrt(scale)
+        return (
+            scale * (xx - 2.0 * arm_y * x_yaw + arm_y * arm_y * yaw_yaw),
+            scale * (xy + arm_x * x_yaw - arm_y * y_yaw - arm_x * arm_y * yaw_yaw),
+            scale * (yy + 2.0 * arm_x * y_yaw + arm_x * arm_x * yaw_yaw),
+            root * (x_yaw - arm_y * yaw_yaw),
+            root * (y_yaw + arm_x * yaw_yaw),
+            yaw_yaw,
         )
-        covariance = np.zeros((6, 6))
-        covariance[:3, :3] = pose[:3, :3]
-        speed_variance = odometry.twist_variance[0] + float(P[YAW, YAW]) * (vx * vx + vy * vy)
-        covariance[[3, 4], [3, 4]] = speed_variance
-        return Estimate(stamp_ns, np.array(self.antenna), velocity, covariance, Heading(yaw, pose[YAW]))
 
     @property
     def antenna(self) -> tuple[float, float, float]:
         """Position of the antenna, m."""
-        x, y, z = self.state.x[:3].tolist()
-        arm_x, arm_y = self._arm()
+        x, y, z, yaw = self.state.x[:SCALE].tolist()
+        arm_x, arm_y = self._arm(yaw)
         return x + arm_x, y + arm_y, z + self._lever_arm[2]
 
     @property
     def yaw(self) -> float:
         """Yaw of the base, rad."""
-        return float(self.state.x[YAW])
+        return self.state.x.item(YAW)
 
     @property
     def yaw_variance(self) -> float:
         """Variance of the yaw, rad^2."""
-        return float(self.state.P[YAW, YAW])
+        return self.state.P.item(YAW, YAW)
 
-    def _arm(self) -> tuple[float, float]:
+    def _arm(self, yaw: float) -> tuple[float, float]:
         """Return the horizontal lever arm in the axes of the map."""
         x, y, _ = self._lever_arm
         if x == y == 0.0:
             return 0.0, 0.0
-        yaw = float(self.state.x[YAW])
         cosine, sine = math.cos(yaw), math.sin(yaw)
         return cosine * x - sine * y, sine * x + cosine * y

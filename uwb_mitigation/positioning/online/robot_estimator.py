@@ -173,36 +173,40 @@ class RobotEstimator:
 
     def _mixture(self, ranges_only: Estimate, heading_filter: OdometryFilter) -> Estimate:
         """Return the mean of both solutions; its covariance includes their difference."""
-        estimate = heading_filter.estimate(ranges_only.stamp_ns, self.odometry)
+        # The height and its velocity are those of the ranges-only estimate, which is new: it can be changed in place.
+        assert self.tag.filter is not None
         excess = 2.0 * (self._separation - EQUAL_SEPARATION)
         weight = math.exp(-self._rejections) / (1.0 + math.exp(min(excess, 50.0)))
-        delta = ranges_only.position - estimate.position
-        # The height and its velocity are those of the ranges-only estimate. Both estimates are new: they can be changed in place.
-        assert estimate.heading is not None
-        assert self.tag.filter is not None
-        covariance, plane = ranges_only.covariance, ranges_only.covariance[:2, :2]
-        delta[2] = 0.0
+        position, covariance = ranges_only.position, ranges_only.covariance
+        x, y, _ = heading_filter.antenna
+        # Python numbers are faster here than NumPy.
+        x0, y0, _ = position.tolist()
+        dx, dy = x0 - x, y0 - y
+        (a, b, to_x), (_, c, to_y) = covariance[:2, :3].tolist()
+        (u, v), (_, w) = self.tag.filter.unseen[:2, :2].tolist()
+        xx, xy, yy, x_yaw, y_yaw, yaw_variance = heading_filter.published_covariance()
         of_mean = weight * (1.0 - CONSTANT_SHARE)
-        plane *= 1.0 - of_mean
-        plane += of_mean * (estimate.covariance[:2, :2] + self.tag.filter.unseen[:2, :2])
-        plane += weight * (1.0 - weight) * np.multiply.outer(delta[:2], delta[:2])
-        covariance[:2, 2] *= 1.0 - weight
-        covariance[2, :2] = covariance[:2, 2]
+        rest, apart = 1.0 - of_mean, weight * (1.0 - weight)
+        covariance[0, 0] = rest * a + of_mean * (xx + u) + apart * dx * dx
+        covariance[0, 1] = covariance[1, 0] = rest * b + of_mean * (xy + v) + apart * dx * dy
+        covariance[1, 1] = rest * c + of_mean * (yy + w) + apart * dy * dy
+        covariance[0, 2] = covariance[2, 0] = (1.0 - weight) * to_x
+        covariance[1, 2] = covariance[2, 1] = (1.0 - weight) * to_y
         covariance[:3, 3:] = covariance[3:, :3] = 0.0
-        position, velocity = ranges_only.position - weight * delta, estimate.velocity
-        velocity[2] = ranges_only.velocity[2]
+        position[0], position[1] = x0 - weight * dx, y0 - weight * dy
         if self._area is not None:
             position = self._area.clip(position)
-        yaw_covariance, yaw = estimate.heading.covariance, estimate.heading.yaw
-        variance = self._test.variance(yaw, yaw_covariance.item(YAW), heading_filter.point)
+        yaw = math.remainder(heading_filter.yaw, math.tau)
+        variance = self._test.variance(yaw, yaw_variance, heading_filter.point)
         self._is_confirmed = variance < KNOWN_YAW_SD**2
         if not self._is_confirmed:
-            return Estimate(estimate.stamp_ns, position, ranges_only.velocity, covariance)
-        yaw_covariance[:2] *= weight
-        yaw_covariance[2:] = 0.0, variance
-        covariance[3:5, 3:5] = estimate.covariance[3:5, 3:5]
-        heading = Heading(yaw, yaw_covariance)
-        return Estimate(estimate.stamp_ns, position, velocity, covariance, heading)
+            return Estimate(ranges_only.stamp_ns, position, ranges_only.velocity, covariance)
+        velocity = ranges_only.velocity
+        velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
+        covariance[3, 4] = covariance[4, 3] = 0.0
+        covariance[3, 3] = covariance[4, 4] = speed_variance
+        heading = Heading(yaw, np.array([weight * x_yaw, weight * y_yaw, 0.0, variance]))
+        return Estimate(ranges_only.stamp_ns, position, velocity, covariance, heading)
 
     def _update_headings(self, measurement: TagRange) -> None:
         tag = self.tag
@@ -215,7 +219,7 @@ class RobotEstimator:
             self._start_yaws(point)
             return
         dt = time_s - self._yaws[0].filter.time_s
-        height = None if tag.filter is None else (float(tag.filter.x[2]), float(tag.filter.P[2, 2]))
+        height = None if tag.filter is None else (tag.filter.x.item(2), tag.filter.P.item(2, 2))
         for hypothesis in self._yaws:
             hypothesis.filter.advance(time_s, point)
             if height is not None:
@@ -238,8 +242,8 @@ class RobotEstimator:
         filter_ = self.tag.filter
         assert filter_ is not None
         x, y, _ = heading_filter.antenna
-        dx, dy = x - float(filter_.x[0]), y - float(filter_.x[1])
-        (a, b), (_, c) = (filter_.P[:2, :2]).tolist()
+        dx, dy = x - filter_.x.item(0), y - filter_.x.item(1)
+        (a, b), (_, c) = filter_.P[:2, :2].tolist()
         separation = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / max(a * c - b * b, 1e-12)
         self._separation += min(max(dt, 0.0) / SEPARATION_S, 1.0) * (separation - self._separation)
         self._rejections *= math.exp(-max(dt, 0.0) / FORGIVEN_S)
