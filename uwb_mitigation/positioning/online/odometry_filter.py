@@ -22,6 +22,8 @@ from uwb_mitigation.types.anchors import AnchorMap
 
 YAW, SCALE, DRIFT, TURN, MOTION = 3, 4, 5, 6, 7
 
+_IDENTITY = np.eye(SCALE, MOTION)
+
 SCALE_SD = 0.05
 """Standard deviation of the constant relative error of distances: wheel diameters."""
 
@@ -103,16 +105,11 @@ class OdometryFilter:
         x[1] += scale * dy
         x[YAW] += point.yaw - before.yaw + drift * yaw_drift + turn * yaw_turn
         if distance or drift or turn:
-            F = np.array(
-                [
-                    [1.0, 0.0, 0.0, -scale * dy, dx, 0.0, 0.0],
-                    [0.0, 1.0, 0.0, scale * dx, dy, 0.0, 0.0],
-                    [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
-                    [0.0, 0.0, 0.0, 1.0, 0.0, drift, turn],
-                ]
-            )
-            P[:SCALE] = F @ P[:MOTION]
-            P[:, :SCALE] = P[:, :MOTION] @ F.T
+            F = _IDENTITY.copy()
+            F[0, YAW], F[0, SCALE], F[1, YAW], F[1, SCALE] = -scale * dy, dx, scale * dx, dy
+            F[YAW, DRIFT], F[YAW, TURN] = drift, turn
+            P[:SCALE] = F.dot(P[:MOTION])
+            P[:, :SCALE] = P[:, :MOTION].dot(F.T)
         q = max(point.position_variance - before.position_variance, 0.0)
         P[0, 0] += q
         P[1, 1] += q
