@@ -23,7 +23,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.config import RobotData
-from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank
+from uwb_mitigation.positioning.geometry import Area, Height, extents
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import load_mapping, shipped_mappings
 from uwb_mitigation.simulation.odometry import RATE_HZ, motion_along, stamps_s
@@ -466,7 +466,7 @@ def load_geometry(
     motion = motion_along(position, yaw, seed)
     truth = replace(truth, yaw=np.interp(truth.stamp_ns, motion.odometry.stamp_ns, yaw))
     area = None
-    if anchor_rank(anchors.position) is AnchorRank.LINE:
+    if extents(anchors.position) == 1:
         wall = float(anchors.position[:, 0].min()) - 0.1
         west, south = (low[:2] - 1.0).tolist()
         area = Area((west, south, 0.0), (wall, float(high[1]) + 1.0, float(high[2]) + 0.5))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.calibration.hypotheses import LIMITS
 from uwb_mitigation.calibration.joint_fit import JointFit, Start, fit_joint
 from uwb_mitigation.errors import DatasetError
-from uwb_mitigation.positioning.geometry import AnchorRank, Area, Height, anchor_rank
+from uwb_mitigation.positioning.geometry import Area, Height, extents
 from uwb_mitigation.types.anchors import AnchorMap
 
 HEIGHTS_M = np.array([-2.0, -1.5, -1.0, 1.0, 1.5, 2.0])
@@ -51,10 +51,9 @@ def check_layout(
     position = anchors.position[used]
     if height is not None:
         position = position * (1.0, 1.0, 0.0)
-    kind = anchor_rank(position)
-    if kind in (AnchorRank.POINT, AnchorRank.LINE):
+    if extents(position) < 2:
         raise DatasetError("the anchors are all on a line", valid="one or more that are not on this line")
-    if height is None and area is None and kind is AnchorRank.PLANE:
+    if height is None and area is None and extents(position) == 2:
         raise DatasetError(
             "the anchors are all in a plane: the mirror image of the track explains the ranges equally well",
             valid="--height of the tag, --area on one side of the plane, or an anchor above or below that plane",

@@ -17,7 +17,7 @@ from uwb_mitigation.calibration.observability import MOVES_M
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.batch.smoother import Smoothed, Smoother
 from uwb_mitigation.positioning.config import EstimatorConfig
-from uwb_mitigation.positioning.geometry import AnchorRank, anchor_rank
+from uwb_mitigation.positioning.geometry import extents
 from uwb_mitigation.positioning.noise_model import Regressors
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.anchors import AnchorMap
@@ -111,7 +111,7 @@ def survey_anchors(
     guesses, used, needed = config.anchors, np.unique(ranges.anchor), config.dims + 1
     if len(used) < needed:
         raise DatasetError(f"{len(used)} anchors were received", valid=f"{needed} or more for a survey")
-    if anchor_rank(guesses.position[used]) is AnchorRank.LINE:
+    if extents(guesses.position[used]) < 2:
         raise DatasetError("the anchors are all on a line", valid="at least one next to the line")
     deviations = np.array(
         [sd if row in fixed else max(off_m, sd) for row, sd in enumerate(guesses.sd.tolist())]

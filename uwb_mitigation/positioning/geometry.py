@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
 
@@ -22,15 +21,6 @@ IMAGE_SHIFT_M = 0.5
 
 CONSTANT_ERROR_M, POSITION_SD_M = 0.1, (5.0, 5.0, 1.0)
 """Constant errors of ranges, and what else is known of a position: without it, weak directions would have infinite variances."""
-
-
-class AnchorRank(enum.Enum):
-    """Arrangement of a set of anchors."""
-
-    POINT = "fewer than two places"
-    LINE = "all on a line"
-    PLANE = "all in a plane"
-    SPACE = "spread in space"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,16 +112,10 @@ def unit_vectors(
     return away / distance[..., None], distance
 
 
-def anchor_rank(position: NDArray[np.float64]) -> AnchorRank:
-    """Return the arrangement of anchors at float64 (m, 3)."""
-    if len(position) < 2:
-        return AnchorRank.POINT
+def extents(position: NDArray[np.float64]) -> int:
+    """Return in how many directions anchors at float64 (m, 3) are spread: 0 in one place, 1 on a line, 2 in a plane."""
     spread = np.linalg.svd(position - position.mean(axis=0), compute_uv=False)
-    spread = np.pad(spread, (0, 3 - len(spread)))
-    if spread[0] < 1e-6:
-        return AnchorRank.POINT
-    extents = int((spread > FLAT * spread[0]).sum())
-    return (AnchorRank.LINE, AnchorRank.PLANE, AnchorRank.SPACE)[extents - 1]
+    return int((spread > max(FLAT * spread[0], 1e-6)).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

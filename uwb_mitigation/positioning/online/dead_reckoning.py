@@ -227,7 +227,12 @@ def _twist_of_poses(
     before: Sequence[float], after: Sequence[float], dt: float, twist: tuple[float, float, float]
 ) -> tuple[float, float, float]:
     """Return the mean twist between two poses, or `twist` of the message if the poses jump."""
-    dx, dy, dyaw = _relative(before, after)
+    dyaw = math.remainder(after[2] - before[2], math.tau)
+    # In the axes halfway between both.
+    middle = before[2] + 0.5 * dyaw
+    east, north = after[0] - before[0], after[1] - before[1]
+    cosine, sine = math.cos(middle), math.sin(middle)
+    dx, dy = cosine * east + sine * north, cosine * north - sine * east
     speed, yaw_rate = math.hypot(dx, dy) / dt, abs(dyaw) / dt
     # False for NaN.
     is_continuous = (
@@ -236,27 +241,7 @@ def _twist_of_poses(
     return (dx / dt, dy / dt, dyaw / dt) if is_continuous else twist
 
 
-def _relative(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:
-    """Return the displacement in the axes halfway between two poses, and the rotation."""
-    dyaw = math.remainder(after[2] - before[2], math.tau)
-    middle = before[2] + 0.5 * dyaw
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    cosine, sine = math.cos(middle), math.sin(middle)
-    return cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw
-
-
 def _moved(point: PathPoint, rates: tuple[float, ...], dt: float) -> PathPoint:
-    segment, x, y, yaw, distance, drift, turn, position_variance, yaw_variance, source = point
-    vx, vy, yaw_rate, speed, drifting, turning, position_density, yaw_density = rates
-    return PathPoint(
-        segment,
-        x + vx * dt,
-        y + vy * dt,
-        yaw + yaw_rate * dt,
-        distance + speed * dt,
-        drift + drifting * dt,
-        turn + turning * dt,
-        position_variance + position_density * dt,
-        yaw_variance + yaw_density * dt,
-        source,
-    )
+    segment, *values, source = point
+    moved = [value + rate * dt for value, rate in zip(values, rates, strict=True)]
+    return PathPoint._make([segment, *moved, source])

@@ -156,7 +156,11 @@ class OdometryFilter:
         arm_x, arm_y = self._arm(yaw)
         cosine, sine = math.cos(yaw), math.sin(yaw)
         variance = odometry.twist_variance[0] + self.yaw_variance * (vx * vx + vy * vy)
-        return cosine * vx - sine * vy - yaw_rate * arm_y, sine * vx + cosine * vy + yaw_rate * arm_x, variance
+        return (
+            cosine * vx - sine * vy - yaw_rate * arm_y,
+            sine * vx + cosine * vy + yaw_rate * arm_x,
+            variance,
+        )
 
     def published_covariance(self) -> tuple[float, ...]:
         """Return the covariance of x and y of the antenna and of the yaw: xx, xy, yy, x yaw, y yaw, yaw yaw (m^2, m rad, rad^2)."""

@@ -21,7 +21,7 @@ from uwb_mitigation.positioning.online.dead_reckoning import DeadReckoning, Path
 from uwb_mitigation.positioning.online.heading_test import HeadingTest
 from uwb_mitigation.positioning.online.initialization import IMPLAUSIBLE
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
-from uwb_mitigation.positioning.online.odometry_filter import YAW, OdometryFilter
+from uwb_mitigation.positioning.online.odometry_filter import OdometryFilter
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator, run_estimator
 from uwb_mitigation.types.tracks import Estimate, Heading, Ranges, Track, rows_of
 
@@ -199,13 +199,13 @@ class RobotEstimator:
         yaw = math.remainder(heading_filter.yaw, math.tau)
         variance = self._test.variance(yaw, yaw_variance, heading_filter.point)
         self._is_confirmed = variance < KNOWN_YAW_SD**2
-        if not self._is_confirmed:
-            return Estimate(ranges_only.stamp_ns, position, ranges_only.velocity, covariance)
         velocity = ranges_only.velocity
-        velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
-        covariance[3, 4] = covariance[4, 3] = 0.0
-        covariance[3, 3] = covariance[4, 4] = speed_variance
-        heading = Heading(yaw, np.array([weight * x_yaw, weight * y_yaw, 0.0, variance]))
+        heading: Heading | None = None
+        if self._is_confirmed:
+            velocity[0], velocity[1], speed_variance = heading_filter.velocity(self.odometry)
+            covariance[3, 4] = covariance[4, 3] = 0.0
+            covariance[3, 3] = covariance[4, 4] = speed_variance
+            heading = Heading(yaw, np.array([weight * x_yaw, weight * y_yaw, 0.0, variance]))
         return Estimate(ranges_only.stamp_ns, position, velocity, covariance, heading)
 
     def _update_headings(self, measurement: TagRange) -> None:
@@ -258,22 +258,17 @@ class RobotEstimator:
 
     def _start_yaws(self, point: PathPoint) -> None:
         """Start filters at the position of the ranges-only filter when the robot drives."""
-        if self.tag.filter is None:
+        start = self.tag.filter
+        if start is None:
             return
         if self._begin is None or self._begin.segment != point.segment:
             self._begin = point
         if point.distance_m - self._begin.distance_m < START_M:
             return
-        config, step = self._config, math.tau / NUM_YAWS
+        config, lever_arm, step = self._config, self._robot.lever_arm, math.tau / NUM_YAWS
         for number in range(NUM_YAWS):
-            started = OdometryFilter(
-                config.anchors,
-                config.model,
-                self.tag.filter,
-                point,
-                self._robot.lever_arm,
-                (number * step, step / 2.0),
-            )
+            yaw = number * step, step / 2.0
+            started = OdometryFilter(config.anchors, config.model, start, point, lever_arm, yaw)
             self._yaws.append(_HeadingHypothesis(started, 0.0))
 
     def _prune(self) -> None:

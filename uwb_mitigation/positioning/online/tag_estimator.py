@@ -101,8 +101,6 @@ class TagEstimator:
     _hypotheses: list[_PositionHypothesis]
     _origin_ns: int | None
     _time_s: float
-    _found_s: float
-    _contradicted_s: float
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.anchors = config.anchors
@@ -210,8 +208,10 @@ class TagEstimator:
         return [i for i, s in enumerate(self._states) if s.received_s >= since_s]
 
     def disagreeing(self) -> list[int]:
-        """Return the rows of anchors whose ranges contradict those of most others."""
+        """Return the rows of anchors whose ranges contradict those of most others, or now those of the other half."""
         received = self.received_anchors(5.0)
+        if self._contradicted_s < math.inf:
+            return [row for row in received if abs(self._states[row].outliers) > LOST_SHARE]
         contradicting = [i for i in received if abs(self._states[i].mean_z) > DISAGREES]
         return contradicting if 2 * len(contradicting) < len(received) else []
 
