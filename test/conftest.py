@@ -88,12 +88,20 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
-def apartment() -> Path:
-    """Return the folder of real EVK1000 logs; skip the test if it is missing."""
+def data() -> Path:
+    """Return the folder of the data sets; skip the test if it is missing."""
     root = Path(os.environ.get("UWB_MITIGATION_DATA", REPOSITORY.parent / "shared" / "data"))
-    folder = root / "evk1000_apartment"
+    if not root.is_dir():
+        pytest.skip(f"the data sets are not at {root}: set UWB_MITIGATION_DATA to run this test")
+    return root
+
+
+@pytest.fixture(scope="session")
+def apartment(data: Path) -> Path:
+    """Return the folder of real EVK1000 logs; skip the test if it is missing."""
+    folder = data / "evk1000_apartment"
     if not (folder / "logs").is_dir():
-        pytest.skip(f"the EVK1000 logs are not at {folder}: set UWB_MITIGATION_DATA to run this test")
+        pytest.skip(f"the EVK1000 logs are not at {folder}")
     return folder
 
 

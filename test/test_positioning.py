@@ -427,7 +427,7 @@ def test_obstacles_in_front_of_half_of_the_anchors_do_not_make_a_tag_lost():
     blocked = (ranges.anchor < 2) & (np.abs(ranges.stamp_ns / NANOSECONDS - 20) < 0.8)
     ranges.range_m[blocked] += 4.0
     locator = TagEstimator(EstimatorConfig(SQUARE, height=Height(2.5)))
-    first = ranges.stamp_ns < 20.5 * NANOSECONDS
+    first = ranges.stamp_ns < 20.7 * NANOSECONDS
     locator.run(ranges.take(first))
     assert locator.disagreeing() == [0, 1]
     assert track_errors(locator.run(ranges.take(~first)), truth).rmse < 0.2

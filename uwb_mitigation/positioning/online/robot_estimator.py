@@ -89,10 +89,9 @@ class RobotEstimator:
         self._heading_filter: OdometryFilter | None = None
         self._yaws: list[_HeadingHypothesis] = []
         self._begin: PathPoint | None = None
-        self._is_rejected = False
+        self._is_rejected, self._is_confirmed = False, False
         self._rejections, self._separation = 0.0, 0.0
         self._test = HeadingTest(self._robot.lever_arm, is_verified=self._robot.is_verified)
-        self._is_confirmed = False
         self._recorded = deque(sorted(self._recorded_motion(), key=lambda message: message[0]))
 
     @property
