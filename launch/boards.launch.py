@@ -39,6 +39,8 @@ def nodes_of(context):
     launching.check_names(getattr(context, "argv", ()), names)
     texts = {name: LaunchConfiguration(name).perform(context) for name in names}
     files = {node: [texts[f"{node}_params"], *filter(None, [texts["params"]])] for node in NODES}
+    for node in NODES:
+        launching.from_files(node, *files[node])  # launch_ros only warns of a missing file
     values = launching.parameters({name: texts[name] for name in PARAMETERS}, NODES, NODES)
     common = {"use_sim_time": texts["use_sim_time"].lower() == "true"}
     environment = launching.respawn_environment()

@@ -12,7 +12,7 @@ from conftest import REPOSITORY
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes.support import launching
-from uwb_mitigation.nodes.support.parameter_tables import CRASHED, REFUSED, TABLES
+from uwb_mitigation.nodes.support.parameter_tables import CRASHED, DAMAGED, REFUSED, TABLES
 
 LAUNCH = REPOSITORY / "launch"
 
@@ -133,15 +133,20 @@ def test_displays_start_on_request(generate):
 
 @pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
 @pytest.mark.parametrize(
-    ("code", "kinds"), [(0, ["event"]), (REFUSED, ["shutdown"]), (CRASHED, []), (-9, [])]
+    ("code", "kinds"), [(0, ["event"]), (DAMAGED, ["event"]), (REFUSED, []), (CRASHED, []), (-9, [])]
 )
 def test_only_a_crashed_node_is_respawned(generate, file: str, code: int, kinds: list[str]):
     """The package launch handles on_exit during respawn_delay, before it respawns a node."""
     source = {"source": "mcap"} if file == "uwb.launch.py" else {"boards": "left=/dev/x"}
     node, *_ = launch(generate, file, **source)
-    actions = node.on_exit(SimpleNamespace(returncode=code, action=node), None)
+    event = SimpleNamespace(returncode=code, action=node, process_name="driver-1")
+    if code == REFUSED:
+        with pytest.raises(RuntimeError, match="driver-1 refused"):
+            node.on_exit(event, None)
+        return
+    actions = node.on_exit(event, None)
     assert [action.kind for action in actions] == kinds
-    if code == 0:
+    if kinds:
         # A recording is not replayed again; the other nodes continue.
         event = actions[0].event
         assert (event.kind, event.process_matcher) == ("shutdown of a process", node)
@@ -255,9 +260,13 @@ def test_simulation_starts_only_on_request(generate, tmp_path: Path):
     assert settings(driver) == {"use_sim_time": False}
 
 
-def test_missing_parameter_file_stops_the_launch(generate):
+@pytest.mark.parametrize(
+    ("file", "options"),
+    [("uwb.launch.py", {"source": "serial"}), ("boards.launch.py", {"boards": "left=/dev/x"})],
+)
+def test_missing_parameter_file_stops_the_launch(generate, file: str, options: dict[str, str]):
     with pytest.raises(FileNotFoundError, match=r"absent\.yaml"):
-        launch(generate, "uwb.launch.py", source="serial", params="absent.yaml")
+        launch(generate, file, **options, params="absent.yaml")
 
 
 def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate):

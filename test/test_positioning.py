@@ -442,7 +442,7 @@ def test_invalid_input_is_skipped_and_a_restarted_replay_resets_the_tag():
     assert locator.add(TagRange(0, 0, 5.0, math.inf)) is None
     locator.run(ranges)
     stamp = int(ranges.stamp_ns[-1])
-    assert locator.add(TagRange(stamp - 1000, 0, float(ranges.range_m[-1]))) is not None
+    assert locator.add(TagRange(stamp - 1000, 0, ranges.range_m[-1])) is not None  # a NumPy scalar
     assert locator.counts["backwards"] == 1
     again = locator.run(ranges)
     assert track_errors(again, truth).rmse < 0.3

@@ -26,9 +26,10 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.recordings.bag.anchor_markers import write_anchors
 from uwb_mitigation.recordings.bag.reader import BagReader
 from uwb_mitigation.recordings.bag.writer import BagWriter
-from uwb_mitigation.types.anchors import anchors_path, dump_anchors, load_anchors
+from uwb_mitigation.types.anchors import Anchor, AnchorMap, anchors_path, dump_anchors, load_anchors
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros.codec import encode_range
 from uwb_mitigation.types.ros.poses import encode_pose, encode_true_position, tag_topic
@@ -110,6 +111,20 @@ def test_seek_shows_data_up_to_the_position(bag: Path):
             ("tag_7", TrackKind.TRUE): last // 10 + 1,
         }
     assert len(scene.pairs[1, 7].traces) == 1
+
+
+def test_anchors_of_a_file_replace_those_of_the_bag(bag: Path, tmp_path: Path):
+    path = tmp_path / "anchors.mcap"
+    with BagWriter(path, {"source": "a test", "simulated": "true"}) as out:
+        write_anchors(out, load_anchors(anchors_path(bag)), START_NS)
+        for number in range(10):
+            out.write(record(number))
+    player, scene = open_bag(path)
+    assert scene.anchors[1].position == (0.0, 0.0, 2.0)
+    moved = AnchorMap([Anchor(1, (5.0, 5.0, 7.5))])
+    player.index(EstimatorConfig(moved)).join()
+    seek(player, 0.05)
+    assert scene.anchors[1].position == (5.0, 5.0, 7.5)
 
 
 def test_recording_plays_in_real_time(bag: Path, monkeypatch: pytest.MonkeyPatch):

@@ -129,13 +129,13 @@ class SiteCalibration:
 
     @property
     def raw_error_m(self) -> NDArray[np.float64]:
-        """Return the errors of the ranges of `solution.rows` as measured, (n,), m."""
+        """The errors of the ranges of `solution.rows` as measured, (n,), m."""
         error_m: NDArray[np.float64] = self.site.ranges.range_m[self.solution.rows] - self.solution.true_m
         return error_m
 
     @property
     def held_out_error_m(self) -> NDArray[np.float64]:
-        """Return the held-out errors of these ranges, corrected by the chosen correction, (n,), m; NaN: unknown."""
+        """The held-out errors of the ranges of `solution.rows`, corrected by the chosen correction, (n,), m; NaN: unknown."""
         return self.held_out[0].residual_m[self.chosen][self.solution.rows]
 
     @property

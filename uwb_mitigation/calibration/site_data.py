@@ -259,8 +259,11 @@ class _RangeTable:
         """Return the ranges by tag and time.
 
         Raises:
-            DatasetError: no range belongs to an anchor in the map.
+            DatasetError: no range can be used, or most are from anchors that are not in the map.
         """
+        if not self._rows and not self._unknown_anchors:
+            reasons = ", ".join(f"{count} x {reason}" for reason, count in self._skipped.items())
+            raise DatasetError(f"no range can be used: {reasons or 'there are none'}")
         for anchor_id, count in self._unknown_anchors.items():
             self._skipped[f"anchor {format_id(anchor_id)} is not in the anchors file"] += count
         if (num_unknown := self._unknown_anchors.total()) > len(self._rows) or not self._rows:

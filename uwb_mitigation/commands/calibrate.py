@@ -140,7 +140,7 @@ def calibrate(
         gather = functools.partial(_gather, anchors=anchor_map, source=source, settings=settings)
         site, drives = gather(bags), [gather([bag]) for bag in check or []]
         with console.stage_bars() as show_stage:
-            show_stage("estimating tracks and offsets", 0.0)
+            show_stage("estimating tracks and offsets", None)
             if truth_topic is not None:
                 paths, lever_arms_m = _poses_of_tags(bags, site, truth_topic, frames, given_arm_m)
                 ids = [tag.tag_id for tag in site.tags]
@@ -155,7 +155,7 @@ def calibrate(
                     area=settings.area,
                     height_sd_m=settings.height_sd_m,
                 )
-            show_stage("testing on held-out ranges", 0.0)
+            show_stage("testing on held-out ranges", None)
             calibration = calibrate_site(site, source, solution, check=drives)
     except DatasetError as error:
         # --force does not override this: the anchors, the offsets or the geometry are wrong.

@@ -18,7 +18,7 @@ from uwb_mitigation.nodes.feeds.replay import ReplayFeed, open_source
 from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER, REFUSED
+from uwb_mitigation.nodes.support.parameter_tables import DAMAGED, DRIVER
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 if TYPE_CHECKING:
@@ -132,5 +132,5 @@ class Driver(ManagedNode):
         self.error = error
         if error is not None:
             self.get_logger().error(str(error))
-            self.exit_code = REFUSED
+            self.exit_code = DAMAGED
         self._ended.set()

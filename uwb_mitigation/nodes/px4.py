@@ -93,7 +93,7 @@ class Px4(ManagedNode):
         self.autostart()
 
     def open(self) -> None:
-        self._latest_ns = None
+        self._latest_ns, self._sent = None, 0
         if self.value("mode") == "ranges":
             self._open_ranges()
         else:
@@ -156,6 +156,8 @@ class Px4(ManagedNode):
 
     def _on_range(self, message: RangeCorrected) -> None:
         """Keep the latest range of each anchor until it is sent."""
+        if not self.is_active:
+            return
         stamp_ns = to_ns(message.header.stamp)
         if message.tag_id != (self._tag or message.tag_id):
             self._dropped[OTHER_TAG] += 1

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.geometry import Area, Symmetry, dop, separation, unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel
 from uwb_mitigation.positioning.online.ambiguity import EXCLUDED_SD, LEVEL, RANGE_ERROR_M, Ambiguity
-from uwb_mitigation.positioning.online.tag_estimator import RANGE_TIMEOUT_S, TagEstimator
+from uwb_mitigation.positioning.online.tag_estimator import CONTRADICTED_S, RANGE_TIMEOUT_S, TagEstimator
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Ranges, Track
 
 UNIQUE, UNKNOWN, CONTRADICTED = Ambiguity.NONE.value, "unknown", "contradicted"
@@ -49,8 +50,9 @@ class Determination:
 
 _CONTRADICTED = Determination(
     CONTRADICTED,
-    "most ranges contradicted it twice within a minute",
-    "check ids, coordinates and units in the anchors file, and the height; `uwb-mitigation survey` finds swapped anchors",
+    "ranges of half of the anchors or more contradicted it twice",
+    "unless obstacles blocked them, or the tag was carried: check ids, coordinates and units in the anchors file, and the height; "
+    "`uwb-mitigation survey` finds swapped anchors",
 )
 
 
@@ -129,12 +131,15 @@ def current_determination(estimator: TagEstimator) -> Determination:
 def drive_determination(estimator: TagEstimator, ranges: Ranges, track: Track) -> Determination:
     """Return the statement for a drive: what held most often, at the position with the median HDOP.
 
+    It is contradicted, if the tag was lost twice within `CONTRADICTED_S`, and once in twice this time or more often.
+
     Args:
         estimator: that processed the drive.
         ranges: of the drive.
         track: positions of the drive; empty: the statement is that for the latest ranges.
     """
-    if estimator.counts["contradicted"]:
+    duration_s = float(ranges.stamp_ns[-1] - ranges.stamp_ns[0]) / NS_PER_S
+    if estimator.counts["contradicted"] and 2.0 * CONTRADICTED_S * estimator.counts["lost"] >= duration_s:
         return _CONTRADICTED
     ambiguities = estimator.images.counts.most_common(1)
     if not len(track) or not ambiguities:

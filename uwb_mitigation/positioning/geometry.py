@@ -113,7 +113,9 @@ def unit_vectors(
 
 
 def extents(position: NDArray[np.float64]) -> int:
-    """Return in how many directions anchors at float64 (m, 3) are spread: 0 in one place, 1 on a line, 2 in a plane."""
+    """Return in how many directions anchors at float64 (m, 3) are spread: 0 in one place, 1 on a line, 2 in a plane, 3."""
+    if len(position) < 2:
+        return 0
     spread = np.linalg.svd(position - position.mean(axis=0), compute_uv=False)
     return int((spread > max(FLAT * spread[0], 1e-6)).sum())
 

@@ -207,7 +207,7 @@ class Cir:
         first_path_power_dbm: first-path signal level; NaN = unknown.
         channel: UWB channel number; 0 = unknown.
         prf_mhz: pulse repetition frequency, 16 or 64; 0 = unknown.
-        radio: type of the radio; UNKNOWN in recordings of earlier versions, which contain only the DW1000.
+        radio: type of the radio; UNKNOWN if other software measured it, and in recordings of earlier versions: models assume the DW1000.
         segment: part of the frame; UNKNOWN as for `radio`.
 
     Raises:
@@ -237,7 +237,9 @@ class Cir:
     def _convert(self) -> None:
         values: NDArray[Any] = np.asarray(self.samples)
         is_complex, is_magnitude = np.iscomplexobj(values), self.encoding == Encoding.MAGNITUDE
-        if values.ndim != 1 or not (is_complex or values.dtype.kind in ("iuf" if is_magnitude else "iu")):
+        if values.ndim != 1 or not (
+            is_complex or not values.size or values.dtype.kind in ("iuf" if is_magnitude else "iu")
+        ):
             valid = "complex `i + 1j * q`, int16 pairs, or magnitudes with encoding=Encoding.MAGNITUDE; one dimension"
             raise ParameterError(f"samples of type {values.dtype}, shape {values.shape}", valid=valid)
         (samples,), (scale,) = int16_samples(values[None])

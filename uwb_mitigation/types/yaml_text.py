@@ -24,7 +24,7 @@ def parse_yaml(text: str | bytes, where: str, valid: str = "") -> Any:
         return yaml.load(text, _UniqueKeyLoader)
     except yaml.reader.ReaderError as error:
         raise ParameterError("not a text file", where=where, valid=valid) from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ParameterError(f"not YAML: {first}", where=where, valid=valid) from error
 

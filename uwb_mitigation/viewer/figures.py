@@ -138,6 +138,9 @@ class Chart:
 
     def fill(self, source: ColumnDataSource, table: NDArray[np.float64], message: str = "") -> None:
         """Set the columns of a source."""
+        if message:
+            # Before its data go: an axis needs data or corners at any moment.
+            self.show_empty(message)
         source.data = dict(zip(source.data, table.T.astype(np.float32), strict=True))
         self.show_empty(message)
 
@@ -465,7 +468,7 @@ class Map:
                 if track_kind is kind and len(view.points)
             }
             state = [
-                (name, len(view.points), view.points[-1][0], math.floor(scene.age_s(view)))
+                (name, len(view.points), view.points[-1][0], math.floor(scene.age_s(view)), colours.get(name))
                 for name, view in tracks.items()
             ]
             if self._page.changed(kind.value, state):

@@ -179,7 +179,8 @@ class BagPlayer:
         self.position_s = min(max(position_s, 0.0), self.seconds)
         start_ns = max(int((self.position_s - self._window_s) * NS_PER_S), 0)
         self._next = None
-        events = self._recording.events(self._recording.contents, start_ns)
+        # The anchors are known already, and may have come from a file.
+        events = self._recording.events(self._recording.contents - {ANCHORS}, start_ns)
         self._events: Iterator[Event] = corrected_events(events, self._backend)
         self._advanced_s = time.monotonic()
         self._read()

@@ -85,6 +85,8 @@ class Texts:
             tag_id: self._verdict(scene, tag_id, pairs, states, notices)
             for tag_id in {page.tag_id, *(tag_id for _, tag_id in pairs)}
         }
+        for tag_id in self._verdicts.keys() - verdicts.keys():
+            del self._verdicts[tag_id]
         shown = verdicts[page.tag_id]
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
         page.set(

@@ -41,7 +41,7 @@ def check_output(output: Path, force: bool = True, suffix: str = ".onnx") -> Non
     Raises:
         ParameterError: it cannot.
     """
-    if not output.name.endswith(suffix) or output.is_dir() or not output.resolve().parent.is_dir():
+    if (suffix and output.suffix != suffix) or output.is_dir() or not output.resolve().parent.is_dir():
         valid = f"a file {suffix} in an existing folder" if suffix else "a file in an existing folder"
         raise ParameterError("cannot be written", where=str(output), valid=valid)
     check_replaceable([output], force)

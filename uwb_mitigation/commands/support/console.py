@@ -159,14 +159,16 @@ def step_bar(name: str, steps: int) -> Iterator[Callable[[], None]]:
 
 
 @contextlib.contextmanager
-def stage_bars() -> Iterator[Callable[[str, float], None]]:
-    """Show a progress bar for each stage in turn; yield a function that sets name and completed fraction."""
+def stage_bars() -> Iterator[Callable[[str, float | None], None]]:
+    """Show a progress bar for each stage in turn; yield a function that sets name and completed fraction, None: unknown."""
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
 
-        def on_progress(stage: str, fraction: float) -> None:
+        def on_progress(stage: str, fraction: float | None) -> None:
             if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=1.0)
+                for earlier in tasks.values():
+                    bar.update(earlier, total=1.0, completed=1.0)
+                tasks[stage] = bar.add_task(stage, total=None if fraction is None else 1.0)
             bar.update(tasks[stage], completed=fraction)
 
         yield on_progress

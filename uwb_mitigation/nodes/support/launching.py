@@ -1,4 +1,4 @@
-"""The arguments of the launch files: one for each parameter of the nodes, checked before a node starts. No ROS here."""
+"""The arguments of the launch files: one for each parameter of the nodes, which check them. Only `on_exit` imports launch."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import yaml
 
 from uwb_mitigation.errors import ParameterError, check_name
 from uwb_mitigation.nodes.support.parameter_tables import (
+    DAMAGED,
     REFUSED,
     RESPAWN_FOLDER,
     TABLES,
@@ -35,16 +36,19 @@ def on_exit(event: Any, context: object) -> list[Any]:
     """Handle the exit of a node during its `respawn_delay`, so that only a crashed node is respawned.
 
     Args:
-        event: `ProcessExited`. Code 0: the node ended, for example after a recording. `REFUSED`: the launch stops.
+        event: `ProcessExited`. Code 0 or `DAMAGED`: the node ended, for example after a recording.
         context: unused.
+
+    Raises:
+        RuntimeError: code `REFUSED`. The launch stops, and `ros2 launch` exits with 1.
     """
-    from launch.actions import EmitEvent, Shutdown
+    from launch.actions import EmitEvent
     from launch.events import matches_action
     from launch.events.process import ShutdownProcess
 
     if event.returncode == REFUSED:
-        return [Shutdown()]
-    if event.returncode == 0:
+        raise RuntimeError(f"{event.process_name} refused its start: see its error above")
+    if event.returncode in (0, DAMAGED):
         return [EmitEvent(event=ShutdownProcess(process_matcher=matches_action(event.action)))]
     return []
 

@@ -273,8 +273,11 @@ RESPAWN_FOLDER = "UWB_MITIGATION_RESPAWN_FOLDER"
 that were set at run time, and the locator also its latest state."""
 
 REFUSED = 1
-"""Exit code of a node that refuses a parameter, a file or a name at its start, or whose recording is damaged. A node
-that crashes has another one, with which a launch file respawns it."""
+"""Exit code of a node that refuses a parameter, a file or a name at its start. A node that crashes has another one, with
+which a launch file respawns it."""
+
+DAMAGED = 74
+"""Exit code of a driver after a damaged recording (EX_IOERR of sysexits.h)."""
 
 CRASHED = 70
 """Exit code of a node after an exception that it does not handle (EX_SOFTWARE of sysexits.h)."""

@@ -68,12 +68,13 @@ class _AnchorState:
 
     Attributes:
         received_s: time of the latest; -inf: none.
-        outliers: share of the latest ranges (about twenty) that contradicted the filter; negative: they were too short.
+        outliers: share of the latest ranges (about twenty) that contradicted the filter; short: share of those that were too short.
         mean_z: running mean of the normalised innovation over about fifty ranges, each limited to 5.
     """
 
     received_s: float = -math.inf
     outliers: float = 0.0
+    short: float = 0.0
     mean_z: float = 0.0
 
 
@@ -88,8 +89,8 @@ class TagEstimator:
 
     Attributes:
         config, anchors: as given, and those of the config.
-        counts: numbers of ranges out of order (`backwards`), and of times the tag was `found`, `lost`, and without ranges
-            (`silent`).
+        counts: numbers of ranges out of order (`backwards`), and of times the tag was `found`, `lost`, lost twice
+            within `CONTRADICTED_S` (`contradicted`), and without ranges (`silent`).
         innovation_mean, innovation_square: running means over about a hundred ranges: of the normalised innovation, and of
             its square (1 is ideal).
         filter: the filter that follows the tag; None: its position is searched.
@@ -211,7 +212,7 @@ class TagEstimator:
         """Return the rows of anchors whose ranges contradict those of most others, or now those of the other half."""
         received = self.received_anchors(5.0)
         if self._contradicted_s < math.inf:
-            return [row for row in received if abs(self._states[row].outliers) > LOST_SHARE]
+            return [row for row in received if self._states[row].outliers > LOST_SHARE]
         contradicting = [i for i in received if abs(self._states[i].mean_z) > DISAGREES]
         return contradicting if 2 * len(contradicting) < len(received) else []
 
@@ -254,7 +255,8 @@ class TagEstimator:
         self.innovation_mean += 0.01 * (limited - self.innovation_mean)
         self.innovation_square += 0.01 * (limited * limited - self.innovation_square)
         state = self._states[measurement.anchor]
-        state.outliers += 0.1 * ((z > OUTLIER) - (z < -OUTLIER) - state.outliers)
+        state.outliers += 0.1 * ((abs(z) > OUTLIER) - state.outliers)
+        state.short += 0.1 * ((z < -OUTLIER) - state.short)
         state.mean_z += 0.02 * (max(-5.0, min(5.0, z)) - state.mean_z)
         if self._time_s >= self._next_check_s:
             self._next_check_s = self._time_s + _RETRY_S
@@ -273,14 +275,15 @@ class TagEstimator:
 
     def _is_lost(self, received: list[int]) -> bool:
         """Whether the ranges of at least half of the received anchors contradict the filter, and obstacles are not the reason."""
-        outliers = [self._states[row].outliers for row in received]
-        contradicting = [share for share in outliers if abs(share) > LOST_SHARE]
+        states = [self._states[row] for row in received]
+        contradicting = [state for state in states if state.outliers > LOST_SHARE]
         if 2 * len(contradicting) < len(received):
             self._contradicted_s = math.inf
             return False
         self._contradicted_s = min(self._contradicted_s, self._time_s)
         is_most = 2 * len(contradicting) > len(received)
-        return is_most or min(contradicting) < 0.0 or self._time_s > self._contradicted_s + OBSTACLE_S
+        is_short = any(2.0 * state.short > state.outliers for state in contradicting)
+        return is_most or is_short or self._time_s > self._contradicted_s + OBSTACLE_S
 
     def _estimate(self, filter_: RangeFilter, stamp_ns: int) -> Estimate:
         """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
@@ -316,7 +319,7 @@ class TagEstimator:
     def _restart_search(self, time_s: float) -> None:
         self.filter, self._hypotheses = None, []
         for state in self._states:
-            state.outliers = 0.0
+            state.outliers = state.short = 0.0
         self.images.reset()
         self.undetermined = False
         self._search_began_s, self._next_check_s = time_s, -math.inf

@@ -46,6 +46,11 @@ class OriginalsFile:
         self._folder, self._port, self._path = Path(home, "uwb_mitigation", "uci"), _digest(port), Path()
         self._lock: IO[str] | None = None
         self.problem = ""
+        # From now on, no other port takes the values of this one.
+        with contextlib.suppress(OSError):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._lock = (self._folder / f"{self._port}.lock").open("a")
+            fcntl.flock(self._lock, fcntl.LOCK_SH)
 
     def load(self, board: str) -> Changes:
         """Return the values of a board, which later calls of `save` replace."""
@@ -63,9 +68,6 @@ class OriginalsFile:
         try:
             if changes:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                if self._lock is None:
-                    self._lock = _lock_path(self._path).open("a")
-                    fcntl.flock(self._lock, fcntl.LOCK_SH)
                 write_atomically(self._path, json.dumps({"format": FORMAT, "keys": changes}))
             else:
                 self._path.unlink(missing_ok=True)

@@ -422,7 +422,9 @@ def read_cir(values: Any, form: str) -> Cir:
     if array.dtype == object and array.ndim:
         array = np.stack(list(array))
     if form == "complex":
-        array = array if array.ndim == 1 else array @ (1, 1j)
+        # Rows of real and imaginary parts, or numbers.
+        is_pairs = array.ndim == 2 and not np.iscomplexobj(array)
+        array = (array.astype(np.float64) @ (1, 1j) if is_pairs else array).astype(np.complex128)
     elif np.iscomplexobj(array):
         array = np.abs(array)
     (samples,), (scale,) = int16_samples(array.reshape(1, -1))

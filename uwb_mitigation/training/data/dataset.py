@@ -49,7 +49,7 @@ class Dataset:
         labels: propagation condition; may be empty.
         skipped: {reason: number of measurements that were not used}.
         headers: float32 (n, 2), preamble count and noise threshold; None = not kept.
-        tags, anchors: ids, int (n,), for splits by location; None = not kept.
+        tags, anchors: ids, int (n,), of each pair; None = not kept.
         radios, segments: known sources of the CIRs. channels: known UWB channels.
         early_path_m: float32 (n,), errors that missed direct paths cause (`mitigation.early_path`), NaN: none; None = not
             computed.
