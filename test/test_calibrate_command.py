@@ -284,7 +284,10 @@ def test_heights_come_from_a_topic_and_stamps_are_shifted(site, clean):
     assert shifted["skipped"] == {"no height at that time": 1}
     for pair, value in clean["offsets_m"].items():
         assert shifted["offsets_m"][pair] == pytest.approx(value, abs=0.02)
-    unusable = run("calibrate drive.mcap --height-topic /odom --stamp-offset 3600 -o x.onnx", folder=site)
+    unusable = run(
+        "calibrate drive.mcap --anchors anchors.yaml --height-topic /odom --stamp-offset 3600 -o x.onnx",
+        folder=site,
+    )
     assert re.search(r"no range can be used: \d+ x no height at that time", unusable.stderr), unusable.stderr
     both = run(f"calibrate drive.mcap {LEVEL} --height-topic /odom -o x.onnx", folder=site)
     assert (both.returncode, "either of them" in both.stderr) == (2, True)

@@ -22,6 +22,7 @@ from scipy.io import savemat
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
 from uwb_mitigation.recordings.bag.odometry import read_odometry
 from uwb_mitigation.recordings.formats import open_mapped
+from uwb_mitigation.recordings.mapping.conversion import read_cir
 from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 from uwb_mitigation.recordings.mapping.mapping import Mapping, TableFormat, load_mapping, shipped_mappings
 from uwb_mitigation.recordings.mapping.messages import MessageRows
@@ -143,6 +144,7 @@ def test_a_matrix_needs_names_for_its_columns(tmp_path: Path):
         ("magnitude", "[3, 4]", [3, 4]),
         ("complex", "[(3-1j); 4+2i]", [3, -1, 4, 2]),
         ("complex", "[[3, -1], [4, 2]]", [3, -1, 4, 2]),
+        ("complex", "[3+0j, 4+0j]", [3, 0, 4, 0]),
         ("interleaved", "3 -1 4 2", [3, -1, 4, 2]),
     ],
 )
@@ -151,6 +153,10 @@ def test_cirs_in_text_keep_their_values(form: str, text: str, samples: list[int]
     assert cirs_of(source) == [samples]
     expected = Encoding.MAGNITUDE if form == "magnitude" else Encoding.COMPLEX_INT16
     assert next(iter(source)).measurement.cir.encoding == expected
+
+
+def test_real_values_of_complex_cirs_are_numbers_and_not_pairs():
+    assert read_cir([3.0, 4.0, 5.0], "complex").samples.tolist() == [3, 0, 4, 0, 5, 0]
 
 
 def test_large_and_fractional_cirs_are_scaled(tmp_path: Path):
