@@ -255,5 +255,5 @@ def _dataset(data: Path, preprocessing: Preprocessing, truth: Sequence[Path] = (
 def _options_given(context: typer.Context, names: Sequence[str]) -> str:
     """Return the options of these parameters that the command line contains, separated by commas."""
     parameters = [parameter for parameter in context.command.params if parameter.name in names]
-    sources = {each.opts[0]: context.get_parameter_source(each.name or "") for each in parameters}
+    sources = {option.opts[0]: context.get_parameter_source(option.name or "") for option in parameters}
     return ", ".join(flag for flag, source in sources.items() if source and source.name == "COMMANDLINE")

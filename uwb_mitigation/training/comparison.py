@@ -96,7 +96,8 @@ class Comparison:
             "rejection": [{"rejected": fraction, "mae": mae} for fraction, mae in self.rejection],
             "passed_through": self.passed_through,
             "without_levels": self.without_levels,
-            "universal_coverage": universal and {label or "all": one for label, one in universal.items()},
+            "universal_coverage": universal
+            and {label or "all": covered for label, covered in universal.items()},
         }
 
 
@@ -178,7 +179,12 @@ def _coverage(
     """Return the coverage by label (n,) of errors (seeds, n) and their variances."""
 
     def shares(rows: NDArray[np.bool_]) -> Shares:
-        return Shares(*(coverage(error_m[:, rows], each[:, rows], 1.0) for each in (variance_m2, wide_m2)))
+        return Shares(
+            *(
+                coverage(error_m[:, rows], published_m2[:, rows], 1.0)
+                for published_m2 in (variance_m2, wide_m2)
+            )
+        )
 
     names = ("", *dict.fromkeys(labels.tolist()))
     return {name: shares((labels == name) | (name == "")) for name in names}

@@ -92,17 +92,17 @@ class Figures:
     def __init__(self, page: PageState) -> None:
         self.map, errors = Map(page), RangeErrors(page)
         over_time = Quality(page), PositionErrors(page)
-        self._parts = self.map, Strip(page), LastCir(page), *over_time, errors
-        self.plots = {part.plot.name: part.plot for part in (*self._parts, errors.distribution)}
+        self._charts = self.map, Strip(page), LastCir(page), *over_time, errors
+        self.plots = {chart.plot.name: chart.plot for chart in (*self._charts, errors.distribution)}
         self._position = new_source("time")
         if page.view.player is not None:
-            for part in over_time:
-                part.plot.vspan("time", source=self._position, line_color=NIGHT, line_width=2)
+            for chart in over_time:
+                chart.plot.vspan("time", source=self._position, line_color=NIGHT, line_width=2)
 
     def draw(self, scene: Scene) -> None:
         """Draw what has changed."""
-        for part in self._parts:
-            part.draw(scene)
+        for chart in self._charts:
+            chart.draw(scene)
 
     def show_position(self, position_s: float) -> None:
         """Mark the position of the player."""

@@ -74,7 +74,7 @@ class ManagedNode(LifecycleNode):
         self._last_unique_s = time.monotonic()
         self._reported: set[str] = set()
         self._opened: list[Callable[[], object]] = []
-        (change_state,) = [each for each in self.services if each.srv_type is ChangeState]
+        (change_state,) = [service for service in self.services if service.srv_type is ChangeState]
         change_state.callback = partial(self._answer_change_state, change_state.callback)
         self._diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         # Use a steady clock: diagnostics must be published even if a simulated clock is paused.

@@ -82,7 +82,7 @@ def evaluate_accuracy(
         corrected=ErrorStatistics.of(corrected_m),
         coverage68=coverage(corrected_m, variances, 1.0),
         coverage95=coverage(
-            corrected_m, variances, np.array([cards[each].interval95_sigmas for each in model_ids])
+            corrected_m, variances, np.array([cards[model_id].interval95_sigmas for model_id in model_ids])
         ),
         by_label=mae_by_group(np.array(labels), raw_m, corrected_m),
         by_configuration=mae_by_group(np.array(configurations), raw_m, corrected_m),
