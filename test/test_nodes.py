@@ -28,6 +28,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import mitigator as mitigator_node
+from uwb_mitigation.nodes.support.parameter_tables import DAMAGED
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -117,7 +118,7 @@ def test_damaged_bag_is_replayed_up_to_the_damage(ros: Ros, bag: Path, tmp_path:
     assert 0 < len(records) < 300
     received = ros.collect(RangeCir, RAW)
     driver = ros.start("driver", "source:=mcap", f"path:={torn}", "rate:=20.0", "start_delay:=0.5")
-    assert driver.wait() == 1
+    assert driver.wait() == DAMAGED
     ros.spin_until(lambda: len(received) == len(records))
     assert "torn.mcap" in driver.output
 
