@@ -89,7 +89,7 @@ class Px4(ManagedNode):
         self._waiting: dict[int, tuple[int, RangeCorrected]] = {}
         self._last_ns: dict[int, int] = {}
         self._unknown: set[int] = set()
-        self._dropped: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self.autostart()
 
     def open(self) -> None:
@@ -104,7 +104,7 @@ class Px4(ManagedNode):
 
     def describe(self) -> Description:
         values: dict[str, object] = {"sent": self._sent, "mode": self.value("mode")}
-        values |= {f"ranges {reason}": count for reason, count in sorted(self._dropped.items())}
+        values |= {f"ranges {reason}": count for reason, count in sorted(self._counts.items())}
         warning = ""
         if self.value("mode") == "ranges" and self._positions is None:
             warning = "the origin of PX4 is unknown: set parameter origin, or wait for GNSS"
@@ -114,10 +114,10 @@ class Px4(ManagedNode):
         elif self._unknown:
             ids = ", ".join(map(format_id, sorted(self._unknown)))
             warning = f"ranges of anchors that are not in the file: {ids}"
-        elif self._dropped[LATE] + self._dropped[FUTURE] > self._sent // 2:
+        elif self._counts[LATE] + self._counts[FUTURE] > self._sent // 2:
             warning = "EKF2 ignores most ranges, because of their stamps: synchronise the clocks"
-        elif self._dropped and not self._sent:
-            warning = f"no ranges are sent: {self._dropped.most_common(1)[0][0]}"
+        elif self._counts and not self._sent:
+            warning = f"no ranges are sent: {self._counts.most_common(1)[0][0]}"
         text = warning or ("sending" if self._sent else "no positions or ranges yet")
         return "PX4", diagnostics.WARN if warning else diagnostics.OK, text, values
 
@@ -133,7 +133,7 @@ class Px4(ManagedNode):
         self._anchors = load_anchors(Path(self.value("anchors")).expanduser())
         self._tag, self._positions = self.value("tag"), None
         self._waiting, self._last_ns, self._unknown, self._tags = {}, {}, set(), set()
-        self._dropped = Counter()
+        self._counts = Counter()
         if self.value("origin"):
             self._place_anchors(parse_origin(self.value("origin")))
         else:
@@ -160,25 +160,25 @@ class Px4(ManagedNode):
             return
         stamp_ns = to_ns(message.header.stamp)
         if message.tag_id != (self._tag or message.tag_id):
-            self._dropped[OTHER_TAG] += 1
+            self._counts[OTHER_TAG] += 1
             return
         if len(self._tags) < MAX_IDS:
             self._tags.add(message.tag_id)
         if len(self._tags) > 1:
             # One of them is on the vehicle. The ranges of another one would move it.
-            self._dropped[OTHER_TAG] += 1 + len(self._waiting)
+            self._counts[OTHER_TAG] += 1 + len(self._waiting)
             self._waiting.clear()
             return
         reason = self._reason_to_drop(message, stamp_ns)
         if reason:
-            self._dropped[reason] += 1
+            self._counts[reason] += 1
             return
         if message.anchor_id in self._waiting:
-            self._dropped[NO_ORIGIN if self._positions is None else TOO_OFTEN] += 1
+            self._counts[NO_ORIGIN if self._positions is None else TOO_OFTEN] += 1
         self._waiting[message.anchor_id] = stamp_ns, message
 
     def _reason_to_drop(self, message: RangeCorrected, stamp_ns: int) -> str:
-        """Return why EKF2 cannot use a range; empty: it can."""
+        """Return why EKF2 cannot use a range; empty: it can. Count one that is late."""
         if message.anchor_id not in self._anchors.index:
             if len(self._unknown) < MAX_IDS:
                 self._unknown.add(message.anchor_id)
@@ -190,7 +190,7 @@ class Px4(ManagedNode):
         age_ns = self.now_ns() - stamp_ns
         if age_ns > MAX_AGE_NS:
             # They are sent, because EKF2_DELAY_MAX may be larger than its default.
-            self._dropped[LATE] += 1
+            self._counts[LATE] += 1
         return FUTURE if age_ns < -MAX_SHIFT_NS else ""
 
     def _send_range(self) -> None:
@@ -206,7 +206,7 @@ class Px4(ManagedNode):
         if self._latest_ns is not None and abs(stamp_ns - self._latest_ns) < CORRELATION_S * NS_PER_S:
             sent_ns = max(stamp_ns, self._latest_ns + RANGE_PERIOD_NS)
             if sent_ns - stamp_ns > MAX_SHIFT_NS:
-                self._dropped[TOO_OFTEN] += 1
+                self._counts[TOO_OFTEN] += 1
                 return
         since_ns = max(abs(stamp_ns - self._last_ns.get(anchor, -NS_PER_S)), RANGE_PERIOD_NS)
         increase = max(1.0, CORRELATION_S * NS_PER_S / since_ns)

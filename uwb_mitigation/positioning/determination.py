@@ -131,7 +131,7 @@ def current_determination(estimator: TagEstimator) -> Determination:
 def drive_determination(estimator: TagEstimator, ranges: Ranges, track: Track) -> Determination:
     """Return the statement for a drive: what held most often, at the position with the median HDOP.
 
-    It is contradicted, if the tag was lost twice within `CONTRADICTED_S`, and once in twice this time or more often.
+    It is contradicted if the tag was lost twice within `CONTRADICTED_S`, and on average once within twice this time.
 
     Args:
         estimator: that processed the drive.

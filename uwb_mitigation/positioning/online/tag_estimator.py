@@ -37,11 +37,11 @@ OUTLIER, LOST_SHARE = 3.0, 0.7
 """The tag was lost if this share of the latest ranges of at least half of the anchors had a larger normalised innovation."""
 
 CONTRADICTED_S = 60.0
-"""Two losses within this time happen in none of the 40 drives of `benchmarks positions` in layouts whose anchors are not on a line; with
-the first two anchors swapped, in 19 of them."""
+"""Two losses within this time happen in none of the 40 drives of `benchmarks positions` in layouts whose anchors are not on a line."""
 
 OBSTACLE_S = 1.5
-"""If these ranges are too long, and those of the other half of the anchors are not, obstacles are the reason unless it lasts longer."""
+"""If the ranges of exactly half of the anchors are too long, obstacles are the reason unless it lasts longer. Chosen in drives behind
+concrete as in `docs/experiments/when_worth_it.py`, with other seeds."""
 
 DISAGREES = 1.5
 """An anchor contradicts the others if the mean of its normalised innovations is larger: persisting errors average out."""
@@ -211,7 +211,7 @@ class TagEstimator:
     def disagreeing(self) -> list[int]:
         """Return the rows of anchors whose ranges contradict those of most others, or now those of the other half."""
         received = self.received_anchors(5.0)
-        if self._contradicted_s < math.inf:
+        if self._blocked_since_s < math.inf:
             return [row for row in received if self._states[row].outliers > LOST_SHARE]
         contradicting = [i for i in received if abs(self._states[i].mean_z) > DISAGREES]
         return contradicting if 2 * len(contradicting) < len(received) else []
@@ -261,7 +261,7 @@ class TagEstimator:
         if self._time_s >= self._next_check_s:
             self._next_check_s = self._time_s + _RETRY_S
             received, was_ambiguous = self.received_anchors(), self.is_ambiguous
-            if self._is_lost(received):
+            if self._detect_loss(received):
                 self.counts["lost"] += 1
                 self._losses_s.append(self._time_s)
                 self.counts["contradicted"] += self.is_contradicted
@@ -273,17 +273,17 @@ class TagEstimator:
             if was_ambiguous and not self.is_ambiguous and self._time_s > self._ambiguous_s + MAX_AMBIGUOUS_S:
                 self._restart_search(self._time_s - WINDOW_S)
 
-    def _is_lost(self, received: list[int]) -> bool:
-        """Whether the ranges of at least half of the received anchors contradict the filter, and obstacles are not the reason."""
+    def _detect_loss(self, received: list[int]) -> bool:
+        """Return whether ranges of at least half of the received anchors contradict the filter, and obstacles are not the reason."""
         states = [self._states[row] for row in received]
         contradicting = [state for state in states if state.outliers > LOST_SHARE]
         if 2 * len(contradicting) < len(received):
-            self._contradicted_s = math.inf
+            self._blocked_since_s = math.inf
             return False
-        self._contradicted_s = min(self._contradicted_s, self._time_s)
+        self._blocked_since_s = min(self._blocked_since_s, self._time_s)
         is_most = 2 * len(contradicting) > len(received)
         is_short = any(2.0 * state.short > state.outliers for state in contradicting)
-        return is_most or is_short or self._time_s > self._contradicted_s + OBSTACLE_S
+        return is_most or is_short or self._time_s > self._blocked_since_s + OBSTACLE_S
 
     def _estimate(self, filter_: RangeFilter, stamp_ns: int) -> Estimate:
         """Return the estimate of a filter for publication, with the known height and a covariance that contains images."""
@@ -323,7 +323,7 @@ class TagEstimator:
         self.images.reset()
         self.undetermined = False
         self._search_began_s, self._next_check_s = time_s, -math.inf
-        self._found_s = self._contradicted_s = math.inf
+        self._found_s = self._blocked_since_s = math.inf
 
     def _search(self, measurement: TagRange) -> None:
         time_s = self._time_s
