@@ -1,4 +1,4 @@
-"""Model selection, and `train` from data and from a bundle."""
+"""Model selection, and `train`."""
 
 from __future__ import annotations
 
@@ -199,24 +199,19 @@ def loads(monkeypatch, data) -> None:
     monkeypatch.setattr(recordings, "load_dataset", lambda *_: ("made up", data))
 
 
-def test_named_model_gets_the_offset_of_the_bag(tmp_path, eight_places):
-    # The same shape as the universal network, which does not replace a named model.
-    started = bundle(tmp_path, Remnet(), linear_bias=LinearBiasModel(5.0))
+def test_true_ranges_of_a_table_are_used(tmp_path, eight_places):
     output, result = tmp_path / "own.onnx", tmp_path / "own.json"
+    truth = ("--truth", write(tmp_path, *EIGHT_PLACES))
     run_or_raise(
-        "train", "--from-bag", "bag", "--truth", write(tmp_path, *EIGHT_PLACES), "--model", started.path, "-o", output,
-        "--epochs", 1, "--folds", 2, "--json", result,
-    )  # fmt: skip
-    found = json.loads(result.read_text())
-    assert found["improved"]
-    assert candidates.COLD_START not in [row["name"] for row in found["choice"]["rows"]]
-    assert found["choice"]["chosen"] in ("new offset", "constant")
-    assert load_bundle(output).card.training["started_from"] == f"{started.model_id:08x}"
+        "train", "--data", "bag", *truth, "--recipe", "constant", "-o", output, "--folds", 2, "--json", result
+    )
+    assert json.loads(result.read_text())["improved"]
+    assert load_bundle(output).linear_bias.offset_m == pytest.approx(0.25)
 
 
 def test_few_configurations_start_from_the_universal_network(tmp_path, monkeypatch):
     loads(monkeypatch, dataset(6, 3, samples=157))
-    far_off = fixed_offset("far off", 9.0)
+    far_off = fixed_offset(candidates.CONSTANT, 9.0)
     monkeypatch.setattr(candidates, "new_models", lambda recipe: [far_off])
     output, result = tmp_path / "cold.onnx", tmp_path / "cold.json"
     printed = run_or_raise("train", "--data", tmp_path, "-o", output, "--folds", 2, "--json", result)
@@ -254,22 +249,6 @@ def test_network_is_compared_with_the_best_baseline(tmp_path, monkeypatch):
     printed = " ".join(run_or_raise("train", "--data", tmp_path, *words).split())
     assert "best baseline, one constant offset: 0.000 m" in printed
     assert "Warning: the model is not better than one constant offset" in printed
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        (),
-        ("--data", "a", "--from-bag", "b"),
-        ("--data", "a", "--truth", "c"),
-        ("--from-bag", "b", "--recipe", "auto"),
-        ("--from-bag", "b", "--samples", 157),
-        ("--from-bag", "b", "--scaling", "max"),
-    ],
-)
-def test_contradictory_options_are_refused(tmp_path, arguments):
-    with pytest.raises(ParameterError):
-        run_or_raise("train", *arguments, "-o", tmp_path / "x.onnx")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from uwb_mitigation.commands.support import console, model_tables
-from uwb_mitigation.commands.support.bundles import ModelOption, bundle_for, show_models
+from uwb_mitigation.commands.support.bundles import ModelOption, show_models
 from uwb_mitigation.commands.support.checks import (
     OffsetsOption,
     ScalingName,
@@ -24,46 +24,30 @@ if TYPE_CHECKING:
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.training.data.dataset import Dataset
 
-DataOption = Annotated[
-    Path, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
-]
+_DATA_HELP = "Recording with true ranges: a bag, or a folder of DecaRanging logs."
 OutputOption = Annotated[Path, output_option("FILE", "Bundle to write.")]
-# Options for one mode of `train` or `evaluate`; they are errors in the other mode.
-_DATA_OPTIONS = ("recipe_name", "samples", "scaling")
+# Options for one mode of `evaluate`; they are errors in the other mode.
 _CROSS_VALIDATION_OPTIONS = ("seeds", "folds", "scaling")
 
 
 def train(
-    context: typer.Context,
     output: OutputOption,
-    data: Annotated[
-        Path | None, typer.Option(help="Recording with true ranges: a bag, or a folder of DecaRanging logs.")
-    ] = None,
-    from_bag: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="BAG",
-            help="Instead of --data: fit an existing model to this recording. Its architecture and preprocessing are "
-            "kept, so that the options marked `with --data` are not allowed.",
-        ),
-    ] = None,
+    data: Annotated[Path, typer.Option("--data", "--from-bag", help=_DATA_HELP)],
     truth: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="CSV",
-            help="With --from-bag: true ranges of its pairs (tag_id, anchor_id, range_m, and optionally start_s, "
-            "stop_s, configuration, label); may be given several times.",
+            help="True ranges of the pairs (tag_id, anchor_id, range_m, and optionally start_s, stop_s, configuration, "
+            "label) instead of those of the recording; may be given several times.",
         ),
     ] = None,
-    model: ModelOption = None,
     recipe_name: Annotated[
         Literal["auto", "constant", "line", "line+network", "network"],
-        typer.Option("--recipe", help="With --data: kind of model; auto: selected by cross-validation."),
+        typer.Option("--recipe", help="Kind of model; auto: selected by cross-validation."),
     ] = "auto",
-    samples: Annotated[int, typer.Option(help="With --data: window length K.")] = 157,
+    samples: Annotated[int, typer.Option(help="Window length K.")] = 157,
     scaling: Annotated[
-        ScalingName,
-        typer.Option(help="With --data: scaling of the CIR by its preamble count, or by its maximum."),
+        ScalingName, typer.Option(help="Scaling of the CIR by its preamble count, or by its maximum.")
     ] = "preamble",
     epochs: Annotated[int | None, typer.Option(help="Passes over the data.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Learning rate of Adam.")] = None,
@@ -80,44 +64,25 @@ def train(
 
     One candidate is `cold start`, a network trained in simulated buildings, with an offset estimated from the data.
     It is preferred with fewer than 20 configurations. With 20 or more, its mean with the linear bias model is another
-    candidate. It is not used with --recipe or --model. A network trained on the data is selected only if it reduces
+    candidate. It is not used with --recipe. A network trained on the data is selected only if it reduces
     the error on held-out data.
     """
     from uwb_mitigation.mitigation.model.architecture import Remnet
     from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
     from uwb_mitigation.training.fit.options import FitOptions
 
-    if (data is None) == (from_bag is None):
-        raise ParameterError("no training data, or two sources of it", valid="either --data or --from-bag")
-    if from_bag is None and (truth or model):
-        raise ParameterError("--truth or --model without --from-bag", valid="with --from-bag")
-    if from_bag is not None and (unused := _options_given(context, _DATA_OPTIONS)):
-        raise ParameterError(
-            f"{unused} with --from-bag",
-            valid="only with --data: with --from-bag the source model determines these options",
-        )
-    chosen_scaling = Scaling(scaling)
     set_options: dict[str, Any] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
     set_options = {key: value for key, value in set_options.items() if value is not None}
-    options = FitOptions(**set_options)
-    architecture = Remnet(samples)
+    architecture, options = Remnet(samples), FitOptions(**set_options)
     check_output(output, force)
     from uwb_mitigation.training import train as training
     from uwb_mitigation.training.fit import candidates, fitting  # noqa: F401  (imports torch)
 
-    recording = data or from_bag
-    assert recording is not None
-    source = None if from_bag is None else bundle_for(model, from_bag)
-    preprocessing = Preprocessing(samples, chosen_scaling) if source is None else source.preprocessing
-    name, dataset = _dataset(recording, preprocessing, truth or ())
+    name, dataset = _dataset(data, Preprocessing(samples, Scaling(scaling)), truth or ())
+    recipe = candidates.Recipe(architecture, options, replace(candidates.NETWORK_ONLY, **set_options))
     with console.stage_bars() as on_progress:
         job = training.TrainingJob(dataset, name, output, folds, on_progress)
-        if source is None:
-            network_only = replace(candidates.NETWORK_ONLY, **set_options)
-            recipe = candidates.Recipe(architecture, options, network_only)
-            trained = training.train_new_model(job, recipe, recipe_name)
-        else:
-            trained = training.train_from_bundle(job, source, options, offer_cold_start=model is None)
+        trained = training.train_new_model(job, recipe, recipe_name)
     model_tables.show_trained(trained)
     console.write_json(json, trained)
 
@@ -171,7 +136,7 @@ def quantise(
 
 def evaluate(
     context: typer.Context,
-    data: DataOption,
+    data: Annotated[Path, typer.Option(help=_DATA_HELP)],
     model: ModelOption = None,
     offsets: OffsetsOption = None,
     cross_validate: Annotated[

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import DatasetError, check_name
 from uwb_mitigation.mitigation.model import floating, graph
-from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, load_bundle, save_bundle
-from uwb_mitigation.mitigation.model.floating import float_network, scaled
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.mitigation.model.weights import FloatWeights
 from uwb_mitigation.training.data import splits
@@ -23,9 +20,8 @@ from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation.metrics import ErrorStatistics, mae_by_group
 from uwb_mitigation.training.fit import candidates as models
 from uwb_mitigation.training.fit import selection as selections
-from uwb_mitigation.training.fit.candidates import Candidate, Recipe, fit_new_model, linear_bias_m
+from uwb_mitigation.training.fit.candidates import FittedModel, Recipe, fit_new_model, linear_bias_m
 from uwb_mitigation.training.fit.model_card import card_of, ood_bands_of
-from uwb_mitigation.training.fit.options import FitOptions
 from uwb_mitigation.training.fit.quantisation import calibration_inputs, quantise_network
 from uwb_mitigation.training.fit.selection import NESTED, Selection
 
@@ -132,102 +128,58 @@ def train_new_model(job: TrainingJob, recipe: Recipe, recipe_name: str = AUTO) -
         raise DatasetError(
             "the recording has no CIRs, which networks need", valid=f"--recipe {AUTO}, constant or line"
         )
+    universal = load_bundle(default_model_path(dataset.preprocessing.scaling))
     if recipe_name == AUTO:
-        universal = load_bundle(default_model_path(dataset.preprocessing.scaling))
-        candidates = models.new_models(recipe)
-        if dataset.has_cirs:
-            candidates = models.with_cold_start(candidates, dataset, universal)
-        else:
-            candidates = [item for item in candidates if not item.trains]
-        selection = _select(job, candidates, seed)
+        selection = _select(job, recipe, universal)
         recipe_name = selection.chosen
-        if recipe_name == models.COLD_START:
-            return _write_selected(job, selection, universal, recipe.fit, ("raw", models.CONSTANT))
-    recipe = recipe.for_candidate(recipe_name)
-    total = recipe.fit.epochs * (folds + 1)
-    on_epoch = selections.step_counter(total, lambda fraction: job.on_progress("training", fraction))
-    validation = cross_validate(dataset, recipe, folds, seed, on_epoch, quantised=dataset.has_cirs)
-    fitted = fit_new_model(dataset, recipe, seed, on_epoch)
-    card = site_card(job.output.stem, recipe, fitted.linear_bias, validation, job.name)
-    card = replace(card, needs_cir=dataset.has_cirs)
-    mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
-    mae_m = mae.get("int8", mae["float"]) if selection is None else selection.mae()[NESTED]
+    training = dict[str, object]()
+    if selection is not None and recipe_name == models.COLD_START:
+        errors = {**selection.errors, "float": selection.errors[recipe_name]}
+        validation, fitted = CrossValidation(dataset, errors, folds, seed), selection.model
+        # The training options of the network are in the card of the universal model.
+        recipe = replace(recipe, line=False, network=False)
+        training = {
+            "started_from": f"{universal.model_id:08x}",
+            "chosen": recipe_name,
+            "recipe": {"line": False, "network": True},
+        }
+    else:
+        recipe = recipe.for_candidate(recipe_name)
+        total = recipe.fit.epochs * (folds + 1)
+        on_epoch = selections.step_counter(total, lambda fraction: job.on_progress("training", fraction))
+        validation = cross_validate(dataset, recipe, folds, seed, on_epoch, quantised=dataset.has_cirs)
+        fitted = fit_new_model(dataset, recipe, seed, on_epoch)
     assert fitted.network is not None
+    card = site_card(job.output.stem, recipe, fitted, validation, job.name)
+    card = replace(card, needs_cir=dataset.has_cirs, training={**card.training, **training})
     bundle = save_bundle(job.output, graph.float_model(fitted.network), card)
+    mae = {row: statistics["mae"] for row, statistics in validation.statistics().items()}
+    if selection is None:
+        mae_m, constant_mae_m = mae.get("int8", mae["float"]), mae["overall_median"]
+    else:
+        mae_m, constant_mae_m = (selection.mae()[name] for name in (NESTED, models.CONSTANT))
     baselines = {"raw": mae["raw"]}
     if recipe_name != models.CONSTANT:
-        baselines[models.CONSTANT] = (
-            mae["overall_median"] if selection is None else selection.mae()[models.CONSTANT]
-        )
+        baselines[models.CONSTANT] = constant_mae_m
     return TrainedBundle(bundle, selection, validation, mae_m, baselines)
 
 
-def train_from_bundle(
-    job: TrainingJob, source: Bundle, options: FitOptions, *, offer_cold_start: bool
-) -> TrainedBundle:
-    """Train a model that starts from `source`, or from the universal network with `offer_cold_start`.
-
-    Raises:
-        DatasetError: too few configurations; see also `fitting.fit`. ModelError: the network is not a REMNet.
-    """
-    if not job.dataset.has_cirs:
-        raise DatasetError("the recording has no CIRs, which networks need", valid="train --data")
-    _check_configurations(job.dataset, selections.min_configurations(job.folds))
-    candidates = models.from_bundle(source, options)
-    universal = load_bundle(default_model_path(job.dataset.preprocessing.scaling))
-    if offer_cold_start:
-        # The source is the universal model: with another offset it is the cold start.
-        candidates = [item for item in candidates if item.name != models.NEW_OFFSET]
-        candidates = models.with_cold_start(candidates, job.dataset, universal)
-    selection = _select(job, candidates, options.seed)
-    start_bundle = universal if selection.chosen == models.COLD_START else source
-    return _write_selected(job, selection, start_bundle, options, ("raw", models.CONSTANT, models.AS_SHIPPED))
-
-
-def _select(job: TrainingJob, candidates: Sequence[Candidate], seed: int) -> Selection:
-    has_cold_start = candidates[0].name == models.COLD_START
+def _select(job: TrainingJob, recipe: Recipe, universal: Bundle) -> Selection:
+    """Select one of the new models or the cold start; without CIRs, one without a network."""
+    dataset, candidates = job.dataset, models.new_models(recipe)
+    if dataset.has_cirs:
+        candidates = models.with_cold_start(candidates, dataset, universal)
+    else:
+        candidates = [item for item in candidates if not item.trains]
     return selections.select_nested(
-        job.dataset,
+        dataset,
         candidates,
-        min(job.folds, len(job.dataset.names)),
-        seed,
+        min(job.folds, len(dataset.names)),
+        recipe.fit.seed,
         lambda fraction: job.on_progress("choosing", fraction),
-        min_gain=selections.COLD_START_MIN_GAIN if has_cold_start else selections.MIN_GAIN,
-    )
-
-
-def _write_selected(
-    job: TrainingJob,
-    selection: Selection,
-    start_bundle: Bundle,
-    options: FitOptions,
-    baselines: Sequence[str],
-) -> TrainedBundle:
-    """Write a model that starts from a bundle; the intervals are from its held-out errors in the selection."""
-    zero_network = scaled(float_network(start_bundle), 0.0)
-    assert isinstance(zero_network.architecture, Remnet)
-    linear_bias, network = selection.model.linear_bias, selection.model.network
-    is_trained = selection.chosen == models.FINE_TUNED
-    recipe = Recipe(zero_network.architecture, options, line=linear_bias.needs_power, network=is_trained)
-    errors = {**selection.errors, "float": selection.errors[selection.chosen]}
-    validation = CrossValidation(job.dataset, errors, selection.folds, selection.seed)
-    card = site_card(job.output.stem, recipe, linear_bias, validation, job.name)
-    training = {
-        **card.training,
-        "started_from": f"{start_bundle.model_id:08x}",
-        "chosen": selection.chosen,
-        # If the network was not fine-tuned, its training options are in the card of the source bundle.
-        "recipe": {**card.training["recipe"], "network": network is not None},
-    }
-    model = graph.float_model(zero_network if network is None else network)
-    bundle = save_bundle(job.output, model, replace(card, training=training))
-    mae = selection.mae()
-    return TrainedBundle(
-        bundle,
-        selection,
-        validation,
-        mae[NESTED],
-        {row: mae[row] for row in baselines if row in mae and row != selection.chosen},
+        min_gain=selections.COLD_START_MIN_GAIN
+        if candidates[0].name == models.COLD_START
+        else selections.MIN_GAIN,
     )
 
 
@@ -275,14 +227,15 @@ def fit_with_card(dataset: Dataset, recipe: Recipe, inner_folds: int) -> tuple[M
     validation = cross_validate(dataset, recipe, folds, seed, quantised=False)
     fitted = fit_new_model(dataset, recipe, seed)
     assert fitted.network is not None
-    return site_card("", recipe, fitted.linear_bias, validation, ""), fitted.network
+    return site_card("", recipe, fitted, validation, ""), fitted.network
 
 
 def site_card(
-    name: str, recipe: Recipe, linear_bias: LinearBiasModel, validation: CrossValidation, data: str
+    name: str, recipe: Recipe, fitted: FittedModel, validation: CrossValidation, data: str
 ) -> ModelCard:
     """Return the card of a float model that was fitted to the dataset of `validation`."""
-    dataset = validation.dataset
+    dataset, network = validation.dataset, fitted.network
+    assert network is not None
     options = asdict(recipe.fit) | {"per_configuration": models.PER_CONFIGURATION} if recipe.network else {}
     training = {
         "data": data,
@@ -298,7 +251,9 @@ def site_card(
     }
     residual_m = validation.errors["float"]
     ood_bands = ood_bands_of(dataset) if dataset.has_cirs else None
-    return card_of(name, recipe.architecture, dataset, linear_bias, dataset, residual_m, training, ood_bands)
+    return card_of(
+        name, network.architecture, dataset, fitted.linear_bias, dataset, residual_m, training, ood_bands
+    )
 
 
 def _check_configurations(dataset: Dataset, needed: int) -> None:

@@ -25,10 +25,7 @@ _ROWS = {
 
 _CANDIDATES = {
     "raw": "measured ranges",
-    "as shipped": "the source model, unchanged",
-    "new offset": "the source model with a new offset",
     "cold start": "network trained in simulation, with an offset of this data",
-    "fine-tuned": "the source network, trained further on this data",
     "constant": "one constant offset",
     "line": "linear bias model in the received powers",
     "line+network": "linear bias model, and a network for its residuals",

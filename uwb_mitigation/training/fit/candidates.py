@@ -1,7 +1,7 @@
 """Candidates for model selection: models that can be fitted to labelled ranges, in order of complexity.
 
-`train` chooses between new models (`new_models`) or models that start from a bundle (`from_bundle`), both with the
-universal network and an offset (`with_cold_start`). Only candidates that train a network need torch.
+`train` chooses between new models (`new_models`) and the universal network with an offset (`with_cold_start`). Only
+candidates that train a network need torch.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwb_mitigation.mitigation.model import graph
-from uwb_mitigation.mitigation.model.architecture import Architecture, Remnet
+from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.bundle import Bundle, session_options
 from uwb_mitigation.mitigation.model.floating import float_network
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
@@ -29,7 +29,6 @@ NEW_MODELS = CONSTANT, LINE, LINE_NETWORK, NETWORK = "constant", "line", "line+n
 """Models that are fitted to the data only."""
 
 COLD_START = "cold start"
-AS_SHIPPED, NEW_OFFSET, FINE_TUNED = "as shipped", "new offset", "fine-tuned"
 
 NETWORK_ONLY = FitOptions(epochs=20, learning_rate=1e-3, dropout=0.2)
 """Options of a network without a line: it needs more training than one that refines a line."""
@@ -140,27 +139,12 @@ def fit_new_model(
             return FittedModel(
                 linear_bias, networks.weights_of(networks.build_network(recipe.architecture, 0))
             )
-    options = replace(recipe.fit, seed=seed)
-    network = _fit_residuals(data, linear_bias, options, recipe.architecture, on_epoch)
-    return FittedModel(linear_bias, network)
-
-
-def _fit_residuals(
-    data: Dataset,
-    linear_bias: LinearBiasModel,
-    options: FitOptions,
-    architecture: Architecture,
-    on_epoch: Callable[[], None] = lambda: None,
-    start: FloatWeights | None = None,
-) -> FloatWeights:
-    """Fit a network to the residuals of a linear bias model."""
-    from uwb_mitigation.training.fit import fitting
-
-    subset = data.rows(splits.subsample(data.configurations, PER_CONFIGURATION, options.seed))
+    subset = data.rows(splits.subsample(data.configurations, PER_CONFIGURATION, seed))
     residual = subset.error_m - linear_bias_m(linear_bias, subset)
     # If the linear bias model needs a power that is unknown, the range is passed through.
-    rows = np.isfinite(residual)
-    return fitting.fit(architecture, subset.inputs[rows], residual[rows], options, on_epoch, start=start)
+    rows, options = np.isfinite(residual), replace(recipe.fit, seed=seed)
+    network = fitting.fit(recipe.architecture, subset.inputs[rows], residual[rows], options, on_epoch)
+    return FittedModel(linear_bias, network)
 
 
 def _constant(data: Dataset) -> LinearBiasModel:
@@ -190,39 +174,11 @@ def fit_line(data: Dataset) -> LinearBiasModel:
     )
 
 
-def _with_new_offset(
-    linear_bias: LinearBiasModel, network: FloatWeights, data: Dataset, seed: int
-) -> FittedModel:
-    """Return a model with an offset of the data."""
-    residual = data.error_m - linear_bias_m(linear_bias, data) - network_m(network, data.inputs)
-    is_finite = np.isfinite(residual)
-    shift = 0.0
-    if is_finite.any():
-        shift = linear_fit.fit_constant(data.configurations[is_finite], residual[is_finite]).offset_m
+def _with_offset(network: FloatWeights, data: Dataset, seed: int) -> FittedModel:
+    """Return a network with an offset of the data."""
     return FittedModel(
-        replace(linear_bias, offset_m=float(np.float32(linear_bias.offset_m + shift))), network
+        linear_fit.fit_constant(data.configurations, data.error_m - network_m(network, data.inputs)), network
     )
-
-
-def _fine_tuned(
-    network: FloatWeights, options: FitOptions, has_line: bool, data: Dataset, seed: int
-) -> FittedModel:
-    """Return a network that is trained further on the residuals of a line or of an offset."""
-    if has_line:
-        linear_bias = fit_line(data)
-    else:
-        linear_bias = _with_new_offset(LinearBiasModel(0.0), network, data, seed).linear_bias
-    options = replace(options, seed=seed)
-    return FittedModel(
-        linear_bias,
-        _fit_residuals(data, linear_bias, options, network.architecture, start=network),
-    )
-
-
-_WITHOUT_NETWORK = (
-    Candidate(CONSTANT, lambda data, seed: FittedModel(_constant(data))),
-    Candidate(LINE, lambda data, seed: FittedModel(fit_line(data))),
-)
 
 
 def new_models(recipe: Recipe) -> list[Candidate]:
@@ -233,23 +189,11 @@ def new_models(recipe: Recipe) -> list[Candidate]:
             name, lambda data, seed: fit_new_model(data, recipe.for_candidate(name), seed), trains=True
         )
 
-    return [*_WITHOUT_NETWORK, network(LINE_NETWORK), network(NETWORK)]
-
-
-def from_bundle(source: Bundle, options: FitOptions) -> list[Candidate]:
-    """Return the unchanged model of a bundle, the same with another offset, a constant, a line, and a fine-tuned network.
-
-    The network is fine-tuned on the residuals of a line if the bundle has one, otherwise of an offset.
-
-    Raises:
-        ModelError: the network is not a REMNet.
-    """
-    linear_bias, network = source.linear_bias, float_network(source)
     return [
-        Candidate(AS_SHIPPED, lambda data, seed: FittedModel(linear_bias, network)),
-        Candidate(NEW_OFFSET, partial(_with_new_offset, linear_bias, network)),
-        *_WITHOUT_NETWORK,
-        Candidate(FINE_TUNED, partial(_fine_tuned, network, options, linear_bias.needs_power), trains=True),
+        Candidate(CONSTANT, lambda data, seed: FittedModel(_constant(data))),
+        Candidate(LINE, lambda data, seed: FittedModel(fit_line(data))),
+        network(LINE_NETWORK),
+        network(NETWORK),
     ]
 
 
@@ -260,7 +204,7 @@ def with_cold_start(candidates: Sequence[Candidate], data: Dataset, universal: B
     """
     added = list(candidates)
     if data.preprocessing == universal.preprocessing:
-        start = partial(_with_new_offset, LinearBiasModel(0.0), float_network(universal))
+        start = partial(_with_offset, float_network(universal))
         place = 0 if has_few_configurations(data) else [item.name for item in added].index(CONSTANT) + 1
         added.insert(place, Candidate(COLD_START, start))
     return added
