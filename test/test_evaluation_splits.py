@@ -20,7 +20,7 @@ from uwb_mitigation.training.data.dataset import Dataset, build_dataset
 from uwb_mitigation.training.evaluation import baselines, zero_shot
 from uwb_mitigation.training.evaluation.intervals import MIN_DEVIATION_M, fit_intervals, fit_scale
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, mae_after_rejection
-from uwb_mitigation.training.evaluation.zero_shot import ZeroShot
+from uwb_mitigation.training.evaluation.zero_shot import HeldOut
 from uwb_mitigation.types.measurement import CirFault, RadioType, Segment, Truth
 
 NAMES = np.repeat([f"c{number}" for number in range(40)], 5)
@@ -181,14 +181,13 @@ def data() -> Dataset:
     return dataset(8, 6)
 
 
-def maes(found: ZeroShot) -> list[float]:
+def maes(found: HeldOut) -> list[float]:
     return [float(np.abs(found.errors[name]).mean()) for name in zero_shot.NAMES]
 
 
 def test_offsets_remove_a_constant_of_the_boards(model, data):
     moved = zero_shot.evaluate_zero_shot(replace(data, error_m=data.error_m + 3.0), model)
     still = zero_shot.evaluate_zero_shot(data, model)
-    assert moved.los_offset_m == pytest.approx(still.los_offset_m + 3.0)
     assert maes(moved)[1:] == pytest.approx(maes(still)[1:])
     assert maes(moved)[0] > maes(still)[0] + 1.0
 
@@ -203,7 +202,6 @@ def test_offset_of_a_placement_is_from_the_other_placements(model, data):
 
 def test_without_a_los_placement_there_is_no_offset(model, data):
     blind = zero_shot.evaluate_zero_shot(replace(data, labels=np.full(len(data), "NLOS")), model)
-    assert blind.los_offset_m == 0.0
     assert (blind.errors["universal_los_offset"] == blind.errors["universal"]).all()
 
 

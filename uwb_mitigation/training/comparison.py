@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from uwb_mitigation.training.data import splits
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.evaluation import baselines, zero_shot
 from uwb_mitigation.training.evaluation.metrics import bootstrap_interval, coverage, mae_after_rejection
+from uwb_mitigation.training.evaluation.zero_shot import HeldOut
 from uwb_mitigation.training.fit import candidates
 from uwb_mitigation.training.fit.candidates import Recipe, linear_bias_m, network_m
 from uwb_mitigation.training.fit.fitting import fit
@@ -101,16 +102,6 @@ class Comparison:
         }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _HeldOut:
-    """Residuals of the folds of one seed by row, and the predicted variances, each (n,)."""
-
-    errors: Mapping[str, NDArray[np.float64]]
-    variance_m2: NDArray[np.float64]
-    sigmas95: NDArray[np.float64]
-    passed_through: NDArray[np.bool_]
-
-
 def compare_models(
     dataset: Dataset,
     recipe: Recipe,
@@ -129,15 +120,14 @@ def compare_models(
     has_levels = np.isfinite(dataset.rx_power_dbm) & np.isfinite(dataset.first_path_power_dbm)
     without_levels = int((~has_levels).sum()) if has_levels.any() else 0
     dataset = dataset.rows(has_levels) if has_levels.any() else dataset
-    held_out_by_seed = [_hold_out(dataset, recipe, folds, seed, on_fold) for seed in range(seeds)]
+    held_out = [_hold_out(dataset, recipe, folds, seed, on_fold) for seed in range(seeds)]
     names = NAMES if dataset.has_cirs else NAMES_WITHOUT_CIRS
-    errors_by_row = {
-        name: np.array([seed_result.errors[name] for seed_result in held_out_by_seed]) for name in names
-    }
-    zero_shot_result = None
+    errors_by_row = {name: np.array([by_seed.errors[name] for by_seed in held_out]) for name in names}
+    universal_coverage = None
     if universal is not None and universal.preprocessing == dataset.preprocessing and dataset.has_cirs:
-        zero_shot_result = zero_shot.evaluate_zero_shot(dataset, universal)
-        errors_by_row |= {name: error[None] for name, error in zero_shot_result.errors.items()}
+        unknown_site = zero_shot.evaluate_zero_shot(dataset, universal)
+        errors_by_row |= {name: error[None] for name, error in unknown_site.errors.items()}
+        universal_coverage = _coverage(dataset.labels, "universal_los_offset", [unknown_site])
     labels = list(dict.fromkeys(dataset.labels.tolist()))
     rows = []
     for name, errors in errors_by_row.items():
@@ -145,23 +135,13 @@ def compare_models(
         by_label = {label: float(np.abs(errors[:, dataset.labels == label]).mean()) for label in labels}
         interval = bootstrap_interval(errors[0], dataset.configurations)
         rows.append(ErrorRow(name, float(maes.mean()), float(maes.std()), by_label, interval))
-    universal_coverage = None
-    if zero_shot_result is not None:
-        universal_errors = zero_shot_result.errors["universal_los_offset"][None]
-        variance = zero_shot_result.variance_m2[None].astype(np.float64)
-        wide_variance = variance * zero_shot_result.sigmas95**2
-        universal_coverage = _coverage(dataset.labels, universal_errors, variance, wide_variance)
-    final = np.array([seed_result.errors[names[-1]] for seed_result in held_out_by_seed])
-    variance = np.array([seed_result.variance_m2 for seed_result in held_out_by_seed])
-    wide_variance = variance * np.array([seed_result.sigmas95 for seed_result in held_out_by_seed]) ** 2
+    final = errors_by_row[names[-1]].ravel()
+    variance = np.concatenate([by_seed.variance_m2 for by_seed in held_out])
     return Comparison(
         rows=tuple(rows),
-        coverage=_coverage(dataset.labels, final, variance, wide_variance),
-        rejection=tuple(
-            (fraction, mae_after_rejection(final.ravel(), variance.ravel(), fraction))
-            for fraction in REJECTED
-        ),
-        passed_through=float(np.mean([seed_result.passed_through for seed_result in held_out_by_seed])),
+        coverage=_coverage(dataset.labels, names[-1], held_out),
+        rejection=tuple((fraction, mae_after_rejection(final, variance, fraction)) for fraction in REJECTED),
+        passed_through=float(np.mean([by_seed.passed_through for by_seed in held_out])),
         without_levels=without_levels,
         folds=folds,
         seeds=seeds,
@@ -170,21 +150,15 @@ def compare_models(
     )
 
 
-def _coverage(
-    labels: NDArray[np.str_],
-    error_m: NDArray[np.float64],
-    variance_m2: NDArray[np.float64],
-    wide_m2: NDArray[np.float64],
-) -> Coverage:
-    """Return the coverage by label (n,) of errors (seeds, n) and their variances."""
+def _coverage(labels: NDArray[np.str_], row: str, held_out: Sequence[HeldOut]) -> Coverage:
+    """Return the coverage by label (n,) of the errors of a row, for all seeds."""
+    error_m = np.array([by_seed.errors[row] for by_seed in held_out])
+    variance_m2 = np.array([by_seed.variance_m2 for by_seed in held_out], np.float64)
+    sigmas95 = np.array([by_seed.sigmas95 for by_seed in held_out])
 
     def shares(rows: NDArray[np.bool_]) -> Shares:
-        return Shares(
-            *(
-                coverage(error_m[:, rows], published_m2[:, rows], 1.0)
-                for published_m2 in (variance_m2, wide_m2)
-            )
-        )
+        selected = error_m[:, rows], variance_m2[:, rows]
+        return Shares(coverage(*selected, 1.0), coverage(*selected, sigmas95[:, rows]))
 
     names = ("", *dict.fromkeys(labels.tolist()))
     return {name: shares((labels == name) | (name == "")) for name in names}
@@ -192,7 +166,7 @@ def _coverage(
 
 def _hold_out(
     dataset: Dataset, recipe: Recipe, folds: int, seed: int, on_fold: Callable[[], None]
-) -> _HeldOut:
+) -> HeldOut:
     recipe = replace(recipe, fit=replace(recipe.fit, seed=seed))
     if not dataset.has_cirs:
         recipe = recipe.for_candidate(candidates.LINE)
@@ -216,7 +190,7 @@ def _hold_out(
         sigmas95[fold.test] = card.interval95_sigmas
         passed_through[fold.test] = corrections.passed_through
         on_fold()
-    return _HeldOut(errors, variance, sigmas95, passed_through)
+    return HeldOut(errors, variance, sigmas95, passed_through)
 
 
 def _baselines(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,22 +19,19 @@ NAMES = ("universal", "universal_los_offset", "universal_offset")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ZeroShot:
-    """Residuals of a bundle on n measurements at an unknown site.
+class HeldOut:
+    """Residuals and predictions of n measurements that no model was fitted to.
 
     Attributes:
-        errors: {row of `NAMES`: float64 (n,), m}; without LOS placements, `universal_los_offset` equals
-            `universal`.
-        los_offset_m: subtracted offset; 0 without LOS placements.
-        variance_m2: predicted variances, float32 (n,).
-        sigmas95: number of standard deviations that should cover 95 %.
+        errors: {row: float64 (n,), m}.
+        variance_m2: predicted variances, (n,).
+        sigmas95: number of standard deviations that should cover 95 %, (n,).
         passed_through: bool (n,), not corrected.
     """
 
-    errors: dict[str, NDArray[np.float64]]
-    los_offset_m: float
-    variance_m2: NDArray[np.float32]
-    sigmas95: float
+    errors: Mapping[str, NDArray[np.float64]]
+    variance_m2: NDArray[np.floating]
+    sigmas95: NDArray[np.float64]
     passed_through: NDArray[np.bool_]
 
 
@@ -60,10 +58,11 @@ def correct_with_card(dataset: Dataset, card: ModelCard, predicted_m: NDArray[np
     )
 
 
-def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> ZeroShot:
-    """Correct a dataset that is preprocessed as for `bundle`.
+def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> HeldOut:
+    """Correct a dataset that is preprocessed as for `bundle`; return the rows `NAMES`.
 
-    The offset of a pair of boards is a median over placements: errors of one placement are not independent.
+    The offset of a pair of boards is a median over placements: errors of one placement are not independent. Without LOS
+    placements, `universal_los_offset` equals `universal`.
 
     Raises:
         ModelError: ONNX Runtime rejects the bundle's network.
@@ -86,5 +85,5 @@ def evaluate_zero_shot(dataset: Dataset, bundle: Bundle) -> ZeroShot:
     )
     residuals = residual, residual - los_offset, residual - offset_of_others[configuration_index]
     errors = dict(zip(NAMES, residuals, strict=True))
-    sigmas95 = bundle.card.interval95_sigmas
-    return ZeroShot(errors, los_offset, corrections.variance_m2, sigmas95, corrections.passed_through)
+    sigmas95 = np.full(len(dataset), bundle.card.interval95_sigmas)
+    return HeldOut(errors, corrections.variance_m2, sigmas95, corrections.passed_through)
