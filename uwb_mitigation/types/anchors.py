@@ -10,9 +10,8 @@ ranges, decimal or 0x... . Other fields are errors.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 from uwb_mitigation.files import read_bounded, write_atomically
-from uwb_mitigation.types.yaml_text import parse_yaml
+from uwb_mitigation.types.yaml_text import check_id, check_metres, parse_yaml
 
 SD_M = 0.05
 """Accuracy of a tape measure."""
@@ -33,7 +32,6 @@ MAX_COORDINATE_M = 1e5
 MILLIMETRES = 200.0
 """Anchors further apart do not receive each other: such coordinates are probably millimetres."""
 
-_MAX_ID = (1 << 64) - 1
 _NEEDED = ("id", "x", "y", "z")
 _FIELDS = (*_NEEDED, "sd", "name")
 SCHEMA = "anchors: a list of {id, x, y, z, and optionally sd, name}, in metres"
@@ -110,12 +108,8 @@ class AnchorMap:
 
     def moved(self, position: NDArray[np.float64], sd: NDArray[np.float64]) -> AnchorMap:
         """Return the same anchors at other positions: float64 (m, 3) and (m,)."""
-        return AnchorMap(
-            [
-                Anchor(anchor.id, (float(p[0]), float(p[1]), float(p[2])), float(s), anchor.name)
-                for anchor, p, s in zip(self.anchors, position, sd, strict=True)
-            ]
-        )
+        rows = zip(self.anchors, position.tolist(), sd.tolist(), strict=True)
+        return AnchorMap([replace(anchor, position=tuple(xyz), sd=sd_m) for anchor, xyz, sd_m in rows])
 
 
 def parse_anchors(text: str | bytes, where: str) -> AnchorMap:
@@ -171,27 +165,12 @@ def _anchor(entry: Any, where: str) -> Anchor:
     absent = [name for name in _NEEDED if name not in entry]
     if absent:
         raise ParameterError(f"the field {absent[0]} is missing", where=where, valid=", ".join(_FIELDS))
-    x, y, z = (_number(entry, name, where, -MAX_COORDINATE_M, MAX_COORDINATE_M) for name in "xyz")
-    sd = _number(entry, "sd", where, 0.0, 100.0) if "sd" in entry else SD_M
+    x, y, z = (check_metres(entry[key], key, where, -MAX_COORDINATE_M, MAX_COORDINATE_M) for key in "xyz")
+    sd = check_metres(entry.get("sd", SD_M), "sd", where, 0.0, 100.0)
     name = entry.get("name", "")
     if not isinstance(name, str) or len(name) > 100:
         raise ParameterError(f"name = {name!r:.60}", where=where, valid="text of at most 100 characters")
-    identity = entry["id"]
-    if not isinstance(identity, int) or isinstance(identity, bool) or not 0 <= identity <= _MAX_ID:
-        raise ParameterError(
-            f"id = {identity!r:.60}", where=where, valid="a whole number of 64 bits, such as 3 or 0x1f"
-        )
-    return Anchor(identity, (x, y, z), sd, name)
-
-
-def _number(entry: dict[str, Any], name: str, where: str, low: float, high: float) -> float:
-    value = entry[name]
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
-    if not (math.isfinite(value) and low <= value <= high):
-        hint = " (millimetres?)" if math.isfinite(value) and abs(value) > high else ""
-        raise ParameterError(f"{name} = {value!r:.60}{hint}", where=where, valid=f"{low:g} to {high:g} m")
-    return float(value)
+    return Anchor(check_id(entry["id"], "id =", where), (x, y, z), sd, name)
 
 
 AnyAnchors: TypeAlias = AnchorMap | Mapping[int, Sequence[float]] | Sequence[Anchor] | str | Path

@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
@@ -24,14 +23,13 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.errors import ParameterError, check_name, format_id
 from uwb_mitigation.files import read_bounded
-from uwb_mitigation.types.yaml_text import parse_yaml
+from uwb_mitigation.types.yaml_text import check_id, check_metres, parse_yaml
 
 MAX_OFFSET_M = 10.0
 """A DW1000 without any antenna delay has an offset of 154 m: set `antenna_delay` in the radio instead."""
 
 MAX_ENTRIES = 10_000
 MAX_TEXT = 1 << 20
-_MAX_ID = (1 << 64) - 1
 _SECTIONS = ("default", "anchors", "tags", "pairs")
 _PAIR = ("anchor", "tag", "offset")
 SCHEMA = (
@@ -178,7 +176,7 @@ def _from_sections(document: Mapping[Any, Any], where: str) -> Offsets:
         check_name("key", name, _SECTIONS, where, f"the keys {', '.join(_SECTIONS)}: {SCHEMA}")
     pairs, sd_by_pair = _by_pair(document.get("pairs") or [], where)
     return Offsets(
-        _number(document.get("default", 0.0), "default", where),
+        _checked(document.get("default", 0.0), "default", where),
         _by_id(document.get("anchors") or {}, "anchors", where),
         _by_id(document.get("tags") or {}, "tags", where),
         pairs,
@@ -206,7 +204,8 @@ def _by_id(entries: object, name: str, where: str) -> dict[int, float]:
     if not isinstance(entries, dict):
         raise ParameterError(f"{name} = {entries!r:.60}", where=where, valid=f"{name}: {{id: metres}}")
     return {
-        _id(id_, name, where): _number(value, f"{name}: {id_!r:.60}", where) for id_, value in entries.items()
+        check_id(key, f"{name}: id", where): _checked(value, f"{name}: {key!r:.60}", where)
+        for key, value in entries.items()
     }
 
 
@@ -226,36 +225,18 @@ def _by_pair(
             raise ParameterError(
                 f"{entry!r:.80} is not a pair", where=entry_where, valid=f"{{{', '.join(_PAIR)}}}"
             )
-        pair = _id(entry["tag"], "tag", entry_where), _id(entry["anchor"], "anchor", entry_where)
+        tag, anchor = (check_id(entry[kind], f"{kind}: id", entry_where) for kind in ("tag", "anchor"))
+        pair = tag, anchor
         if pair in offsets_by_pair:
             raise ParameterError("duplicate pair", where=entry_where, valid="one entry for each pair")
-        offsets_by_pair[pair] = _number(entry["offset"], "offset", entry_where)
+        offsets_by_pair[pair] = _checked(entry["offset"], "offset", entry_where)
         if "sd" in entry:
-            sd_by_pair[pair] = _number(entry["sd"], "sd", entry_where)
+            sd_by_pair[pair] = _checked(entry["sd"], "sd", entry_where)
     return offsets_by_pair, sd_by_pair
 
 
-def _id(value: object, name: str, where: str) -> int:
-    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MAX_ID:
-        return value
-    raise ParameterError(
-        f"{name}: id {value!r:.60}", where=where, valid="an unsigned 64-bit integer, such as 3 or 0x1f"
-    )
-
-
-def _number(value: object, name: str, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
-    return _checked(value, name, where)
-
-
-def _checked(value: float, name: str, where: str) -> float:
-    if math.isfinite(value) and abs(value) <= MAX_OFFSET_M:
-        return float(np.float32(value))
-    hint = ": are these millimetres?" if MAX_OFFSET_M < abs(value) <= 1000.0 * MAX_OFFSET_M else ""
-    raise ParameterError(
-        f"{name} = {value!r:.60} m{hint}", where=where, valid=f"{-MAX_OFFSET_M:g} to {MAX_OFFSET_M:g} m"
-    )
+def _checked(value: object, name: str, where: str) -> float:
+    return float(np.float32(check_metres(value, name, where, -MAX_OFFSET_M, MAX_OFFSET_M)))
 
 
 NO_OFFSETS = Offsets()

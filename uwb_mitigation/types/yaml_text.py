@@ -1,7 +1,9 @@
-"""YAML and JSON that users write: anchors, offsets, mappings."""
+"""YAML and JSON that users write: anchors, offsets, mappings; checks of the values in it."""
 
 from __future__ import annotations
 
+import math
+from numbers import Real
 from typing import Any
 
 import yaml
@@ -27,6 +29,26 @@ def parse_yaml(text: str | bytes, where: str, valid: str = "") -> Any:
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ParameterError(f"not YAML: {first}", where=where, valid=valid) from error
+
+
+def check_id(value: object, what: str, where: str) -> int:
+    """Return a 64-bit id; raise ParameterError for another value."""
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 64:
+        return value
+    raise ParameterError(
+        f"{what} {value!r:.60}", where=where, valid="an unsigned 64-bit integer, such as 3 or 0x1f"
+    )
+
+
+def check_metres(value: object, name: str, where: str, low: float, high: float) -> float:
+    """Return a number of metres; raise ParameterError for another value, or one out of its limits."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ParameterError(f"{name} = {value!r:.60}", where=where, valid="a number of metres")
+    metres = float(value)
+    if math.isfinite(metres) and low <= metres <= high:
+        return metres
+    hint = ": are these millimetres?" if high < abs(metres) <= 1000.0 * high else ""
+    raise ParameterError(f"{name} = {value!r:.60} m{hint}", where=where, valid=f"{low:g} to {high:g} m")
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
