@@ -162,7 +162,9 @@ def test_solved_requantisation_equals_the_float_formula_on_every_accumulator(see
 
     assert found is not None
     accumulators = np.arange(low, high + 1)
-    assert np.array_equal(found.apply(accumulators), requantisation.requantise(accumulators, moved))
+    high_word = ((accumulators + found.bias) * found.multiplier) >> 32
+    levels = np.clip((high_word + found.offset) >> requantisation.REQUANTISATION_SHIFT, 0, 255)
+    assert np.array_equal(levels, requantisation.requantise(accumulators, moved))
 
 
 # Every second accumulator of 1 / 64 is a tie, and even and odd levels are rounded in opposite directions.

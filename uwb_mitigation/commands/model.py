@@ -11,12 +11,7 @@ import typer
 
 from uwb_mitigation.commands.support import console, model_tables
 from uwb_mitigation.commands.support.bundles import ModelOption, show_models
-from uwb_mitigation.commands.support.checks import (
-    OffsetsOption,
-    ScalingName,
-    check_output,
-    output_option,
-)
+from uwb_mitigation.commands.support.checks import OffsetsOption, ScalingName, check_output, output_option
 from uwb_mitigation.commands.support.console import JsonOption
 from uwb_mitigation.errors import ParameterError
 

@@ -79,11 +79,5 @@ def train_universal(
     model_tables.show_held_out(trained.held_out)
     model_tables.show_bundle(bundle)
     console.write_json(
-        json,
-        {
-            "model_id": bundle.model_id,
-            "seed": seed,
-            "simulated": True,
-            "held_out": trained.held_out,
-        },
+        json, {"model_id": bundle.model_id, "seed": seed, "simulated": True, "held_out": trained.held_out}
     )

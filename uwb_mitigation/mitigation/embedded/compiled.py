@@ -48,22 +48,14 @@ class _Cir(ctypes.Structure):
 class _Corrected(ctypes.Structure):
     """`uwb_corrected`."""
 
-    _fields_ = (
-        ("range_m", c_float),
-        ("correction_m", c_float),
-        ("variance_m2", c_float),
-        ("status", c_int),
-    )
+    _fields_ = (("range_m", c_float), ("correction_m", c_float), ("variance_m2", c_float), ("status", c_int))
 
 
 _SIGNATURES: compiling.Signatures = {
     "exported_model": (c_void_p, ()),
     "arena_size": (c_size_t, (c_void_p,)),
     "network": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, POINTER(c_float))),
-    "correct": (
-        None,
-        (c_void_p, c_float, c_float, POINTER(_Cir), c_void_p, c_size_t, POINTER(_Corrected)),
-    ),
+    "correct": (None, (c_void_p, c_float, c_float, POINTER(_Cir), c_void_p, c_size_t, POINTER(_Corrected))),
 }
 
 

@@ -320,10 +320,7 @@ def build_bundle(path: Path, graph: bytes, card: ModelCard) -> tuple[Bundle, byt
         "segments": [segment.name for segment in card.segments],
         "architecture": asdict(card.architecture)
         | {"kind": "mlp" if isinstance(card.architecture, Mlp) else "remnet"},
-        "preprocessing": {
-            "samples": card.preprocessing.samples,
-            "scaling": card.preprocessing.scaling.value,
-        },
+        "preprocessing": {"samples": card.preprocessing.samples, "scaling": card.preprocessing.scaling.value},
     }
     if not card.channels:
         del metadata["channels"]
@@ -355,8 +352,7 @@ def _card(metadata: dict[str, Any]) -> ModelCard:
         name=str(metadata["name"]),
         architecture=_architecture(metadata["architecture"]),
         preprocessing=Preprocessing(
-            _integer(metadata["preprocessing"]["samples"]),
-            Scaling(metadata["preprocessing"]["scaling"]),
+            _integer(metadata["preprocessing"]["samples"]), Scaling(metadata["preprocessing"]["scaling"])
         ),
         linear_bias=LinearBiasModel(
             **{key: float(value) for key, value in dict(metadata["linear_bias"]).items()}

@@ -162,9 +162,7 @@ class OodBands:
 
 
 def ood_features(
-    windows: NDArray[np.float32],
-    scaling: Scaling,
-    *reported: NDArray[np.floating],
+    windows: NDArray[np.float32], scaling: Scaling, *reported: NDArray[np.floating]
 ) -> tuple[Values, ...]:
     """Return the six features of n measurements, each float32 (n,).
 

@@ -58,11 +58,6 @@ class Requantisation:
     multiplier: int
     offset: int
 
-    def apply(self, accumulator: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return the requantised values of int32 accumulators without the bias of the layer."""
-        high = ((accumulator + self.bias) * self.multiplier) >> 32
-        return saturate((high + self.offset) >> REQUANTISATION_SHIFT)
-
 
 @dataclass(frozen=True, slots=True)
 class Sum:
@@ -224,10 +219,7 @@ def accumulator_range(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the smallest and largest accumulator of each output for uint8 inputs; `weight` has outputs first."""
     rows = weight.reshape(len(weight), -1).astype(np.int64)
-    return (
-        bias + 255 * np.minimum(rows, 0).sum(axis=1),
-        bias + 255 * np.maximum(rows, 0).sum(axis=1),
-    )
+    return (bias + 255 * np.minimum(rows, 0).sum(axis=1), bias + 255 * np.maximum(rows, 0).sum(axis=1))
 
 
 def nudge_weight_scale(

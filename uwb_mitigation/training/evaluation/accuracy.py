@@ -52,40 +52,39 @@ def evaluate_accuracy(
     Raises:
         DatasetError: no measurement can be compared.
     """
-    raw, corrected, variance, labels, configurations, model_ids = [], [], [], [], [], []
+    rows: list[tuple[float, float, float, str, str, int]] = []
     statuses: Counter[str] = Counter()
     read = 0
     for record, result in mitigation.correct_records(records):
         read += 1
         on_record()
+        truth = record.truth
         # An infinite variance marks an invalid range.
-        if record.truth is None or not np.isfinite(record.truth.range_m + result.variance_m2):
+        if truth is None or not np.isfinite(truth.range_m + result.variance_m2):
             continue
-        raw.append(result.range_raw_m - record.truth.range_m)
-        corrected.append(result.range_m - record.truth.range_m)
-        variance.append(result.variance_m2)
-        labels.append(record.truth.label)
-        configurations.append(record.truth.configuration)
-        model_ids.append(result.model_id)
+        errors = result.range_raw_m - truth.range_m, result.range_m - truth.range_m
+        rows.append((*errors, result.variance_m2, truth.label, truth.configuration, result.model_id))
         statuses[result.status.name] += 1
-    if not raw:
+    if not rows:
         raise DatasetError(f"none of {read} measurements has a valid range and a true one")
-    raw_m, corrected_m, variances = np.array(raw), np.array(corrected), np.array(variance)
+    *columns, model_ids = zip(*rows, strict=True)
+    raw_m, corrected_m, variances, labels, configurations = map(np.array, columns)
     cards = {bundle.model_id: bundle.card for bundle in mitigation.bundles}
     model_id = max(cards, key=model_ids.count)
     # This part of the card is for people and may contain any JSON value.
     known = cards[model_id].training.get("configurations")
-    trained_on = [name for name in set(configurations) if isinstance(known, list) and name in known]
+    names = set(configurations.tolist())
+    trained_on = [name for name in names if isinstance(known, list) and name in known]
     return Accuracy(
-        n=len(raw),
+        n=len(rows),
         raw=ErrorStatistics.of(raw_m),
         corrected=ErrorStatistics.of(corrected_m),
         coverage68=coverage(corrected_m, variances, 1.0),
         coverage95=coverage(
             corrected_m, variances, np.array([cards[model_id].interval95_sigmas for model_id in model_ids])
         ),
-        by_label=mae_by_group(np.array(labels), raw_m, corrected_m),
-        by_configuration=mae_by_group(np.array(configurations), raw_m, corrected_m),
+        by_label=mae_by_group(labels, raw_m, corrected_m),
+        by_configuration=mae_by_group(configurations, raw_m, corrected_m),
         statuses=dict(statuses.most_common()),
         model_id=model_id,
         trained_on=tuple(sorted(trained_on)),
