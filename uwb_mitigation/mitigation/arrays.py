@@ -22,23 +22,13 @@ from uwb_mitigation.types.measurement import (
 _ROWS = 128
 """Number of rows of arrays that are converted at a time: more are hardly faster."""
 
-_ARRAY_FIELDS = (
-    *("start_index", "preamble_count", "rx_power_dbm", "first_path_power_dbm"),
-    *("tag_id", "anchor_id", "radio", "segment"),
-)
+_DEFAULTS = dict.fromkeys(("start_index", "preamble_count"), 0.0)
+_DEFAULTS |= dict.fromkeys(("rx_power_dbm", "first_path_power_dbm"), math.nan)
+_DEFAULTS |= dict.fromkeys(("tag_id", "anchor_id"), 0)
+_CONSTANTS = ("radio", "segment")
 
 
-def columns_of_arrays(
-    range_m: Any,
-    cir: Any,
-    first_path_index: Any,
-    *,
-    start_index: Any = 0,
-    preamble_count: Any = 0,
-    rx_power_dbm: Any = math.nan,
-    first_path_power_dbm: Any = math.nan,
-    **constants: Any,
-) -> Iterator[RangeColumns]:
+def columns_of_arrays(range_m: Any, cir: Any, first_path_index: Any, **fields: Any) -> Iterator[RangeColumns]:
     """Yield the columns of n ranges from arrays, `_ROWS` at a time, which bounds the memory; numbers are valid for all ranges.
 
     The arguments are those of `Mitigation.correct_arrays`.
@@ -47,27 +37,20 @@ def columns_of_arrays(
         ParameterError: see `Mitigation.correct_arrays`.
     """
     samples = _checked_samples(cir)
-    for name in constants:
-        check_name("field", name, _ARRAY_FIELDS)
+    for name in fields:
+        check_name("field", name, (*_DEFAULTS, *_CONSTANTS))
+    constants = {name: fields.pop(name) for name in _CONSTANTS if name in fields}
 
-    def column(name: str, value: Any, dtype: Any = np.float64) -> NDArray[Any]:
+    def column(name: str, value: Any) -> NDArray[Any]:
+        dtype: Any = np.uint64 if name in ("tag_id", "anchor_id") else np.float64
         try:
             return np.broadcast_to(np.asarray(value, dtype), len(samples))
         except (ValueError, TypeError, OverflowError) as error:
             shape = f"{name} of shape {np.shape(value)} with a cir of shape {samples.shape}"
             raise ParameterError(shape, valid="one number, or one for each row of the cir") from error
 
-    columns: dict[str, Any] = {
-        name: column(name, constants.pop(name, 0), np.uint64) for name in ("tag_id", "anchor_id")
-    }
-    columns |= {
-        "range_m": column("range_m", range_m),
-        "start_index": column("start_index", start_index),
-        "first_path_index": column("first_path_index", first_path_index),
-        "preamble_count": column("preamble_count", preamble_count),
-        "rx_power_dbm": column("rx_power_dbm", rx_power_dbm),
-        "first_path_power_dbm": column("first_path_power_dbm", first_path_power_dbm),
-    }
+    values = {"range_m": range_m, "first_path_index": first_path_index, **_DEFAULTS, **fields}
+    columns: dict[str, Any] = {name: column(name, value) for name, value in values.items()}
     index = columns["first_path_index"] - columns["start_index"]
     _check_units(columns["range_m"], index, samples.shape[1])
     encoding = Encoding.COMPLEX_INT16 if np.iscomplexobj(samples) else Encoding.MAGNITUDE

@@ -57,9 +57,9 @@ class Job:
     offsets: Offsets = NO_OFFSETS
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Outcome:
-    """The result of a job.
+    """The result of a job, counted while it is processed.
 
     Attributes:
         job: the job.
@@ -124,66 +124,47 @@ def process_bag(job: Job, report: Report | None = None) -> Outcome:
         "source": f"{job.source.name}, corrected by model {' or '.join(f'{b.model_id:08x}' for b in mitigation.bundles)}",
         "simulated": metadata.get("simulated", "unknown"),
     }
+    outcome = Outcome(job, models=mitigation.used, written=True)
     with BagWriter(job.output, origin, force=job.force) as out:
-        corrector = _Corrector(job.source, mitigation, out)
+        corrector = _Corrector(outcome, mitigation, out)
         if ANCHORS not in bag.topics and bag.bounds_ns and (anchors := recorded_anchors(job.source)):
             write_anchors(out, anchors, bag.bounds_ns[0])
-        damage = None
-        total, num_read = bag.message_count, 0
         messages = bag.messages()
-        while True:
+        while outcome.error is None:
             batch: list[RawMessage] = []
             try:
                 # Not list(islice()): messages before the damage must be kept.
                 for message in islice(messages, BATCH):
                     batch.append(message)  # noqa: PERF402
             except DamagedRecordingError as error:
-                damage = error
+                outcome.error = error
             if not batch:
                 break
             corrector.write(batch)
-            num_read += len(batch)
+            outcome.messages += len(batch)
             if report is not None:
-                report(num_read, total)
-            if damage is not None:
-                break
-        if damage is not None and num_read == 0:
-            raise damage
+                report(outcome.messages, bag.message_count)
+        if outcome.error is not None and outcome.messages == 0:
+            raise outcome.error
         if RANGE_RAW not in bag.topics:
             topics = ", ".join(sorted(bag.topics)) or "no topic"
             raise RecordingError(
                 f"no topic {RANGE_RAW}", where=str(job.source), valid=f"the bag contains: {topics}"
             )
-    seconds = time.perf_counter() - started
-    return Outcome(
-        job,
-        messages=num_read,
-        ranges=corrector.statuses.total(),
-        statuses=corrector.statuses,
-        reasons=corrector.reasons,
-        replaced=corrector.replaced,
-        skipped=corrector.skipped + bag.warnings,
-        models=mitigation.used,
-        seconds=seconds,
-        error=damage,
-        written=True,
-    )
+    outcome.seconds = time.perf_counter() - started
+    outcome.ranges = outcome.statuses.total()
+    outcome.skipped.update(bag.warnings)
+    return outcome
 
 
 class _Corrector:
     """Writes batches of messages and inserts the corrected ranges."""
 
-    def __init__(self, source: Path, mitigation: Mitigation, out: BagWriter) -> None:
-        self._source = source
-        self._mitigation = mitigation
-        self._out = out
+    def __init__(self, outcome: Outcome, mitigation: Mitigation, out: BagWriter) -> None:
+        self._outcome, self._mitigation, self._out = outcome, mitigation, out
         # The bag keeps references to its channels, so that an id() identifies one channel of one file.
         self._channels: dict[int, int] = {}
         self._corrected = out.corrected_channel()
-        self.statuses: Counter[str] = Counter()
-        self.reasons: Counter[str] = Counter()
-        self.skipped: Counter[str] = Counter()
-        self.replaced = 0
 
     def write(self, batch: list[RawMessage]) -> None:
         """Write the messages of a batch, and after each raw range its corrected range."""
@@ -191,12 +172,12 @@ class _Corrector:
         raw = [message for message in batch if message.channel.topic == RANGE_RAW]
         for channel in {id(message.channel): message.channel for message in raw}.values():
             if id(channel) not in channels:
-                check_channel(channel, RANGE_CIR_TYPE, self._source)
+                check_channel(channel, RANGE_CIR_TYPE, self._outcome.job.source)
                 channels[id(channel)] = out.copy_channel(channel)
         corrected = iter(self._correct([message.data for message in raw]))
         for channel, sequence, log_ns, publish_ns, data in batch:
             if channel.topic == RANGE_CORRECTED:
-                self.replaced += 1
+                self._outcome.replaced += 1
                 continue
             if id(channel) not in channels:
                 channels[id(channel)] = out.copy_channel(channel)
@@ -219,9 +200,9 @@ class _Corrector:
             corrected = self._mitigation.correct_columns(batch.columns)
             kinds = zip(corrected.status.tolist(), corrected.fault.tolist(), strict=True)
             for (status, fault), count in Counter(kinds).items():
-                self.statuses[Status(status).name] += count
+                self._outcome.statuses[Status(status).name] += count
                 if text := reason(status, fault, 0.0):
-                    self.reasons[text] += count
+                    self._outcome.reasons[text] += count
             for index, message in zip(indices, batch.encode_corrected(corrected), strict=True):
                 encoded[index] = message
         return encoded
@@ -233,10 +214,10 @@ class _Corrector:
             try:
                 decoded[index] = decode_range(messages[index])
             except RecordingError as error:  # noqa: PERF203
-                self.skipped[error.what] += 1
+                self._outcome.skipped[error.what] += 1
         corrected = self._mitigation.correct([*decoded.values()])
         for (index, measurement), result in zip(decoded.items(), corrected, strict=True):
             encoded[index] = encode_corrected(measurement, result)
-            self.statuses[result.status.name] += 1
+            self._outcome.statuses[result.status.name] += 1
             if result.reason:
-                self.reasons[result.reason] += 1
+                self._outcome.reasons[result.reason] += 1

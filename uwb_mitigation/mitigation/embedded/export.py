@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +159,6 @@ def _scale(card: ModelCard) -> str:
 
 def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
     remnet = bool(network.modules)
-    linear_bias, (low, high) = card.linear_bias, card.correction_limits_m
     values = [
         f"0x{model_id:08x}u",
         f"{network.samples}u",
@@ -176,11 +175,8 @@ def _model(network: PackedNetwork, card: ModelCard, model_id: int) -> str:
         f"{len(network.head_weights)}u",
         f"{network.head_bias}",
         format_number(network.head_scale),
-        format_number(linear_bias.offset_m),
-        format_number(linear_bias.per_rx_power),
-        format_number(linear_bias.per_power_gap),
-        format_number(low),
-        format_number(high),
+        *map(format_number, astuple(card.linear_bias)),
+        *map(format_number, card.correction_limits_m),
         format_number(card.variance_uncorrected_m2),
         "uwb_model_scale",
         f"{len(card.scale)}u",
