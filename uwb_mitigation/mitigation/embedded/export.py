@@ -17,7 +17,7 @@ from uwb_mitigation.mitigation.embedded.packing import Channels, PackedNetwork, 
 from uwb_mitigation.mitigation.model import graph
 from uwb_mitigation.mitigation.model.bundle import Bundle, ModelCard, Session
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.mitigation.model.ood import OodBands
+from uwb_mitigation.mitigation.model.ood import OodBands, check_float32
 from uwb_mitigation.mitigation.model.requantisation import Sum
 from uwb_mitigation.mitigation.preprocessing import Scaling
 
@@ -206,10 +206,8 @@ def format_number(value: float | np.floating[Any]) -> str:
         ModelError: the value is not finite or not a float32.
     """
     with np.errstate(over="ignore"):
-        single = np.float32(value)
-    if not np.isfinite(single) or float(single) != float(value):
-        raise ModelError(f"{value!r} is not a finite float32 value")
-    digits = f"{float(single):.9g}"
+        check_float32("a number of the model", float(value))
+    digits = f"{float(value):.9g}"
     if not re.search(r"[.e]", digits):
         digits += ".0"
     return digits + "f"

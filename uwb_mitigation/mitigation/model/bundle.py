@@ -8,7 +8,6 @@ before ONNX Runtime reads the file; it does not protect against forgery.
 from __future__ import annotations
 
 import json
-import math
 import re
 import zlib
 from collections.abc import Mapping
@@ -25,7 +24,7 @@ from uwb_mitigation.errors import ModelError, UwbMitigationError
 from uwb_mitigation.files import read_bounded, write_atomically
 from uwb_mitigation.mitigation.model.architecture import Architecture, Mlp, Remnet
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.mitigation.model.ood import Band, OodBands
+from uwb_mitigation.mitigation.model.ood import Band, OodBands, check_float32
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
 from uwb_mitigation.types.measurement import RadioType, Segment
 
@@ -122,11 +121,7 @@ class ModelCard:
             "variance_uncorrected_m2": self.variance_uncorrected_m2,
         }
         for name, value in numbers.items():
-            if not math.isfinite(value):
-                raise ModelError(f"{name} = {value}", valid="a finite number")
-            # Host and firmware compute in float32: store exactly the values that are used.
-            if float(np.float32(value)) != value:
-                raise ModelError(f"{name} = {value!r} is not a float32 value")
+            check_float32(name, value)
         for name in ("variance_m2", "variance_uncorrected_m2"):
             if numbers[name] <= 0:
                 raise ModelError(f"{name} = {numbers[name]}", valid="a positive number")
@@ -137,14 +132,10 @@ class ModelCard:
             )
         if not 1.0 <= self.interval95_sigmas <= 1e3:
             raise ModelError(f"interval95_sigmas = {self.interval95_sigmas}", valid="1 to 1000")
-        if (
-            self.ood_bands is not None
-            and self.ood_bands.needs_levels
-            and self.preprocessing.scaling is not Scaling.PREAMBLE
-        ):
-            raise ModelError(
-                "bands of received powers for windows without a level", valid="the scaling preamble"
-            )
+        needs_levels = self.ood_bands is not None and self.ood_bands.needs_levels
+        if needs_levels and self.preprocessing.scaling is not Scaling.PREAMBLE:
+            what = "bands of received powers for windows without a level"
+            raise ModelError(what, valid="the scaling preamble")
         if self.correction_limits_m[0] >= self.correction_limits_m[1]:
             raise ModelError(f"correction_limits_m = {self.correction_limits_m}", valid="low, high")
 

@@ -38,6 +38,12 @@ _DB_PER_OCTAVE = float(np.float32(10 * math.log10(2)))
 _SQUARE, _LINEAR, _CONSTANT = float(np.float32(-4 / 3)), 4.0, float(np.float32(8 / 3))
 
 
+def check_float32(name: str, value: float) -> None:
+    """Raise ModelError unless a value is finite and exact in float32, in which host and firmware compute."""
+    if not math.isfinite(value) or float(np.float32(value)) != value:
+        raise ModelError(f"{name} = {value!r}", valid="a finite float32 value")
+
+
 @dataclass(frozen=True, slots=True)
 class Margins:
     """Extension of a band beyond the training data, in half widths of the data.
@@ -74,8 +80,7 @@ class Band:
 
     def __post_init__(self) -> None:
         for value in astuple(self):
-            if not math.isfinite(value) or float(np.float32(value)) != value:
-                raise ModelError(f"band with {value!r}", valid="finite float32 values")
+            check_float32("value of a band", value)
         if self.low > self.high or self.margin <= 0 or not math.isfinite(np.float32(1) / self.margin):
             raise ModelError(f"band {astuple(self)}", valid="low <= high, and a positive margin")
 
@@ -120,9 +125,7 @@ class OodBands:
     lead_level_db: Band | None = None
 
     def __post_init__(self) -> None:
-        offset = self.known_offset_m
-        if not math.isfinite(offset) or float(np.float32(offset)) != offset:
-            raise ModelError(f"known_offset_m = {offset!r}", valid="a finite float32 value")
+        check_float32("known_offset_m", self.known_offset_m)
 
     @property
     def bands(self) -> tuple[Band | None, ...]:
