@@ -110,8 +110,7 @@ def quantise(
     with console.reading() as on_record:
         dataset = recordings.load_inputs(data, source.preprocessing, on_record)
     console.show_skipped(dataset.skipped)
-    quantised = quantisation.quantise_bundle(source, dataset, output)
-    bundle, difference = quantised.bundle, quantised.difference_m
+    bundle, difference = quantisation.quantise_bundle(source, dataset, output)
     model_tables.show_bundle(bundle)
     console.out.print(
         f"int8 differs from float by {difference.mean():.4f} m on average, {difference.max():.4f} m at most"

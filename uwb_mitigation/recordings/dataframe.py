@@ -6,10 +6,12 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from uwb_mitigation.types.measurement import CorrectedRange, Record
+from uwb_mitigation.types.measurement import CorrectedRange, Record, Truth
 
 if TYPE_CHECKING:
     import pandas as pd
+
+_UNKNOWN = Truth(math.nan)
 
 
 def to_dataframe(records: Iterable[Record | tuple[Record, CorrectedRange]]) -> pd.DataFrame:
@@ -32,30 +34,16 @@ def to_dataframe(records: Iterable[Record | tuple[Record, CorrectedRange]]) -> p
     rows = []
     for item in records:
         record, corrected = item if isinstance(item, tuple) else (item, None)
-        measurement, truth = record.measurement, record.truth
-        x, y, z = record.tag_position or (math.nan,) * 3
-        row = {
-            "stamp": measurement.stamp_ns,
-            "tag_id": measurement.tag_id,
-            "anchor_id": measurement.anchor_id,
-            "range_m": measurement.range_m,
-            "rx_power_dbm": measurement.cir.rx_power_dbm,
-            "first_path_power_dbm": measurement.cir.first_path_power_dbm,
-            "true_range_m": math.nan if truth is None else truth.range_m,
-            "label": "" if truth is None else truth.label,
-            "configuration": "" if truth is None else truth.configuration,
-            "x": x,
-            "y": y,
-            "z": z,
-        }
+        measured, truth = record.measurement, record.truth or _UNKNOWN
+        row = {name: getattr(measured, name) for name in ("stamp_ns", "tag_id", "anchor_id", "range_m")}
+        row |= {name: getattr(measured.cir, name) for name in ("rx_power_dbm", "first_path_power_dbm")}
+        row |= {"true_range_m": truth.range_m, "label": truth.label, "configuration": truth.configuration}
+        row |= dict(zip("xyz", record.tag_position or (math.nan,) * 3, strict=True))
         if corrected is not None:
-            row |= {
-                "corrected_range_m": corrected.range_m,
-                "variance_m2": corrected.variance_m2,
-                "status": corrected.status.name,
-            }
+            row |= {"corrected_range_m": corrected.range_m, "variance_m2": corrected.variance_m2}
+            row["status"] = corrected.status.name
         rows.append(row)
-    frame = pd.DataFrame(rows)
+    frame = pd.DataFrame(rows).rename(columns={"stamp_ns": "stamp"})
     if rows:
         frame["stamp"] = pd.to_datetime(frame["stamp"], utc=True)
         frame = frame.astype({"tag_id": "uint64", "anchor_id": "uint64"})

@@ -97,14 +97,13 @@ def show_table(
             table.add_row(*(escape(cells[number]) for number in selected), style=bold)
         return table
 
-    num_omitted = 0
+    omitted: list[str] = []
     # Rich limits the measured width to that of the options.
     unlimited = out.options.update_width(10_000)
-    while num_omitted < len(optional) and (
-        out.measure(build(optional[len(optional) - num_omitted :]), options=unlimited).maximum > out.width
+    while len(omitted) < len(optional) and (
+        out.measure(build(omitted), options=unlimited).maximum > out.width
     ):
-        num_omitted += 1
-    omitted = optional[len(optional) - num_omitted :]
+        omitted.insert(0, optional[-1 - len(omitted)])
     out.print(build(omitted))
     if len(rows) > max_rows:
         print_line(f"and {len(rows) - max_rows} more rows")

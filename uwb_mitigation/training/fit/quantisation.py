@@ -7,7 +7,7 @@ then fit the 16-bit sums of processors without VNNI, so that all processors give
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,14 +80,6 @@ def quantise_network(
     return nudge(quantised) if exact else quantised
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Quantised:
-    """A bundle that was written; `difference_m` (n,) is its difference from float on the calibration inputs."""
-
-    bundle: Bundle
-    difference_m: NDArray[np.float32]
-
-
 def check(source: Bundle) -> None:
     """Check the arguments of `quantise_bundle` before data is read; raises the same errors."""
     if source.quantised:
@@ -98,8 +90,11 @@ def check(source: Bundle) -> None:
         )
 
 
-def quantise_bundle(source: Bundle, dataset: Dataset, output: Path) -> Quantised:
+def quantise_bundle(source: Bundle, dataset: Dataset, output: Path) -> tuple[Bundle, NDArray[np.float32]]:
     """Quantise a float bundle with the data that it was trained on, and write it.
+
+    Returns:
+        The bundle, and its differences from float on the n calibration inputs, m, float32 (n,).
 
     Raises:
         ModelError: it is quantised already; see also `quantise_network`.
@@ -110,7 +105,7 @@ def quantise_bundle(source: Bundle, dataset: Dataset, output: Path) -> Quantised
     integers = quantise_network(network, inputs)
     difference = np.abs(IntegerNetwork(integers).predict_m(inputs) - floating.predict_m(network, inputs))
     card = replace(source.card, name=output.stem, quantised=True)
-    return Quantised(save_bundle(output, graph.int8_model(integers), card), difference)
+    return save_bundle(output, graph.int8_model(integers), card), difference
 
 
 def _weight_scale(name: str, weight: NDArray[np.float32]) -> NDArray[np.float32]:
