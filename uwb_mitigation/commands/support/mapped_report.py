@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from uwb_mitigation.recordings.mapping.mapped import MappedRecording
 
 _ROWS = 5
-_BAR = 40
 _FIELDS = (
     ("range, m", "range", 3),
     ("true range, m", "true range", 3),
@@ -64,7 +63,7 @@ def _with_cir(source: MappedRecording) -> int:
 
 
 def show_preview(source: MappedRecording) -> None:
-    """Print the first ranges with units, a histogram of the errors, and what is missing."""
+    """Print the first ranges with units, percentiles of the errors, and what is missing."""
     values = source.values
     shown = range(min(_ROWS, len(source)))
     first = int(values["stamp"][0])
@@ -82,7 +81,10 @@ def show_preview(source: MappedRecording) -> None:
     print_line(_extent(source))
     title = f"The first of {len(source)} ranges, from {np.datetime64(first // 1_000_000, 'ms')} UTC"
     show_table(title, ("", *(str(row + 1) for row in shown)), rows)
-    _show_errors(source.errors_m)
+    if len(errors_m := source.errors_m):
+        low, middle, high = np.percentile(errors_m, (1, 50, 99))
+        text = f"median {middle:+.2f} m, 1 % below {low:+.2f} m, 1 % above {high:+.2f} m"
+        print_line(f"Errors (measured - true) of {len(errors_m)} ranges: {text}")
     for line in missing(source):
         print_line(line)
 
@@ -125,15 +127,3 @@ def missing(source: MappedRecording) -> list[str]:
         ),
     )
     return [text for applies, text in cases if applies]
-
-
-def _show_errors(errors: Any) -> None:
-    if not len(errors):
-        return
-    low, high = np.percentile(errors, (1, 99))
-    counts, edges = np.histogram(np.clip(errors, low, high), bins=10)
-    rows = [
-        [f"{start:+.2f} to {stop:+.2f}", str(count), "#" * round(_BAR * count / max(counts.max(), 1))]
-        for count, start, stop in zip(counts.tolist(), edges[:-1], edges[1:], strict=True)
-    ]
-    show_table(f"Errors (measured - true) of {len(errors)} ranges", ("error, m", "ranges", ""), rows, left=1)
