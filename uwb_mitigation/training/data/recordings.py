@@ -32,10 +32,10 @@ def load_dataset(
     Raises:
         RecordingError, DatasetError: it cannot be read, or no measurement is usable.
     """
-    truth_segments = [row for table in truth for row in load_truth(table)]
+    table = load_truth(*truth)
     with formats.open_recording(path) as source:
         try:
-            records = with_truth(source, truth_segments) if truth_segments else source
+            records = with_truth(source, table) if table else source
             dataset = datasets.build_dataset(records, preprocessing, on_record)
         except DatasetError as error:
             if preprocessing.scaling is Scaling.MAX or CirFault.NO_PREAMBLE_COUNT.text not in error.what:
