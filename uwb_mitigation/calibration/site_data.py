@@ -148,9 +148,7 @@ class SiteData:
             ranges.range_m - true_m - offset_m,
             np.array(names),
             np.full(len(rows), ""),
-            radios=self.sources.radios,
-            segments=self.sources.segments,
-            channels=self.sources.channels,
+            **self.sources.as_fields(),
         )
 
 

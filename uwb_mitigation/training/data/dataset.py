@@ -112,35 +112,26 @@ class Dataset:
         return [str(name) for name in np.unique(self.configurations)]
 
 
+@dataclass(slots=True)
 class CirSources:
     """Collects the radios, segments and channels of CIRs; unknown radios and segments are those of earlier versions: DW1000, IPATOV."""
 
-    def __init__(self) -> None:
-        self._radios: set[RadioType] = set()
-        self._segments: set[Segment] = set()
-        self._channels: set[int] = set()
+    radios: set[RadioType] = field(default_factory=set)
+    segments: set[Segment] = field(default_factory=set)
+    channels: set[int] = field(default_factory=set)
 
     def add(self, cir: Cir) -> None:
         """Add a CIR; without samples it has no segment."""
-        self._radios.add(cir.radio or RadioType.DW1000)
-        self._channels.add(cir.channel)
+        self.radios.add(cir.radio or RadioType.DW1000)
+        self.channels.add(cir.channel)
         if len(cir):
-            self._segments.add(cir.segment or Segment.IPATOV)
+            self.segments.add(cir.segment or Segment.IPATOV)
 
-    @property
-    def radios(self) -> tuple[RadioType, ...]:
-        """All radios."""
-        return tuple(sorted(self._radios))
-
-    @property
-    def segments(self) -> tuple[Segment, ...]:
-        """All segments."""
-        return tuple(sorted(self._segments)) or (Segment.IPATOV,)
-
-    @property
-    def channels(self) -> tuple[int, ...]:
-        """All channels; empty if one is unknown."""
-        return () if 0 in self._channels else tuple(sorted(self._channels))
+    def as_fields(self) -> dict[str, Any]:
+        """Return the fields of a `Dataset`; no channels if one is unknown."""
+        segments = tuple(sorted(self.segments)) or (Segment.IPATOV,)
+        channels = () if 0 in self.channels else tuple(sorted(self.channels))
+        return {"radios": tuple(sorted(self.radios)), "segments": segments, "channels": channels}
 
 
 class _Row(NamedTuple):
@@ -211,10 +202,8 @@ def _dataset_of(rows: Sequence[_Row], preprocessing: Preprocessing, skipped: Map
         np.array([(cir.preamble_count, cir.noise_threshold) for cir in cirs], np.float32),
         tags=np.array([measurement.tag_id for measurement in measurements], np.uint64),
         anchors=np.array([measurement.anchor_id for measurement in measurements], np.uint64),
-        radios=sources.radios,
-        segments=sources.segments,
-        channels=sources.channels,
         early_path_m=np.array(early_paths, np.float32),
+        **sources.as_fields(),
     )
 
 
