@@ -203,7 +203,18 @@ def test_true_ranges_of_a_table_are_used(tmp_path, eight_places):
     output, result = tmp_path / "own.onnx", tmp_path / "own.json"
     truth = ("--truth", write(tmp_path, *EIGHT_PLACES))
     run_or_raise(
-        "train", "--data", "bag", *truth, "--recipe", "constant", "-o", output, "--folds", 2, "--json", result
+        "train",
+        "--from-bag",
+        "bag",
+        *truth,
+        "--recipe",
+        "constant",
+        "-o",
+        output,
+        "--folds",
+        2,
+        "--json",
+        result,
     )
     assert json.loads(result.read_text())["improved"]
     assert load_bundle(output).linear_bias.offset_m == pytest.approx(0.25)

@@ -81,10 +81,12 @@ class DeepUwbRecording(Source):
         self.skipped: Counter[str] = Counter()
         frame = _read_frame(path)
         where = str(path)
-        amplitudes = _amplitudes(frame["CIR"], where)
-        self._error_m = _numbers(frame["Error"], "Error", where)
+        amplitudes = _numbers(frame, "CIR", (CIR_SAMPLES,), where)
+        plausible = np.isfinite(amplitudes).all(axis=1) & (np.abs(amplitudes) < 1e20).all(axis=1)
+        _check(plausible, "CIR", where, f"{CIR_SAMPLES} finite amplitudes")
+        self._error_m = _numbers(frame, "Error", (), where)
         _check(np.abs(self._error_m) <= MAX_ERROR_M, "Error", where, f"within +-{MAX_ERROR_M:g} m")
-        rooms = _numbers(frame["Room"], "Room", where)
+        rooms = _numbers(frame, "Room", (), where)
         _check(np.isin(rooms, range(len(ROOMS))), "Room", where, f"0 to {len(ROOMS) - 1}")
         self._rooms = rooms.astype(int)
         self._obstacles = list(frame["Obstacles"])
@@ -144,22 +146,15 @@ def _check(valid: NDArray[np.bool_], column: str, where: str, expected: str) -> 
         )
 
 
-def _numbers(cells: pd.Series, column: str, where: str) -> NDArray[np.float64]:
-    is_number = [isinstance(cell, (int, float, np.number)) for cell in cells]
-    _check(np.array(is_number), column, where, "a number")
-    return np.array(cells, np.float64)
-
-
-def _amplitudes(cells: pd.Series, where: str) -> NDArray[np.float64]:
-    """CIRs as float64 (n, 157)."""
-    samples, valid = np.zeros((len(cells), CIR_SAMPLES)), np.zeros(len(cells), np.bool_)
-    for row, cell in enumerate(cells):
+def _numbers(frame: pd.DataFrame, column: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+    """Return the numbers in the cells of a column, float64 (n, *shape)."""
+    numbers, valid = np.zeros((len(frame), *shape)), np.zeros(len(frame), np.bool_)
+    for row, cell in enumerate(frame[column]):
         values = np.asarray(cell, object if isinstance(cell, (list, tuple)) else None)
         is_numeric = values.dtype.kind in "biuf" or all(
-            isinstance(v, (int, float, np.number)) for v in values.flat
+            isinstance(value, (int, float, np.number)) for value in values.flat
         )
-        if values.shape == (CIR_SAMPLES,) and is_numeric:
-            samples[row] = values
-            valid[row] = np.isfinite(samples[row]).all() and np.abs(samples[row]).max() < 1e20
-    _check(valid, "CIR", where, f"{CIR_SAMPLES} finite amplitudes")
-    return samples
+        if values.shape == shape and is_numeric:
+            numbers[row], valid[row] = values, True
+    _check(valid, column, where, f"numbers of shape {shape}" if shape else "a number")
+    return numbers
