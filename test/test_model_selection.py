@@ -201,21 +201,8 @@ def loads(monkeypatch, data) -> None:
 
 def test_true_ranges_of_a_table_are_used(tmp_path, eight_places):
     output, result = tmp_path / "own.onnx", tmp_path / "own.json"
-    truth = ("--truth", write(tmp_path, *EIGHT_PLACES))
-    run_or_raise(
-        "train",
-        "--from-bag",
-        "bag",
-        *truth,
-        "--recipe",
-        "constant",
-        "-o",
-        output,
-        "--folds",
-        2,
-        "--json",
-        result,
-    )
+    words = ("--truth", write(tmp_path, *EIGHT_PLACES), "--recipe", "constant", "--folds", 2)
+    run_or_raise("train", "--from-bag", "bag", *words, "-o", output, "--json", result)
     assert json.loads(result.read_text())["improved"]
     assert load_bundle(output).linear_bias.offset_m == pytest.approx(0.25)
 
