@@ -96,6 +96,7 @@ setup(
     extras_require={
         "training": [*required("training"), "torch"],
         "viewer": required("viewer"),
+        "dask": required("dask"),
         "formats": required("formats"),
         "spi": required("spi"),
         # colcon reads this to detect that pytest runs the tests.

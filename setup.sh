@@ -88,7 +88,7 @@ fi
 installed=$(.venv/bin/uv pip freeze --quiet --python .venv/bin/python | sha256sum)
 if [ "$(cat .venv/compiled 2>/dev/null)" != "$installed" ]; then
   step bytecode
-  .venv/bin/python -m compileall -q -j 0 -x '/(torch|sympy|networkx|sklearn|matplotlib|pyarrow|selenium)/' .venv/lib uwb_mitigation \
+  .venv/bin/python -m compileall -q -j 0 -x '/(torch|sympy|networkx|sklearn|matplotlib|pyarrow|dask|distributed|selenium)/' .venv/lib uwb_mitigation \
     >/dev/null || true  # templates do not compile
   echo "$installed" > .venv/compiled
 fi

@@ -21,8 +21,9 @@ from firmware_models import random_measurement
 from model_material import cir
 from port_events import wait_until
 
-from uwb_mitigation.commands.offline.parallel import plan
+from uwb_mitigation.commands.offline.parallel import plan, run_on_dask
 from uwb_mitigation.commands.offline.process import Job, process_bag
+from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import shipped_model_path
@@ -302,3 +303,28 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
     )
     assert ast.literal_eval(done.stdout.decode()) == {"in0.mcap": True, "in1.mcap": False, "in2.mcap": True}
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_dask_cluster_gives_the_same_result_and_continues_after_an_invalid_bag(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
+    sources = [write_bag(tmp_path / f"in{n}.mcap", exchanges(50)) for n in range(3)]
+    sources[1].write_bytes(b"nothing of the kind")
+    jobs = [job(source, tmp_path / f"{source.stem}_out.mcap") for source in sources]
+    local = {"dashboard_address": None, "host": "127.0.0.1", "env": {"PYTHONPATH": str(REPOSITORY)}}
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=True, **local) as cluster:
+        outcomes = {outcome.job: outcome for outcome in run_on_dask(jobs, cluster.scheduler_address)}
+    assert "not an MCAP file" in str(outcomes[jobs[1]].error)
+    for number in (0, 2):
+        assert outcomes[jobs[number]].error is None
+        assert corrected_of(jobs[number].output) == one_by_one(exchanges(50))
+
+
+def test_unreachable_scheduler_is_named(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="python -m pip install distributed")
+    import dask
+
+    with dask.config.set({"distributed.comm.timeouts.connect": "200ms"}):
+        for address in ("tcp://127.0.0.1:9", "nonsense://127.0.0.1:9"):
+            with pytest.raises(ParameterError, match="no Dask scheduler"):
+                list(run_on_dask([job(tmp_path / "a", tmp_path / "b")], address))
+    assert distributed

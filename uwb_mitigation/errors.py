@@ -119,7 +119,9 @@ _DISTRIBUTIONS = {"serial": "pyserial", "sklearn": "scikit-learn", "yaml": "pyya
 """{name of the import: name of the package}, if they differ."""
 
 _DOCTOR = "run uwb-mitigation doctor"
-_REMEDIES = dict.fromkeys(("torch", "sklearn", "threadpoolctl"), "run `make setup-training`")
+_REMEDIES = dict.fromkeys(("torch", "sklearn", "threadpoolctl"), "run `make setup-training`") | {
+    "distributed": "python -m pip install distributed"
+}
 """{name of the import of an optional package: how to install it}."""
 
 

@@ -40,6 +40,10 @@ def process(
             "-j", "--jobs", help="Bags that are processed at the same time. Default: number of cores."
         ),
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Address of the scheduler of a Dask cluster: tcp://HOST:8786."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")] = False,
     json: JsonOption = None,
 ) -> None:
@@ -58,7 +62,8 @@ def process(
     bags = parallel.plan(sources, output)
     # Load the model first: an invalid model would give the same error for every bag.
     bundle = load_model(model)
-    path = bundle.path if isinstance(bundle, Bundle) else AUTO
+    # Absolute paths, since a worker of a cluster has another working directory.
+    path = bundle.path.absolute() if isinstance(bundle, Bundle) else AUTO
     radio_offsets = read_offsets(offsets or "")
     jobs = []
     for place, bag in bags.items():
@@ -67,7 +72,9 @@ def process(
             _make_folder(place.parent)
 
     started = time.perf_counter()
-    if len(jobs) == 1:
+    if scheduler is not None:
+        outcomes = _follow(jobs, parallel.run_on_dask(jobs, scheduler))
+    elif len(jobs) == 1:
         outcomes = [_process_one(jobs[0])]
     else:
         outcomes = _follow(jobs, parallel.run_locally(jobs, workers or parallel.num_cores()))

@@ -1,12 +1,12 @@
-"""Select bags and output paths; process bags in parallel."""
+"""Select bags and output paths; process bags in parallel on this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +109,7 @@ def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
     is_new = {job: not job.output.exists() for job in jobs}
     unfinished = []
     with _processes(min(workers, len(jobs))) as executor:
-        for job, outcome in _run(executor, jobs):
+        for job, outcome in _run(executor, _in_worker, jobs):
             if outcome is None:
                 unfinished.append(job)
             else:
@@ -120,9 +120,38 @@ def run_locally(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
         reason = "the process crashed, perhaps because memory ran out"
         crashed = Outcome(job, error=RecordingError(reason, where=str(job.source)))
         with _processes(1) as executor:
-            for _, outcome in _run(executor, [again]):
+            for _, outcome in _run(executor, _in_worker, [again]):
                 yield replace(outcome or crashed, job=job)
         partial_file(job.output).unlink(missing_ok=True)
+
+
+def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
+    """Process the bags on the Dask cluster with the scheduler at `address`; yield each outcome when it is ready.
+
+    The workers need this package and the same file paths. A bag that has started is finished even if the
+    iterator is closed, since Dask cannot interrupt it.
+
+    Raises:
+        ImportError: `distributed` is not installed.
+        ParameterError: no scheduler responds.
+    """
+    from distributed import Client
+    from distributed.comm import get_address_host
+
+    try:
+        # If the client itself tries an invalid address, closing it takes a minute.
+        get_address_host(address)
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise ParameterError(
+            f"no Dask scheduler: {str(error) or type(error).__name__}",
+            where=address,
+            valid="tcp://HOST:8786, as `dask scheduler` prints",
+        ) from error
+    with client, client.get_executor(pure=False) as executor:
+        for _, outcome in _run(executor, try_process, jobs):
+            assert outcome is not None
+            yield outcome
 
 
 def _processes(workers: int) -> ProcessPoolExecutor:
@@ -132,9 +161,11 @@ def _processes(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, context, initializer=_ignore_interrupts)
 
 
-def _run(executor: ProcessPoolExecutor, jobs: Sequence[Job]) -> Iterator[tuple[Job, Outcome | None]]:
+def _run(
+    executor: Executor, work: Callable[[Job], Outcome], jobs: Sequence[Job]
+) -> Iterator[tuple[Job, Outcome | None]]:
     """Yield each job with its outcome when it is ready; None: a worker process crashed before."""
-    futures = {executor.submit(_in_worker, job): job for job in jobs}
+    futures = {executor.submit(work, job): job for job in jobs}
     try:
         for future in as_completed(futures):
             job = futures[future]
@@ -142,7 +173,7 @@ def _run(executor: ProcessPoolExecutor, jobs: Sequence[Job]) -> Iterator[tuple[J
                 yield job, future.result()
             except BrokenProcessPool:
                 yield job, None
-            except Exception as error:  # Errors of pickling have no common type.
+            except Exception as error:  # Errors of the cluster or of pickling have no common type.
                 reason = f"cannot be processed: {type(error).__name__}: {error}"
                 yield job, Outcome(job, error=RecordingError(reason, where=str(job.source)))
     finally:
