@@ -22,7 +22,6 @@ from fast import SLOW_FIXTURES, is_fast
 from hypothesis import HealthCheck, settings
 from real_logs import import_once, read_once
 
-from benchmarks.equipment.dw1000_model.air import Air
 from uwb_mitigation.types.anchors import dump_anchors
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 LONGEST = (
     "site_page self_calibration tracking viewer_page viewer_node calibrate_command tutorial viewer_recordings "
     "robot_estimator firmware_emulator paper_experiment firmware_parity firmware_arduino_build "
-    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors universal px4 process"
+    "robot_localization positioning locator_odometry viewer_playback serial_driver survey_anchors training px4 process"
 )
 """Files that start first, so that none of them runs alone at the end."""
 
@@ -115,13 +114,6 @@ def apartment_reading(apartment: Path, tmp_path_factory: pytest.TempPathFactory)
 def apartment_imported(apartment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the real logs in `apartment.mcap`, which is read faster; see `import_once`."""
     return import_once(apartment, tmp_path_factory)
-
-
-@pytest.fixture
-def air() -> Iterator[Air]:
-    """Return an environment for modelled chips; it needs a C compiler."""
-    with Air(1) as air:
-        yield air
 
 
 @pytest.fixture

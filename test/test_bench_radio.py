@@ -1,8 +1,10 @@
-"""Ranges of modelled radios at all clock errors and distances, and a soak test with resets, losses and damage."""
+"""Ranges of modelled radios at all clock errors and distances, a soak test, and the model as a library."""
 
 from __future__ import annotations
 
 import json
+import re
+import subprocess
 from pathlib import Path
 
 from compilers import NEEDS_CC
@@ -10,6 +12,8 @@ from typer.testing import CliRunner
 
 from benchmarks import cli as benchmarks
 from benchmarks import radio
+from benchmarks.equipment.dw1000_model.library import MODEL_FOLDER
+from uwb_mitigation.mitigation.embedded.compiling import WARNINGS, c_compiler, run_tool
 
 pytestmark = NEEDS_CC
 
@@ -41,3 +45,16 @@ def test_benchmark_writes_what_it_measured(tmp_path: Path):
     assert result["device_rate_hz"] >= 80
     assert result["evb1000_rate_hz"] is None
     assert result["soak"]["wrong"] == 0
+
+
+def test_program_on_the_page_prints_the_shown_output(tmp_path: Path):
+    page = (MODEL_FOLDER / "README.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    (promise,) = re.findall(r"prints `(.*?)` twice", page)
+    source = tmp_path / "blink.c"
+    source.write_text(text, encoding="utf-8")
+    program, sources = str(tmp_path / "blink"), (*MODEL_FOLDER.glob("*.c"), source)
+    options = ("-std=c11", "-O1", "-g", "-fsanitize=address,undefined", *WARNINGS, f"-I{MODEL_FOLDER}")
+    run_tool([*c_compiler(), *options, *map(str, sources), "-lm", "-lpthread", "-o", program])
+    done = subprocess.run([program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [promise] * 2

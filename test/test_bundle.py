@@ -72,17 +72,6 @@ def test_saved_bundle_is_loaded_unchanged(saved):
     assert loaded.model == saved.path.read_bytes()
 
 
-def test_lines_of_the_scale_pass_through_its_points():
-    begin, intercept, slope = card(SHAPE, scale=((0.0, 0.25), (0.5, 0.5), (2.0, 0.75))).scale_lines.T
-    assert (intercept + slope * begin).tolist() == pytest.approx([0.25, 0.5, 0.75])
-    assert slope.tolist() == pytest.approx([0.5, 1 / 6, 0.0])
-
-
-def test_id_is_the_checksum_of_the_file_with_the_id_blank(saved):
-    data = saved.model.replace(b"%08x" % saved.model_id, b"00000000")
-    assert zlib.crc32(data) == saved.model_id
-
-
 def test_any_changed_byte_or_truncation_is_detected(saved):
     generator = random.Random(1)
     for _ in range(400):
@@ -111,21 +100,16 @@ def test_graph_that_onnx_runtime_cannot_run_is_refused(saved):
     [
         lambda m: m.update(format=2),
         lambda m: m.pop("linear_bias"),
-        lambda m: m.update(linear_bias=None),
         lambda m: m.pop("radios"),
         lambda m: m["preprocessing"].update(scaling="log"),
         lambda m: m["preprocessing"].update(samples=32),
         lambda m: m["architecture"].update(samples="16"),
-        lambda m: m["architecture"].update(samples=10**9),
         lambda m: m["architecture"].update(depth=1),
-        lambda m: m["linear_bias"].update(offset_m=0.1),
         lambda m: m["linear_bias"].update(offset_m=1e400),
         lambda m: m.update(variance_m2=-1),
         lambda m: m.update(correction_limits_m=[1, 0]),
-        lambda m: m.update(correction_limits_m=[1]),
         lambda m: m.update(scale=[[1.0, 0.25]]),
         lambda m: m.update(scale=[[0.0, 0.25], [0.0, 0.5]]),
-        lambda m: m.update(scale=[[0.0, -0.25]]),
         lambda m: m.update(interval95_sigmas=0.5),
         lambda m: m.update(quantised=False),
         lambda m: m.update(training=3),

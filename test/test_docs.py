@@ -54,20 +54,6 @@ def test_links_between_pages_are_valid(page: Path):
     assert [link for link, path in targets.items() if path not in GENERATED and not path.exists()] == []
 
 
-def test_every_page_of_the_documentation_can_be_reached():
-    read: set[Path] = set()
-    waiting = [REPOSITORY / "README.md"]
-    while waiting:
-        page = waiting.pop()
-        if page.parent == generated.REFERENCE and (template := generated.TEMPLATES / page.name).is_file():
-            page = template
-        if page in read or page.suffix != ".md" or not page.is_file():
-            continue
-        read.add(page)
-        waiting += [(folder_of(page) / target).resolve() for target in links(page) if "://" not in target]
-    assert {page for page in PAGES if page.is_relative_to(REPOSITORY / "docs")} <= read
-
-
 # Commands and code blocks.
 
 
@@ -244,9 +230,3 @@ def test_committed_generated_files_are_up_to_date():
         if path.read_text(encoding="utf-8") != text
     ]
     assert not stale, "run: python docs/generated.py"
-
-
-def test_templates_use_everything_that_can_be_generated():
-    templates = "\n".join(page.read_text(encoding="utf-8") for page in generated.TEMPLATES.glob("*.md"))
-    assert set(re.findall(r"^<!-- generated: (\w+) -->$", templates, re.M)) == set(generated.PARTS)
-    assert not [path.name for path, text in GENERATED.items() if "<!-- generated" in text]

@@ -19,8 +19,7 @@ from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.simulation.buildings import block_of
-from uwb_mitigation.simulation.channel import Multipath
-from uwb_mitigation.simulation.radio import DW3000_STS, PULSE_SPACING_TAPS, TAPS
+from uwb_mitigation.simulation.radio import DW3000_STS
 from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, Record, Segment, Status
 
 UNUSED_SEED = 424_242
@@ -96,14 +95,3 @@ def test_firmware_of_a_dw1000_gets_no_model_for_a_dw3000(tmp_path: Path) -> None
     done = CliRunner().invoke(app, ["board", "export-c", "--model", "dw3000_sts", "-o", str(tmp_path / "c")])
     assert isinstance(done.exception, ModelError)
     assert "DW3000 STS" in str(done.exception)
-
-
-def test_side_lobes_of_the_sts_are_at_multiples_of_the_pulse_spacing() -> None:
-    one_path = Multipath(np.zeros((400, 1)), np.full((400, 1), 1e-3 + 0j))
-    reception = DW3000_STS.receive(one_path, np.random.default_rng(1))
-    power = (reception.samples.astype(float).reshape(400, TAPS, 2) ** 2).sum(axis=2)
-    rows, peaks = np.arange(400), power.argmax(axis=1)
-    at_lobe, between = (power[rows, peaks - PULSE_SPACING_TAPS // part].mean() for part in (1, 2))
-    # 64 symbols of 64 pulses: the lobes are 1/4096 of the peak.
-    assert 10 * np.log10(at_lobe / power[rows, peaks].mean()) == pytest.approx(-36.1, abs=1.0)
-    assert between < 0.3 * at_lobe

@@ -75,25 +75,3 @@ def test_signal_during_an_import_ends_the_process(
     process.send_signal(number)
     output, _ = process.communicate(timeout=240)
     assert (process.returncode, output) == (128 + number, "")
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_in_a_destructor_is_not_lost(number: signal.Signals, tmp_path: Path):
-    (tmp_path / "program.py").write_text(
-        "import os, signal, sys, time\n"
-        "class Signalled:\n"
-        "    def __del__(self):\n"
-        f"        os.kill(os.getpid(), {int(number)})\n"
-        "        time.sleep(0.01)\n"
-        "def main():\n"
-        f"    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))\n"
-        "    try:\n"
-        "        Signalled()\n"
-        "        time.sleep(30)\n"
-        "    except KeyboardInterrupt:\n"
-        "        sys.exit(130)\n"
-    )
-    start = "from uwb_mitigation.commands.entry import run_program; run_program('program', 'main')"
-    done = subprocess.run([sys.executable, "-c", start], cwd=tmp_path, capture_output=True, timeout=240)
-    assert done.returncode == 128 + number, done.stderr
-    assert done.stderr == b""

@@ -1,4 +1,4 @@
-"""Errors for unknown names: each suggests a similar name and lists the valid ones."""
+"""Errors for unknown names, which suggest a similar name and list the valid ones; ids as text."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.paper.experiment import Task
-from uwb_mitigation.errors import UwbMitigationError
+from uwb_mitigation.errors import UwbMitigationError, format_id
 from uwb_mitigation.mitigation.model.shipped import model_path
 from uwb_mitigation.nodes.support import launching
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
@@ -18,6 +18,7 @@ from uwb_mitigation.recordings.bag.pose_paths import check_topic
 from uwb_mitigation.recordings.mapping.mapping import load_mapping
 from uwb_mitigation.types.anchors import parse_anchors
 from uwb_mitigation.types.offsets import parse_offsets
+from uwb_mitigation.types.ros.poses import tag_frame, tag_of_frame
 
 
 @pytest.mark.parametrize(
@@ -40,3 +41,14 @@ def test_unknown_name_is_refused_with_a_suggestion(call: Callable[[], object], n
     assert caught.value.suggestion.startswith(f"did you mean {name!r}")
     assert caught.value.valid
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+@pytest.mark.parametrize("number", [0, 7, 65535, 65536, 2**64 - 1])
+def test_id_text_is_complete_and_parsed_back(number: int):
+    assert int(format_id(number), 0) == number
+    assert len(format_id(number)) == (18 if number > 65535 else len(str(number)))
+    assert tag_of_frame(f"left/{tag_frame(number)}") == number
+
+
+def test_frame_of_no_tag_is_none():
+    assert [tag_of_frame(frame) for frame in ("uwb_tag", "tag_", "tag_x", "base_link")] == [None] * 4

@@ -23,15 +23,12 @@ from benchmarks.firmware import CLOCK_HZ
 from benchmarks.paper import published
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.embedded import toolchain
-from uwb_mitigation.mitigation.embedded.compiling import run_tool
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target
 from uwb_mitigation.mitigation.model import requantisation
-from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
-from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.mitigation.model.weights import Int8Weights
-from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
@@ -98,17 +95,6 @@ def test_any_length_and_number_of_modules(samples: int, modules: int, tmp_path: 
     run_compared(tmp_path, weights, windows)
 
 
-def test_trace_and_counter_agree_and_portable_c_takes_four_times_the_instructions(tmp_path: Path):
-    weights = random_networks.remnet(8, 3)
-    windows = random_networks.rounding_windows(8, weights.activation_scale["input"], 200)
-    kernels, result = run_compared(tmp_path, weights, windows)
-    _, portable = run_compared(tmp_path, weights, windows, Kernels.PORTABLE, "-O3")
-    assert portable.instructions > 4 * result.instructions
-    # The counter also sees the instructions that set up the call.
-    counted = emulator.run_windows(kernels, windows[:1]).instructions
-    assert abs(counted - emulator.count_executed(kernels, windows[0]).total()) <= 10
-
-
 def check_corrections(
     bundle: Bundle, measurements: Sequence[RangeMeasurement], folder: Path, offset_m: float = 0.0
 ) -> set[int]:
@@ -137,25 +123,6 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(is_stri
     measurements = [firmware_models.random_measurement(random) for _ in range(500)]
     statuses = check_corrections(bundle_in(tmp_path), measurements, tmp_path, 0.22 * is_strict)
     assert statuses >= {0, 1, 2, 3}
-
-
-@pytest.mark.parametrize(
-    "shipped",
-    [default_model_path(), shipped_model_path("evk1000_apartment"), default_model_path(Scaling.MAX)],
-    ids=lambda path: path.stem,
-)
-def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: Path, tmp_path: Path):
-    measurements = firmware_models.real_measurements(apartment)
-    assert 0 in check_corrections(load_bundle(shipped), measurements, tmp_path)
-
-
-def test_shipped_model_fits_and_has_the_size_of_its_file(tmp_path: Path):
-    export_bundle(load_bundle(default_model_path()), tmp_path)
-    image = emulator.measure_size(tmp_path, tmp_path)
-    assert image.flash_bytes < 27_000
-    assert (image.available_flash_bytes, image.available_ram_bytes) == (512 << 10, 64 << 10)
-    text, data, bss = map(int, run_tool(["arm-none-eabi-size", str(image.elf)]).splitlines()[1].split()[:3])
-    assert (image.flash_bytes, image.static_bytes) == (text + data, data + bss)
 
 
 def test_image_of_the_dwm1001_dev_fits_and_is_written_as_hex(tmp_path: Path):

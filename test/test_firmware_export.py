@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks import cli as benchmarks
 from benchmarks.equipment import random_networks
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import MissingDependencyError, ModelError
@@ -55,22 +54,6 @@ def test_shipped_model_is_exported_with_its_identity(tmp_path: Path):
     text = Path(values["header"]).read_text()
     assert f"0x{bundle.model_id:08x}u" in text
     assert format_number(bundle.linear_bias.per_rx_power) in text
-
-
-@pytest.mark.skipif(bool(toolchain.missing_tools()), reason=toolchain.APT)
-def test_bench_firmware_writes_the_documented_keys(tmp_path: Path):
-    bundle = firmware_models.exact_bundle(tmp_path, 8)
-    result = tmp_path / "result.json"
-    arguments = ["firmware", "--model", str(bundle.path), "--inputs", "20", "--json", str(result)]
-    done = CliRunner().invoke(benchmarks.app, arguments)
-    assert done.exit_code == 0, done.output
-    rows = json.loads(result.read_text())["rows"]
-    promised = {"model", "k", "k0", "instructions", "cycles_estimated", "ram_bytes", "flash_bytes"}
-    assert [row["kernels"] for row in rows] == ["cortex_m4", "portable"]
-    for row in rows:
-        assert promised <= row.keys()
-        assert (row["mismatches"], row["inputs"]) == (0, 20)
-        assert row["instructions"] < row["cycles_estimated"] < 2 * row["instructions"]
 
 
 def test_missing_tools_are_named_with_the_install_command(monkeypatch: pytest.MonkeyPatch):

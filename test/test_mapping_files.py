@@ -5,8 +5,8 @@ from __future__ import annotations
 import gzip
 import json
 import lzma
-import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import pytest
 import yaml
 from command_line import succeed
 from scipy.io import savemat
-from test_mapping import PLAIN, cirs_of, of, ranges_of, read, values_of, with_fields, write
+from test_mapping import BOOT, MESSAGE, PLAIN, cirs_of, of, ranges_of, read, values_of, with_fields, write
 
 from uwb_mitigation.errors import DamagedRecordingError, MissingDependencyError, RecordingError
 from uwb_mitigation.recordings import text_blocks
@@ -35,6 +35,24 @@ def rows(count: int = 80, start: float = 0.0, step: float = 0.1, factors: Any = 
         measured = (true + 0.1) * (factors or {}).get(anchor, 1)
         lines.append(f"{start + n * step:.6f},{anchor},{measured:.5f},{true:.5f}\n")
     return "".join(lines)
+
+
+def every(step_s: float) -> str:
+    """Return ranges in equal intervals."""
+    return "t,a,r\n" + "".join(f"{n * step_s:.9f},1,2\n" for n in range(50))
+
+
+def in_unit(unit: str) -> Any:
+    """Return fields with stamps of another unit."""
+    return with_fields(stamp={"column": "t", "unit": unit})
+
+
+AMPLITUDES = {"cir": {"column": "cir", "samples": "magnitude"}}
+
+
+def with_cir(samples: Iterable[float]) -> str:
+    """Return a range with a CIR."""
+    return f't,a,r,cir\n0,2,3.0,"{" ".join(map(str, samples))}"\n'
 
 
 # Text files ------------------------------------------------------------------------------------------------------
@@ -88,9 +106,9 @@ def test_repeated_headers_and_merged_rows_are_dropped_and_keep_the_row_numbers(t
         ('t,a,r\n0,1,"4,7"\n', {}, "range = '4,7' is not a number .*decimal: ','"),
         (TDOA, {}, r"of the ranges are negative .*\(TDoA\)"),
         ("t,a,r,i\n0,1,2,46350\n", with_fields(first_path_index="i"), "first_path_index is 46,350 samples.*unit: '10.6'"),
-        ("t,a,r\nyesterday,1,2\n", with_fields(stamp={"column": "t", "unit": "iso8601"}), "stamp = 'yesterday' is not a date"),
+        ("t,a,r\nyesterday,1,2\n", in_unit("iso8601"), "stamp = 'yesterday' is not a date"),
         ("t,a,r\n1700000000000,1,2\n", {}, "stamp = 1700000000000 is outside .*unit: ms"),
-        ("t,a,r\n1700000000000000,1,2\n", with_fields(stamp={"column": "t", "unit": "ms"}), r"1824 to 2115 \(unit: us\)"),
+        ("t,a,r\n1700000000000000,1,2\n", in_unit("ms"), r"1824 to 2115 \(unit: us\)"),
         ("t,a,r\n2024-06-09T19:39:13,1,2\n", {}, "is not a number .*dates: set unit: iso8601"),
         ("t,a,r\n31/12/2023 10:00:00,1,2\n", {}, "set unit: '%d/%m/%Y %H:%M:%S', in the order of the file"),
         ("t,a,r\n10:00:00.5,1,2\n", {}, "set unit: iso8601"),
@@ -103,18 +121,21 @@ def test_repeated_headers_and_merged_rows_are_dropped_and_keep_the_row_numbers(t
         # Such as those of R, which writes no name of the column with the row numbers.
         ("t,a,r\n1,0.1,7,2.5\n2,0.2,7,2.6\n", {}, "columns: all names; skip: 1"),
         ("", {}, "the file is empty"),
+        (HEADER + rows(factors={1: 40, 2: 40, 3: 40, 4: 100}), {}, "anchor 4 is .*set unit: mm or cm of range"),
+        (BOOT, {"fields": MESSAGE}, "anchor = 'boot' does not match .*optional: true"),
+        (every(100), {}, "100 s apart.*unit: ms"),
+        (every(0.1), in_unit("ms"), "0.0001 s apart.*unit: s of the stamps"),
+        (every(0.0001), {}, r"unit: s, scale: 3600 \(hours\)"),
+        (every(100_000), {}, "unit: us"),
+        (every(100_000), in_unit("ms"), "unit: us"),
+        (every(1 / 864_000), {}, r"unit: s, scale: 86400 \(days\)"),
+        (with_cir(round(40 + 30 / (1 + n), 2) for n in range(200)), AMPLITUDES, "row 1: a CIR in dB"),
+        (with_cir((-1) ** n * 40 for n in range(200)), AMPLITUDES, "row 1: negative magnitudes .*interleaved, or complex"),
     ],
 )  # fmt: skip
 def test_unsuitable_file_is_an_error_with_a_remedy(text: str, document: Any, message: str, tmp_path: Path):
     with pytest.raises(RecordingError, match=message):
-        of(text, tmp_path / "x.csv", **document)
-
-
-def test_names_of_columns_comments_and_hexadecimal_ids_are_set(tmp_path: Path):
-    text = "# log\nt,a,r,r\n0,10,2,3\n# note\n1,1e2,2,4\n"
-    document = with_fields(anchor={"column": "a", "hex": True}, range="r2")
-    document |= {"columns": ["t", "a", "r", "r2"], "skip": 2, "comment": "#"}
-    assert values_of(of(text, tmp_path / "x.csv", **document)) == [(0.0, 1, 16, 3.0), (1.0, 1, 0x1E2, 4.0)]
+        list(of(text, tmp_path / "x.csv", **document))
 
 
 def test_decompression_bomb_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -144,12 +165,6 @@ def test_unit_of_one_anchor_is_found_and_can_be_set(unit: str, factor: float, tr
     fields = with_fields(range={"column": "r", "units": {3: unit}})
     source = of(text, tmp_path / "x.csv", **fields | TRUE)
     assert source.errors_m == pytest.approx(np.full(80, 0.1), abs=1e-4)
-
-
-def test_unit_of_all_anchors_is_suggested_if_most_ranges_are_long(tmp_path: Path):
-    text = HEADER + rows(factors={1: 40, 2: 40, 3: 40, 4: 100})
-    with pytest.raises(RecordingError, match=r"anchor 4 is .*set unit: mm or cm of range"):
-        of(text, tmp_path / "x.csv")
 
 
 @pytest.mark.parametrize(
@@ -193,14 +208,6 @@ def test_true_ranges_of_another_file_are_interpolated(tmp_path: Path):
     del ranges["stamp"]
     with pytest.raises(RecordingError, match=r"have several true ranges \(truth.range.stamp"):
         read(PLAIN | {"truth": {"range": ranges}}, tmp_path / "x.csv")
-
-
-def test_registers_without_receive_power_give_the_first_path_level(tmp_path: Path):
-    text = "t,a,r,f1,f2,f3,n\n0,1,2,4889,13876,10464,1024\n"
-    document = with_fields(preamble_count="n") | {"registers": {"amplitudes": ["f1", "f2", "f3"]}}
-    cir = next(iter(of(text, tmp_path / "x.csv", **document))).measurement.cir
-    assert np.isnan(cir.rx_power_dbm)
-    assert cir.first_path_power_dbm == pytest.approx(10 * np.log10(325939393 / 1024**2) - 121.74, abs=0.01)
 
 
 def test_missing_file_of_anchors_is_named(tmp_path: Path):
@@ -258,7 +265,7 @@ def test_stamps_of_a_32_bit_counter_are_continued(lowest: int, tmp_path: Path):
     counts = [2**32 - 2_000_000 + lowest + n * 100_000 for n in range(60)]
     stamps = [(count - lowest) % 2**32 + lowest for count in counts]
     text = "t,a,r\n" + "".join(f"{stamp},{n % 4},{n % 4 + 3}\n" for n, stamp in enumerate(stamps))
-    source = of(text, tmp_path / "x.csv", **with_fields(stamp={"column": "t", "unit": "us"}))
+    source = of(text, tmp_path / "x.csv", **in_unit("us"))
     assert np.diff(source.values["stamp"]).tolist() == [100_000_000] * 59
     assert source.warnings == ["the stamps overflow or pass midnight; they were continued"]
 
@@ -281,7 +288,7 @@ def test_stamps_of_a_32_bit_counter_are_continued(lowest: int, tmp_path: Path):
 )
 def test_stamps_of_every_unit(unit: str, texts: list[str], stamps_ns: list[int], tmp_path: Path):
     text = "t,a,r\n" + "".join(f'"{cell}",1,2.{n}\n' for n, cell in enumerate(texts))
-    source = of(text, tmp_path / "x.csv", **with_fields(stamp={"column": "t", "unit": unit}))
+    source = of(text, tmp_path / "x.csv", **in_unit(unit))
     found = [one.measurement.stamp_ns for one in source]
     assert max(abs(one - other) for one, other in zip(found, stamps_ns, strict=True)) < 500
 
@@ -331,21 +338,6 @@ def test_json_lines_and_documents_are_read(tmp_path: Path):
     assert source.dropped == {"lines without a range, such as 'ready' (not JSON: 'ready')": 1}
     document = json.dumps({"runs": {"one": rows[:1], "two": rows[1:]}})
     assert values_of(of(document, tmp_path / "x.json", group="runs[][]")) == values_of(source)
-
-
-def test_rows_of_other_messages_are_dropped_by_an_expression_or_unknown(tmp_path: Path):
-    text = "t,m\n0,boot\n1,Range 2.5 from 3\n2,Range 2.6 from 3\n"
-    fields = {
-        "stamp": "t", "anchor": {"column": "m", "pattern": r"from (\d+)"},
-        "range": {"column": "m", "pattern": r"Range ([\d.]+)"},
-    }  # fmt: skip
-    rule = {"column": "m", "matches": "^(?!Range)"}
-    source = of(text, tmp_path / "x.csv", fields=fields, drop=[rule])
-    assert (ranges_of(source), source.dropped) == ([2.5, 2.6], {"m matches ^(?!Range)": 1})
-    with pytest.raises(RecordingError, match=r"anchor = 'boot' does not match .*optional: true"):
-        of(text, tmp_path / "x.csv", fields=fields)
-    optional = {name: field | {"optional": True} for name, field in fields.items() if name != "stamp"}
-    assert ranges_of(of(text, tmp_path / "x.csv", fields=fields | optional)) == [2.5, 2.6]
 
 
 # Public data sets ------------------------------------------------------------------------------------------------
@@ -460,33 +452,6 @@ def test_delay_of_cirs_and_the_offset_that_attaches_them_are_reported(tmp_path: 
     ]
 
 
-def test_stamps_are_kept_unless_ros_cannot_represent_them(tmp_path: Path):
-    source = of("t,a,r\n" + "".join(f"{n / 10},1,2\n" for n in range(20)), tmp_path / "x.csv")
-    assert source.values["stamp"].tolist() == [n * 10**8 for n in range(20)]
-    source = of("t,a,r\n" + "".join(f"{n / 10 - 7.5},1,2\n" for n in range(20)), tmp_path / "y.csv")
-    assert source.warnings == ["+8 s were added to all stamps, because those of ROS are from 1970 to 2038"]
-    assert next(iter(source)).measurement.stamp_ns == 500_000_000
-
-
-@pytest.mark.parametrize(
-    ("step", "unit", "message"),
-    [
-        (100, "s", "100 s apart.*unit: ms"),
-        (0.1, "ms", "0.0001 s apart.*unit: s of the stamps"),
-        (0.0001, "s", r"unit: s, scale: 3600 \(hours\)"),
-        (100_000, "s", "unit: us"),
-        (100_000, "ms", "unit: us"),
-        (1 / 864_000, "s", r"unit: s, scale: 86400 \(days\)"),
-    ],
-)
-def test_implausible_rate_is_an_error(step: float, unit: str, message: str, tmp_path: Path):
-    text = "t,a,r\n" + "".join(f"{n * step:.9f},1,2\n" for n in range(50))
-    with pytest.raises(RecordingError, match=message):
-        of(text, tmp_path / "x.csv", **with_fields(stamp={"column": "t", "unit": unit}))
-    # Placements may be minutes apart.
-    assert step != 100 or len(of(text, tmp_path / "x.csv", moving=False)) == 50
-
-
 @pytest.mark.parametrize(("unit", "metres"), [("ft", 0.3048), ("in", 0.0254)])
 def test_feet_and_inches_are_found_by_the_truth(unit: str, metres: float, tmp_path: Path):
     rng = np.random.default_rng(1)
@@ -569,27 +534,3 @@ def test_dry_run_shows_units_errors_outliers_names_and_what_is_missing(tmp_path:
     assert [line.split()[1:4:2] for line in done.stdout.splitlines() if "hall" in line] == [["hall", "2"]]
     assert "no receive level" not in done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.yaml", "x.csv", "x.json"]
-
-
-def test_chunks_without_rows_do_not_change_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("uwb_mitigation.recordings.text_blocks.BLOCK_CHARS", 8)
-    text = "t,a,r\n" + "".join(f"{n / 10},1,{-1 if n in (0, 1, 5) else n}\n" for n in range(8))
-    source = of(text, tmp_path / "x.csv", drop=[{"column": "r", "below": 0}])
-    assert ranges_of(source) == [2.0, 3.0, 4.0, 6.0, 7.0]
-    assert (source.values["cir"] == -1).all()
-
-
-@pytest.mark.parametrize(
-    ("values", "problem"),
-    [
-        ([round(40.0 + 30.0 / (1.0 + n), 2) for n in range(200)], "a CIR in dB"),
-        ([(-1) ** n * 40 for n in range(200)], "negative magnitudes (cir.samples: interleaved, or complex)"),
-    ],
-)
-def test_cirs_that_are_no_magnitudes_are_refused_with_their_row(
-    tmp_path: Path, values: list[float], problem: str
-):
-    text = " ".join(map(str, values))
-    cir = {"column": "cir", "samples": "magnitude"}
-    with pytest.raises(RecordingError, match=re.escape(f"row 1: {problem}")):
-        list(of(f't,a,r,cir\n0,2,3.0,"{text}"\n', tmp_path / "x.csv", cir=cir))

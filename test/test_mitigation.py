@@ -11,6 +11,7 @@ import pytest
 from model_material import LINE, bundle, measurement, window_of
 
 from uwb_mitigation.errors import ModelError
+from uwb_mitigation.mitigation.at_rest import LENGTH, MIN_ALIKE, PairsAtRest
 from uwb_mitigation.mitigation.correction import OTHER_CHANNEL_FACTOR, UNRELIABLE_VARIANCE_M2, Mitigation
 from uwb_mitigation.mitigation.model.architecture import Remnet
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
@@ -39,21 +40,16 @@ BAD = [
     (EMPTY, 3.0, Status.NO_CIR, "no samples"),
     ({"samples": np.zeros(2032, np.int16)}, 3.0, Status.BAD_CIR, "only zeros"),
     ({"samples": np.full(2032, -32768, np.int16)}, 3.0, Status.BAD_CIR, "saturated"),
-    ({"samples": np.ones(20, np.int16)}, 3.0, Status.BAD_CIR, "the first-path index is outside the CIR"),
     ({"samples": IN_DB, "encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR, "in dB"),
     ({"encoding": Encoding.MAGNITUDE}, 3.0, Status.BAD_CIR, "negative"),
     ({"first_path_index": math.nan}, 3.0, Status.BAD_CIR, "index is not finite"),
-    ({"first_path_index": 1010.0}, 3.0, Status.BAD_CIR, "too short"),
     ({"scale": math.nan}, 3.0, Status.BAD_CIR, "NaN"),
     ({"preamble_count": 0}, 3.0, Status.BAD_CIR, "is unknown, and the model"),
     ({"rx_power_dbm": math.nan}, 3.0, Status.BAD_CIR, "power is unknown"),
-    ({"rx_power_dbm": -math.inf}, 3.0, Status.BAD_CIR, "power is unknown"),
     ({"first_path_power_dbm": math.nan}, 3.0, Status.BAD_CIR, "power is unknown"),
     ({"first_path_power_dbm": 1e300}, 3.0, Status.BAD_CIR, "power is unknown"),
     ({"rx_power_dbm": 300.0}, 3.0, Status.OUT_OF_DISTRIBUTION, "unlike the training data"),
     ({}, math.nan, Status.OUT_OF_DISTRIBUTION, "range of nan m"),
-    ({}, math.inf, Status.OUT_OF_DISTRIBUTION, "range of inf m"),
-    ({}, -math.inf, Status.OUT_OF_DISTRIBUTION, "range of -inf m"),
     ({}, -0.5, Status.OUT_OF_DISTRIBUTION, "range of -0.50 m"),
     ({}, 1e300, Status.OUT_OF_DISTRIBUTION, "range of"),
     (EMPTY, math.nan, Status.NO_CIR, "range of nan m"),
@@ -118,12 +114,6 @@ def test_invalid_measurement_passes_through_with_its_reason(mitigation, changes,
     assert math.isnan(result.range_m) == math.isnan(range_m)
     assert result.correction_m == 0.0
     assert result.variance_m2 == (0.5 if 0.0 <= range_m <= 1e6 else math.inf)
-
-
-def test_constant_bias_model_needs_no_level(tmp_path):
-    subject = Mitigation(bundle(tmp_path, SHAPE, linear_bias=LinearBiasModel(0.25)))
-    result = subject.correct([measurement(rx_power_dbm=math.nan, first_path_power_dbm=math.nan)])[0]
-    assert result.status is Status.OK
 
 
 @pytest.mark.parametrize(
@@ -267,3 +257,58 @@ def test_bands_contain_the_measurements_they_are_computed_from():
     found = OodBands.of(0.3, np.column_stack(values))
     assert (OodDetector(found.bands).score(values) <= 0).all()
     assert replace(found, known_offset_m=0.0).bands == found.bands
+
+
+WINDOW = np.random.default_rng(0).gamma(2.0, 0.3, 157).astype(np.float32)
+OTHER = np.random.default_rng(1).gamma(2.0, 0.3, 157).astype(np.float32)
+PREDICTED_M = np.float32([0.3, 0.1, 0.2, 0.5, 0.4, 0.0, 0.7, 0.6, 0.9, 0.8, 1.1, 1.0])
+
+
+def smoothed(pairs, predicted_m, window=WINDOW, range_m=3.0, anchor=1):
+    n = len(predicted_m)
+    result = np.array(predicted_m, np.float32)
+    ids = np.ones(n, np.uint64), np.full(n, anchor, np.uint64)
+    pairs.apply(ids, np.full(n, range_m), np.tile(window, (n, 1)), Scaling.PREAMBLE, result)
+    return result
+
+
+def test_pair_at_rest_gets_the_median_of_the_latest_predictions():
+    result = smoothed(PairsAtRest(), PREDICTED_M)
+    assert np.array_equal(result[: MIN_ALIKE - 1], PREDICTED_M[: MIN_ALIKE - 1])
+    for end in range(MIN_ALIKE, len(PREDICTED_M) + 1):
+        latest = np.sort(PREDICTED_M[max(0, end - LENGTH) : end])
+        assert result[end - 1] == latest[len(latest) // 2]
+
+
+def test_result_does_not_depend_on_the_batches():
+    one_by_one = PairsAtRest()
+    single = np.concatenate([smoothed(one_by_one, [value]) for value in PREDICTED_M])
+    assert np.array_equal(single, smoothed(PairsAtRest(), PREDICTED_M))
+
+
+def test_median_ends_with_the_first_range_that_moved():
+    for change in ({"window": OTHER}, {"range_m": 3.3}, {"anchor": 2}, {"window": WINDOW[:60]}):
+        pairs = PairsAtRest()
+        smoothed(pairs, PREDICTED_M)
+        assert smoothed(pairs, [2.5], **change) == [2.5]
+
+
+def test_failed_prediction_stays_failed_and_is_not_used():
+    values = np.insert(PREDICTED_M[:MIN_ALIKE], 3, np.nan)
+    result = smoothed(PairsAtRest(), values)
+    assert np.isnan(result[3])
+    assert result[-1] == np.sort(PREDICTED_M[:MIN_ALIKE])[MIN_ALIKE // 2]
+
+
+def test_only_a_live_correction_depends_on_earlier_ranges(tmp_path):
+    model = bundle(tmp_path, Remnet(samples=157))
+    one = measurement(3.0)
+    noise = np.random.default_rng(0).integers(-60, 60, (12, len(one.cir.samples)))
+    noisy = [
+        replace(one, cir=replace(one.cir, samples=(one.cir.samples + x).astype(np.int16))) for x in noise
+    ]
+    alone = [result.correction_m for result in Mitigation(model).correct(noisy)]
+    live = [result.correction_m for result in Mitigation(model, median_at_rest=True).correct(noisy)]
+    assert alone == [Mitigation(model).correct(each).correction_m for each in noisy]
+    assert live[: MIN_ALIKE - 1] == alone[: MIN_ALIKE - 1]
+    assert live[-1] == sorted(alone[-LENGTH:])[LENGTH // 2] != alone[-1]

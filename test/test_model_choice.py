@@ -105,21 +105,6 @@ def test_a_mixed_batch_is_corrected_like_single_ranges_by_the_named_models(backe
     assert sum(auto.used.values()) == 2 * len(ranges)
 
 
-def test_arrays_with_and_without_levels_use_two_models() -> None:
-    (each,) = mixed(1)
-    cir = each.cir.samples.reshape(-1, 2).astype(float) @ [1, 1j]
-    result = Mitigation(AUTO).correct_arrays(
-        each.range_m,
-        np.stack([cir, cir]),
-        each.cir.first_path_index - each.cir.start_index,
-        preamble_count=each.cir.preamble_count,
-        rx_power_dbm=[each.cir.rx_power_dbm, NAN],
-        first_path_power_dbm=each.cir.first_path_power_dbm,
-    )
-    assert [NAMES[model_id] for model_id in result.model_id] == ["universal", "universal_amplitude"]
-    assert result.status.tolist() == [Status.OK, Status.OK]
-
-
 def test_calibrate_starts_from_one_model() -> None:
     with pytest.raises(ParameterError, match="load_model"):
         calibrate([], SimulatedSource().anchors, AUTO)

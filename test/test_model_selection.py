@@ -67,14 +67,6 @@ def test_line_is_selected_only_for_errors_that_depend_on_power():
     assert line.model.linear_bias.per_rx_power == pytest.approx(-0.069, abs=1e-3)
 
 
-def test_nested_error_is_from_configurations_outside_the_selection():
-    # The best candidate of each fold is the worst in the others.
-    data = numbered(lambda number: 0.5 if number < 6 else 0.0)
-    found = selection.select_nested(data, CONSTANTS[:2], 2, 0)
-    assert np.isin(np.abs(found.errors[NESTED]), (0.0, 0.5)).all()
-    assert found.mae()[NESTED] >= min(found.mae()[name] for name in ("none", "half"))
-
-
 def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
     data = numbered(lambda number: 0.3)
     offered = [*CONSTANTS[:2], fixed_offset("quarter", 0.25, trains=True)]
@@ -88,12 +80,6 @@ def test_trained_network_must_show_its_gain_in_the_nested_error(monkeypatch):
 
     monkeypatch.setattr(selection, "select_simplest", select_simplest)
     assert selection.select_nested(data, offered, 3, 0).chosen == "half"
-
-
-@pytest.mark.parametrize(("configurations", "folds"), [(3, 6), (4, 2), (4, 3), (5, 4), (7, 6)])
-def test_least_number_of_configurations_is_enough(configurations, folds):
-    assert configurations >= selection.min_configurations(folds)
-    selection.select_nested(dataset(configurations, 2, samples=8), CONSTANTS, min(folds, configurations), 0)
 
 
 # --- candidates ---
@@ -117,13 +103,6 @@ def test_cold_start_is_preferred_with_few_configurations_only(tmp_path):
     assert names(dataset(19, 2)) == [candidates.COLD_START, *candidates.NEW_MODELS]
     assert names(dataset(20, 2)) == ["constant", candidates.COLD_START, "line", "line+network", "network"]
     assert names(dataset(20, 2, samples=8)) == list(candidates.NEW_MODELS)
-
-
-@pytest.mark.parametrize("name", [candidates.CONSTANT, candidates.LINE])
-def test_model_without_network_predicts_zero(name):
-    fitted = candidates.fit_new_model(dataset(8, 5, samples=8), RECIPE.for_candidate(name), 0)
-    assert not network_m(fitted.network, windows(5, 8)).any()
-    assert fitted.linear_bias.needs_power == (name == candidates.LINE)
 
 
 # --- true ranges from a table ---

@@ -65,14 +65,6 @@ def test_errors_are_absolute_and_grouped_by_label():
     assert statistics.missing == 0  # a board that corrects sends no raw ranges
 
 
-def test_summary_without_data_shows_no_nan():
-    console = Console(width=100, record=True)
-    console.print(summary(RangeStatistics()))
-    shown = console.export_text()
-    assert "0 ranges received" in shown
-    assert "nan" not in shown
-
-
 @pytest.mark.parametrize("width", [80, 60])
 def test_table_with_units_fits_the_terminal_and_omits_columns(width: int):
     statistics = RangeStatistics()

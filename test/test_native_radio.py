@@ -131,14 +131,6 @@ def test_stray_octets_in_an_answer_repeat_the_request(damage: bytes, position: i
             board.transfer(b"\x00", None, 4)
 
 
-def test_an_old_answer_is_not_taken_for_the_version():
-    def answer(request: bytes) -> bytes:
-        return b"ynew\0\3" if b"deca?" in request else b""
-
-    with terminal(answer, b"yold\0") as name, contextlib.closing(bus(name)()) as board:
-        assert board.version == "new"
-
-
 def test_board_in_standalone_mode_is_reported_with_the_switch_to_change():
     with (
         EmulatedEvb1000s(None, boards=2, ranging=frozenset({0})) as emulated,

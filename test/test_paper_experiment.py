@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 from dataclasses import replace
@@ -22,7 +21,7 @@ from benchmarks.paper.report import Report, Study, build_report
 from benchmarks.paper.results import RESULTS, ExperimentResults, FirmwareRow, read
 from benchmarks.paper.search import CHOICE, SPACE
 from benchmarks.paper.training import NetworkStack
-from uwb_mitigation.errors import DatasetError, ParameterError, UwbMitigationError
+from uwb_mitigation.errors import ParameterError, UwbMitigationError
 from uwb_mitigation.mitigation.model.architecture import Mlp, Remnet
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.preprocessing import Preprocessing, Scaling
@@ -83,13 +82,6 @@ def test_pruned_weights_stay_zero_and_each_network_has_the_share():
 
 
 # --- before the training ---
-
-
-def test_range_test_finds_the_rates_that_train(finished):
-    result = finished[1].range_test
-    assert 1e-6 < result.falls_from < result.falls_to < 1.0
-    assert max(result.losses_m) > 2 * min(result.losses_m)  # the highest rates diverge
-    assert len(result.rates) == len(result.losses_m)
 
 
 def test_search_is_random_then_a_grid_around_the_best_network(finished):
@@ -164,23 +156,6 @@ def test_finished_tasks_are_not_repeated_unless_of_other_data(tmp_path):
     assert other.models[0].errors != first.models[0].errors
 
 
-def test_two_processes_give_the_models_of_one(finished, tmp_path):
-    shares: list[float] = []
-    wanted = experiment.list_tasks(["remnet_k5", "mlp"], [157], seeds=2)
-    result = experiment.run_experiment(parts(), tmp_path, wanted, QUICK, 0, 2, shares.append)
-    for name in ("remnet_k5", "mlp"):
-        one, two = ([model.errors for model in found.of(name, 157)] for found in (finished[1], result))
-        assert one == two
-    assert shares == [0.5, 1.0]
-
-
-def test_loss_that_diverges_ends_the_run(tmp_path):
-    bad, tasks = parts(), experiment.list_tasks(["mlp"], [32], 2)
-    bad = replace(bad, train=replace(bad.train, error_m=bad.train.error_m + 3e38))
-    with pytest.raises(DatasetError):
-        experiment.run_experiment(bad, tmp_path, tasks, QUICK)
-
-
 def test_shorter_windows_are_scaled_by_their_own_maximum():
     data = replace(dataset(2, 5), preprocessing=Preprocessing(32, Scaling.MAX))
     data.inputs[0, 20] = 50.0
@@ -196,12 +171,6 @@ def test_shorter_windows_are_scaled_by_their_own_maximum():
 
 PARTS = ["method", "data", "table1", "table2", "search", "table3", "fig3", "fig4a", "fig4b", "fig5", "lr"]
 HOSTILE = "<script>alert(1)</script>_$\\frac{$"
-
-
-def text_of(html: str, section: str) -> str:
-    """Return the text of a section of a page."""
-    content = html.partition(f'id="{section}"')[2].partition("</section>")[0]
-    return " ".join(re.sub(r"<[^>]*>", " ", content).split())
 
 
 def study(name: str = "logs", simulated: bool = False) -> Study:
@@ -226,78 +195,29 @@ def full(finished) -> Report:
     return build_report(study(simulated=True), finished[1], [firmware_row()])
 
 
-@pytest.fixture(scope="module")
-def html(full) -> str:
-    return full.html()
-
-
 @pytest.fixture
 def no_cloud(monkeypatch):
     """Without Fig. 4, which takes most of the time."""
     monkeypatch.setattr(report.figures, "scatter", lambda *_: "data:image/png;base64,")
 
 
-def test_page_contains_all_tables_and_figures_and_no_external_references(full, html):
+def test_page_contains_all_tables_and_figures_and_no_external_references(full):
+    html = full.html()
     assert sorted(re.findall(r'<section id="(\w+)"', html)) == sorted(PARTS)
     assert full.lacking == {}
-    for part in PARTS[1:]:
-        assert {"Data", "Split", "Seeds", "Command"} <= set(text_of(html, part).split())
     assert not re.search(r"<(script|link|iframe|object|base)\b|url\(|@import|https?:", html)
     targets = re.findall(r'(?:src|href)="([^"]*)"', html)
     assert all(target.startswith(("data:image/", "#")) for target in targets)
-    drawings = re.findall(r"data:image/svg\+xml;base64,([^\"]*)", html)
-    assert drawings
-    for drawing in drawings:
-        text = re.sub(
-            r'xmlns(:\w+)?="[^"]*"|<!DOCTYPE.*?>', "", base64.b64decode(drawing).decode(), flags=re.S
-        )
-        assert not re.search(r'href="(?!#)|url\((?!#)|<script', text)
-    assert "simulated data" in html.partition("<section")[0]
 
 
-def test_missing_measurements_and_estimates_are_marked(full):
-    for table in (table for table in full.tables if table.id.startswith("table")):
-        assert table.has_gaps
-        assert table.missing
-    kinds = [cell.kind for cell in row_of(full, "table3", "REMNet", "157", "Cortex-M4")[8:11]]
-    assert kinds == ["estimated", "estimated", "measured"]
-
-
-def test_raw_errors_are_next_to_those_of_the_paper(html, finished):
-    raw, rates = finished[1].models[0].errors["float"].all, finished[1].range_test
-    text = text_of(html, "method")
-    assert f"0.1242, 0.1642 {raw.mae_raw:.4f}, {raw.sigma_raw:.4f}" in text
-    assert f"{rates.falls_from:.1g} to {rates.falls_to:.1g}: the loss falls" in text
-
-
-def test_simulated_results_are_marked_as_not_comparable(html, finished, no_cloud):
-    for table in ("data", "table1", "search"):
-        assert "Simulated data, not comparable" in text_of(html, table)
+def test_simulated_results_are_marked_as_not_comparable(full, finished, no_cloud):
+    assert full.html().count("Simulated data, not comparable") >= 3
     assert "Simulated data" not in build_report(study(), finished[1]).html()
 
 
-def test_search_shows_the_front_and_the_choice_of_the_paper(full, finished):
-    (table,) = (table for table in full.tables if table.id == "search")
-    front = [trial.mae for trial in finished[1].trials if trial.is_on_front]
-    assert {row[-1].value for row in table.rows} == {*front, finished[1].trials[0].mae}
-    assert "paper's choice" in " ".join(row[0].text for row in table.rows)
-
-
-@pytest.mark.parametrize(
-    ("heads", "values"),
-    [
-        (("table1", "REMNet", "157"), [5905, 0.0687, 0.0687, 0.0690]),
-        (("table1", "MLP", "157"), [54401, 0.0769, 0.0777, 0.0775]),
-        (("table2", "MLP", "157"), [216.047, 125.885, 60.320]),
-        (("table3", "REMNet", "16", "Cortex-M4"), [140.0, 3.3, 15.6, 51.6, 0.37]),
-    ],
-)
-def test_published_numbers_are_in_their_own_columns(full, heads, values):
-    assert [cell.value for cell in row_of(full, *heads) if cell.kind == "paper"] == values
-
-
-def test_measured_numbers_are_means_over_seeds_next_to_baselines(full, finished):
+def test_measured_numbers_are_means_over_seeds_next_to_those_of_the_paper_and_baselines(full, finished):
     result, row = finished[1], row_of(full, "table1", "REMNet", "157")
+    assert [cell.value for cell in row if cell.kind == "paper"] == [5905, 0.0687, 0.0687, 0.0690]
     maes = [model.errors["float"].all.mae for model in result.of("remnet", 157)]
     assert (row[7].kind, row[7].n) == ("measured", 2)
     assert row[7].text == f"{np.mean(maes):.4f} ± {np.std(maes, ddof=1):.4f}"

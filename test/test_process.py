@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import os
-import pickle
 import signal
 import subprocess
-import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +18,8 @@ from firmware_models import random_measurement
 from model_material import cir
 from port_events import wait_until
 
-from uwb_mitigation.commands.offline.parallel import plan, run_on_dask
+from uwb_mitigation.commands.offline import parallel
+from uwb_mitigation.commands.offline.parallel import plan, run_locally, run_on_dask
 from uwb_mitigation.commands.offline.process import Job, process_bag
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
@@ -246,20 +244,22 @@ def test_folders_of_sources_are_kept_and_earlier_outputs_skipped(
 def test_signal_leaves_no_partial_file(number: signal.Signals, tmp_path: Path) -> None:
     code, bags = tmp_path / "code", tmp_path / "bags"
     code.mkdir()
-    # The first message is not written before the signal.
+    # The first message is not written before the signal. A signal just before a sleep is handled after it.
     (code / "sitecustomize.py").write_text(
-        "import time\n"
+        "import pathlib, time\n"
         "from uwb_mitigation.commands.offline import process as job\n"
         "class Waiting(job.BagWriter):\n"
         "    def write_serialized(self, *arguments, **options):\n"
-        "        time.sleep(600)\n"
+        f"        pathlib.Path({str(code / 'waits')!r}).touch()\n"
+        "        while True:\n"
+        "            time.sleep(0.1)\n"
         "job.BagWriter = Waiting\n"
     )
     words = command("process", write_bag(bags / "in.mcap", exchanges(9)), "-o", "out.mcap")
     output = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     environment = ENVIRONMENT | {"PYTHONPATH": f"{code}:{REPOSITORY}"}
     with subprocess.Popen(words, cwd=bags, env=environment, start_new_session=True, **output) as process:
-        wait_until((bags / "out.mcap.part").exists)
+        wait_until((code / "waits").exists)
         os.killpg(process.pid, number)
         _, stderr = process.communicate(timeout=240)
     assert process.returncode == 128 + number, stderr
@@ -267,7 +267,7 @@ def test_signal_leaves_no_partial_file(number: signal.Signals, tmp_path: Path) -
     assert [path.name for path in bags.iterdir()] == ["in.mcap"]
 
 
-def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
+def test_crashed_worker_loses_only_its_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs = [
         job(write_bag(tmp_path / f"in{n}.mcap", exchanges(9)), tmp_path / f"out{n}.mcap") for n in range(3)
     ]
@@ -289,19 +289,11 @@ def test_crashed_worker_loses_only_its_bag(tmp_path: Path) -> None:
         "    return outcome\n"
         "job.process_bag = killed\n"
     )
-    code = (
-        "import pickle, sys; from uwb_mitigation.commands.offline.parallel import run_locally\n"
-        "jobs = pickle.load(sys.stdin.buffer)\n"
-        "print({one.job.source.name: one.error is None for one in run_locally(jobs, 2)})"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        input=pickle.dumps(jobs),
-        env=ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{REPOSITORY}"},
-        capture_output=True,
-        timeout=240,
-    )
-    assert ast.literal_eval(done.stdout.decode()) == {"in0.mcap": True, "in1.mcap": False, "in2.mcap": True}
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{REPOSITORY}")
+    # Start new processes, because a server of processes, if another test started one, did not read `sitecustomize`.
+    monkeypatch.setattr(parallel.multiprocessing, "get_all_start_methods", list)
+    finished = {one.job.source.name: one.error is None for one in run_locally(jobs, 2)}
+    assert finished == {"in0.mcap": True, "in1.mcap": False, "in2.mcap": True}
     assert not list(tmp_path.glob("*.part"))
 
 

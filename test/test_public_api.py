@@ -7,7 +7,6 @@ import pickle
 import re
 import subprocess
 import sys
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ from uwb_mitigation import (
     RangeMeasurement,
     Record,
     SiteCalibration,
-    Status,
     UwbMitigationError,
     load_anchors,
     load_model,
@@ -201,18 +199,6 @@ def test_pickled_correction_has_the_same_result(mitigation: Mitigation, records:
     assert copy.correct(measurements) == mitigation.correct(measurements)
 
 
-@pytest.mark.parametrize(
-    ("fields", "status"), [({}, Status.BAD_CIR), ({"preamble_count": 100}, Status.OUT_OF_DISTRIBUTION)]
-)
-def test_universal_without_count_or_levels_says_what_it_needs(
-    mitigation: Mitigation, records: list[Record], fields: dict, status: Status
-):
-    cir, index = samples(records[0].measurement)[None], records[0].measurement.cir.first_path_index
-    corrected = mitigation.correct_arrays(3.0, cir, index, **fields)
-    assert corrected.status.tolist() == [status]
-    assert "is unknown, and the model" in corrected.reason[0]
-
-
 def test_track_of_a_recording_has_errors_data_frame_file_and_plot(tmp_path: Path, folder: Path):
     tracks = track(folder / "drive.mcap", folder / "anchors.yaml", offsets=0.22, height_m=0.4)
     assert (len(tracks), tracks.warnings) == (1, [])
@@ -237,16 +223,6 @@ def test_track_of_records_equals_that_of_their_bag(folder: Path):
         for recording in (records, folder / "drive.mcap")
     )
     assert np.array_equal(of_records.smoothed.position, of_bag.smoothed.position)
-
-
-def test_arrays_need_little_more_memory_than_the_input(mitigation: Mitigation, records: list[Record]):
-    cir = np.tile(samples(records[0].measurement), (1500, 1))
-    mitigation.correct_arrays([3.0], cir[:1], 700.0)
-    tracemalloc.start()
-    mitigation.correct_arrays(3.0, cir, 700.0, preamble_count=100)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 1.5 * cir.nbytes
 
 
 def test_magnitudes_in_db_are_detected_and_linear_ones_are_not(records: list[Record]):

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from compilers import NEEDS_CC
 
-from benchmarks.equipment.dw1000_model import boards as modelled
-from benchmarks.equipment.dw1000_model.boards import ModelledAir
+from benchmarks.equipment.dw1000_model.boards import ModelledAir, SerialLink
 from benchmarks.equipment.dw1000_model.pairs import Pair
 from uwb_mitigation.radios.settings import PREAMBLES, RadioSettings, Role
+from uwb_mitigation.radios.wire import messages
+from uwb_mitigation.radios.wire.events import Refused
+from uwb_mitigation.radios.wire.messages import SetRadio
+from uwb_mitigation.radios.wire.session import BoardSession
 
 pytestmark = NEEDS_CC
 
@@ -46,10 +49,6 @@ def ranges_of(channel: Pair, seconds: float, **settings: object) -> tuple[np.nda
         pair(air, channel, **settings)
         air.run(seconds)
         return air.ranges()
-
-
-def test_row_of_results_is_that_of_the_compiler():
-    assert modelled._library().radio_air_result_bytes() == modelled.RANGE.itemsize
 
 
 @pytest.mark.parametrize("window", [0, 157, 1016])
@@ -180,3 +179,21 @@ def test_power_dependent_bias_is_corrected_if_enabled():
     table = [-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86]
     bias_m = np.interp(-true_dbm, np.arange(61, 97, 2), table) / 1000
     assert abs(rows["range_m"].mean() - 5 + bias_m) < 0.005
+
+
+def test_settings_that_a_board_does_not_support_are_refused_with_a_reason():
+    with ModelledAir() as air:
+        board, session = air.add(RadioSettings(), serial_link=SerialLink()), BoardSession()
+        session.opened(0)
+        events = []
+        for step in range(150):
+            if step == 50:
+                request = SetRadio(RadioSettings(channel=6))
+                assert messages.decode(*messages.encode(request)) == request
+                session._radio_request.begin(request)
+            now_ns = round(air.run(0.01) * 1e9)
+            events += session.receive(air.read(board), now_ns, now_ns)
+            air.write(board, session.outgoing())
+    (refusal,) = (event for event in events if isinstance(event, Refused))
+    assert "channel" in refusal.text
+    assert session.radio.settings.channel == 5

@@ -109,17 +109,6 @@ DRX_TUNE2 27 08 4 351A009A      DRX_SFDTOC 27 20 2 0421         LDE_CFG2 2E 1806
 LDE_REPC 2E 2804 2 0A3D         USR_SFD 21 0 1 40
 """,
     ),
-    "channel 7, 64 MHz, 6.8 Mbit/s, long preamble": (
-        RadioSettings(channel=7, preamble=1024),
-        """
-SYS_CFG 04 0 4 00001200         TX_POWER 1E 0 4 5171B1D1        CHAN_CTRL 1F 0 4 8C480077
-RF_TXCTRL 28 0C 4 001E7DE0      TC_PGDELAY 2A 0B 1 93           RF_RXCTRLH 28 0B 1 BC
-FS_PLLCFG 2B 07 4 0800041D      FS_PLLTUNE 2B 0B 1 BE           AGC_TUNE1 23 04 2 889B
-DRX_TUNE0b 27 02 2 0001         DRX_TUNE1a 27 04 2 008D         DRX_TUNE1b 27 06 2 0020
-DRX_TUNE2 27 08 4 353B015E      DRX_SFDTOC 27 20 2 03E9         LDE_CFG2 2E 1806 2 0607
-LDE_REPC 2E 2804 2 3332         USR_SFD 21 0 1 08
-""",
-    ),
 }
 
 
@@ -151,11 +140,9 @@ def test_every_register_write_at_the_start_is_that_of_the_table(air: Air, name: 
     ("settings", "boost_db"),
     [
         (RadioSettings(), 6.0),  # up to 250 us
-        (RadioSettings(preamble=64), 6.0),
         (RadioSettings(preamble=256), 3.0),
         (RadioSettings(preamble=1024), 0.0),
         (RadioSettings(channel=2, prf_mhz=16, preamble=2048), 0.0),
-        (RadioSettings(rate_kbps=850), 0.0),
         (RadioSettings(rate_kbps=110, preamble=1024), 0.0),
         (RadioSettings(rate_kbps=110, preamble=1024, tx_power=0x25456585), 0.0),
     ],
@@ -187,17 +174,14 @@ def test_smart_power_sends_one_frame_per_millisecond(air: Air):
     ("settings", "tag", "anchor", "revision"),
     [
         (RadioSettings(channel=2), 2 * 0x4011, 2 * 0x4111, 2),
-        (RadioSettings(channel=2, rate_kbps=110, preamble=1024), 2 * 0x4022, 2 * 0x4122, 2),
         (RadioSettings(channel=5), 2 * 0x4033, 2 * 0x4133, 2),
         (RadioSettings(channel=5, rate_kbps=110, preamble=1024), 2 * 0x4044, 2 * 0x4144, 2),
         (RadioSettings(channel=5, rate_kbps=850), 0x8050, 0x8050, 2),
         (RadioSettings(channel=3), 0x8050, 0x8050, 2),
-        (RadioSettings(channel=3, prf_mhz=16), 0x8060, 0x8060, 2),
         (RadioSettings(channel=2, antenna_delay=32_700), 32_700, 32_700, 2),
         # Only revisions 2 and 3 are those of a TREK1000.
         (RadioSettings(), 0x8050, 0x8050, 1),
         (RadioSettings(), 2 * 0x4033, 2 * 0x4133, 3),
-        (RadioSettings(), 0x8050, 0x8050, 4),
     ],
 )
 def test_antenna_delay_of_a_trek1000_is_from_otp(
@@ -222,28 +206,6 @@ def test_reply_within_the_pause_of_smart_power_is_refused(rate_kbps: int, refuse
     radio = load_native().native_radio_new(ctypes.byref(Io()), *settings, 1)
     assert (load_native().native_radio_configure(radio, *settings) is not None) == refused
     load_native().native_radio_free(radio)
-
-
-class StickyStatusBus(ModelBus):
-    """The chip does not clear status bits when receiver or transmitter start: only a write clears them."""
-
-    _status = 0
-
-    def transfer(self, header: bytes, out: bytes | None, count: int) -> bytes:
-        answer = super().transfer(header, out, count)
-        if header[0] & 0x3F != SYS_STATUS:
-            return answer
-        if out is None:
-            self._status |= int.from_bytes(answer, "little")
-            return self._status.to_bytes(5, "little")[:count]
-        self._status &= ~int.from_bytes(out, "little")
-        return answer
-
-
-def test_driver_clears_the_reception_status(air: Air):
-    run = Run(air, bus=StickyStatusBus)
-    assert len(run.ranges) > 10
-    assert all(measured.range_m == pytest.approx(6.0, abs=0.03) for measured in run.ranges)
 
 
 @pytest.mark.parametrize(

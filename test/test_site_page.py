@@ -130,12 +130,6 @@ def terminals(tmp_path: Path, ros: Ros) -> Iterator[Terminals]:
     opened.close()
 
 
-def test_every_command_of_the_page_is_in_a_block_that_is_run():
-    """Commands in prose or in indented blocks would not be tested below."""
-    rest = FENCED.sub("", PAGE.read_text(encoding="utf-8"))
-    assert not re.findall(r"^ {4,}(?:uwb-mitigation|ros2) .*", rest, re.MULTILINE)
-
-
 def test_commands_of_the_page_lead_from_boards_to_positions(terminals: Terminals, ros: Ros):
     folder = terminals.folder
     poses = ros.collect(PoseWithCovarianceStamped, "/uwb/pose")

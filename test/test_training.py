@@ -1,19 +1,28 @@
-"""Training of the linear bias model and of the network."""
+"""The networks, training of the linear bias model, of a network and of the universal model."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import astuple
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
-from model_material import dataset, windows
+from model_material import card, dataset, random_weights, windows
+from typer.testing import CliRunner
 
+from uwb_mitigation.commands.cli import app
 from uwb_mitigation.errors import DatasetError, ParameterError
-from uwb_mitigation.mitigation.model import floating
-from uwb_mitigation.mitigation.model.architecture import Remnet
+from uwb_mitigation.mitigation.model import floating, graph
+from uwb_mitigation.mitigation.model.architecture import HEAD, Mlp, Remnet
+from uwb_mitigation.mitigation.model.bundle import Session, load_bundle, save_bundle
+from uwb_mitigation.mitigation.model.integer import IntegerNetwork
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
+from uwb_mitigation.mitigation.model.weights import FloatWeights
+from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.training.fit.linear_fit import fit_linear_bias, least_absolute_deviations
+from uwb_mitigation.training.fit.quantisation import quantise_network
 
 SHAPE = Remnet(samples=32)
 
@@ -57,6 +66,7 @@ torch = pytest.importorskip("torch", reason="run `make setup-training`")
 from uwb_mitigation.training import train  # noqa: E402
 from uwb_mitigation.training.fit.candidates import Recipe, fit_new_model  # noqa: E402
 from uwb_mitigation.training.fit.fitting import FitOptions, fit  # noqa: E402
+from uwb_mitigation.training.fit.networks import build_network  # noqa: E402
 
 
 def test_seed_gives_the_same_weights():
@@ -68,14 +78,6 @@ def test_seed_gives_the_same_weights():
     )
     assert all(np.array_equal(first.weight[name], again.weight[name]) for name in first.weight)
     assert not np.array_equal(first.weight["first"], other.weight["first"])
-
-
-def test_fitting_does_not_change_the_global_random_state():
-    torch.manual_seed(5)
-    expected = torch.rand(1)
-    torch.manual_seed(5)
-    fit(SHAPE, windows(4, 32), np.zeros(4), FitOptions(epochs=1))
-    assert torch.equal(torch.rand(1), expected)
 
 
 def test_network_learns_a_function_of_its_inputs():
@@ -90,11 +92,6 @@ def test_loss_that_diverges_ends_the_training():
     targets = np.full(64, 3e38)
     with pytest.raises(DatasetError, match="in epoch"):
         fit(SHAPE, windows(64, 32) * 1e30, targets, FitOptions(epochs=50, learning_rate=1.0))
-
-
-def test_inputs_that_are_not_finite_are_refused():
-    with pytest.raises(DatasetError, match="all finite"):
-        fit(SHAPE, np.full((2, 32), np.nan, np.float32), np.zeros(2), FitOptions())
 
 
 @pytest.mark.parametrize("change", [{"epochs": 0}, {"learning_rate": 0.0}, {"dropout": 1.0}, {"seed": -1}])
@@ -132,9 +129,109 @@ def test_card_contains_the_errors_on_held_out_configurations(validation):
     assert card.training["metrics_m"]["raw"]["mae"] == round(float(np.abs(data.error_m).mean()), 4)
 
 
-def test_measurements_without_levels_do_not_harm_the_network():
-    data = dataset(8, 20)
-    data.rx_power_dbm[3] = np.nan
-    fitted = fit_new_model(data, RECIPE, 0)
-    assert fitted.linear_bias.needs_power
-    assert np.isfinite(floating.predict_m(fitted.network, data.inputs)).all()
+def weights_of(shape: Mlp | Remnet) -> FloatWeights:
+    if isinstance(shape, Remnet):
+        return random_weights(shape)
+    generator = np.random.default_rng(0)
+    weight = {
+        layer.name: generator.normal(0, (2 / layer.inputs) ** 0.5, (layer.outputs, layer.inputs))
+        for layer in shape.layers
+    }
+    weight[HEAD] = generator.normal(0, 0.3, (shape.features, 1))
+    bias = {layer.name: generator.normal(0, 0.1, layer.outputs) for layer in shape.layers}
+    bias[HEAD] = generator.normal(0, 0.1, 1)
+    return FloatWeights(
+        shape,
+        {name: values.astype(np.float32) for name, values in weight.items()},
+        {name: values.astype(np.float32) for name, values in bias.items()},
+    )
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Remnet(157),
+        Remnet(128, first_kernel=5),
+        Remnet(8),
+        Remnet(33, kernel=5, filters=8, modules=2),
+        Remnet(5, kernel=1, modules=4),
+        Remnet(1, kernel=7, first_kernel=9),
+        Mlp(32),
+    ],
+)
+def test_torch_and_numpy_compute_the_same(shape):
+    weights = weights_of(shape)
+    inputs = windows(20, shape.samples)
+    with torch.no_grad():
+        computed = build_network(shape, 0.5, weights).eval()(torch.from_numpy(inputs)).numpy()
+    assert np.allclose(floating.predict_m(weights, inputs), computed, atol=1e-5)
+
+
+@pytest.mark.parametrize("quantised", [True, False])
+@pytest.mark.parametrize("shape", [Mlp(16, (12, 8)), Remnet(16)])
+def test_bundle_loads_and_runs(tmp_path, shape, quantised):
+    weights = weights_of(shape)
+    integers = quantise_network(weights, windows(50, 16), exact=False)
+    model = graph.int8_model(integers) if quantised else graph.float_model(weights)
+    save_bundle(tmp_path / "mlp.onnx", model, card(shape, quantised=quantised))
+    bundle = load_bundle(tmp_path / "mlp.onnx")
+    assert bundle.architecture == shape
+    inputs = windows(20, 16, 3)
+    expected = (
+        IntegerNetwork(integers).predict_m(inputs) if quantised else floating.predict_m(weights, inputs)
+    )
+    computed = Session(bundle).predict_m(inputs)
+    assert np.allclose(computed, expected, atol=0 if quantised else 1e-5)
+    if not quantised:
+        read = graph.float_weights(bundle.model, shape)
+        assert all(np.array_equal(weights.weight[name], read.weight[name]) for name in weights.weight)
+
+
+@pytest.mark.parametrize("options", [{"samples": 0}, {"hidden": ()}, {"hidden": (0,)}, {"hidden": (1,) * 7}])
+def test_invalid_mlp_is_refused(options):
+    with pytest.raises(ParameterError, match="MLP"):
+        Mlp(**options)
+
+
+def test_command_writes_both_bundles_with_the_error_by_condition(tmp_path: Path) -> None:
+    words = ["train-universal", "-o", str(tmp_path / "a.onnx"), "--float", str(tmp_path / "b.onnx")]
+    words += ["--samples", "8", "--scaling", "max", "--blocks", "1", "--json", str(tmp_path / "a.json")]
+    words += ["--radio", "dw3000", "--workers", "1"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    made, floating = (load_bundle(tmp_path / name) for name in ("a.onnx", "b.onnx"))
+    assert (made.quantised, floating.quantised) == (True, False)
+    assert made.preprocessing.scaling is Scaling.MAX
+    assert made.card.source == "DW3000 STS"
+    assert "experimental, no real recording was available" in made.card.origin
+    ood_bands = made.card.ood_bands
+    assert ood_bands is not None
+    assert not ood_bands.needs_levels
+    assert ood_bands.lead_level_db is not None
+    result = json.loads((tmp_path / "a.json").read_text())
+    assert result["model_id"] == made.model_id
+    assert result["simulated"]
+    held_out = result["held_out"]
+    assert list(held_out) == ["raw", "constant", "line in levels", "float", "int8"]
+    assert all(set(row) == {"all", "LOS", "NLOS", "NDP NLOS"} for row in held_out.values())
+    assert held_out["raw"]["LOS"]["mae"] < held_out["raw"]["NDP NLOS"]["mae"]
+    mae_m = {row: by["all"]["mae"] for row, by in held_out.items()}
+    assert mae_m["line in levels"] < mae_m["constant"] < mae_m["raw"]
+
+
+@pytest.mark.parametrize(
+    ("words", "excerpt"),
+    [
+        ("--samples 2000", "1016"),
+        ("--scaling loud", "preamble"),
+        ("--radio dw1001", "dw1000"),
+        ("--seed -1", "seed"),
+        ("--blocks 0", "blocks"),
+        ("--workers 0", "workers"),
+    ],
+)
+def test_invalid_training_is_refused(tmp_path: Path, words: str, excerpt: str) -> None:
+    done = CliRunner().invoke(app, ["train-universal", "-o", str(tmp_path / "a.onnx"), *words.split()])
+    assert done.exit_code != 0
+    assert excerpt in done.output + str(done.exception)
+    assert not list(tmp_path.iterdir())
