@@ -54,6 +54,20 @@ def test_links_between_pages_are_valid(page: Path):
     assert [link for link, path in targets.items() if path not in GENERATED and not path.exists()] == []
 
 
+def test_every_page_of_the_documentation_can_be_reached():
+    read: set[Path] = set()
+    waiting = [REPOSITORY / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page.parent == generated.REFERENCE and (template := generated.TEMPLATES / page.name).is_file():
+            page = template
+        if page in read or page.suffix != ".md" or not page.is_file():
+            continue
+        read.add(page)
+        waiting += [(folder_of(page) / target).resolve() for target in links(page) if "://" not in target]
+    assert {page for page in PAGES if page.is_relative_to(REPOSITORY / "docs")} <= read
+
+
 # Commands and code blocks.
 
 

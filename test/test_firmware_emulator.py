@@ -26,9 +26,11 @@ from uwb_mitigation.mitigation.embedded import toolchain
 from uwb_mitigation.mitigation.embedded.export import export_bundle
 from uwb_mitigation.mitigation.embedded.toolchain import Kernels, Target
 from uwb_mitigation.mitigation.model import requantisation
-from uwb_mitigation.mitigation.model.bundle import Bundle
+from uwb_mitigation.mitigation.model.bundle import Bundle, load_bundle
 from uwb_mitigation.mitigation.model.integer import IntegerNetwork
+from uwb_mitigation.mitigation.model.shipped import default_model_path, shipped_model_path
 from uwb_mitigation.mitigation.model.weights import Int8Weights
+from uwb_mitigation.mitigation.preprocessing import Scaling
 from uwb_mitigation.types.measurement import RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
 
@@ -123,6 +125,16 @@ def test_good_and_hostile_measurements_are_corrected_as_by_the_mitigator(is_stri
     measurements = [firmware_models.random_measurement(random) for _ in range(500)]
     statuses = check_corrections(bundle_in(tmp_path), measurements, tmp_path, 0.22 * is_strict)
     assert statuses >= {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize(
+    "shipped",
+    [default_model_path(), shipped_model_path("evk1000_apartment"), default_model_path(Scaling.MAX)],
+    ids=lambda path: path.stem,
+)
+def test_real_logs_are_corrected_as_by_the_mitigator(shipped: Path, apartment: Path, tmp_path: Path):
+    measurements = firmware_models.real_measurements(apartment)
+    assert 0 in check_corrections(load_bundle(shipped), measurements, tmp_path)
 
 
 def test_image_of_the_dwm1001_dev_fits_and_is_written_as_hex(tmp_path: Path):

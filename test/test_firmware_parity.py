@@ -86,6 +86,16 @@ def test_golden_vectors_pass_under_the_sanitizers(tmp_path: Path):
     assert "0 of 8 golden vectors wrong" in run_tool([program])
 
 
+def test_golden_vectors_detect_a_changed_weight(tmp_path: Path):
+    header = firmware_models.write_model(tmp_path, random_networks.remnet(16, 3))
+    text = header.read_text()
+    start = text.index("{\n", text.index("uwb_module1_residual_weights[")) + 2
+    first = text[start : text.index(",", start)].strip()
+    header.write_text(text[:start] + text[start:].replace(first, str(int(first) ^ 32), 1))
+    with pytest.raises(UwbMitigationError, match="exit 1"):
+        run_tool([build_program("golden", tmp_path)])
+
+
 @pytest.mark.parametrize("scaling", list(Scaling))
 def test_arbitrary_cirs_pass_the_sanitizers(scaling: Scaling, tmp_path: Path):
     firmware_models.write_model(

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
+from browser import Browser
 from conftest import REPOSITORY
 
 from uwb_mitigation.types.anchors import Anchor, AnchorMap
@@ -93,6 +94,40 @@ def test_foxglove_layout_uses_existing_topics_and_fields():
         names = re.search(r"const \{ (.*) \} = event.message", source)[1].split(", ")
         assert set(names) <= set.union(*(fields[TYPES[topic]] for topic in inputs))
         assert set(re.findall(r"\bcir\.(\w+)", source)) <= fields[CIR_TYPE]
+
+
+def test_foxglove_scripts_filter_64_bit_ids_and_compute_magnitudes(browser: Browser):
+    layout = json.loads((REPOSITORY / "foxglove" / "uwb.json").read_text())
+
+    def run(name: str, topic: str, message: str, **variables: str) -> object:
+        source = layout["userNodes"][name]["sourceCode"]
+        assert f'"{topic}"' in re.search(r"inputs = (.*)", source)[1]
+        source = re.sub(
+            r"import .*|type Output.*|: any\b|: Output \| undefined|export default |export ", "", source
+        )
+        event = f"{{topic: '{topic}', message: {message}}}"
+        return browser.run(f"{source}; return script({event}, arguments[0]) ?? null", variables)
+
+    big = str(2**64 - 1)
+    cir = f"{{anchor_id: {big}n, tag_id: 7n, cir: {{encoding: 0, scale: 2, samples: new Int16Array([3, 4, 0, 1]),"
+    cir += " start_index: 730, first_path_index: 731.5}}"
+    shown = run("uwb-cir", "/uwb/range_raw", cir, anchor=big, tag="")
+    assert shown == {"anchor": big, "tag": "7", "magnitude": [10, 2], "first_path": [0, 10]}
+    assert run("uwb-cir", "/uwb/range_raw", cir, anchor=str(2**64 - 2), tag="") is None
+    assert run("uwb-cir", "/uwb/range_raw", cir, anchor="", tag="8") is None
+    ranges = f"{{anchor_id: {big}n, tag_id: 7n, range: 4.5, range_raw: 5, status: 0}}"
+    shown = run("uwb-range", "/uwb/range_corrected", ranges, anchor=big, tag="7")
+    assert (shown["raw"], shown["corrected"]) == (5, 4.5)
+    assert run("uwb-range", "/uwb/range_truth", ranges)["truth"] == 4.5
+    odometry = "{header: {frame_id: 'map'}, pose: {pose: {position: {x: 1}}, covariance: []}}"
+    place = run("uwb-truth", "/uwb/odometry_truth", odometry)
+    assert place == {"header": {"frame_id": "map"}, "pose": {"position": {"x": 1}}}
+
+
+@pytest.mark.parametrize("path", ["foxglove/uwb.json", "rviz/uwb.rviz", "plotjuggler/uwb.xml"])
+def test_layouts_show_several_tags(path: str):
+    text = (REPOSITORY / path).read_text()
+    assert all(topic in text for topic in TAGS)
 
 
 def test_plotjuggler_shows_fields_of_the_topics():
