@@ -19,7 +19,7 @@ from uwb_mitigation.calibration.motion_segments import Segments, find_segments
 from uwb_mitigation.calibration.observability import check_height, check_layout, check_motion, mirrored
 from uwb_mitigation.errors import DatasetError
 from uwb_mitigation.positioning.config import EstimatorConfig
-from uwb_mitigation.positioning.geometry import Area, Height
+from uwb_mitigation.positioning.geometry import Area, Height, unit_vectors
 from uwb_mitigation.positioning.noise_model import NoiseModel, Regressors
 from uwb_mitigation.types.anchors import AnchorMap
 from uwb_mitigation.types.tracks import Ranges
@@ -90,12 +90,39 @@ class SelfCalibration:
         """The mean offset of all pairs, m, and its standard deviation."""
         return self._mean_of(self.pairs())
 
+    def displacement(self) -> tuple[float, float]:
+        """Return the part of the differences of the offsets that a displacement of the whole track explains, and its standard deviation.
+
+        Both are root mean squares over the pairs, m. Seen from the middle of the anchors, each of them is always in about the same
+        direction, so that offsets and a displacement of the track have nearly the same effect.
+        """
+        pairs, positions, fit = self.pairs(), self.fit.config.anchors.position, self.fit
+        directions = np.stack(
+            [unit_vectors(fit.position, positions[row])[0].mean(axis=0)[: fit.config.dims] for _, row in pairs]
+        )
+        directions -= directions.mean(axis=0)
+        weights = self._weights(pairs)
+        displaced = directions @ np.linalg.pinv(directions) @ (weights - weights.mean(axis=0))
+        mean_square = np.mean((displaced @ fit.parameters) ** 2)
+        variance = np.trace(displaced @ fit.covariance @ displaced.T) / len(pairs)
+        return float(np.sqrt(mean_square)), float(np.sqrt(variance))
+
+    def _weights(self, pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+        """Return the weights of the q parameters in the offset of each pair, (p, q)."""
+        return np.array(
+            [
+                [
+                    name in ("offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}")
+                    for name in self.fit.prior.names
+                ]
+                for tag, row in pairs
+            ],
+            np.float64,
+        )
+
     def _mean_of(self, pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
         """Return the mean of the offsets of pairs and its standard deviation, m."""
-        weight = np.zeros(len(self.fit.parameters))
-        for tag, row in pairs:
-            names = {"offset", f"anchor {row}", f"tag {tag}", f"pair {tag} {row}"}
-            weight += np.array([name in names for name in self.fit.prior.names]) / len(pairs)
+        weight = self._weights(pairs).mean(axis=0)
         # The error of an anchor's position looks like an offset. Averaged over all directions from which the tag received it,
         # about half of its variance remains.
         placed = self.fit.config.anchors.sd[[row for _, row in pairs]] ** 2 / 2.0

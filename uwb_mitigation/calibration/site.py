@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from uwb_mitigation.calibration.held_out import (
     BLOCK_S,
-    MAX_INCREASE,
     MIN_GAIN,
     PROMISED_SHARE,
     RAW,
@@ -174,11 +173,11 @@ class SiteCalibration:
         """Return why the calibration does not help; empty: it does."""
         for errors in self.held_out:
             drive = "on the drive of the check " if errors is not self.held_out[0] else ""
-            live_gain = errors.live_gain(self.chosen, self.baseline).mean
-            if self.solution.truth is not None and math.isnan(live_gain):
+            least_gain = errors.live_gain(self.chosen, self.baseline).low
+            if self.solution.truth is not None and math.isnan(least_gain):
                 return f"{drive}there are too few live positions to compare"
-            if live_gain < -MAX_INCREASE:
-                return f"{drive}the live position is worse than with {self._baseline_text}"
+            if least_gain <= 0.0:
+                return f"{drive}the live position is not clearly better than with {self._baseline_text}"
             if not errors.range_gain(self.chosen, self.baseline).mean >= MIN_GAIN:
                 return f"{drive}the ranges are not better than with {self._baseline_text}"
         is_raw = self.solution.truth is None and self.baseline == RAW
@@ -398,7 +397,7 @@ class _Fold:
             range_m = site.ranges.range_m - predicted_m
             # Without ground truth the reference of ranges without offsets contains no common offset, because the locator
             # estimates it.
-            common_m = solution.common[0] if level == NONE and solution.truth is None else 0.0
+            common_m = solution.common_m if level == NONE and solution.truth is None else 0.0
             corrected_m = np.maximum(range_m - _offsets_m(site, solution.offsets(level)), 0.0)
             residual_m[name] = self.reference.errors_of(corrected_m - common_m) + common_m
             if solution.truth is not None:
@@ -442,15 +441,15 @@ class _Fold:
 
 def _candidates(site: SiteData, solution: SiteSolution) -> list[tuple[str, str]]:
     """Return (level of the offsets, kind of the model) of the corrections that can be selected, in order of complexity."""
-    if solution.truth is not None:
-        levels = (ONE,) if site.has_cirs else (ONE, PAIR)
-        model = NETWORK if site.has_cirs else LINE
-        return [*((level, NO_MODEL) for level in levels), (ONE, model), (PAIR, model)]
-    if site.has_cirs:
+    if solution.truth is None and site.has_cirs:
         # What the network leaves behind walls looks like offsets of anchors, on each drive the same.
         return [(ONE, NETWORK)]
-    # A line in the received power does not transfer to other drives.
-    return [(ONE, NO_MODEL), *([] if solution.offsets_refused else [(PAIR, NO_MODEL)])]
+    if site.has_cirs:
+        return [(ONE, NETWORK), (PAIR, NETWORK)]
+    if solution.truth is None:
+        # A line in the received power does not transfer to other drives.
+        return [(ONE, NO_MODEL), *([] if solution.offsets_refused else [(PAIR, NO_MODEL)])]
+    return [(ONE, NO_MODEL), (PAIR, NO_MODEL), (ONE, LINE), (PAIR, LINE)]
 
 
 def _name(level: str, kind: str) -> str:

@@ -38,9 +38,15 @@ MAX_SKEWNESS = 1.4
 the 5 % quantile): obstacles lengthen ranges in some directions only, which looks like offsets. Simulated: 0.93 to 1.40 in layouts
 without many obstacles, 1.41 or more in 16 of 20 sites with walls (seeds 103 to 309)."""
 
-RAW_SHARE = 0.5
-"""Share of the differences of the offsets of raw ranges that is subtracted: where obstacles contribute to them, the whole differences
-increased the live error of another drive by up to 32 %, half of them by up to 10 % (simulated sites 118 and 304)."""
+MIN_DISPLACEMENT_SD_M = 0.05
+"""Offsets of single anchors are not used if a displacement of the whole track explains less of them than its standard deviation, if
+that is larger than this. In a simulated room (`box` in 3-D, seed 347), offsets of two opposite pairs of corners were wrong by 0.06 to
+0.15 m, together, and the live error of another drive increased by 9 %. Seen on rings of anchors: 0.03 m."""
+
+SUBTRACTED_SHARE = 0.5
+"""Share of an estimate without ground truth that is subtracted: with CIRs that of the common offset, otherwise that of the differences
+from it. Obstacles contribute to both. The whole differences increased the live error of another drive by up to 32 %, half of them by up
+to 10 % (simulated sites 118 and 304)."""
 
 OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
 """A range is an outlier if the distance of its error from the median exceeds both limits."""
@@ -67,7 +73,7 @@ class SiteSolution:
     Attributes:
         rows: int (n,), the ranges of the site that the model is fitted to. true_m: (n,), their true ranges.
         segment: int (n,), segment of the track. stationary: bool, for each segment.
-        pairs: offsets of the radios. common: mean offset, m, and its standard deviation.
+        pairs: offsets of the radios. common_m: the offset that is subtracted from all ranges, m.
         offsets_refused: why offsets of single anchors are not used; empty: they can be used.
         offset_share: share of the differences of the offsets from the common one that is subtracted.
         outliers: number of ranges that were excluded everywhere because their errors are implausible.
@@ -87,7 +93,7 @@ class SiteSolution:
     segment: NDArray[np.intp]
     stationary: NDArray[np.bool_]
     pairs: Pairs
-    common: tuple[float, float]
+    common_m: float
     outliers: int
     notes: tuple[str, ...]
     errors_of: Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -103,7 +109,7 @@ class SiteSolution:
 
     def subtracted(self, level: str) -> Pairs:
         """Return what is subtracted from the ranges of each pair with the level `ONE` or `PAIR`, and its standard deviation, m."""
-        common_m = self.common[0]
+        common_m = self.common_m
         if level == ONE:
             return {
                 pair: (common_m, math.hypot(sd, value - common_m)) for pair, (value, sd) in self.pairs.items()
@@ -116,10 +122,10 @@ class SiteSolution:
     def offsets(self, level: str) -> Offsets:
         """Return the offset of each pair, with the level `ONE` the common offset for all, and with `NONE` none."""
         if level != PAIR:
-            return Offsets(self.common[0] if level == ONE else 0.0)
+            return Offsets(self.common_m if level == ONE else 0.0)
         sds = {pair: sd for pair, (_, sd) in self.pairs.items() if math.isfinite(sd)}
         values = {pair: value for pair, (value, _) in self.subtracted(PAIR).items()}
-        return Offsets(self.common[0], pairs=values, pair_sd=sds)
+        return Offsets(self.common_m, pairs=values, pair_sd=sds)
 
 
 NONE, ONE, PAIR = "none", "one", "pair"
@@ -230,6 +236,7 @@ class _RangesOnly:
         """Return true ranges and offsets."""
         calibration = self._calibration
         segments, observations = calibration.segments, calibration.fit.observations
+        common_m, _ = calibration.mean()
         distance_m = calibration.distance_m
         has_truth = np.isfinite(distance_m) & (calibration.distance_sd_m <= MAX_TRUTH_SD_M)
         has_truth, outliers = _without_outliers(segments.ranges.range_m - distance_m, has_truth)
@@ -246,9 +253,9 @@ class _RangesOnly:
             segment=segments.segment[labelled],
             stationary=segments.is_stationary,
             pairs=self._pairs,
-            common=calibration.mean(),
+            common_m=common_m * (SUBTRACTED_SHARE if self._site.has_cirs else 1.0),
             offsets_refused=self._offsets_refused(has_truth),
-            offset_share=1.0 if self._site.has_cirs else RAW_SHARE,
+            offset_share=SUBTRACTED_SHARE,
             outliers=outliers,
             notes=tuple(notes),
             errors_of=functools.partial(self._errors_of, has_truth),
@@ -263,6 +270,9 @@ class _RangesOnly:
         """Return why offsets of single anchors are not used, see `SiteSolution`."""
         if not self._calibration.has_redundant_anchors:
             return "need more anchors"
+        displacement_m, displacement_sd_m = self._calibration.displacement()
+        if displacement_sd_m > max(MIN_DISPLACEMENT_SD_M, displacement_m):
+            return "look like a displacement of the whole track: drive nearer to each anchor"
         ranges = self._calibration.segments.ranges
         anchor, error_m = ranges.anchor[has_truth], (ranges.range_m - self._calibration.distance_m)[has_truth]
         for row in np.unique(anchor):
@@ -327,7 +337,7 @@ def solve_with_truth(
         lever_arms_m=alignment.lever_arm_m,
         estimate_lever_arm=False,
     )
-    common, pairs = _aligned_offsets(site, alignment)
+    common_m, pairs = _aligned_offsets(site, alignment)
     rows = np.flatnonzero(is_used & site.is_usable)
     level = height or _level_height(alignment.position[rows])
     segment = site.tag[rows]
@@ -337,7 +347,7 @@ def solve_with_truth(
         segment=segment,
         stationary=np.zeros(len(site.tags), np.bool_),
         pairs=pairs,
-        common=(common, 0.0),
+        common_m=common_m,
         outliers=outliers,
         notes=(),
         errors_of=lambda range_m: np.where(is_used, range_m - alignment.distance_m, np.nan),
