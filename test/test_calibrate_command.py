@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bag_material import write_records
 from command_line import run, succeed
-from drives import HALL, drive
+from drives import HALL, circuit, drive
 from rosbags.typesys import Stores, get_typestore
 
 from uwb_mitigation.calibration.held_out import HeldOut, select
@@ -193,32 +193,35 @@ def test_delayed_localisation_provides_the_truth(site):
     assert (wrong.returncode, "/odom (nav_msgs/msg/Odometry)" in wrong.stderr) == (1, True)
 
 
-@pytest.fixture(scope="module")
-def calibrate_with():
-    """Return a function that calibrates the first anchors of a drive whose ranges have these offsets."""
-    ranges, _ = drive(SITE, seconds=100, rate_hz=10.0, offset_m=0.0)
-
-    def calibrate(own):
-        some = ranges.take(ranges.anchor < len(own))
-        return calibrated(records_of(some, np.full(len(some), np.nan), some.range_m + own[some.anchor]))
-
-    return calibrate
 
 
 @pytest.mark.parametrize(
-    ("own", "chosen", "refusal"),
+    ("own", "size", "chosen", "refusal"),
     [
-        (OWN, "offsets", ""),
+        (OWN, 1.0, "offsets", ""),
         (
             OWN[:6] / 4.0,
+            1.0,
             "common offset",
             "estimates the common offset itself, and offsets of single anchors need more anchors",
         ),
-        (np.full(7, 0.3), "common offset", "offsets of single anchors are not clearly better"),
+        (np.full(7, 0.3), 1.0, "common offset", "offsets of single anchors are not clearly better"),
+        (OWN, 0.5, "common offset", "look like a displacement of the whole track"),
     ],
 )
-def test_without_cirs_seven_anchors_with_different_offsets_are_needed(calibrate_with, own, chosen, refusal):
-    calibration = calibrate_with(own)
+def test_without_cirs_a_drive_past_seven_anchors_with_different_offsets_is_needed(
+    own, size, chosen, refusal
+):
+    centre = np.array([6.0, 4.5, 1.0])
+
+    def path(time_s):
+        return centre + size * (circuit(time_s) - centre)
+
+    ranges, _ = drive(SITE, seconds=100, rate_hz=10.0, offset_m=0.0, path=path)
+    ranges = ranges.take(ranges.anchor < len(own))
+    calibration = calibrated(
+        records_of(ranges, np.full(len(ranges), np.nan), ranges.range_m + own[ranges.anchor])
+    )
     assert calibration.chosen == chosen
     assert refusal in calibration.refusal
     assert bool(refusal) == bool(calibration.refusal)
@@ -353,8 +356,8 @@ def no_range_gain(held_out, chosen):
     return replace(held_out, residual_m=held_out.residual_m | {chosen: held_out.residual_m["raw"]})
 
 
-def worse_live_position(held_out, chosen):
-    return replace(held_out, live_m=held_out.live_m | {chosen: 2.0 * held_out.live_m["raw"]})
+def no_live_gain(held_out, chosen):
+    return replace(held_out, live_m=held_out.live_m | {chosen: held_out.live_m["raw"]})
 
 
 def no_live_position(held_out, chosen):
@@ -365,7 +368,7 @@ def no_live_position(held_out, chosen):
     ("change", "refusal"),
     [
         (no_range_gain, "the ranges are not better than with raw ranges"),
-        (worse_live_position, "the live position is worse than with raw ranges"),
+        (no_live_gain, "the live position is not clearly better than with raw ranges"),
         (no_live_position, "there are too few live positions to compare"),
     ],
 )
@@ -416,7 +419,7 @@ def test_small_displacement_and_heavy_tail_accuse_no_anchor():
     blocked = (ranges.anchor == 3) & (rng.random(len(ranges)) < 0.8)
     tail = np.where(blocked, rng.exponential(1.0, len(ranges)), 0.0)
     exact = np.linalg.norm(path.position - HALL.position[ranges.anchor], axis=1)
-    one = HALL.position + np.outer(np.arange(5) == 1, (0.25, 0.0, 0.0))
+    one = HALL.position + np.outer(np.arange(5) == 1, (0.45, 0.0, 0.0))
     for anchors, value in (
         (HALL.moved(HALL.position + np.array([0.15, 0.0, 0.0]), HALL.sd), ranges.range_m),
         (HALL.moved(one, HALL.sd), exact),
@@ -481,6 +484,8 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path):
     )
     measured = [record.measurement for record in records[:200]]
     common_m = result["offsets_m"]["101-1"]
+    # Half of the estimate: the radios have an offset of 0.22 m, and 0.28 m were added on average.
+    assert common_m == pytest.approx(0.25, abs=0.07)
     for before, after in zip(
         Mitigation(UNIVERSAL).correct(measured), with_offset.correct(measured), strict=True
     ):

@@ -143,16 +143,6 @@ class SiteCalibration:
         return {name: self.held_out[0].mae_m(name) for name in self.held_out[0].residual_m}
 
     @property
-    def raw_mae_m(self) -> float:
-        """Return the MAE of the measured ranges."""
-        return self.mae_m[RAW]
-
-    @property
-    def calibrated_mae_m(self) -> float:
-        """Return the MAE of the chosen correction on the held-out halves."""
-        return self.mae_m[self.chosen]
-
-    @property
     def live_position_change(self) -> float:
         """Return the promised change of the live position error on another drive, relative to the baseline; NaN: unknown.
 
@@ -199,23 +189,23 @@ class SiteCalibration:
 
     def as_json(self) -> dict[str, object]:
         """Return the result of `uwb-mitigation calibrate`."""
-        solution, halves = self.solution, self.held_out[0]
+        solution, halves, mae_m = self.solution, self.held_out[0], self.mae_m
         return {
             "offsets_m": {pair: value for pair, (value, _) in self.pairs.items()},
             "offset_sd_m": {pair: sd for pair, (_, sd) in self.pairs.items()},
             "live_position_change": self.live_position_change,
             "live_position_m": {name: halves.live_rmse_m(name) for name in halves.residual_m},
             "compared_with": self.baseline,
-            "raw_mae_m": self.raw_mae_m,
-            "baseline_mae_m": self.mae_m[self.baseline],
-            "calibrated_mae_m": self.calibrated_mae_m,
+            "raw_mae_m": mae_m[RAW],
+            "baseline_mae_m": mae_m[self.baseline],
+            "calibrated_mae_m": mae_m[self.chosen],
             "check_mae_m": [
                 [errors.mae_m(self.baseline), errors.mae_m(self.chosen)] for errors in self.held_out[1:]
             ],
             "truth": solution.truth or "none",
             "refused": None,
             "chosen": self.chosen,
-            "candidates": {name: mae_m for name, mae_m in self.mae_m.items() if name != RAW},
+            "candidates": {name: value for name, value in mae_m.items() if name != RAW},
             "ranges": sum(map(len, self.site.tags)),
             "labelled": len(solution.rows),
             "outliers": solution.outliers,

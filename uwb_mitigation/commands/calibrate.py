@@ -215,8 +215,7 @@ def _gather(bags: list[Path], anchors: AnchorMap, source: Bundle, settings: Trac
         )
     if heights is not None and len(site.tags) > 1:
         raise ParameterError(f"--height-topic with {len(site.tags)} tags", valid="bags with one tag")
-    for reason, count in site.skipped.items():
-        warn(f"skipped: {count} x {reason}")
+    console.show_skipped(site.skipped)
     return site
 
 
