@@ -193,8 +193,6 @@ def test_delayed_localisation_provides_the_truth(site):
     assert (wrong.returncode, "/odom (nav_msgs/msg/Odometry)" in wrong.stderr) == (1, True)
 
 
-
-
 @pytest.mark.parametrize(
     ("own", "size", "chosen", "refusal"),
     [
@@ -209,9 +207,7 @@ def test_delayed_localisation_provides_the_truth(site):
         (OWN, 0.5, "common offset", "look like a displacement of the whole track"),
     ],
 )
-def test_without_cirs_a_drive_past_seven_anchors_with_different_offsets_is_needed(
-    own, size, chosen, refusal
-):
+def test_without_cirs_a_drive_past_seven_anchors_with_different_offsets_is_needed(own, size, chosen, refusal):
     centre = np.array([6.0, 4.5, 1.0])
 
     def path(time_s):

@@ -103,10 +103,10 @@ def _split_at_stops(ranges: Ranges, rows: NDArray[np.intp]) -> list[tuple[NDArra
     # Whether the tag has one position in a bin and the next one: the ranges of each anchor are similar.
     bins = int(number[-1]) + 1
     starts = np.searchsorted(number, np.arange(bins + 1))
-    noise_group = np.zeros(bins, np.bool_)
+    is_still = np.zeros(bins, np.bool_)
     for k in range(bins - 1):
-        noise_group[k] = _is_stationary(ranges, rows[starts[k] : starts[k + 2]], least=2)
-    still = noise_group | np.concatenate([[False], noise_group[:-1]])
+        is_still[k] = _is_stationary(ranges, rows[starts[k] : starts[k + 2]], least=2)
+    still = is_still | np.concatenate([[False], is_still[:-1]])
     edges = np.flatnonzero(np.diff(still)) + 1
     segments: list[tuple[NDArray[np.intp], bool]] = []
     moving: list[NDArray[np.intp]] = []

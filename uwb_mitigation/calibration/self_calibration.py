@@ -98,7 +98,10 @@ class SelfCalibration:
         """
         pairs, positions, fit = self.pairs(), self.fit.config.anchors.position, self.fit
         directions = np.stack(
-            [unit_vectors(fit.position, positions[row])[0].mean(axis=0)[: fit.config.dims] for _, row in pairs]
+            [
+                unit_vectors(fit.position, positions[row])[0].mean(axis=0)[: fit.config.dims]
+                for _, row in pairs
+            ]
         )
         directions -= directions.mean(axis=0)
         weights = self._weights(pairs)
@@ -161,38 +164,46 @@ def self_calibrate(
     if heights_m is not None:
         # Initial positions are found with the median height.
         height = Height(float(np.median(heights_m)), max(float(np.std(heights_m)), height_sd_m))
-    extra = regressors or Regressors.none(sum(map(len, tags)))
     config = EstimatorConfig(anchors, MODEL, height, area)
     check_layout(anchors, np.unique(np.concatenate([tag.anchor for tag in tags])), height, area)
-    solver = _Solver(config, tags, extra, heights_m, near_offset_m)
+    segments = find_segments(tags)
+    site_rows = np.cumsum([0, *map(len, tags)])[segments.tag] + segments.row
+    extra = (regressors or Regressors.none(sum(map(len, tags)))).select_rows(site_rows)
+    if heights_m is not None and height is not None:
+        segments = replace(segments, relative_height=heights_m[site_rows] - height.value)
+    expected_m = extra.rows @ extra.mean
+    offset_m = likely_offset(config, segments, expected_m) if near_offset_m is None else near_offset_m
+    start, has_position = first_positions(config, segments, expected_m + offset_m)
+    prior = Regressors.single("offset", np.ones(len(site_rows)), offset_m, COMMON_SD_M)
+    prior = replace(prior.concat(extra), noise_group=extra.noise_group)
     if heights_m is not None and height is not None:
         # The spread of the heights was for the initial positions: each height has the accuracy of its measurement.
-        solver.config = replace(config, height=Height(height.value, height_sd_m))
-    common = solver.fit_common_offset()
+        config = replace(config, height=Height(height.value, height_sd_m))
+    segments, common, notes = _fit_common_offset(config, segments, prior, start, has_position)
 
     def solve(model: NoiseModel) -> SelfCalibration:
         fit = replace(common, config=replace(common.config, model=model))
-        for members in own_offset_groups(solver.segments):
-            fit = with_own_offsets(solver.segments, fit, members)
+        for members in own_offset_groups(segments):
+            fit = with_own_offsets(segments, fit, members)
         antenna, sd_m = fit.leave_anchors_out(
             fit.observations.range_m - fit.observations.rows @ fit.parameters
         )
         index = fit.observations.observation_index
         return SelfCalibration(
-            segments=solver.segments,
+            segments=segments,
             fit=fit,
-            notes=tuple(solver.notes),
+            notes=tuple(notes),
             tag_ids=tuple(tag.tag_id for tag in tags),
             antenna=antenna[index],
             distance_sd_m=sd_m[index],
         )
 
-    num_anchors = len(np.unique(solver.segments.ranges.anchor))
+    num_anchors = len(np.unique(segments.ranges.anchor))
     is_raw = not extra.names and num_anchors >= config.dims + MIN_REDUNDANT
     if near_offset_m is None:
         # The limits of these checks are for equal thresholds.
         result = solve(MODEL)
-        check_anchors(solver.segments, result.fit, result.antenna)
+        check_anchors(segments, result.fit, result.antenna)
         if heights_m is None:
             check_height(result.fit)
         if not is_raw:
@@ -200,77 +211,53 @@ def self_calibrate(
     return solve(RAW_MODEL if is_raw else MODEL)
 
 
-class _Solver:
-    """The steps of `self_calibrate`.
+def _fit_common_offset(
+    config: EstimatorConfig,
+    segments: Segments,
+    prior: Regressors,
+    position: NDArray[np.float64],
+    has_position: NDArray[np.bool_],
+) -> tuple[Segments, JointFit, list[str]]:
+    """Fit tracks and common parameters; return the segments whose positions are determined, the fit, and notes on the others.
 
-    Attributes:
-        config: anchors, noise model, height and area. segments: ranges whose positions can be determined.
-        common: regressors of `segments`: the common offset, and the given ones.
-        notes: messages about ranges that were left out.
+    Args:
+        config: anchors, noise model, height and area.
+        segments: all segments.
+        prior: common parameters of their ranges.
+        position: initial positions, as `first_positions` returns them.
+        has_position: which segments have any, bool (s,).
+
+    Raises:
+        DatasetError: the track is ambiguous, or position and offset cannot be separated.
     """
-
-    def __init__(
-        self,
-        config: EstimatorConfig,
-        tags: Sequence[Ranges],
-        extra: Regressors,
-        heights_m: NDArray[np.float64] | None,
-        near_offset_m: float | None,
-    ) -> None:
-        self.config, self.notes = config, list[str]()
-        self.segments = find_segments(tags)
-        site_rows = np.cumsum([0, *map(len, tags)])[self.segments.tag] + self.segments.row
-        extra = extra.select_rows(site_rows)
-        if heights_m is not None and config.height is not None:
-            relative_height = heights_m[site_rows] - config.height.value
-            self.segments = replace(self.segments, relative_height=relative_height)
-        expected = extra.rows @ extra.mean
-        offset = near_offset_m
-        if offset is None:
-            offset = likely_offset(config, self.segments, expected)
-        self._position, has_position = first_positions(config, self.segments, expected + offset)
-        common = Regressors.single("offset", np.ones(len(expected)), offset, COMMON_SD_M)
-        self.common = replace(common.concat(extra), noise_group=extra.noise_group)
-        if not has_position.any():
-            raise DatasetError(
-                "no position of a tag can be determined",
-                valid="four anchors or more that receive a tag at once, --height or --area",
-            )
-        if not has_position.all():
-            self.notes.append(
-                f"{int((~has_position).sum())} of {len(has_position)} segments left out: no position of the tag can be "
-                "determined"
-            )
-        self._select(has_position)
-
-    def _select(self, is_selected: NDArray[np.bool_]) -> None:
-        self.common = self.common.select_rows(is_selected[self.segments.segment])
-        self.segments = self.segments.select(is_selected)
-
-    def fit_common_offset(self) -> JointFit:
-        """Fit tracks and common parameters.
-
-        Raises:
-            DatasetError: the track is ambiguous, or position and offset cannot be separated.
-        """
-        # The positions contain no knots of segments that were left out.
-        fit = fit_segments(self.config, self.segments, self.common, Start(self._position))
-        ambiguous = mirrored(fit)
-        if ambiguous.all():
-            raise DatasetError(
-                "the track has two mirror images, and either explains the ranges equally well",
-                valid="--height or --area to choose one, or an anchor that is not on the others' line (above or below their "
-                "plane)",
-            )
-        if ambiguous.any():
-            self.notes.append(
-                f"{int(ambiguous.sum())} of {len(ambiguous)} segments left out: their mirror images fit equally well"
-            )
-            position = fit.position[~ambiguous[fit.observations.knot_segment]]
-            self._select(~ambiguous)
-            fit = fit_segments(self.config, self.segments, self.common, Start(position))
-        check_motion(fit)
-        return fit
+    if not has_position.any():
+        raise DatasetError(
+            "no position of a tag can be determined",
+            valid="four anchors or more that receive a tag at once, --height or --area",
+        )
+    notes = list[str]()
+    if not has_position.all():
+        notes.append(
+            f"{int((~has_position).sum())} of {len(has_position)} segments left out: no position of the tag can be determined"
+        )
+    prior, segments = prior.select_rows(has_position[segments.segment]), segments.select(has_position)
+    # The positions contain no knots of segments that were left out.
+    fit = fit_segments(config, segments, prior, Start(position))
+    ambiguous = mirrored(fit)
+    if ambiguous.all():
+        raise DatasetError(
+            "the track has two mirror images, and either explains the ranges equally well",
+            valid="--height or --area to choose one, or an anchor that is not on the others' line (above or below their plane)",
+        )
+    if ambiguous.any():
+        notes.append(
+            f"{int(ambiguous.sum())} of {len(ambiguous)} segments left out: their mirror images fit equally well"
+        )
+        position = fit.position[~ambiguous[fit.observations.knot_segment]]
+        prior, segments = prior.select_rows(~ambiguous[segments.segment]), segments.select(~ambiguous)
+        fit = fit_segments(config, segments, prior, Start(position))
+    check_motion(fit)
+    return segments, fit, notes
 
 
 def own_offset_groups(segments: Segments) -> list[dict[str, NDArray[np.bool_]]]:

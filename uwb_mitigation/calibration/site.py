@@ -484,6 +484,5 @@ def _fit(kind: str, site: SiteData, solution: SiteSolution, level: str) -> SiteM
 
 def _labelled(site: SiteData, solution: SiteSolution, level: str) -> Dataset:
     """Return the ranges of `solution.rows` with the offsets subtracted."""
-    rows, segment = solution.rows, solution.segment
-    offset_m = _offsets_m(site, solution.offsets(level))[rows]
-    return site.to_dataset(rows, solution.true_m, offset_m, segment, solution.stationary[segment])
+    offset_m = _offsets_m(site, solution.offsets(level))[solution.rows]
+    return site.to_dataset(solution.rows, solution.true_m, offset_m)

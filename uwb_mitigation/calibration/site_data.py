@@ -113,32 +113,20 @@ class SiteData:
         return self.ranges.stamp_ns <= stamps[cut], False
 
     def to_dataset(
-        self,
-        rows: NDArray[np.intp],
-        true_m: NDArray[np.float64],
-        offset_m: NDArray[np.float64],
-        segment: NDArray[np.intp],
-        is_stationary: NDArray[np.bool_],
+        self, rows: NDArray[np.intp], true_m: NDArray[np.float64], offset_m: NDArray[np.float64]
     ) -> Dataset:
-        """Return a dataset of selected ranges, without CIRs.
+        """Return a dataset of selected ranges, without CIRs. A configuration is a pair for `CONFIGURATION_S`.
 
         Args:
-            rows: indices, (k,), into the ranges of all tags.
+            rows: indices, (k,), into the ranges of all tags, in ascending order.
             true_m: (k,), their true ranges.
             offset_m: (k,), subtracted from the ranges.
-            segment: int (k,), segment of the track.
-            is_stationary: bool (k,), whether the tag is stationary. A configuration is a
-                pair while the tag is stationary, or for `CONFIGURATION_S` of motion.
         """
-        ranges = self.ranges.take(rows)
-        segment_start_ns = np.full(int(segment.max()) + 1, np.iinfo(np.int64).max)
-        np.minimum.at(segment_start_ns, segment, ranges.stamp_ns)
-        elapsed_s = (ranges.stamp_ns - segment_start_ns[segment]) / NS_PER_S
-        interval = np.where(is_stationary, 0, elapsed_s // CONFIGURATION_S).astype(int)
-        names = [
-            f"segment {s}/{c}/tag {t}/anchor {a}"
-            for s, c, t, a in zip(segment, interval, self.tag[rows], ranges.anchor, strict=True)
-        ]
+        ranges, tag = self.ranges.take(rows), self.tag[rows]
+        _, first, slot = np.unique(tag, return_index=True, return_inverse=True)
+        elapsed_s = (ranges.stamp_ns - ranges.stamp_ns[first][slot]) / NS_PER_S
+        interval = (elapsed_s // CONFIGURATION_S).astype(int)
+        names = [f"tag {t}/{c}/anchor {a}" for t, c, a in zip(tag, interval, ranges.anchor, strict=True)]
         return Dataset(
             self.preprocessing,
             np.zeros((len(rows), self.preprocessing.samples), np.float32),

@@ -72,10 +72,8 @@ class SiteSolution:
 
     Attributes:
         rows: int (n,), the ranges of the site that the model is fitted to. true_m: (n,), their true ranges.
-        segment: int (n,), segment of the track. stationary: bool, for each segment.
         pairs: offsets of the radios. common_m: the offset that is subtracted from all ranges, m.
         offsets_refused: why offsets of single anchors are not used; empty: they can be used.
-        offset_share: share of the differences of the offsets from the common one that is subtracted.
         outliers: number of ranges that were excluded everywhere because their errors are implausible.
         notes: what was left out.
         errors_of: returns for corrected ranges of all tags, (r,), m, their errors against the reference, (r,), m; NaN:
@@ -90,8 +88,6 @@ class SiteSolution:
 
     rows: NDArray[np.intp]
     true_m: NDArray[np.float64]
-    segment: NDArray[np.intp]
-    stationary: NDArray[np.bool_]
     pairs: Pairs
     common_m: float
     outliers: int
@@ -105,7 +101,6 @@ class SiteSolution:
     track: NDArray[np.float64]
     track_of: NDArray[np.intp]
     offsets_refused: str = ""
-    offset_share: float = 1.0
 
     def subtracted(self, level: str) -> Pairs:
         """Return what is subtracted from the ranges of each pair with the level `ONE` or `PAIR`, and its standard deviation, m."""
@@ -114,10 +109,8 @@ class SiteSolution:
             return {
                 pair: (common_m, math.hypot(sd, value - common_m)) for pair, (value, sd) in self.pairs.items()
             }
-        return {
-            pair: (common_m + self.offset_share * (value - common_m), sd)
-            for pair, (value, sd) in self.pairs.items()
-        }
+        share = SUBTRACTED_SHARE if self.truth is None else 1.0
+        return {pair: (common_m + share * (value - common_m), sd) for pair, (value, sd) in self.pairs.items()}
 
     def offsets(self, level: str) -> Offsets:
         """Return the offset of each pair, with the level `ONE` the common offset for all, and with `NONE` none."""
@@ -250,12 +243,9 @@ class _RangesOnly:
         return SiteSolution(
             rows=self._site_rows[labelled],
             true_m=distance_m[labelled],
-            segment=segments.segment[labelled],
-            stationary=segments.is_stationary,
             pairs=self._pairs,
             common_m=common_m * (SUBTRACTED_SHARE if self._site.has_cirs else 1.0),
             offsets_refused=self._offsets_refused(has_truth),
-            offset_share=SUBTRACTED_SHARE,
             outliers=outliers,
             notes=tuple(notes),
             errors_of=functools.partial(self._errors_of, has_truth),
@@ -340,12 +330,9 @@ def solve_with_truth(
     common_m, pairs = _aligned_offsets(site, alignment)
     rows = np.flatnonzero(is_used & site.is_usable)
     level = height or _level_height(alignment.position[rows])
-    segment = site.tag[rows]
     return SiteSolution(
         rows=rows,
         true_m=alignment.distance_m[rows],
-        segment=segment,
-        stationary=np.zeros(len(site.tags), np.bool_),
         pairs=pairs,
         common_m=common_m,
         outliers=outliers,
@@ -357,7 +344,7 @@ def solve_with_truth(
         height=level,
         antenna_position=alignment.position,
         track=alignment.position[rows],
-        track_of=segment,
+        track_of=site.tag[rows],
     )
 
 
