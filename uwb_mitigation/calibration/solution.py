@@ -319,7 +319,8 @@ def solve_with_truth(
         if not localisation.estimate_lever_arm:
             _check_lever_arm(site, align, alignment)
         # With outliers: many ranges of swapped anchors are some.
-        hypotheses = AnchorHypotheses(site.anchors, site.ranges, alignment.position, site.tag)
+        ranges = replace(site.ranges, range_m=site.ranges.range_m - site.universal_m)
+        hypotheses = AnchorHypotheses(site.anchors, ranges, alignment.position, site.tag)
         hypotheses.check("the localisation", is_independent=True)
     aligned = replace(
         localisation,
