@@ -30,7 +30,7 @@ from uwb_mitigation.types.measurement import Cir, RadioType, RangeMeasurement, R
 from uwb_mitigation.types.offsets import read_offsets
 from uwb_mitigation.types.ros.poses import encode_odometry
 from uwb_mitigation.types.ros.topics import TF_TYPE
-from uwb_mitigation.types.tracks import Estimate, PosePath
+from uwb_mitigation.types.tracks import Estimate, PosePath, TruePath
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 UNIVERSAL = load_bundle(default_model_path())
@@ -487,6 +487,21 @@ def test_recording_with_cirs_uses_the_universal_network(tmp_path):
     ):
         assert after.range_m == pytest.approx(before.range_m - common_m, abs=1e-4)
         assert after.variance_m2 == before.variance_m2
+
+
+def test_with_cirs_half_of_the_differences_of_true_offsets_is_subtracted():
+    """What the network leaves behind walls depends on the drive."""
+    source = SimulatedSource.with_anchors(5, seed=4, count=600, rate_hz=20.0)
+    records = list(source)
+    site = read_site([records], source.anchors, UNIVERSAL)
+    stamp_ns = np.array([record.measurement.stamp_ns for record in records])
+    path = TruePath(stamp_ns, np.array([record.tag_position for record in records]))
+    localisation = replace(localisation_of(path), tag_ids=[site.tags[0].tag_id])
+    solution = solve_with_truth(site, localisation)
+    values = np.array([value for value, _ in solution.pairs.values()])
+    assert np.ptp(values) > 0.02
+    subtracted = np.array([value for value, _ in solution.subtracted("pair").values()])
+    assert subtracted == pytest.approx(0.5 * (values + solution.common_m))
 
 
 def test_levels_correct_ranges_of_other_radios_with_truth(tmp_path):

@@ -36,7 +36,7 @@ class HypothesisLimits:
             (simulated sites 4, 7, 8 and 9); a true one by 1 m explains 0.72 to 0.86 (sites 3 and 6).
         independent_m, independent_share: both limits if the positions do not depend on the anchors: errors of other anchors cannot
             look like a displacement then. Walls fit displacements that explain up to 0.43 of the misfit, and those above 0.5 m up to
-            0.31 (94 anchors of simulated sites 700 to 715); of 94 anchors that are 1 m and 2 m off, 70 and 89 exceed both.
+            0.37 (simulated sites 360, 364 and 700 to 715). Of 94 anchors that are 1 m and 2 m off, 70 and 89 exceed both limits.
         swap_share: minimum share of the misfit of all anchors that a swap explains.
         stands_out: minimum ratio of the gain to that of the next anchor, if the positions come from the other anchors: obstacles
             make several anchors look displaced, and a displaced one bends the tracks that judge the others.

@@ -44,9 +44,9 @@ that is larger than this. In a simulated room (`box` in 3-D, seed 347), offsets 
 0.15 m, together, and the live error of another drive increased by 9 %. Seen on rings of anchors: 0.03 m."""
 
 SUBTRACTED_SHARE = 0.5
-"""Share of an estimate without ground truth that is subtracted: with CIRs that of the common offset, otherwise that of the differences
-from it. Obstacles contribute to both. The whole differences increased the live error of another drive by up to 32 %, half of them by up
-to 10 % (simulated sites 118 and 304)."""
+"""Share of an estimate that is subtracted where obstacles contribute to it: without ground truth and with CIRs, of the common offset;
+without ground truth or with CIRs, of the differences from it. Whole differences increased the live error of another drive by up to 32 %,
+and with ground truth and CIRs by 21 %, half of them by up to 10 % and not (simulated sites 118, 304 and 368)."""
 
 OUTLIER_M, OUTLIER_SDS = 3.0, 10.0
 """A range is an outlier if the distance of its error from the median exceeds both limits."""
@@ -73,6 +73,7 @@ class SiteSolution:
     Attributes:
         rows: int (n,), the ranges of the site that the model is fitted to. true_m: (n,), their true ranges.
         pairs: offsets of the radios. common_m: the offset that is subtracted from all ranges, m.
+        offset_share: share of the differences of the offsets from the common one that is subtracted.
         offsets_refused: why offsets of single anchors are not used; empty: they can be used.
         outliers: number of ranges that were excluded everywhere because their errors are implausible.
         notes: what was left out.
@@ -100,6 +101,7 @@ class SiteSolution:
     antenna_position: NDArray[np.float64]
     track: NDArray[np.float64]
     track_of: NDArray[np.intp]
+    offset_share: float = SUBTRACTED_SHARE
     offsets_refused: str = ""
 
     def subtracted(self, level: str) -> Pairs:
@@ -109,8 +111,10 @@ class SiteSolution:
             return {
                 pair: (common_m, math.hypot(sd, value - common_m)) for pair, (value, sd) in self.pairs.items()
             }
-        share = SUBTRACTED_SHARE if self.truth is None else 1.0
-        return {pair: (common_m + share * (value - common_m), sd) for pair, (value, sd) in self.pairs.items()}
+        return {
+            pair: (common_m + self.offset_share * (value - common_m), sd)
+            for pair, (value, sd) in self.pairs.items()
+        }
 
     def offsets(self, level: str) -> Offsets:
         """Return the offset of each pair, with the level `ONE` the common offset for all, and with `NONE` none."""
@@ -336,6 +340,7 @@ def solve_with_truth(
         true_m=alignment.distance_m[rows],
         pairs=pairs,
         common_m=common_m,
+        offset_share=SUBTRACTED_SHARE if site.has_cirs else 1.0,
         outliers=outliers,
         notes=(),
         errors_of=lambda range_m: np.where(is_used, range_m - alignment.distance_m, np.nan),
