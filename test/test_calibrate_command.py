@@ -18,11 +18,13 @@ from uwb_mitigation.calibration.hypotheses import AnchorHypotheses
 from uwb_mitigation.calibration.site import calibrate_site
 from uwb_mitigation.calibration.site_data import read_site
 from uwb_mitigation.calibration.solution import Localisation, solve_with_truth, solve_without_truth
+from uwb_mitigation.commands.calibrate import _body_of_tag, _lever_arm_in
 from uwb_mitigation.errors import DatasetError, RecordingError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.positioning.geometry import Height
+from uwb_mitigation.recordings.bag import pose_paths
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, save_anchors
@@ -426,8 +428,6 @@ def test_small_displacement_and_heavy_tail_accuse_no_anchor():
 
 
 def test_tag_is_matched_with_its_own_frame_in_any_namespace():
-    from uwb_mitigation.commands.calibrate import _body_of_tag
-
     assert _body_of_tag(7, ["left/tag_7", "left/tag_8"], "x") == "left/tag_7"
     assert _body_of_tag(7, ["base_link"], "x") == "base_link"
     for names in (["tag_8"], ["base_link", "camera"], ["left/tag_7", "right/tag_7"]):
@@ -436,9 +436,6 @@ def test_tag_is_matched_with_its_own_frame_in_any_namespace():
 
 
 def test_lever_arm_is_read_from_every_bag_and_must_be_the_same(site, monkeypatch):
-    from uwb_mitigation.commands.calibrate import _lever_arm_in
-    from uwb_mitigation.recordings.bag import pose_paths
-
     arms = {"a": None, "b": (0.4, 0.1, 0.0), "c": (0.4, 0.1, 0.2)}
     monkeypatch.setattr(pose_paths, "read_lever_arm", lambda bag, body, frame: arms[bag])
     assert _lever_arm_in(["a", "b"], ["base_link"] * 2, ["antenna"]) == arms["b"]

@@ -13,7 +13,7 @@ import pytest
 from bag_material import write_records
 from model_material import amplitudes_only, changed
 
-from uwb_mitigation.calibration.radio_offsets import OffsetEstimate, estimate_offset
+from uwb_mitigation.calibration.radio_offsets import estimate_offset
 from uwb_mitigation.errors import DatasetError, ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
@@ -61,16 +61,12 @@ def without_levels(records: list[Record]) -> Iterator[Record]:
         yield changed(record, amplitudes_only(record.measurement.cir, **unknown))
 
 
-def at_one_place(found: OffsetEstimate) -> set[str]:
-    return {one.placement for one in found.placements if not one.refused}
-
-
 def test_added_offset_is_estimated(universal: Mitigation, direct: list[Record]):
     before, after = estimate_offset(universal, direct), estimate_offset(universal, longer(direct, 0.625))
     assert after.offset_m - before.offset_m == pytest.approx(0.625, abs=0.02)
     assert after.sd_m == pytest.approx(before.sd_m, abs=0.02)
     assert before.ranges >= 20
-    assert len(at_one_place(before)) > 1
+    assert len([one for one in before.placements if not one.refused]) > 1
     # The offset of simulated boards.
     assert before.offset_m == pytest.approx(0.22, abs=3.0 * before.sd_m)
     # Offsets that the mitigator already subtracts are not counted twice.
@@ -84,7 +80,6 @@ def test_without_levels_los_is_detected_in_the_cir(direct: list[Record]):
     amplitude = Mitigation(load_bundle(default_model_path(Scaling.MAX)))
     found = estimate_offset(amplitude, without_levels(direct))
     assert found.offset_m == pytest.approx(0.22, abs=3.0 * found.sd_m)
-    assert len(at_one_place(found)) > 1
     reported = estimate_offset(amplitude, direct)
     gaps = {one.placement: one.power_gap_db for one in reported.placements}
     for one in found.placements:
@@ -176,9 +171,7 @@ def test_written_offsets_are_read_by_the_other_commands(direct: list[Record], tm
 @pytest.mark.parametrize(
     ("options", "excerpt"),
     [
-        ((), "either --distance or --truth"),
         (("--distance", "5", "--truth"), "either --distance or --truth"),
-        (("--distance", "-5"), "distance = -5.0"),
         (("--distance", "nan"), "distance = nan"),
         (("--truth", "-o", "none/o.yaml"), "a file in an existing folder"),
         (("--truth", "--anchor", "door"), "anchor = 'door'"),
