@@ -8,7 +8,7 @@ first drive are the ground truth of the calibration.
 
 Printed for each pair: the correction, the promised change of the live position error, its change on the other drive, RMSE without
 and with the calibration; or the reason of the refusal. Without a calibration, the ranges are corrected by the shipped model if they
-have CIRs, otherwise raw. Seeds below 200 were used for development; results are reported for seeds from 200 on.
+have CIRs, otherwise raw. Seeds below 200, from 700 on, and those that the code names were used for development.
 
     PYTHONPATH=. python docs/experiments/calibrate_drives.py cirs bare flat geometry --first 200 --seeds 2
     PYTHONPATH=. python docs/experiments/calibrate_drives.py levels hanyang --check -o drives.jsonl
