@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.viewer.histories import NO_DATA_S, Pair
+from uwb_mitigation.viewer.palette import GREEN, ORANGE, PAPER, VERMILLION
 from uwb_mitigation.viewer.scene import Scene
 
 LONG_M, VERY_LONG_M = 0.15, 0.3
@@ -25,6 +26,13 @@ EVIDENCE = 10
 RELEASE = 0.8
 """A state ends below this share of the limit at which it begins (hysteresis)."""
 GOOD, CHECK, BAD, UNKNOWN = "\u2713 good", "! check", "\u2297 bad", "? unknown"
+LOOKS = {
+    GOOD: ("hex", GREEN),
+    CHECK: ("square_pin", ORANGE),
+    BAD: ("circle_x", VERMILLION),
+    UNKNOWN: ("hex_dot", PAPER),
+}
+"""Marker and colour of an anchor for each state; statuses of ranges have other markers."""
 STATES = (
     f"{BAD}: no ranges, or a mean residual over {VERY_LONG_M:.2f} m with line of sight. {CHECK}: a mean residual over {LONG_M:.2f} "
     f"m, {MAX_LOST:.0f} % lost, {MAX_NOT_OK:.0f} % with a status that needs attention, or {MAX_NLOS:.0f} % NLOS. {UNKNOWN}: fewer than "

@@ -143,7 +143,7 @@ class Page:
         position_s = round(player.shown_s, 3)
         shown = {"playing": player.playing, "speed": player.speed, "behind": player.is_behind}
         self._state.set(player=shown | {"position": position_s, "seconds": player.seconds})
-        self._figures.show_position(position_s)
+        self._figures.position.location = position_s
         if (timeline := player.timeline) is not None and self._state.changed("marks", timeline.is_complete):
             relative = timeline.log_s / max(player.seconds, 1e-9)
             bad = np.unique(relative[timeline.bad].round(3)).tolist()

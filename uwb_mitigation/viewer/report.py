@@ -54,7 +54,6 @@ def draw_scene(view: View) -> tuple[dict[str, figure], Controls]:
     figures = Figures(state)
     Texts(state).draw(view.scene)
     figures.draw(view.scene)
-    figures.map.show_labels()
     return figures.plots, state.controls
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -149,10 +150,11 @@ def new_source(*columns: str, **options: Any) -> ColumnDataSource:
     return ColumnDataSource({column: [] for column in columns}, **options)
 
 
-def set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:
+def set_rows(source: ColumnDataSource, rows: Sequence[Sequence[Any]]) -> None:
     """Set the rows of a source, unless it is and remains empty."""
     if rows or any(map(len, source.data.values())):
-        source.data = {column: [row[column] for row in rows] for column in source.data}
+        columns = map(list, zip(*rows, strict=True)) if rows else ([] for _ in source.data)
+        source.data = dict(zip(source.data, columns, strict=True))
 
 
 def drawable(value_m: float) -> float:

@@ -106,7 +106,7 @@ class Texts:
     def _pairs(self, scene: Scene) -> dict[Pair, Means]:
         """Write the table of pairs; return their means."""
         timeline, now_s = self._view.timeline, self._page.now_s()
-        rows, pairs = list[dict[str, Any]](), dict[Pair, Means]()
+        rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(history)
             means = history.statistics() | {
@@ -120,12 +120,11 @@ class Texts:
                 is_judged = not timeline.displaced or pair[0] in timeline.displaced
                 means |= residual_means(residuals_m[-STATISTICS:].tolist() if is_judged else [])
             pairs[pair] = means
-            rows.append(means | {
-                "anchor": format_id(pair[0]), "tag": format_id(pair[1]), "state": self._health(pair, means),
-                "status": missing or sample.status.name, "no_data": bool(missing), "raw": sample.raw_m,
-                "corrected": sample.range_m, "sigma": sample.sigma_m,
-            })  # fmt: skip
-        self._page.has_data = any(not row["no_data"] for row in rows)
+            status, ids = missing or sample.status.name, map(format_id, pair)
+            measured = sample.raw_m, sample.range_m, sample.sigma_m
+            shown = (means[name] for name in list(COLUMNS)[5:])
+            rows.append((*ids, bool(missing), self._health(pair, means), status, *measured, *shown))
+        self._page.has_data = any(not is_missing for _, _, is_missing, *_ in rows)
         set_rows(self.pairs, rows)
         return pairs
 

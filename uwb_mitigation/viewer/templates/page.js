@@ -106,34 +106,22 @@ function start(doc) {
     view.update_range({xrs: new Map([moved[0]]), yrs: new Map([moved[1]])}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
   // A name that would cover another one is hidden: tags come first, then the selected anchor.
-  const [tags, anchors, labels] = ["label_y", "id", "offset"].map((column) => map.renderers.map((r) => r.data_source).find((s) => column in s.data));
-  const placeLabels = () => {
-    const {x_scale, y_scale, bbox} = Bokeh.index.find_one(map).frame, boxes = [], shown = {x: [], y: [], text: [], offset: [], shift: []};
-    // Above the marker, or below it where it would leave the frame or cover another one.
-    const place = (x, y, text, ...offsets) => {
-      const half = 3.5 * text.length + 2, px = x_scale.compute(x), py = y_scale.compute(y);
-      const shift = Math.max(bbox.left - px + half, 0) + Math.min(bbox.right - px - half, 0);
-      for (const offset of offsets) {
-        const bottom = py + offset, box = [px - half + shift, bottom - 15, px + half + shift, bottom];
-        if (box[1] < bbox.top || boxes.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
-        boxes.push(box);
-        for (const [name, value] of Object.entries({x, y, text, offset, shift})) shown[name].push(value);
-        return;
-      }
-    };
-    tags.data.x.forEach((x, i) => {
-      const [px, py] = [x_scale.compute(x), y_scale.compute(tags.data.y[i])];
-      boxes.push([px - 8, py - 3, px + 8, py + 8]);
-    });
-    tags.data.name.forEach((name, i) => place(tags.data.x[i], tags.data.label_y[i], name, -4, 2 * (y_scale.compute(tags.data.y[i]) - y_scale.compute(tags.data.label_y[i])) + 28));
-    const isSelected = (i) => controls.selected && BigInt(controls.selected[0]) == anchors.data.id[i];
-    const order = [...anchors.data.name.keys()].sort((a, b) => isSelected(b) - isSelected(a));
-    for (const i of order) place(anchors.data.x[i], anchors.data.y[i], anchors.data.label[i], isSelected(i) ? -16 : -13, 28);
-    if (JSON.stringify(shown) !== JSON.stringify(labels.data)) labels.setv({data: shown}, {sync: false});
+  const names = map.renderers.filter(({glyph}) => glyph.text).reverse();
+  const placeNames = () => {
+    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame, boxes = [];
+    for (const {view, glyph, data_source: {data}} of names) {
+      const booleans = data[glyph.text.field].map((text, i) => {
+        const box = [3.5 * text.length + 2, x_scale.compute(data.x[i]), y_scale.compute(data[glyph.y.field][i]) + glyph.y_offset.value];
+        const isFree = boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 15);
+        if (isFree) boxes.push(box);
+        return isFree;
+      });
+      if (String(booleans) !== String(view.filter.booleans)) view.filter.setv({booleans}, {sync: false});
+    }
   };
-  tags.properties.data.change.connect(placeLabels);
+  for (const {data_source} of names) data_source.properties.data.change.connect(placeNames);
   // The view and the size of the map change without a common event.
-  setInterval(placeLabels, 200);
+  setInterval(placeNames, 200);
   $("fit").addEventListener("click", fit);
   $("accuracy").addEventListener("change", (event) => send("accuracy", event.target.checked));
   const keys = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1], "+": [0, 0, 0.8], "-": [0, 0, 1.25]};
@@ -152,7 +140,7 @@ function start(doc) {
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
-    const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = anchors.data;
+    const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = names[1].data_source.data;
     const i = id.findIndex((_, i) => Math.hypot(x_scale.compute(x[i]) - event.clientX + box.left, y_scale.compute(y[i]) - event.clientY + box.top) < 15);
     const {anchor, tag} = source.data, own = [...anchor.keys()].filter((pair) => BigInt(anchor[pair]) == id[i]);
     const pair = own.find((pair) => tag[pair] === controls.selected[1]) ?? own[0];
