@@ -254,7 +254,7 @@ def test_predicted_accuracy_is_shown_on_request():
     ],
 )  # fmt: skip
 def test_advice_names_the_probable_cause(residuals_m: list[float], nlos: list[float], expected: str) -> None:
-    others = dict.fromkeys(("rate", "lost", "not_ok", "stopped", "displaced"), 0.0)
+    others = dict.fromkeys(("rate", "lost", "not_ok", "stopped", "displaced"), 0.0) | {"evidence": 100.0}
     anchors = {
         number: others | {"nlos": share, "residual": residual_m}
         for number, (residual_m, share) in enumerate(zip(residuals_m, nlos, strict=True), 1)

@@ -110,12 +110,8 @@ def write_report(
     while player.is_behind:
         player.advance()
     figures, controls = draw_scene(View(player.scene, player=player))
-    state, reason, action, facts = controls.verdict
-    lines = [
-        f"Position {state}" + (f": {reason}" if reason else "") + (f". {action}" if action else ""),
-        facts,
-        *controls.notice,
-    ]
+    _, _, action, facts = controls.verdict
+    lines = [f"{controls.headline}. {action}", facts, *controls.notice]
     sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
     sections |= {HEADINGS[name]: figures[name] for name in SHOWN}
     sections["Anchors at the end"] = [ANCHOR_TITLES, *controls.health]

@@ -61,7 +61,7 @@ class Controls(DataModel):  # type: ignore[misc]
         update: set by the server after each update: its number, how long the previous one took, and the age of the
             latest range by its reception and by its stamp, s; the age is negative if there are no recent ranges.
         acknowledged: set by the script to the number of the last update that it has drawn.
-        verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
+        headline, verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
         available: set by the server: whether a control has an effect, {id: bool}.
         empty: set by the server: messages of figures without data, {name: message}.
     """
@@ -71,6 +71,7 @@ class Controls(DataModel):  # type: ignore[misc]
     acknowledged = AnyValue(default=0)
     health = AnyValue(default=[])
     cards = AnyValue(default=[])
+    headline = AnyValue(default="")
     verdict = AnyValue(default=[])
     tag_rows = AnyValue(default=[])
     incidents = AnyValue(default=[])

@@ -88,9 +88,11 @@ class Texts:
         for tag_id in self._verdicts.keys() - verdicts.keys():
             del self._verdicts[tag_id]
         shown = verdicts[page.tag_id]
+        tag = f" of tag {format_id(page.tag_id or 0)}" if len(verdicts) > 1 else ""
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
         page.set(
-            verdict=[shown.state, shown.reason, shown.action, self._facts(scene, shown.accuracy)],
+            headline=shown.headline(tag),
+            verdict=[*shown[:3], self._facts(scene, shown.accuracy)],
             health=_anchor_rows(anchors, states, names),
             tag_rows=_tag_rows(scene, pairs, verdicts),
             incidents=self._incidents(scene),

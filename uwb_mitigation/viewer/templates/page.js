@@ -49,12 +49,12 @@ function start(doc) {
   });
   texts("notice", "notice", (text) => element("div", text));
   texts("cards", "cards", (lines) => element("div", lines.map((text, i) => element(i === 1 ? "strong" : "span", text))));
-  for (const name of ["verdict", "selected", "tag_rows"]) on(name, () => {
-    const [state, reason, action, facts] = controls.verdict, box = $("verdict");
-    if (!state) return;
-    const tag = controls.tag_rows.length > 1 && controls.selected ? ` of tag ${controls.selected[1]}` : "";
-    box.className = state;
-    [`Position${tag} ${state}${reason ? `: ${reason}` : ""}`, action, facts].forEach((text, i) => setText(box.children[i], text));
+  const [headline, action, facts] = $("verdict").children;
+  on("headline", () => setText(headline, controls.headline));
+  on("verdict", () => {
+    const [state, , ...texts] = controls.verdict;
+    $("verdict").className = state ?? "";
+    [action, facts].forEach((element, i) => setText(element, texts[i] ?? ""));
   });
   on("available", () => { for (const [id, is] of Object.entries(controls.available)) if ($(id)) $(id).disabled = !is; });
 
