@@ -337,16 +337,15 @@ def test_late_positions_give_no_residuals():
         clock.now_s += 0.1
         scene.add_pose("tag_7", Pose(4.0 + step / 10, 3.0, 0.0, stamp_s=clock.now_s + 897.0, sd_m=0.1))
         scene.add_sample((1, 7), Sample(clock.now_s + 900.0, 9.0, 9.0, 0.1, Status.OK))
-    assert np.isnan([sample.residual_m for sample in list(scene.pairs[1, 7].samples)[-18:]]).all()
+    assert np.isnan(scene.pairs[1, 7].columns.residual_m[-18:]).all()
     assert {row[0] for row in controls(scene).health} == {health.GOOD}
 
 
 def test_history_of_the_selected_anchor_and_errors_with_standard_deviations():
     scene, _ = driven({1: 0.6})
-    scene.pairs[1, 7].samples[-1].gap_db = 9.0
-    for sample in scene.pairs[1, 7].samples:
-        sample.true_m = 5.0
-        scene.count_error(sample)
+    scene.pairs[1, 7].columns.gap_db[-1] = 9.0
+    for stamp_s in scene.pairs[1, 7].columns.stamp_s:
+        scene.set_truth((1, 7), stamp_s, 5.0)
     column = shown(scene).column
     assert column("history", "residual") == pytest.approx(0.6)
     assert (column("history", "rate")[-1], column("history", "NLOS")[-1]) == pytest.approx((10.0, 100.0))

@@ -24,7 +24,6 @@ from uwb_mitigation.viewer.palette import BLUE, GREEN, GREY, NIGHT, PAPER, VERMI
 from uwb_mitigation.viewer.scene import (
     ERROR_EDGES_M,
     Scene,
-    count_errors,
     finite_or_zero,
     plain_tag_id,
     tag_label,
@@ -159,20 +158,20 @@ class Strip(Chart):
         self.plot.scatter("age", "corrected", source=self._bad, size=8, **status_marks())
 
     def draw(self, scene: Scene) -> None:
-        page, now_s = self.page, self.page.now_s()
+        page, now_s = self.page, scene.now_s(self.page.tag_id)
         # Also draw a pair without new data, because its ranges age.
-        if not page.changed("strip", (page.selected, now_s, scene.ranges, page.view.timeline is None)):
+        if not page.changed("strip", (page.selected, now_s, scene.ranges)):
             return
-        ranges = page.ranges(now_s - HISTORY_S, now_s)
-        columns = ranges.time_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, ranges.status
-        table = np.column_stack(columns)[ranges.time_s >= now_s - HISTORY_S]
+        ranges = page.history.columns
+        columns = ranges.stamp_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, ranges.status
+        table = np.column_stack(columns)[ranges.stamp_s >= now_s - HISTORY_S]
         table[:, 1:][~(np.abs(table[:, 1:]) < MAX_RANGE_M)] = np.nan
         faults = table[np.isin(table[:, 4], FAULTS)][:, [0, 2, 4]]
         rows = [(age_s, range_m, Status(int(status)).name) for age_s, range_m, status in faults]
         set_rows(self._bad, rows)
         message = ""
         if not np.isfinite(table[:, 1]).any():
-            interval = f" in the last {HISTORY_S:.0f} s" if page.history.samples else " yet"
+            interval = f" in the last {HISTORY_S:.0f} s" if len(page.history.rows) else " yet"
             message = f"No range of this pair{interval}."
         self.fill(thinned(table[:, :4], page.history.max_gap_s), message)
 
@@ -196,10 +195,11 @@ class Quality(Chart):
 
     def draw(self, scene: Scene) -> None:
         page = self.page
-        now_s = finite_or_zero(scene.now_s(page.tag_id)) if page.view.player is None else 0.0
+        now_s = scene.clock() if page.view.player is None else 0.0
         # All of it moves every second.
         if page.changed("history", (page.selected, math.floor(now_s), page.view.complete is None)):
-            table = page.ranges().quality() - (now_s, 0.0, 0.0, 0.0)
+            history = page.view.whole.pairs.get(page.selected or (-1, -1)) or page.history
+            table = history.quality() - (now_s, 0.0, 0.0, 0.0)
             message = "" if np.isfinite(table[:, 1]).any() else "No residuals of this pair yet."
             self.fill(thinned(table, page.history.max_gap_s), message)
 
@@ -246,11 +246,11 @@ class LastCir(Chart):
 
     def draw(self, scene: Scene) -> None:
         page = self.page
-        trace = page.history.traces[-1] if page.history.traces else None
+        trace, player = page.trace, page.view.player
         message = ""
         if trace is None:
             message = "No CIRs: the source sends none, or no raw ranges are received."
-            if any(other.traces for other in scene.pairs.values()):
+            if any(other.trace for other in scene.pairs.values()) or (player and player.timeline.cirs_ns):
                 message = "No CIR of this pair yet."
         # Compare the trace instead of its stamp, because stamps may be equal.
         if not page.changed("cir", (page.selected, trace, message)):
@@ -291,10 +291,9 @@ class RangeErrors(Chart):
         )  # fmt: skip
 
     def draw(self, scene: Scene) -> None:
-        timeline = self.page.view.timeline
-        if not self.page.changed("errors", scene.errors if timeline is None else -1):
+        if not self.page.changed("errors", scene.errors):
             return
-        counts = scene.error_counts if timeline is None else count_errors(timeline.range_errors)
+        counts = scene.error_counts
         shares = 100.0 * np.cumsum(counts, axis=1) / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         table = np.stack([ERROR_EDGES_M[1:], ERROR_EDGES_M[:-1], *counts, *shares], axis=1)
         self.fill(table, "" if counts.any() else "No true ranges.")
@@ -380,7 +379,11 @@ class Map:
         self._draw_tracks(scene)
         self._draw_rays(scene)
         self.draw_accuracy(scene)
-        fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
+        fitted = (
+            self._page.view.complete is not None,
+            bool(scene.anchors),
+            bool(scene.anchors or scene.tracks),
+        )
         if fitted > self._fitted or not self._extent.data["x"]:
             self._fitted = fitted
             self.fit(scene)
@@ -426,17 +429,17 @@ class Map:
         colours = palette.tag_colours(scene.tags)
         for kind, source in self._tracks.items():
             tracks = {
-                name: view for (name, of), view in scene.tracks.items() if of is kind and len(view.points)
+                name: view for (name, of), view in scene.tracks.items() if of is kind and len(view.rows)
             }
             state = [
-                (name, len(view.points), view.points[-1][0], math.floor(scene.age_s(view)), colours.get(name))
+                (name, len(view.rows), view.received_s, math.floor(scene.age_s(view)), colours.get(name))
                 for name, view in tracks.items()
             ]
             if self._page.changed(kind.value, state):
                 colour = palette.TRACK_COLOURS[kind] or NIGHT
                 is_own = kind is TrackKind.CORRECTED
                 set_rows(source, [
-                    (*self._trail(view.columns(), scene.age_s(view)).T, colours.get(name, BLUE) if is_own else colour)
+                    (*self._trail(view.rows, scene.age_s(view)).T, colours.get(name, BLUE) if is_own else colour)
                     for name, view in tracks.items()
                 ])  # fmt: skip
 
@@ -476,9 +479,8 @@ class Map:
         """Fit the view of the map to its current content."""
         places = [anchor.position[:2] for anchor in scene.anchors.values()]
         places += [(pose.x, pose.y) for pose in scene.tags.values()]
-        timeline, live = self._page.view.complete, (view.columns() for view in scene.tracks.values())
-        for track in live if timeline is None else timeline.tracks.values():
-            places += np.percentile(track[:, 1:3], (2, 98), axis=0).tolist() if len(track) else []
+        for track in list(self._page.view.whole.tracks.values()):
+            places += np.percentile(track.rows[:, 1:3], (2, 98), axis=0).tolist() if len(track.rows) else []
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # A margin for ellipses and labels; without anchors, one in which the tag can move.

@@ -14,7 +14,7 @@ from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Track, TruePath
 from uwb_mitigation.viewer.histories import HISTORY_S, Pair
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, Counts, tag_label, tag_name
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, Counts, Scene, tag_label, tag_name
 from uwb_mitigation.viewer.state import View
 
 if TYPE_CHECKING:
@@ -33,21 +33,16 @@ def cards(view: View, tag_id: int | None) -> list[Card]:
     positions, timeline, scene = positions_of(view, tag_id), view.timeline, view.scene
     if timeline is not None:
         raw_name = "raw + same filter" if timeline.estimates else "raw + locator with default settings"
-        counts, errors_m = timeline.counts, timeline.range_errors
-        return positions.cards(-math.inf, WHOLE, raw_name, counts) + _range_cards(counts, errors_m, WHOLE)
+        return positions.cards(-math.inf, WHOLE, raw_name, scene.counts) + _range_cards(scene, WHOLE)
     if view.player is not None:
         return [["Reading the recording ...", "", ""]]
-    begin_s = -math.inf
-    if track := scene.tracks.get((positions.name, TrackKind.CORRECTED)):
-        begin_s = track.points[-1][0] + scene.age_s(track) - HISTORY_S
-    errors_m = scene.error_sums_m[:, None] / (scene.errors or math.nan)
-    recent = positions.cards(begin_s, RECENT, "raw + locator", scene.counts)
-    return recent + _range_cards(scene.counts, errors_m, LIVE)
+    recent = positions.cards(scene.clock() - HISTORY_S, RECENT, "raw + locator", scene.counts)
+    return recent + _range_cards(scene, LIVE)
 
 
-def _range_cards(counts: Counts, errors_m: NDArray[np.float64], window: str) -> list[Card]:
-    """Return the figures of ranges; `errors_m`: raw and corrected, or their mean absolute error, float64 (2, n)."""
-    corrected, count, faults = counts
+def _range_cards(scene: Scene, window: str) -> list[Card]:
+    """Return the figures of ranges."""
+    corrected, count, faults = scene.counts
     if not count:
         return []
     percentage = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
@@ -57,25 +52,24 @@ def _range_cards(counts: Counts, errors_m: NDArray[np.float64], window: str) -> 
         percentage,
         text + (f"; {faults} need attention" if faults else ""),
     ]
-    raw, mean = (_metres(np.abs(errors)) for errors in errors_m)
-    return [share] if mean == "-" else [share, [f"Mean absolute range error, {window}", mean, f"raw: {raw}"]]
+    if not scene.errors:
+        return [share]
+    raw, mean = map(_metres, scene.error_sums_m / scene.errors)
+    return [share, [f"Mean absolute range error, {window}", mean, f"raw: {raw}"]]
 
 
 def positions_of(view: View, tag_id: int | None) -> Positions:
     """Return the positions of a tag: from topics, or of a recording whose index is complete."""
-    if (timeline := view.complete) is not None:
-        return Positions(timeline.tracks, tag_id, timeline.rows, timeline.estimates)
-    tracks = view.scene.tracks.items() if view.player is None else ()
-    return Positions(
-        {key: track.columns() for key, track in tracks if len(track.points)}, tag_id, view.scene.pairs
-    )
+    is_ready = view.player is None or view.complete is not None
+    tracks = {key: track.rows for key, track in view.whole.tracks.items()} if is_ready else {}
+    return Positions(tracks, tag_id, view.whole.pairs, view.complete.estimates if view.complete else {})
 
 
 class Positions:
     """The positions of one tag.
 
     Args:
-        tracks: {(name, kind): time (s), x, y, z and standard deviation (m), float64 (n, 5)}.
+        tracks: {(name, kind): see `Scene.tracks`}.
         tag_id: the tag; None: the first one.
         pairs: all pairs with ranges.
         estimates: {name: tracks that the viewer itself has estimated}.
@@ -162,9 +156,9 @@ class Positions:
 
 
 def _track(columns: NDArray[np.float64]) -> Track:
-    """Return time (s), x, y, z, ..., float64 (n, 4 or more), as a track without covariances."""
+    """Return rows of `Scene.tracks` as a track without covariances."""
     n = len(columns)
-    stamp_ns = np.rint(columns[:, 0] * NS_PER_S).astype(np.int64)
+    stamp_ns = np.rint(columns[:, 5] * NS_PER_S).astype(np.int64)
     return Track(stamp_ns, columns[:, 1:4], np.zeros((n, 3)), np.full((n, 6, 6), np.nan))
 
 

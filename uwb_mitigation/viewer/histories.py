@@ -263,7 +263,9 @@ class History(Rows):
         columns = self.columns
         residual_m = np.where(np.abs(columns.residual_m) < MAX_RANGE_M, columns.residual_m, np.nan)
         is_nlos = np.where(np.isfinite(columns.gap_db), columns.gap_db >= LINE_OF_SIGHT_DB, np.nan)
-        latest = pd.DataFrame({"interval": columns.interval_s, "nlos": is_nlos}).rolling(RATE_RANGES, min_periods=1)
+        latest = pd.DataFrame({"interval": columns.interval_s, "nlos": is_nlos}).rolling(
+            RATE_RANGES, min_periods=1
+        )
         interval_s, nlos = latest.mean().to_numpy().T
         return np.column_stack([columns.received_s, residual_m, 1.0 / interval_s, 100.0 * nlos])
 

@@ -24,7 +24,14 @@ from uwb_mitigation.recordings.bag.anchor_markers import parse_markers
 from uwb_mitigation.types.ros.topics import ANCHORS
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.histories import Pair, Trace
-from uwb_mitigation.viewer.recording import POSITIONS, RANGES, Recording, Timeline, estimate_tracks, read_recording
+from uwb_mitigation.viewer.recording import (
+    POSITIONS,
+    RANGES,
+    Recording,
+    Timeline,
+    estimate_tracks,
+    read_recording,
+)
 from uwb_mitigation.viewer.scene import MissingData, Scene
 
 MAX_STEP_S = 1.0
@@ -73,7 +80,7 @@ class BagPlayer:
         if not recording.contents & POSITIONS:
             needs = "they need anchors, and --height if all anchors have one height"
             self.missing.positions = f"No tag positions: {needs}."
-        self._advanced_s = time.monotonic()
+        self._advanced_s, self._drawn_s = time.monotonic(), math.nan
         self._read_trace = lru_cache(16)(recording.read_trace)
         self.scene.clock = lambda: self.shown_s
         self.scene.stamp_clock = lambda: self.shown_s + recording.start_ns / NS_PER_S
@@ -115,6 +122,7 @@ class BagPlayer:
             if config is not None:
                 estimate_tracks(recording, timeline, table, config, stamp_offset_s, estimated)
             timeline.is_complete = True
+            self._show()
             if check is not None and config is not None and timeline.estimates:
                 if timeline.scene.ranges <= MAX_CHECKED:
                     timeline.displaced = check(list(timeline.estimates.values()), config)
@@ -159,7 +167,8 @@ class BagPlayer:
         if self.playing and not self.is_behind:
             self.position_s = min(self.position_s + self.speed * passed_s, self.seconds)
             self.playing = self.position_s < self.seconds
-        self._show()
+        if self.shown_s != self._drawn_s:
+            self._show()
 
     def read_trace(self, pair: Pair) -> Trace | None:
         """Return the last CIR of a pair up to the position; None: it has none."""
@@ -168,5 +177,6 @@ class BagPlayer:
         return self._read_trace(pair, times_ns[count - 1]) if count else None
 
     def _show(self) -> None:
+        self._drawn_s = self.shown_s
         with self.timeline.scene.lock, self.scene.lock:
-            self.scene.show(self.timeline.scene, self.shown_s)
+            self.scene.show(self.timeline.scene, self._drawn_s)

@@ -36,7 +36,15 @@ from uwb_mitigation.viewer.feed import DECODERS, SceneUpdater
 from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, Pair, Trace
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, POSITION, NodeStatus, Scene, tag_label, tag_name
+from uwb_mitigation.viewer.scene import (
+    DEFAULT_TAG,
+    MAX_TAGS,
+    POSITION,
+    NodeStatus,
+    Scene,
+    tag_label,
+    tag_name,
+)
 
 BATCH = 64
 """Number of messages that are read ahead to correct their ranges in one call."""
@@ -246,7 +254,8 @@ def estimate_tracks(
 
     Args:
         recording: the bag.
-        timeline, table: what `read_recording` has read.
+        timeline: what `read_recording` has read.
+        table: its result.
         config: of the estimators.
         stamp_offset_s: added to the stamps of the ranges.
         estimated: tracks with `config` that are known already.
@@ -327,8 +336,8 @@ def _add_largest_error(scene: Scene) -> None:
         columns = history.columns
         change_m = np.abs(columns.corrected_m - (columns.true_m if scene.errors else columns.raw_m))
         row = int(np.where(change_m < MAX_RANGE_M, change_m, -1.0).argmax())
-        largest = max(largest, (float(change_m[row]), float(columns.received_s[row]), pair))
-    change_m, time_s, (anchor_id, tag_id) = largest
-    if change_m > 0.0:
-        text = f"largest {name} of a range, {change_m:.2f} m: anchor {format_id(anchor_id)}, tag {format_id(tag_id)}"
-        scene.incidents.found.append((time_s, text))
+        largest = max(largest, (float(change_m[row]), -float(columns.received_s[row]), pair))
+    largest_m, time_s, (anchor_id, tag_id) = largest
+    if largest_m > 0.0:
+        text = f"largest {name} of a range, {largest_m:.2f} m: anchor {format_id(anchor_id)}, tag {format_id(tag_id)}"
+        scene.incidents.found.append((-time_s, text))

@@ -141,7 +141,7 @@ class Scene:
         dropped: number of ranges that the viewer could not read in time.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
-        tracks: {(name, kind): positions}.
+        tracks: {(name, kind): positions, with the columns of `POSITION`}.
         reports: (time of reception, name, diagnostics) of a recording.
         latest_stamps: {tag: (its latest stamp, time of its reception)}.
         revision: increases with every change, so that a page draws only changes.
@@ -177,7 +177,11 @@ class Scene:
 
     def now_s(self, tag_id: int | None = None) -> float:
         """Return the latest stamp of a tag (None: of the latest range) plus the time since then; NaN before any."""
-        entry = next(reversed(self.latest_stamps.values()), None) if tag_id is None else self.latest_stamps.get(tag_id)
+        entry = (
+            next(reversed(self.latest_stamps.values()), None)
+            if tag_id is None
+            else self.latest_stamps.get(tag_id)
+        )
         latest_s, received_s = entry or (math.nan, math.nan)
         return latest_s + max(self.clock() - received_s, 0.0)
 
@@ -281,7 +285,11 @@ class Scene:
         if not self.is_whole and stamp_s < latest[5] - 1.0:
             track.clear()
         step_s, step_m = stamp_s - latest[5], math.dist(latest[1:3], (x, y))
-        if self.is_whole or step_s < -1.0 or (step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S)):
+        if (
+            self.is_whole
+            or step_s < -1.0
+            or (step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S))
+        ):
             limit = None if self.is_whole else MAX_TRACK
             track.append((self.clock(), x, y, z, sd_m, stamp_s, *shape), limit)
 
@@ -291,14 +299,19 @@ class Scene:
         self.revision += 1
 
     def show(self, whole: Scene, now_s: float) -> None:
-        """Show the minute before a time of a recording, and its tracks until then."""
+        """Show the minute before a time of a recording, and its tracks until then; counts are those of all its ranges."""
         self.clear()
+        self.ranges, self.corrected, self.faults = whole.ranges, whole.corrected, whole.faults
+        self.error_counts, self.error_sums_m, self.errors = (
+            whole.error_counts,
+            whole.error_sums_m,
+            whole.errors,
+        )
         histories = {pair: history.until(now_s, now_s - HISTORY_S) for pair, history in whole.pairs.items()}
         for pair, history in sorted(histories.items(), key=lambda item: item[1].received_s):
             if (latest := history.latest) is not None:
                 self.pairs.add(pair, history)
                 self.latest_stamps.add(pair[1], (latest.stamp_s, history.received_s))
-                self.ranges += len(history.rows)
                 self.received_s = history.received_s
         for (name, kind), track in whole.tracks.items():
             rows = track.until(now_s).rows
@@ -307,7 +320,10 @@ class Scene:
             if len(rows) and kind is TrackKind.CORRECTED:
                 received_s, x, y, z, sd_m, stamp_s, *ellipse, heading_rad = rows[-1].tolist()
                 self.tags.add(name, Pose(x, y, z, tuple(ellipse), heading_rad, stamp_s, sd_m, received_s))
-        begin, end = (bisect_right(whole.reports, time_s, key=itemgetter(0)) for time_s in (now_s - HISTORY_S, now_s + 1e-6))
+        begin, end = (
+            bisect_right(whole.reports, time_s, key=itemgetter(0))
+            for time_s in (now_s - HISTORY_S, now_s + 1e-6)
+        )
         for _, name, report in islice(whole.reports, begin, end):
             self.set_node_status(name, report)
 

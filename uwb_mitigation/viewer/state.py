@@ -11,7 +11,7 @@ from bokeh.core.properties import Any as AnyValue
 from bokeh.model import DataModel
 from bokeh.models import ColumnDataSource
 
-from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair, RangeColumns
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair, Trace
 from uwb_mitigation.viewer.scene import MissingData, Scene
 
 if TYPE_CHECKING:
@@ -44,13 +44,18 @@ class View:
 
     @property
     def timeline(self) -> Timeline | None:
-        """The index of the recording; None: live, or not ready."""
-        return None if self.player is None else self.player.timeline
+        """The content of the recording; None: live, or not read completely."""
+        return self.player.timeline if self.player is not None and self.player.timeline.is_read else None
 
     @property
     def complete(self) -> Timeline | None:
-        """The index of the recording with its tracks; None: live, or not ready."""
+        """The content of the recording with its tracks; None: live, or not ready."""
         return self.timeline if self.timeline is not None and self.timeline.is_complete else None
+
+    @property
+    def whole(self) -> Scene:
+        """All data: of the recording as soon as it has been read, else those of the scene."""
+        return self.scene if self.timeline is None else self.timeline.scene
 
 
 class Controls(DataModel):  # type: ignore[misc]
@@ -115,18 +120,11 @@ class PageState:
         """The last minute of the selected pair; empty without one."""
         return self.view.scene.pairs.get(self.selected or (-1, -1)) or History()
 
-    def now_s(self) -> float:
-        """Return the current time of `ranges`."""
+    @property
+    def trace(self) -> Trace | None:
+        """The last CIR of the selected pair."""
         player = self.view.player
-        is_indexed = player is not None and player.timeline is not None
-        return player.shown_s if player and is_indexed else self.view.scene.now_s(self.tag_id)
-
-    def ranges(self, begin_s: float = -math.inf, end_s: float = math.inf) -> RangeColumns:
-        """Return the ranges of the selected pair: in an interval of an indexed recording, else those of the scene."""
-        timeline = self.view.timeline
-        if timeline is None:
-            return self.history.columns()
-        return timeline.ranges(self.selected or (-1, -1), begin_s, end_s)
+        return player.read_trace(self.selected) if player and self.selected else self.history.trace
 
     def changed(self, name: str, value: object) -> bool:
         """Return whether a value differs from that of the last call."""

@@ -15,12 +15,10 @@ from uwb_mitigation.viewer.headline import Card, cards
 from uwb_mitigation.viewer.health import HeldVerdict, Means, Verdict
 from uwb_mitigation.viewer.histories import (
     HISTORY_S,
-    MAX_CIRS,
     NO_DATA_S,
     RATE_RANGES,
     STATISTICS,
     Pair,
-    residual_means,
 )
 from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
 from uwb_mitigation.viewer.state import PageState, new_source, set_rows
@@ -28,7 +26,7 @@ from uwb_mitigation.viewer.state import PageState, new_source, set_rows
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
 
-_RANGES, _CIRS = f"last {STATISTICS} ranges", f"last {MAX_CIRS} CIRs"
+_RANGES = f"last {STATISTICS} ranges"
 
 COLUMNS = {
     "state": ("state", "", health.STATES),
@@ -39,10 +37,10 @@ COLUMNS = {
     "correction": ("correction, m", _RANGES, "mean of raw minus corrected range"),
     "residual": ("residual, m", _RANGES, "mean of corrected range minus distance to the estimated position"),
     "not_ok": ("not OK, %", _RANGES, "share of ranges whose status is not OK"),
-    "nlos": ("NLOS, %", _CIRS, "share of CIRs without line of sight: first path 6 dB below the total"),
-    "rx": ("RX, dBm", _CIRS, "mean receive level"),
+    "nlos": ("NLOS, %", _RANGES, "share of CIRs without line of sight: first path 6 dB below the total"),
+    "rx": ("RX, dBm", _RANGES, "mean receive level"),
     "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
-    "lost": ("lost, %", "all; in a recording: since the minute before", "share of missing sequence numbers"),
+    "lost": ("lost, %", f"last {HISTORY_S:.0f} s", "share of missing sequence numbers"),
 }
 """Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
@@ -107,7 +105,7 @@ class Texts:
 
     def _pairs(self, scene: Scene) -> dict[Pair, Means]:
         """Write the table of pairs; return their means."""
-        timeline, now_s = self._view.timeline, self._page.now_s()
+        timeline = self._view.timeline
         rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(history)
@@ -116,11 +114,9 @@ class Texts:
                 "stopped": age_s if missing else 0.0,
                 "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], 0.0),
             }
-            if timeline is not None:
-                residuals_m = timeline.ranges(pair, now_s - HISTORY_S, now_s).residual_m
+            if timeline is not None and timeline.displaced and pair[0] not in timeline.displaced:
                 # A displaced anchor bends the track with which the others are compared.
-                is_judged = not timeline.displaced or pair[0] in timeline.displaced
-                means |= residual_means(residuals_m[-STATISTICS:].tolist() if is_judged else [])
+                means |= {"residual": math.nan, "evidence": 0.0}
             pairs[pair] = means
             status, ids = missing or sample.status.name, map(format_id, pair)
             measured = sample.raw_m, sample.range_m, sample.sigma_m
@@ -146,7 +142,7 @@ class Texts:
         states_of_tag = {key: states[key] for key in of_tag}
         verdict = health.verdict(scene, tag_id, of_tag, states_of_tag, next(remedies, ""))
         is_read = self._view.player is None or self._view.complete is not None
-        if verdict.state == health.UNDETERMINED and not is_read:
+        if verdict.state in (health.UNDETERMINED, health.WAITING) and not is_read:
             verdict = Verdict(health.WAITING, "the recording is being read")
         return self._verdicts[tag_id].update(verdict, scene.clock())
 
@@ -156,7 +152,7 @@ class Texts:
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
         if scene.ranges:
-            corrected, count, faults = (self._view.timeline or scene).counts
+            corrected, count, faults = scene.counts
             not_corrected = "no range corrected" + ("" if faults else ": no CIRs")
             texts.append(
                 f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else not_corrected
@@ -190,7 +186,7 @@ class Texts:
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
         if self._view.player is not None:
-            return [] if self._view.timeline is None else list(self._view.timeline.incidents)
+            return [] if self._view.timeline is None else sorted(self._view.whole.incidents.found)
         scene.incidents.check(now_s := scene.clock())
         latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
         return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]
