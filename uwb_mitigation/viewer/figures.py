@@ -11,6 +11,7 @@ from bokeh import models
 from bokeh.models import BooleanFilter, CDSView, ColumnDataSource, DataRange1d, Range1d
 from bokeh.palettes import cividis
 from bokeh.plotting import figure
+from bokeh.plotting.contour import contour_data
 from bokeh.transform import factor_cmap, factor_mark
 from numpy.typing import NDArray
 
@@ -304,17 +305,18 @@ class Map:
 
     Attributes:
         plot: the figure.
-        coverage: the predicted accuracy and its legend, which are shown on request.
+        shows_accuracy: whether it shows the predicted accuracy.
     """
 
     def __init__(self, page: PageState) -> None:
+        self.shows_accuracy = False
         self._page, self._fitted = page, (False, False, False)
         # Glyphs with NaN are not drawn: without a heading, for example.
         self._anchors = new_source("x", "y", "name", "id", "health", "label", "ring")
         self._tags = new_source("x", "y", "name", "colour", "top", "width", "height", "angle", "heading")
         self._tracks = {kind: new_source("xs", "ys", "colour") for kind in STROKES}
         self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
-        self._accuracy = new_source("image", "x", "y", "dw", "dh")
+        self._accuracy = new_source("xs", "ys", "colour", "step")
         # The map shows these corners until the user changes the view; it must not follow the data.
         self._extent = new_source("x", "y")
         self.plot = plot = new_figure(
@@ -324,16 +326,6 @@ class Map:
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self._extent, size=0, alpha=0)
         plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
-        clear, count = "#00000000", len(health.STEPS_M)
-        colours = models.LinearColorMapper(cividis(count), low=-0.5, high=count - 0.5, nan_color=clear)
-        labels = {step: f"\u2264 {limit_m:g}" for step, limit_m in enumerate(health.STEPS_M)}
-        bar = models.ColorBar(
-            color_mapper=colours, width=10, padding=4, title="predicted sd, m", visible=False,
-            ticker=models.FixedTicker(ticks=list(labels)), major_label_overrides=labels,
-        )  # fmt: skip
-        plot.add_layout(bar, "right")
-        image = plot.image("image", source=self._accuracy, color_mapper=colours, alpha=0.6, visible=False)
-        self.coverage = image, bar
         for glyph, source, style in self._layers():
             getattr(plot, glyph)(source=source, **style)
         named = [r for r in plot.renderers if isinstance(r.glyph, models.Text)]
@@ -349,6 +341,9 @@ class Map:
             "background_fill_color": PAPER, "background_fill_alpha": 0.8,
         }  # fmt: skip
         return [
+            ("multi_polygons", self._accuracy, {
+                "fill_color": "colour", "fill_alpha": 0.6, "line_color": None, "legend_field": "step",
+            }),
             ("segment", self._rays, {"line_color": marks["color"], "line_alpha": 0.8}),
             *(("multi_line", source, stroke(kind) | {"line_color": "colour"}) for kind, source in self._tracks.items()),
             ("ellipse", self._tags, {
@@ -378,12 +373,9 @@ class Map:
         self._draw_tags(scene)
         self._draw_tracks(scene)
         self._draw_rays(scene)
-        self.draw_accuracy(scene)
-        fitted = (
-            self._page.view.complete is not None,
-            bool(scene.anchors),
-            bool(scene.anchors or scene.tracks),
-        )
+        self._draw_accuracy(scene)
+        is_complete = self._page.view.complete is not None
+        fitted = is_complete, bool(scene.anchors), bool(scene.anchors or scene.tracks)
         if fitted > self._fitted or not self._extent.data["x"]:
             self._fitted = fitted
             self.fit(scene)
@@ -460,20 +452,23 @@ class Map:
                 rows.append((*middle, x, y, pose.x, pose.y, sample.status.name))
         set_rows(self._rays, rows)
 
-    def draw_accuracy(self, scene: Scene) -> None:
-        """Draw the map of the predicted accuracy if it is visible."""
-        if not self.coverage[0].visible or len(scene.anchors) < 2:
+    def _draw_accuracy(self, scene: Scene) -> None:
+        """Draw areas of the predicted accuracy if they are shown."""
+        inputs, rows = None, list[tuple[Any, ...]]()
+        if self.shows_accuracy and len(scene.anchors) > 1:
+            anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
+            height_m = next((finite_or_zero(pose.z) for pose in scene.tags.values()), 0.0)
+            sds_m = [sample.sigma_m for _, _, sample in scene.latest() if sample.sigma_m > 0.0]
+            inputs = anchors.tobytes(), round(height_m, 1), round(float(np.median(sds_m or [RANGE_SD_M])), 2)
+        if not self._page.changed("accuracy", inputs):
             return
-        pose = next(iter(scene.tags.values()), None)
-        anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
-        height_m = finite_or_zero(pose.z) if pose else 0.0
-        sds_m = [sample.sigma_m for _, _, sample in scene.latest() if sample.sigma_m > 0.0]
-        sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
-        if self._page.changed("accuracy", (anchors.tobytes(), round(height_m, 1), sd_m)):
-            image, low, size = health.predicted_accuracy(anchors, height_m, sd_m)
-            steps = np.searchsorted(health.STEPS_M, image).astype(np.float32)
-            steps[~(image <= health.STEPS_M[-1])] = np.nan
-            set_rows(self._accuracy, [(steps, *low, *size)])
+        if inputs is not None:
+            image = health.predicted_accuracy(anchors, height_m, inputs[-1])
+            areas = contour_data(*image, [0.0, *health.STEPS_M], want_line=False).fill_data
+            for xs, ys, limit_m in zip(areas.xs, areas.ys, areas.upper_levels, strict=True):
+                colour = cividis(len(health.STEPS_M))[health.STEPS_M.index(limit_m)]
+                rows.append((xs, ys, colour, f"sd \u2264 {limit_m:g} m"))
+        set_rows(self._accuracy, rows)
 
     def fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""

@@ -52,7 +52,7 @@ HOLD_S = 2.0
 RADIUS95 = math.sqrt(5.991 / 2.0)
 """Radius of 95 % of a circular normal distribution, relative to the root of the sum of its variances in x and y."""
 CELLS = 40
-"""Width and height of the map of the predicted accuracy, cells."""
+"""Width and height of the map of the predicted accuracy, points."""
 STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
 """Upper limits of the colours of the map of the predicted accuracy; above the last one, it is not shown."""
 
@@ -252,7 +252,7 @@ class HeldVerdict:
 
 def predicted_accuracy(
     anchors: NDArray[np.float64], height_m: float, sd_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the horizontal standard deviation of positions at a known height if all anchors are received.
 
     It is HDOP times the standard deviation of the ranges.
@@ -263,10 +263,10 @@ def predicted_accuracy(
         sd_m: standard deviation of a range, m.
 
     Returns:
-        The values, m, float32 (CELLS, CELLS), infinite where undetermined; lower left corner and size, float64 (2,), m.
+        x and y of the points of a grid, float64 (CELLS,), m; the values, float64 (CELLS, CELLS), m, infinite where undetermined.
     """
     margin_m = 1.0 + 0.1 * np.ptp(anchors[:, :2], axis=0)
-    low, size = anchors[:, :2].min(axis=0) - margin_m, np.ptp(anchors[:, :2], axis=0) + 2.0 * margin_m
-    x, y = low[:, None] + (np.arange(CELLS) + 0.5) / CELLS * size[:, None]
+    low, high = anchors[:, :2].min(axis=0) - margin_m, anchors[:, :2].max(axis=0) + margin_m
+    x, y = np.linspace(low, high, CELLS).T
     image = [[dop(anchors, np.array([at_x, at_y, height_m]), level=True).hdop for at_x in x] for at_y in y]
-    return (sd_m * np.array(image)).astype(np.float32), low, size
+    return x, y, sd_m * np.array(image)

@@ -157,8 +157,7 @@ class Page:
         try:
             name, arguments = str(command[0]), list(command[1])
             if name == "accuracy":
-                for renderer in self._figures.map.coverage:
-                    renderer.visible = bool(arguments[0])
+                self._figures.map.shows_accuracy = bool(arguments[0])
             elif name == "select":
                 self.select((int(str(arguments[0]), 0), int(str(arguments[1]), 0)))
             elif self._player is not None:

@@ -119,8 +119,7 @@ function start(doc) {
       if (String(booleans) !== String(view.filter.booleans)) view.filter.setv({booleans}, {sync: false});
     }
   };
-  for (const {data_source} of names) data_source.properties.data.change.connect(placeNames);
-  // The view and the size of the map change without a common event.
+  // Data, view and size of the map change without a common event.
   setInterval(placeNames, 200);
   $("fit").addEventListener("click", fit);
   $("accuracy").addEventListener("change", (event) => send("accuracy", event.target.checked));
@@ -171,13 +170,6 @@ function start(doc) {
   if (position) {
     position.addEventListener("input", () => { held = true; $("time").textContent = `${Number(position.value).toFixed(1)} s`; });
     position.addEventListener("change", () => { held = false; send("seek", Number(position.value)); });
-    const steps = {ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1, PageDown: -10, PageUp: 10};
-    position.addEventListener("keydown", (event) => {
-      if (!steps[event.key]) return;
-      event.preventDefault();
-      position.value = Number(position.value) + steps[event.key];
-      send("seek", Number(position.value));
-    });
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
