@@ -57,7 +57,7 @@ def test_good_position_has_its_accuracy_age_and_share_of_corrected_ranges():
     state, reason, _, facts = controls(scene).verdict
     assert (state, reason) == ("good", "")
     assert facts.startswith(
-        "horizontal sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp \u00b7 100 % of ranges corrected"
+        "horizontal sd 0.10 m, 95 % within 0.17 m \u00b7 last range 1.0 s old by stamp \u00b7 ranges corrected: 100.0 % (120 of 120 ranges)"
     )
 
 
@@ -168,10 +168,14 @@ def test_radio_without_cirs_is_a_normal_state():
     page = shown(driven(status=Status.NO_CIR)[0])
     state, *_, facts = page.controls.verdict
     assert state == "good"
-    assert facts.endswith("no range corrected: no CIRs")
-    assert controls(driven(status=Status.BAD_CIR)[0]).verdict[3].endswith("no range corrected")
+    assert facts.endswith("ranges corrected: none (0 of 120 ranges: no CIRs)")
+    assert (
+        controls(driven(status=Status.BAD_CIR)[0])
+        .verdict[3]
+        .endswith("none (0 of 120 ranges; 120 need attention)")
+    )
     assert {row[0] for row in page.controls.health} == {health.GOOD}
-    assert page.cards()["Ranges corrected, since the start"] == ("none", "0 of 120 ranges corrected: no CIRs")
+    assert page.cards()["Ranges corrected, since the start"] == ("none", "0 of 120 ranges: no CIRs")
 
 
 @pytest.mark.parametrize("status", [Status.OK, Status.NO_CIR])

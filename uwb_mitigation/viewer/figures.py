@@ -19,7 +19,7 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import FAULTS, Status
 from uwb_mitigation.viewer import health, palette
-from uwb_mitigation.viewer.headline import positions_of
+from uwb_mitigation.viewer.headline import Positions
 from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, NO_DATA_S
 from uwb_mitigation.viewer.palette import BLUE, GREEN, GREY, NIGHT, PAPER, VERMILLION, TrackKind
 from uwb_mitigation.viewer.scene import (
@@ -31,11 +31,6 @@ from uwb_mitigation.viewer.scene import (
     with_gaps,
 )
 from uwb_mitigation.viewer.state import PageState, drawable, new_source, set_rows
-
-TRACE_BEFORE, TRACE_AFTER = 20, 180
-"""Number of samples shown before and after the first path."""
-MAX_POINTS = 1200
-"""Maximum number of displayed points of a line."""
 
 HEADINGS = {
     "map": "Map",
@@ -59,18 +54,17 @@ STROKES = {
 _COMPARED = TrackKind.RAW, TrackKind.CORRECTED
 _AGE = "time before now, s"
 
-HEIGHT = 380
-"""So that the map is on the first screen, pixels."""
-HEADING_M = 1.0
-"""Length of the line that shows the heading of a tag."""
-MAX_LABEL = 20
-"""Maximum number of characters of a name."""
-RING = 22.0
-"""Diameter of the ring around the selected anchor, pixels."""
-MARGIN_M = 5.0
-"""Margin around a tag on a map without anchors."""
-RANGE_SD_M = 0.1
-"""Standard deviation for the predicted accuracy if the ranges have none."""
+MAX_POINTS = 1200  # of a line
+TRACE_BEFORE, TRACE_AFTER = 20, 180  # samples before and after the first path
+HEIGHT = 380  # of the map, pixels, so that it is on the first screen
+HEADING_M = 1.0  # length of the line that shows the heading of a tag
+MAX_LABEL = 20  # characters of a name on the map
+RING = 22.0  # diameter of the ring around the selected anchor, pixels
+MARGIN_M = 5.0  # around a tag on a map without anchors
+RANGE_SD_M = 0.1  # for the predicted accuracy if ranges have no standard deviation
+
+Lines = Mapping[str, Mapping[str, Any]]
+"""Styles of the lines of a figure, {column: style}."""
 
 _OPTIONAL = {"95 % ellipse": "width", "heading": "heading", "selected anchor": "ring"}
 """Layers of the map, and their columns that are NaN where they have nothing to show."""
@@ -106,24 +100,13 @@ class Chart:
 
     Args:
         page: state of its page.
-        name: see `HEADINGS`.
-        x, y: titles of the axes.
+        plot: the figure.
         source: its data; the first column is that of the horizontal axis.
-        lines: {column: style of its line}.
-        options: of `figure`.
+        lines: its lines.
     """
 
-    def __init__(
-        self,
-        page: PageState,
-        name: str,
-        x: str,
-        y: str,
-        source: ColumnDataSource,
-        lines: Mapping[str, Mapping[str, Any]] = {},
-        **options: Any,
-    ) -> None:
-        self.page, self.source, self.plot = page, source, new_figure(name, 230, x, y, **options)
+    def __init__(self, page: PageState, plot: figure, source: ColumnDataSource, lines: Lines) -> None:
+        self.page, self.plot, self.source = page, plot, source
         self._corners = self.plot.scatter([0.0, 10.0], [0.0, 10.0], size=0, alpha=0)
         for axis in (self.plot.x_range, self.plot.y_range):
             if isinstance(axis, DataRange1d):
@@ -137,9 +120,7 @@ class Chart:
         """Draw what has changed."""
         raise NotImplementedError
 
-    def fill(
-        self, table: NDArray[np.float64], message: str = "", source: ColumnDataSource | None = None
-    ) -> None:
+    def fill(self, table: NDArray[np.float64], message: str, source: ColumnDataSource | None = None) -> None:
         """Set the columns of a source; a message, in place of missing data."""
         source = source or self.source
         # Before the data go: an axis needs data or corners at any moment.
@@ -155,7 +136,8 @@ class Strip(Chart):
     def __init__(self, page: PageState) -> None:
         lines = {kind.name.lower(): stroke(kind) for kind in (*_COMPARED, TrackKind.TRUE)}
         source, self._bad = new_source("age", *lines), new_source("age", "corrected", "status")
-        super().__init__(page, "strip", _AGE, "m", source, lines, x_range=Range1d(-HISTORY_S, 0))
+        plot = new_figure("strip", _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
+        super().__init__(page, plot, source, lines)
         self.plot.scatter("age", "corrected", source=self._bad, size=8, **status_marks())
 
     def draw(self, scene: Scene) -> None:
@@ -186,13 +168,11 @@ class Quality(Chart):
             name: {"line_color": colour, "line_dash": dash, "y_range_name": axis, "legend_label": name}
             for name, (colour, dash, axis) in zip(("residual", "rate", "NLOS"), looks, strict=True)
         }
-        options = _time_axis(page) | {"extra_y_ranges": {"share": Range1d(0, 100)}}
-        super().__init__(
-            page, "history", y="residual, m", source=new_source("age", *lines), lines=lines, **options
-        )
-        axis = models.LinearAxis(y_range_name="share", axis_label="rate, Hz; NLOS, %")
-        self.plot.add_layout(axis, "right")
-        self.plot.y_range.renderers = [r for r in self.plot.renderers if r.y_range_name == "default"]
+        plot = new_figure("history", y="residual, m", **_time_axis(page))
+        plot.extra_y_ranges = {"share": Range1d(0, 100)}
+        plot.add_layout(models.LinearAxis(y_range_name="share", axis_label="rate, Hz; NLOS, %"), "right")
+        super().__init__(page, plot, new_source("age", *lines), lines)
+        plot.y_range.renderers = [r for r in plot.renderers if r.y_range_name == "default"]
 
     def draw(self, scene: Scene) -> None:
         page = self.page
@@ -210,8 +190,8 @@ class PositionErrors(Chart):
 
     def __init__(self, page: PageState) -> None:
         source, self._raw = new_source("time", "error", "bound"), new_source("time", "raw")
-        lines = {"error": stroke(TrackKind.CORRECTED)}
-        super().__init__(page, "positions", y="m", source=source, lines=lines, **_time_axis(page))
+        plot = new_figure("positions", y="m", **_time_axis(page))
+        super().__init__(page, plot, source, {"error": stroke(TrackKind.CORRECTED)})
         band = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
         self.plot.varea("time", 0, "bound", source=source, **band)
         self.plot.line("time", "raw", source=self._raw, **stroke(TrackKind.RAW))
@@ -221,7 +201,7 @@ class PositionErrors(Chart):
         live_s = math.floor(scene.clock()) if is_live else -1
         if not page.changed("positions", (page.tag_id, page.view.complete is None, live_s)):
             return
-        positions = positions_of(page.view, page.tag_id)
+        positions = Positions(page.view, page.tag_id)
         table, raw = (positions.error_columns(kind) for kind in (TrackKind.CORRECTED, TrackKind.RAW))
         now_s = table[-1, 0] if is_live and len(table) else 0.0
         message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
@@ -233,11 +213,10 @@ class LastCir(Chart):
     """The last CIR of the selected pair, with first path, noise and the input of the network."""
 
     def __init__(self, page: PageState) -> None:
+        x_range = Range1d(-TRACE_BEFORE, TRACE_AFTER)
+        plot = new_figure("cir", "samples (1 ns) from the first path", "magnitude", x_range=x_range)
         line = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
-        super().__init__(
-            page, "cir", "samples (1 ns) from the first path", "magnitude", new_source("sample", "magnitude"),
-            {"magnitude": line}, x_range=Range1d(-TRACE_BEFORE, TRACE_AFTER),
-        )  # fmt: skip
+        super().__init__(page, plot, new_source("sample", "magnitude"), {"magnitude": line})
         self._marks = source = new_source("noise", "first", "from", "to")
         style = {"fill_color": GREEN, "fill_alpha": 0.15, "line_color": None, "legend_label": "network input"}
         self.plot.vstrip("from", "to", source=source, **style)
@@ -275,7 +254,7 @@ class RangeErrors(Chart):
         shares = {f"{kind.name.lower()}_share": stroke(kind) for kind in _COMPARED}
         source = new_source("right", "left", *(kind.name.lower() for kind in _COMPARED), *shares)
         y_range = DataRange1d(start=0.0, min_interval=1.0)
-        super().__init__(page, "errors", "range error, m", "ranges", source, y_range=y_range)
+        super().__init__(page, new_figure("errors", "range error, m", "ranges", y_range=y_range), source, {})
         low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
         self.plot.xaxis.ticker = models.FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
         self.plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
@@ -286,10 +265,9 @@ class RangeErrors(Chart):
                 hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
             )  # fmt: skip
         finish(self.plot, "left", "right", "raw", "corrected")
-        self.distribution = Chart(
-            page, "distribution", "range error, m", "share of ranges, %", source, shares,
-            x_range=Range1d(float(low), float(high)), y_range=Range1d(0, 100),
-        )  # fmt: skip
+        axes = {"x_range": Range1d(float(low), float(high)), "y_range": Range1d(0, 100)}
+        plot = new_figure("distribution", "range error, m", "share of ranges, %", **axes)
+        self.distribution = Chart(page, plot, source, shares)
 
     def draw(self, scene: Scene) -> None:
         if not self.page.changed("errors", scene.errors):
@@ -319,9 +297,7 @@ class Map:
         self._accuracy = new_source("xs", "ys", "colour", "step")
         # The map shows these corners until the user changes the view; it must not follow the data.
         self._extent = new_source("x", "y")
-        self.plot = plot = new_figure(
-            "map", HEIGHT, "x, m", "y, m", "pan,wheel_zoom,reset,save", match_aspect=True
-        )
+        self.plot = plot = new_figure("map", "x, m", "y, m", HEIGHT, match_aspect=True)
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self._extent, size=0, alpha=0)
@@ -484,10 +460,9 @@ class Map:
         self._extent.data = {name: [float(low[i]), float(high[i])] for i, name in enumerate("xy")}
 
 
-def new_figure(
-    name: str, height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset,save", **options: Any
-) -> figure:
-    """Return an empty figure with the style of the page."""
+def new_figure(name: str, x: str, y: str, height: int = 230, **options: Any) -> figure:
+    """Return an empty figure with the style of the page; `x`, `y`: titles of its axes."""
+    tools = "pan,wheel_zoom,reset,save" + ("" if options.get("match_aspect") else ",box_zoom")
     plot = figure(
         name=name, height=height, min_width=200, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, tools=tools,
         **options,

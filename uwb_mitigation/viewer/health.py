@@ -171,8 +171,8 @@ def verdict(
     Args:
         scene: its data.
         tag_id: the tag; None: no ranges yet.
-        anchors: means of each anchor.
-        states: their states.
+        anchors: means of each of its anchors.
+        states: states of all anchors.
         remedy: why the position is not unique, with the remedy; empty: it is, or unknown.
     """
     name = "" if tag_id is None else f"tag {format_id(tag_id)}"
@@ -195,7 +195,7 @@ def verdict(
     names = {anchor_id: place.name for anchor_id, place in scene.anchors.items()}
     common, texts = advice(anchors, names)
     # With a common cause, anchors that need attention are bad together.
-    bad = [anchor_id for anchor_id, state in states.items() if state == BAD or (common and state == CHECK)]
+    bad = [key for key in anchors if states[key] == BAD or (common and states[key] == CHECK)]
     received = sum(means["stopped"] == 0.0 for means in anchors.values())
     if not reason and bad:
         worst = max(bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "displaced", "residual")])
@@ -208,7 +208,7 @@ def verdict(
         reason, action = f"uncertain by {sd_m:.2f} m", "Add an anchor, or set height and area of the locator."
     if reason:
         return Verdict(DEGRADED, reason, _sentence(action), accuracy)
-    action = next((texts[key] for key, state in states.items() if state == CHECK), "")
+    action = next((texts[key] for key in anchors if states[key] == CHECK), "")
     return Verdict(POSITION_GOOD, "", action, accuracy)
 
 

@@ -67,7 +67,7 @@ def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Itera
     """
     names = list(next(iter(rows.values())))
     height = 90 + 20 * len(rows) * len(names)
-    plot = new_figure(name, height, axis, "", y_range=FactorRange(*reversed(names)))
+    plot = new_figure(name, axis, "", height, y_range=FactorRange(*reversed(names)))
     for number, (kind, boxes) in enumerate(rows.items()):
         columns = np.array([list(box) for box in boxes.values()]).reshape(-1, len(_BOX))
         # Of each row, the first kind is the upper one.

@@ -79,9 +79,12 @@ class Texts:
         page.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
+        of_tags: dict[int | None, dict[int, Means]] = {page.tag_id: {}}
+        for (anchor_id, of_tag), means in pairs.items():
+            of_tags.setdefault(of_tag, {})[anchor_id] = means
         verdicts = {
-            tag_id: self._verdict(scene, tag_id, pairs, states, notices)
-            for tag_id in {page.tag_id, *(tag_id for _, tag_id in pairs)}
+            tag_id: self._verdict(scene, tag_id, means_of, states, notices)
+            for tag_id, means_of in of_tags.items()
         }
         for tag_id in self._verdicts.keys() - verdicts.keys():
             del self._verdicts[tag_id]
@@ -122,7 +125,7 @@ class Texts:
             measured = sample.raw_m, sample.range_m, sample.sigma_m
             shown = (means[name] for name in list(COLUMNS)[5:])
             rows.append((*ids, bool(missing), self._health(pair, means), status, *measured, *shown))
-        self._page.has_data = any(not is_missing for _, _, is_missing, *_ in rows)
+        self._page.has_data = any(means["stopped"] == 0.0 for means in pairs.values())
         set_rows(self.pairs, rows)
         return pairs
 
@@ -130,7 +133,7 @@ class Texts:
         self,
         scene: Scene,
         tag_id: int | None,
-        pairs: dict[Pair, Means],
+        anchors: dict[int, Means],
         states: dict[int, str],
         notices: list[str],
     ) -> Verdict:
@@ -138,9 +141,7 @@ class Texts:
         tag = f"tag {'' if tag_id is None else format_id(tag_id)}"
         texts = (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
         remedies = (line.partition(text)[2] for text in texts for line in notices if text in line)
-        of_tag = {anchor_id: means for (anchor_id, pair_tag), means in pairs.items() if pair_tag == tag_id}
-        states_of_tag = {key: states[key] for key in of_tag}
-        verdict = health.verdict(scene, tag_id, of_tag, states_of_tag, next(remedies, ""))
+        verdict = health.verdict(scene, tag_id, anchors, states, next(remedies, ""))
         is_read = self._view.player is None or self._view.complete is not None
         if verdict.state in (health.UNDETERMINED, health.WAITING) and not is_read:
             verdict = Verdict(health.WAITING, "the recording is being read")
@@ -151,17 +152,10 @@ class Texts:
         tag_id, texts = self._page.tag_id, [accuracy] if accuracy else []
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
-        if scene.ranges:
-            corrected, count, faults = scene.counts
-            not_corrected = "no range corrected" + ("" if faults else ": no CIRs")
-            texts.append(
-                f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else not_corrected
-            )
-            texts += [
-                f"{title.lower()}: {value} ({text})"
-                for title, value, text in self._cards
-                if title.startswith("Correction")
-            ]
+        for title, value, text in self._cards:
+            name, _, _ = title.lower().partition(",")
+            if name in ("ranges corrected", "correction"):
+                texts.append(f"{name}: {value} ({text})")
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
         return " \u00b7 ".join(texts)
