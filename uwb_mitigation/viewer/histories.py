@@ -72,7 +72,7 @@ class Rows:
         """Time of reception of the last row; NaN: there is none."""
         return float(self._data[self._end - 1, 0]) if self._end > self._begin else math.nan
 
-    def append(self, row: Sequence[float], limit: int | None) -> None:
+    def append(self, row: Sequence[float], limit: int | None = None) -> None:
         """Append a row, and remove the first ones above a limit."""
         if self._end == len(self._data):
             rows = self.rows
@@ -83,10 +83,6 @@ class Rows:
         self._end += 1
         if limit is not None:
             self._begin = max(self._begin, self._end - limit)
-
-    def clear(self) -> None:
-        """Remove all rows."""
-        self._begin = self._end
 
     def until(self: R, end_s: float, begin_s: float = -math.inf) -> R:
         """Return the rows that were received in an interval; at least the last one before its end."""
@@ -176,11 +172,12 @@ class History(Rows):
 
     Attributes:
         trace: the last CIR of a stream.
+        is_interrupted: the time until the next range does not count for losses and rate: the viewer itself has dropped ranges.
     """
 
     def __init__(self, rows: NDArray[np.float64] | None = None) -> None:
         super().__init__(np.empty((0, len(RangeColumns._fields))) if rows is None else rows)
-        self._is_interrupted = False
+        self.is_interrupted = False
         self.trace: Trace | None = None
 
     @property
@@ -198,19 +195,15 @@ class History(Rows):
 
     def add(self, sample: Sample, received_s: float, residual_m: float, limit: int | None) -> None:
         """Add a range; see `RangeColumns` and `append`."""
-        latest = None if self._is_interrupted else self.latest
+        latest = None if self.is_interrupted else self.latest
         interval_s = math.nan if latest is None else sample.stamp_s - latest.stamp_s
-        self._is_interrupted = False
+        self.is_interrupted = False
         self.append((received_s, residual_m, interval_s, *sample), limit)
 
     def remove_before(self, stamp_s: float) -> None:
         """Remove ranges with earlier stamps from the beginning."""
         while self._begin < self._end and self.columns.stamp_s[0] < stamp_s:
             self._begin += 1
-
-    def interrupt(self) -> None:
-        """Exclude the time until the next range from losses and rate: the viewer itself has dropped ranges."""
-        self._is_interrupted = True
 
     def statistics(self) -> dict[str, float]:
         """Return means and shares (%) of the latest ranges; NaN: unknown."""
@@ -246,7 +239,7 @@ class History(Rows):
         if not span_s > 0:
             return math.nan
         rate_hz = len(intervals_s) / span_s
-        is_recent = age_s * rate_hz <= NO_DATA_INTERVALS or self._is_interrupted
+        is_recent = age_s * rate_hz <= NO_DATA_INTERVALS or self.is_interrupted
         return rate_hz if is_recent else (len(intervals_s) + 1) / (span_s + age_s)
 
     @property

@@ -12,7 +12,6 @@ from bisect import bisect_right
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
-from operator import itemgetter
 from threading import Lock
 
 import numpy as np
@@ -217,8 +216,10 @@ class Scene:
         If the time of a pair jumps back by more than a second (a replay in a loop), the strips of its tag start again.
         """
         tag_id, stamp_s = pair[1], sample.stamp_s
-        history = self.history(pair)
-        latest, (tag_latest_s, _) = history.latest, self.latest_stamps.get(tag_id, (-math.inf, 0.0))
+        latest, (tag_latest_s, _) = (
+            self.history(pair).latest,
+            self.latest_stamps.get(tag_id, (-math.inf, 0.0)),
+        )
         if stamp_s < tag_latest_s - HISTORY_S or (latest and stamp_s < latest.stamp_s - 1.0):
             tag_latest_s = -math.inf
             if not self.is_whole:
@@ -230,7 +231,7 @@ class Scene:
         self.faults += sample.status.is_fault
         self.incidents.add_range(pair, self.clock(), stamp_s)
         self.received_s = self.clock()
-        residual_m = self._compare_with_position(pair, sample)
+        residual_m, history = self._compare_with_position(pair, sample), self.pairs[pair]
         history.add(sample, self.received_s, residual_m, None if self.is_whole else MAX_SAMPLES)
         if not self.is_whole:
             history.remove_before(tag_latest_s - HISTORY_S)
@@ -281,17 +282,16 @@ class Scene:
             return
         key = tag[:MAX_TEXT], kind
         track = self.tracks.add(key, self.tracks.get(key) or Rows(np.empty((0, POSITION))))
+        row = self.clock(), x, y, z, sd_m, stamp_s, *shape
+        if self.is_whole:
+            track.append(row)
+            return
         latest = track.rows[-1].tolist() if len(track.rows) else [-math.inf] * POSITION
-        if not self.is_whole and stamp_s < latest[5] - 1.0:
-            track.clear()
         step_s, step_m = stamp_s - latest[5], math.dist(latest[1:3], (x, y))
-        if (
-            self.is_whole
-            or step_s < -1.0
-            or (step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S))
-        ):
-            limit = None if self.is_whole else MAX_TRACK
-            track.append((self.clock(), x, y, z, sd_m, stamp_s, *shape), limit)
+        if step_s < -1.0:
+            self.set_track(tag, kind, np.array([row]))
+        elif step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S):
+            track.append(row, MAX_TRACK)
 
     def set_track(self, tag: str, kind: TrackKind, rows: NDArray[np.float64]) -> None:
         """Replace a track, float64 (k, `POSITION`)."""
@@ -302,10 +302,10 @@ class Scene:
         """Show the minute before a time of a recording, and its tracks until then; counts are those of all its ranges."""
         self.clear()
         self.ranges, self.corrected, self.faults = whole.ranges, whole.corrected, whole.faults
-        self.error_counts, self.error_sums_m, self.errors = (
+        self.errors, self.error_counts, self.error_sums_m = (
+            whole.errors,
             whole.error_counts,
             whole.error_sums_m,
-            whole.errors,
         )
         histories = {pair: history.until(now_s, now_s - HISTORY_S) for pair, history in whole.pairs.items()}
         for pair, history in sorted(histories.items(), key=lambda item: item[1].received_s):
@@ -320,11 +320,8 @@ class Scene:
             if len(rows) and kind is TrackKind.CORRECTED:
                 received_s, x, y, z, sd_m, stamp_s, *ellipse, heading_rad = rows[-1].tolist()
                 self.tags.add(name, Pose(x, y, z, tuple(ellipse), heading_rad, stamp_s, sd_m, received_s))
-        begin, end = (
-            bisect_right(whole.reports, time_s, key=itemgetter(0))
-            for time_s in (now_s - HISTORY_S, now_s + 1e-6)
-        )
-        for _, name, report in islice(whole.reports, begin, end):
+        begin, end = (bisect_right(whole.reports, (at_s,)) for at_s in (now_s - HISTORY_S, now_s + 1e-6))
+        for _, name, report in whole.reports[begin:end]:
             self.set_node_status(name, report)
 
     def _compare_with_position(self, pair: Pair, sample: Sample) -> float:
@@ -381,14 +378,12 @@ class Scene:
         """Count ranges that the viewer itself has dropped; they do not count as lost."""
         self.dropped += number
         for history in self.pairs.values():
-            history.interrupt()
+            history.is_interrupted = True
 
     def clear_history(self, tag_id: int) -> None:
         """Remove the last minute of the pairs of a tag, but not the counts."""
         self.latest_stamps.pop(tag_id, None)
-        for (_, pair_tag), history in self.pairs.items():
-            if pair_tag == tag_id:
-                history.clear()
+        self.pairs.update({pair: History() for pair in self.pairs if pair[1] == tag_id})
 
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
         """Yield every pair with its last range, by anchor and tag; also pairs that have stopped."""
