@@ -6,7 +6,7 @@ window.WebSocket = class extends WebSocket {
 };
 addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); });
 
-const DIGITS = {rate: 1, not_ok: 0, nlos: 0, lost: 0, rx: 1, fp: 1};
+const DIGITS = {rate: 1, not_ok: 0, nlos: 0, lost: 0, rx: 1};
 const number = (value, digits = 3) => value == null || Number.isNaN(value) ? "-"
   : Math.abs(value) < 1e5 ? value.toFixed(digits) : value.toExponential(1);
 const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
@@ -94,16 +94,16 @@ function start(doc) {
   });
   on("empty", () => { for (const [name, message] of Object.entries(controls.empty)) $(name).dataset.empty = message; });
   // Map.
-  const map = model("map"), ranges = () => [map.x_range, map.y_range];
+  const map = model("map");
   const fit = () => Bokeh.index.find_one(map).reset();
   const pan = (x, y, zoom = 1) => {
     const view = Bokeh.index.find_one(map);
-    const moved = ranges().map((range, axis) => {
-      const middle = (range.start + range.end) / 2 + [x, y][axis] * (range.end - range.start);
-      const half = (range.end - range.start) / 2 * zoom;
-      return [range, {start: middle - half, end: middle + half}];
-    });
-    view.update_range({xrs: new Map([moved[0]]), yrs: new Map([moved[1]])}, {panning: zoom === 1, scrolling: zoom !== 1});
+    const moved = ({start, end}, share) => {
+      const middle = (start + end) / 2 + share * (end - start), half = (end - start) / 2 * zoom;
+      return {start: middle - half, end: middle + half};
+    };
+    const xrs = new Map([[map.x_range, moved(map.x_range, x)]]), yrs = new Map([[map.y_range, moved(map.y_range, y)]]);
+    view.update_range({xrs, yrs}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
   // A name that would cover another one is hidden: tags come first, then the selected anchor.
   const names = map.renderers.filter(({glyph}) => glyph.text).reverse();
@@ -149,12 +149,11 @@ function start(doc) {
   // Recording.
   let held = false, savedMs = 0;
   const saveUrl = (isPosition) => {
-    const [anchor, tag] = controls.selected ?? [], at = controls.player?.position;
-    const parts = {anchor, tag, t: position && at != null ? at.toFixed(2) : undefined};
-    const text = Object.entries(parts).filter(([, value]) => value !== undefined).map(([name, value]) => `${name}=${encodeURIComponent(value)}`);
     // Browsers limit how often a page changes its URL.
     if (isPosition && controls.player?.playing && performance.now() < savedMs + 500) return;
-    history.replaceState(null, "", "#" + text.join("&"));
+    const [anchor, tag] = controls.selected ?? [], parts = new URLSearchParams(controls.selected ? {anchor, tag} : {});
+    if (position && controls.player) parts.set("t", controls.player.position.toFixed(2));
+    history.replaceState(null, "", `#${parts}`);
     savedMs = performance.now();
   };
   const wanted = new URLSearchParams(location.hash.slice(1));
