@@ -15,7 +15,7 @@ from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.headline import cards
 from uwb_mitigation.viewer.histories import Sample, Trace
-from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
+from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.scene import MAX_PAIRS, Pose, Scene
 from uwb_mitigation.viewer.state import View
 
@@ -180,7 +180,7 @@ def test_statuses_and_tracks_are_distinct_and_have_the_contrast_of_aa() -> None:
     assert len(looks) == len(Status)
     for part in zip(*looks, strict=True):
         assert len(set(part)) == len(Status)
-    for colour in {look.colour for look in looks} | set(TRACK_COLOURS.values()) - {None}:
+    for colour in {look.colour for look in looks} | {style[0] for style in TRACK_STYLES.values()} - {NIGHT}:
         for paper in (PAPER, NIGHT) if colour else ():
             assert contrast(colour, paper) >= 3.0, (colour, paper)
     assert contrast(PAPER, NIGHT) >= 4.5

@@ -224,10 +224,13 @@ def test_map_has_heading_ellipse_and_a_legend_of_what_it_contains():
     page = shown(scene)
 
     def legend() -> set[str]:
-        (found,) = page.document.get_model_by_name("map").legend
-        return {getattr(item.label, "value", "status") for item in found.items if item.visible}
+        items = [item for item in page.document.get_model_by_name("map").legend[0].items if item.visible]
+        fields = {item.label.field for item in items if hasattr(item.label, "field")}
+        return {value for field in fields for value in page.column("map", field)} | {
+            item.label.value for item in items if hasattr(item.label, "value")
+        }
 
-    assert legend() == {"raw", "corrected", "true", "status", "anchor", "selected anchor", "tag"}
+    assert legend() == {"raw", "corrected", "true", "OK", "anchor", "selected anchor", "tag"}
     scene.add_pose("tag_7", Pose(4, 3, 1, (0.4, 0.2, 0.3), 0.5, stamp_s=1003.0))
     page.send("draw")
     assert legend() >= {"95 % ellipse", "heading"}

@@ -43,14 +43,6 @@ HEADINGS = {
 }
 """Names and headings of the figures."""
 
-STROKES = {
-    TrackKind.RAW: (1.0, "solid"),
-    TrackKind.CORRECTED: (3.0, "solid"),
-    TrackKind.SMOOTHED: (2.0, "dotdash"),
-    TrackKind.TRUE: (2.0, "dashed"),
-}
-"""Width and dashes of the lines of each kind, in drawing order."""
-
 _COMPARED = TrackKind.RAW, TrackKind.CORRECTED
 _AGE = "time before now, s"
 
@@ -259,7 +251,7 @@ class RangeErrors(Chart):
         self.plot.xaxis.ticker = models.FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
         self.plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
         for kind, hatch in zip(_COMPARED, ("/", None), strict=True):
-            colour = palette.TRACK_COLOURS[kind]
+            colour, _, _ = palette.TRACK_STYLES[kind]
             self.plot.quad(
                 left="left", right="right", bottom=0, top=kind.name.lower(), source=source, color=colour, fill_alpha=0.35,
                 hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
@@ -292,7 +284,7 @@ class Map:
         # Glyphs with NaN are not drawn: without a heading, for example.
         self._anchors = new_source("x", "y", "name", "id", "health", "label", "ring")
         self._tags = new_source("x", "y", "name", "colour", "top", "width", "height", "angle", "heading")
-        self._tracks = {kind: new_source("xs", "ys", "colour") for kind in STROKES}
+        self._tracks = new_source("xs", "ys", "colour", "line_width", "dash", "kind")
         self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
         self._accuracy = new_source("xs", "ys", "colour", "step")
         # The map shows these corners until the user changes the view; it must not follow the data.
@@ -321,14 +313,16 @@ class Map:
                 "fill_color": "colour", "fill_alpha": 0.6, "line_color": None, "legend_field": "step",
             }),
             ("segment", self._rays, {"line_color": marks["color"], "line_alpha": 0.8}),
-            *(("multi_line", source, stroke(kind) | {"line_color": "colour"}) for kind, source in self._tracks.items()),
+            ("multi_line", self._tracks, {
+                "line_color": "colour", "line_width": "line_width", "line_dash": "dash", "legend_field": "kind",
+            }),
             ("ellipse", self._tags, {
                 "width": "width", "height": "height", "angle": "angle", "color": "colour", "fill_alpha": 0.25, "legend_label": "95 % ellipse",
             }),
             ("ray", self._tags, {
                 "length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3, "legend_label": "heading",
             }),
-            ("scatter", self._rays, marks | {"size": 10, "line_width": 2}),
+            ("scatter", self._rays, marks | {"size": 7, "line_width": 2}),
             ("scatter", self._anchors, {
                 "marker": marker, "size": 15, "line_color": NIGHT, "fill_color": colour, "legend_label": "anchor",
             }),
@@ -395,21 +389,24 @@ class Map:
 
     def _draw_tracks(self, scene: Scene) -> None:
         colours = palette.tag_colours(scene.tags)
-        for kind, source in self._tracks.items():
-            tracks = {
-                name: view for (name, of), view in scene.tracks.items() if of is kind and len(view.rows)
-            }
-            state = [
-                (name, len(view.rows), view.received_s, math.floor(scene.age_s(view)), colours.get(name))
-                for name, view in tracks.items()
-            ]
-            if self._page.changed(kind.value, state):
-                colour = palette.TRACK_COLOURS[kind] or NIGHT
-                is_own = kind is TrackKind.CORRECTED
-                set_rows(source, [
-                    (*self._trail(view.rows, scene.age_s(view)).T, colours.get(name, BLUE) if is_own else colour)
-                    for name, view in tracks.items()
-                ])  # fmt: skip
+        tracks = [
+            (kind, name, track)
+            for kind in palette.TRACK_STYLES
+            for (name, track_kind), track in scene.tracks.items()
+            if track_kind is kind and len(track.rows)
+        ]
+        state = [
+            (kind, name, len(track.rows), track.received_s, math.floor(scene.age_s(track)), colours.get(name))
+            for kind, name, track in tracks
+        ]
+        if self._page.changed("tracks", state):
+            rows = []
+            for kind, name, track in tracks:
+                colour, *style = palette.TRACK_STYLES[kind]
+                if kind is TrackKind.CORRECTED:
+                    colour = colours.get(name, BLUE)
+                rows.append((*self._trail(track.rows, scene.age_s(track)).T, colour, *style, kind.value))
+            set_rows(self._tracks, rows)
 
     def _trail(self, track: NDArray[np.float64], age_s: float) -> NDArray[np.float32]:
         """Return x and y of the displayed time of a track whose last point has an age, float32 (k, 2)."""
@@ -495,8 +492,7 @@ def _time_axis(page: PageState) -> dict[str, Any]:
 
 def stroke(kind: TrackKind) -> dict[str, Any]:
     """Return style and legend of the lines of a kind."""
-    width, dash = STROKES[kind]
-    colour = palette.TRACK_COLOURS[kind] or NIGHT
+    colour, width, dash = palette.TRACK_STYLES[kind]
     return {"line_color": colour, "line_width": width, "line_dash": dash, "legend_label": kind.value}
 
 

@@ -19,7 +19,7 @@ from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.viewer.figures import HEADINGS, Figures, finish, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
-from uwb_mitigation.viewer.palette import TRACK_COLOURS, TrackKind
+from uwb_mitigation.viewer.palette import TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.state import Controls, PageState, View
 from uwb_mitigation.viewer.texts import ANCHOR_TITLES, TAG_TITLES, Texts
@@ -73,7 +73,7 @@ def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Itera
         # Of each row, the first kind is the upper one.
         places = [(row, (0.5 * (len(rows) - 1) - number) / len(rows)) for row in boxes]
         source = ColumnDataSource(dict(zip(_BOX, columns.T, strict=True)) | {"row": places})
-        style = {"source": source, "color": TRACK_COLOURS[kind], "legend_label": kind.value}
+        style = {"source": source, "color": TRACK_STYLES[kind][0], "legend_label": kind.value}
         plot.segment("low", "row", "high", "row", **style)
         plot.hbar("row", right="end", left="begin", height=0.35, fill_alpha=0.35, **style)
         plot.scatter("middle", "row", marker="dash", angle=math.pi / 2, size=14, line_width=3, **style)
