@@ -194,7 +194,7 @@ def show_states(browser: Browser, folder: Path) -> None:
         with ViewerServer(view, port=0) as server:
             browser.open(f"{server.url}#t={state.seconds}", *FIRST_SCREEN)
             browser.wait("the page", browser.ready)
-            while player.position_s != state.seconds or player.is_behind:
+            while player.position_s != state.seconds or (state.is_indexed and player.is_behind):
                 time.sleep(0.1)
             time.sleep(5.0)
             if not state.is_connected:

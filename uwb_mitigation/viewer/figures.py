@@ -334,7 +334,7 @@ class Map:
             }),
             # The script of the page hides names that cover others.
             ("text", self._anchors, text | {"text": "label", "y_offset": -13, "view": CDSView(filter=BooleanFilter())}),
-            ("text", self._tags, text | {"text": "name", "y": "top", "y_offset": -4, "view": CDSView(filter=BooleanFilter())}),
+            ("text", self._tags, text | {"text": "name", "y": "top", "y_offset": -6, "view": CDSView(filter=BooleanFilter())}),
         ]  # fmt: skip
 
     def draw(self, scene: Scene) -> None:

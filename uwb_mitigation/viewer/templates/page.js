@@ -105,14 +105,15 @@ function start(doc) {
     const xrs = new Map([[map.x_range, moved(map.x_range, x)]]), yrs = new Map([[map.y_range, moved(map.y_range, y)]]);
     view.update_range({xrs, yrs}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
-  // A name that would cover another one is hidden: tags come first, then the selected anchor.
+  // A name that would cover a tag or another name is hidden: tags come first, then the selected anchor.
   const names = map.renderers.filter(({glyph}) => glyph.text).reverse();
   const placeNames = () => {
-    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame, boxes = [];
+    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame, {x, y} = names[0].data_source.data;
+    const boxes = x.map((_, i) => [9, x_scale.compute(x[i]), y_scale.compute(y[i]) + 10]);
     for (const {view, glyph, data_source: {data}} of names) {
       const booleans = data[glyph.text.field].map((text, i) => {
         const box = [3.5 * text.length + 2, x_scale.compute(data.x[i]), y_scale.compute(data[glyph.y.field][i]) + glyph.y_offset.value];
-        const isFree = boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 15);
+        const isFree = boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 14);
         if (isFree) boxes.push(box);
         return isFree;
       });
@@ -135,7 +136,7 @@ function start(doc) {
 
   const legend = (figure) => [...figure.above, ...figure.below].find((part) => part.items);
   for (const figure of figures) if (legend(figure)) new ResizeObserver(([{contentRect: {width}}]) => {
-    legend(figure).ncols = Math.max(2, Math.floor(width / (figure === map ? 125 : 110)));
+    legend(figure).ncols = Math.max(2, Math.floor(width / 110));
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
