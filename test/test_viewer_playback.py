@@ -267,6 +267,19 @@ def test_bag_without_ranges_and_tracks_is_refused(tmp_path: Path):
         open_bag(path)
 
 
+def test_raw_ranges_of_a_pair_without_corrected_ones_are_skipped(tmp_path: Path):
+    path = tmp_path / "some.mcap"
+    with BagWriter(path, {}) as out:
+        for number in range(40):
+            out.write(record(number))
+            if number % 2 == 0:
+                write_corrected(out, record(number).measurement, corrected(number))
+    player, scene = open_bag(path, HALL)
+    player.seek(player.seconds)
+    assert player.timeline.is_complete
+    assert list(latest(scene)) == [(1, 7)]
+
+
 def test_several_namespaces_need_a_choice(tmp_path: Path):
     path = tmp_path / "two.mcap"
     with BagWriter(path, {}) as out:

@@ -5,17 +5,16 @@ Only CIRs are read from the bag when they are shown.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from uwb_mitigation.errors import RecordingError
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.mitigation.model.choice import Choice
 from uwb_mitigation.positioning.config import EstimatorConfig
@@ -85,8 +84,8 @@ class BagPlayer:
         self.scene.clock = lambda: self.shown_s
         self.scene.stamp_clock = lambda: self.shown_s + recording.start_ns / NS_PER_S
         # Anchors are published once at the beginning.
-        with contextlib.suppress(RecordingError, StopIteration):
-            self.scene.set_anchors(parse_markers(next(recording.events([ANCHORS])).message))
+        for event in islice(recording.events([ANCHORS]), 1):
+            self.scene.set_anchors(parse_markers(event.message))
 
     @property
     def is_behind(self) -> bool:

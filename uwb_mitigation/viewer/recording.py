@@ -335,7 +335,8 @@ def _add_largest_error(scene: Scene) -> None:
     for pair, history in scene.pairs.items():
         columns = history.columns
         change_m = np.abs(columns.corrected_m - (columns.true_m if scene.errors else columns.raw_m))
-        row = int(np.where(change_m < MAX_RANGE_M, change_m, -1.0).argmax())
+        change_m[~(change_m < MAX_RANGE_M)] = 0.0
+        row = int(change_m.argmax())
         largest = max(largest, (float(change_m[row]), -float(columns.received_s[row]), pair))
     largest_m, time_s, (anchor_id, tag_id) = largest
     if largest_m > 0.0:

@@ -255,8 +255,9 @@ class Scene:
             self._count_error(columns.raw_m[row], columns.corrected_m[row], true_m)
 
     def set_trace(self, pair: Pair, trace: Trace) -> None:
-        """Set the last CIR of a pair."""
-        self.history(pair).trace = trace
+        """Set the last CIR of a pair; those of a recording stay in the bag."""
+        if not self.is_whole:
+            self.history(pair).trace = trace
 
     def add_pose(self, tag: str, pose: Pose) -> None:
         """Set the pose of a tag."""
