@@ -193,16 +193,6 @@ def test_output_of_track_is_shown(tmp_path: Path):
     assert [(anchor.id, anchor.position) for anchor in written] == [(a.id, a.position) for a in HALL.anchors]
 
 
-def test_ages_use_the_time_of_the_recording(tmp_path: Path):
-    player, scene = open_bag(corrected_bag(tmp_path / "one.mcap", (*range(99), 2100)))
-    player.seek(20.0)
-    ages = {pair: scene.age_s(history) for pair, history, _ in scene.latest()}
-    assert ages == pytest.approx({(1, 7): 20.0 - 0.98, (2, 7): 20.0 - 0.97})
-    assert scene.now_s() == pytest.approx(START_NS / 1e9 + 20.0)
-    player.seek(0.5)
-    assert max(scene.age_s(history) for _, history, _ in scene.latest()) < 0.02
-
-
 def test_recording_is_shown_as_far_as_it_has_been_read(bag: Path):
     player, scene = open_bag(bag)
     player.seek(3.0)
