@@ -136,7 +136,7 @@ function start(doc) {
 
   const legend = (figure) => [...figure.above, ...figure.below].find((part) => part.items);
   for (const figure of figures) if (legend(figure)) new ResizeObserver(([{contentRect: {width}}]) => {
-    legend(figure).ncols = Math.max(2, Math.floor(width / 110));
+    legend(figure).ncols = Math.max(2, Math.floor((width - 40) / 110));
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
