@@ -452,7 +452,7 @@ class Map:
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # A margin for ellipses and labels; without anchors, one in which the tag can move.
-        margin = 0.1 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
+        margin = 0.15 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
         low, high = low - margin, high + margin
         self._extent.data = {name: [float(low[i]), float(high[i])] for i, name in enumerate("xy")}
 
