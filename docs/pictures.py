@@ -145,7 +145,7 @@ class State(NamedTuple):
     Attributes:
         building: see `FLATS`. anchors: changes the map. change: changes each record; None: it is not received.
         seconds: time in the recording.
-        is_indexed: whether its index is ready. is_connected: whether its viewer still runs.
+        is_indexed: whether its tracks have been estimated. is_connected: whether its viewer still runs.
     """
 
     building: str = "open"
@@ -188,13 +188,14 @@ def show_states(browser: Browser, folder: Path) -> None:
         anchors = state.anchors(source.anchors)
         player = BagPlayer(bag, lambda: mitigation(settings))
         player.scene.set_anchors(anchors.anchors)
-        if state.is_indexed:
-            player.index(settings.config(anchors), check=displaced_anchor).join()
+        config = settings.config(anchors) if state.is_indexed else None
+        player.index(config, check=displaced_anchor).join()
+        player.timeline.is_complete = state.is_indexed
         view = View(player.scene, f"{name}.mcap", player=player)
         with ViewerServer(view, port=0) as server:
             browser.open(f"{server.url}#t={state.seconds}", *FIRST_SCREEN)
             browser.wait("the page", browser.ready)
-            while player.position_s != state.seconds or player.is_behind:
+            while player.position_s != state.seconds or (state.is_indexed and player.is_behind):
                 time.sleep(0.1)
             time.sleep(5.0)
             if not state.is_connected:

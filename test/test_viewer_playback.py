@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ from uwb_mitigation.types.ros.topics import (
     RANGE_RAW,
 )
 from uwb_mitigation.types.tracks import Estimate
-from uwb_mitigation.viewer import playback, texts
+from uwb_mitigation.viewer import texts
 from uwb_mitigation.viewer.feed import SceneUpdater
 from uwb_mitigation.viewer.headline import WHOLE, cards
 from uwb_mitigation.viewer.palette import TrackKind
@@ -76,16 +77,13 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def open_bag(path: Path, namespace: str | None = None) -> tuple[BagPlayer, Scene]:
+def open_bag(
+    path: Path, anchors: AnchorMap | None = None, namespace: str | None = None, **options: Any
+) -> tuple[BagPlayer, Scene]:
+    """Return the player of a bag that has been read, and its scene."""
     player = BagPlayer(path, lambda: Mitigation(load_bundle(default_model_path())), namespace)
+    player.index(None if anchors is None else EstimatorConfig(anchors), **options).join()
     return player, player.scene
-
-
-def seek(player: BagPlayer, position_s: float) -> None:
-    """Show a position; a long read continues at further calls."""
-    player.seek(position_s)
-    while player.is_behind:
-        player.advance()
 
 
 def latest(scene: Scene) -> dict[tuple[int, int], float]:
@@ -96,21 +94,19 @@ def test_seek_shows_data_up_to_the_position(bag: Path):
     player, scene = open_bag(bag)
     assert player.seconds == pytest.approx((COUNT - 1) * STEP_NS / 1e9)
     for last in (399, 100, 250, 0):
-        seek(player, last * STEP_NS / 1e9)
+        player.seek(last * STEP_NS / 1e9)
         before = last - 1
         expected = {(1 + number % 2, 7): 4.25 + number for number in (before, last) if number >= 0}
         assert latest(scene) == expected
         assert scene.now_s() == pytest.approx((START_NS + last * STEP_NS) / 1e9)
-        assert scene.errors == last + 1, "the truth is joined, and nothing is counted twice"
-        lengths = {
-            key: len(track.points) for key, track in scene.tracks.items() if key[1] is not TrackKind.RAW
-        }
-        assert lengths == {
+        assert {key: len(track.rows) for key, track in scene.tracks.items()} == {
             ("tag", TrackKind.CORRECTED): last // 10 + 1,
             ("tag_9", TrackKind.CORRECTED): last // 10 + 1,
             ("tag_7", TrackKind.TRUE): last // 10 + 1,
         }
-    assert len(scene.pairs[1, 7].traces) == 1
+    assert player.read_trace((2, 7)) is None
+    assert player.read_trace((1, 7)).cir.samples.tolist() == record(0).measurement.cir.samples.tolist()
+    assert scene.errors == COUNT, "the truth is joined, and nothing is counted twice"
 
 
 def test_anchors_of_a_file_replace_those_of_the_bag(bag: Path, tmp_path: Path):
@@ -119,11 +115,9 @@ def test_anchors_of_a_file_replace_those_of_the_bag(bag: Path, tmp_path: Path):
         write_anchors(out, load_anchors(anchors_path(bag)), START_NS)
         for number in range(10):
             out.write(record(number))
-    player, scene = open_bag(path)
-    assert scene.anchors[1].position == (0.0, 0.0, 2.0)
-    moved = AnchorMap([Anchor(1, (5.0, 5.0, 7.5))])
-    player.index(EstimatorConfig(moved)).join()
-    seek(player, 0.05)
+    assert open_bag(path)[1].anchors[1].position == (0.0, 0.0, 2.0)
+    player, scene = open_bag(path, AnchorMap([Anchor(1, (5.0, 5.0, 7.5))]))
+    player.seek(0.05)
     assert scene.anchors[1].position == (5.0, 5.0, 7.5)
 
 
@@ -161,9 +155,9 @@ def test_raw_ranges_are_corrected_for_display_as_in_a_processed_bag(tmp_path: Pa
     for path in (raw, tmp_path / "out.mcap"):
         player, scene = open_bag(path)
         assert player.corrects == (path == raw)
-        seek(player, player.seconds)
+        player.seek(player.seconds)
         assert scene.errors == 150
-        assert [sample.true_m for sample in scene.pairs[1, 7].samples] == [4.0 + n for n in range(0, 150, 2)]
+        assert scene.pairs[1, 7].columns.true_m.tolist() == [4.0 + n for n in range(0, 150, 2)]
         expected = Mitigation(load_bundle(default_model_path())).correct([record(149).measurement])[0].range_m
         assert latest(scene)[2, 7] == pytest.approx(expected)
 
@@ -187,51 +181,40 @@ def test_output_of_track_is_shown(tmp_path: Path):
     _, processed_scene = open_bag(processed)
     assert sorted(processed_scene.anchors) == sorted(HALL.index)
     player, scene = open_bag(track)
-    seek(player, player.seconds)
+    player.seek(player.seconds)
     kinds = {kind for _, kind in scene.tracks}
     assert kinds >= {TrackKind.CORRECTED, TrackKind.SMOOTHED}
     assert {name for name, kind in scene.tracks if kind is TrackKind.SMOOTHED} == set(scene.tags)
     assert any("0x1122334455667788" in name for name in scene.tags)
     for view in scene.tracks.values():
-        assert view.points[-1][1:3] == pytest.approx(truth.position[-1, :2], abs=0.5)
+        assert view.rows[-1, 1:3] == pytest.approx(truth.position[-1, :2], abs=0.5)
     assert "without ranges" in player.missing.ranges
     written = load_anchors(anchors_path(track)).anchors
     assert [(anchor.id, anchor.position) for anchor in written] == [(a.id, a.position) for a in HALL.anchors]
 
 
-def test_ages_use_the_time_of_the_recording(tmp_path: Path):
-    player, scene = open_bag(corrected_bag(tmp_path / "one.mcap", (*range(99), 2100)))
-    seek(player, 20.0)
-    ages = {pair: scene.age_s(history) for pair, history, _ in scene.latest()}
-    assert ages == pytest.approx({(1, 7): 20.0 - 0.98, (2, 7): 20.0 - 0.97})
-    assert scene.now_s() == pytest.approx(START_NS / 1e9 + 20.0)
-    seek(player, 0.5)
-    assert max(scene.age_s(history) for _, history, _ in scene.latest()) < 0.02
-
-
-def test_long_read_continues_at_the_next_call(bag: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(playback, "MAX_MESSAGES", 150)
-    monkeypatch.setattr(playback, "READ_S", 0.0)
+def test_recording_is_shown_as_far_as_it_has_been_read(bag: Path):
     player, scene = open_bag(bag)
-    player.seek(player.seconds)
+    player.seek(3.0)
+    player.play(True)
+    player.timeline.read_s = 2.0
+    player.advance()
     assert player.is_behind
-    player.playing = True
-    assert player.shown_s == scene.clock() < player.position_s, "the slider shows the time of the map"
-    player.playing = False
-    while player.is_behind:
-        player.advance()
-    assert latest(scene)[2, 7] == 4.25 + COUNT - 1
-    assert scene.ranges < COUNT / 2, "the messages before are skipped"
+    assert player.shown_s == scene.clock() == 2.0, "the slider shows the time of the map"
+    assert latest(scene) == {(1, 7): 4.25 + 200, (2, 7): 4.25 + 199}
+    player.timeline.read_s = player.seconds
+    player.advance()
+    assert latest(scene) == {(1, 7): 4.25 + 300, (2, 7): 4.25 + 299}
 
 
 def test_truncated_bag_is_shown_up_to_the_damage(bag: Path, tmp_path: Path):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(write_bag(tmp_path / "whole.mcap", 3000).read_bytes()[:-20_000])
     player, scene = open_bag(cut)
-    seek(player, player.seconds)
+    player.seek(player.seconds)
     assert scene.node_statuses["recording"].level == 2
     assert "nothing beyond" in scene.node_statuses["recording"].message
-    seek(player, 0.0)
+    player.seek(0.0)
     assert latest(scene)
 
 
@@ -260,7 +243,7 @@ def test_implausible_values_of_standard_messages_are_ignored() -> None:
         )
         feed.add(POSE, message)
         assert np.isnan(scene.tags["tag"].ellipse).all()
-    feed.add(POSE, None)
+    feed.add_encoded(RANGE_RAW, b"")
     assert feed.malformed == 1
 
 
@@ -274,6 +257,19 @@ def test_bag_without_ranges_and_tracks_is_refused(tmp_path: Path):
         open_bag(path)
 
 
+def test_raw_ranges_of_a_pair_without_corrected_ones_are_skipped(tmp_path: Path):
+    path = tmp_path / "some.mcap"
+    with BagWriter(path, {}) as out:
+        for number in range(40):
+            out.write(record(number))
+            if number % 2 == 0:
+                write_corrected(out, record(number).measurement, corrected(number))
+    player, scene = open_bag(path, HALL)
+    player.seek(player.seconds)
+    assert player.timeline.is_complete
+    assert list(latest(scene)) == [(1, 7)]
+
+
 def test_several_namespaces_need_a_choice(tmp_path: Path):
     path = tmp_path / "two.mcap"
     with BagWriter(path, {}) as out:
@@ -283,8 +279,8 @@ def test_several_namespaces_need_a_choice(tmp_path: Path):
                 out.write_message(f"/{board}/uwb/range_raw", RANGE_CIR_TYPE, data, START_NS + number)
     with pytest.raises(UwbMitigationError, match="--namespace with one of: '/left', '/right'"):
         open_bag(path)
-    player, scene = open_bag(path, "/left")
-    seek(player, 1.0)
+    player, scene = open_bag(path, namespace="/left")
+    player.seek(1.0)
     assert scene.ranges == 4
 
 
@@ -292,49 +288,41 @@ def test_index_of_a_drive_has_tracks_errors_and_residuals(tmp_path: Path, monkey
     bag = tmp_path / "flat.mcap"
     done = run("data", "simulate", "--like", "drive", "--ranges", "400", "-o", bag, folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    player, scene = open_bag(bag)
     anchors = load_anchors(anchors_path(bag))
-    scene.set_anchors(anchors.anchors)
-    player.index(EstimatorConfig(anchors)).join()
-    timeline = player.timeline
-    assert timeline is not None
-    assert len(timeline.log_s) == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
+    player, scene = open_bag(bag, anchors)
+    timeline, whole = player.timeline, player.timeline.scene
+    assert whole.ranges == sum(1 for _ in BagReader(bag).messages([RANGE_RAW]))
     figures = {title: (value, text) for title, value, text in cards(View(scene, player=player), 101)}
     corrected, references = figures["Position RMSE, whole recording"]
     assert float(corrected.split()[0]) < 0.8 * float(re.search(r"raw \+ same filter: (\S+) m", references)[1])
     counted: list[str] = []
     monkeypatch.setattr(texts, "cards", lambda *_: counted.append(WHOLE) or [])
-    seek(player, 0.0)
     page = Drawn(View(scene, player=player))
     for position_s in (5.0, 8.0):
         page.send("seek", position_s)
     assert counted == [WHOLE], "a seek in a long recording must not compute its figures again"
-    raw_m, corrected_m = np.abs(timeline.range_errors).mean(axis=1)
-    assert corrected_m < raw_m
-    ranges = timeline.ranges((1, 101))
+    assert whole.error_sums_m[1] < whole.error_sums_m[0]
+    ranges = whole.pairs[1, 101].columns
     assert np.isfinite(ranges.residual_m).mean() > 0.9, "of the whole recording"
     assert np.isfinite(ranges.gap_db).all()
     assert np.ptp(page.column("history", "age")) > 0.9 * player.seconds
     assert np.nanmean(page.column("positions", "error")) < np.nanmean(page.column("positions", "raw"))
-    seek(player, player.seconds)
-    assert set(scene.tracks) == set(timeline.tracks)
-    track = timeline.tracks["tag_101", TrackKind.CORRECTED]
-    assert scene.tracks["tag_101", TrackKind.CORRECTED].columns()[-1] == pytest.approx(track[-1])
+    player.seek(player.seconds)
+    assert set(scene.tracks) == set(whole.tracks)
+    shown = (of.tracks["tag_101", TrackKind.CORRECTED].rows[-1] for of in (scene, whole))
+    assert np.array_equal(*shown, equal_nan=True)
     assert "tag_101" in scene.tags
     assert np.nanmax(np.abs(page.column("pairs", "residual"))) < 1.0, "of the minute before the position"
-    again, _ = open_bag(bag)
-    again.index(EstimatorConfig(anchors), estimated=list(timeline.estimates.values())).join()
+    again, _ = open_bag(bag, anchors, estimated=list(timeline.estimates.values()))
     assert again.timeline.estimates == timeline.estimates, "known tracks are not estimated again"
 
 
 @pytest.mark.parametrize("count", [1, 40])
 def test_tag_without_a_position_does_not_stop_the_player(tmp_path: Path, count: int):
     path = corrected_bag(tmp_path / "one_anchor.mcap", range(0, 2 * count, 2))
-    player, scene = open_bag(path)
-    player.index(EstimatorConfig(HALL)).join()
-    assert player.timeline is not None
+    player, scene = open_bag(path, HALL)
     player.play(True)
-    seek(player, player.seconds)
+    player.seek(player.seconds)
     assert latest(scene) == {(1, 7): 4.25 + 2 * count - 2}
     assert "1 anchors received, 3 or more needed" in player.timeline.notices[0]
 

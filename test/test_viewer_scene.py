@@ -15,7 +15,7 @@ from uwb_mitigation.types.anchors import Anchor, AnchorMap
 from uwb_mitigation.types.measurement import Cir, Encoding, Status
 from uwb_mitigation.viewer.headline import cards
 from uwb_mitigation.viewer.histories import Sample, Trace
-from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_COLOURS, TrackKind
+from uwb_mitigation.viewer.palette import NIGHT, PAPER, STATUS_LOOKS, TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.scene import MAX_PAIRS, Pose, Scene
 from uwb_mitigation.viewer.state import View
 
@@ -81,10 +81,9 @@ def test_ranges_that_the_viewer_drops_change_neither_rate_nor_losses() -> None:
         if number in range(30, 36):
             scene.count_dropped(1)
             continue
-        scene.add_sample((1, 7), Sample(1000.0 + number / 10, 5.3, 5.1, 0.1, Status.OK))
-        scene.pairs[1, 7].count_lost(number)
+        scene.add_sample((1, 7), Sample(1000.0 + number / 10, 5.3, 5.1, 0.1, Status.OK, sequence=number))
     history = scene.pairs[1, 7]
-    assert (history.rate_hz(), history.lost) == (pytest.approx(10.0), 0)
+    assert (history.rate_hz(), history.statistics()["lost"]) == (pytest.approx(10.0), 0)
     assert history.rate_hz(age_s=2.0) < 8.0
     scene.count_dropped(1)
     assert history.rate_hz(age_s=2.0) == pytest.approx(10.0)
@@ -111,12 +110,12 @@ def test_clocks_may_differ_and_jump_back() -> None:
     scene.add_sample((1, 7), Sample(1005.0, 5.3, 5.1, 0.1, Status.OK))
     assert [pair for pair, _, _ in scene.latest()] == [(1, 7)], "a stamp of the future hides nothing for long"
     scene.add_sample((1, 7), Sample(1001.0, 5.3, 5.1, 0.1, Status.OK))
-    assert len(scene.pairs[1, 7].samples) == 1, "a replay starts again"
+    assert len(scene.pairs[1, 7].rows) == 1, "a replay starts again"
     scene = Scene()
     for step in range(100):
         for tag, clock_s in ((7, 1000.0), (8, 4600.0)):
             scene.add_sample((1, tag), Sample(clock_s + step / 10, 5.3, 5.1, 0.1, Status.OK))
-    assert [len(scene.pairs[1, tag].samples) for tag in (7, 8)] == [100, 100]
+    assert [len(scene.pairs[1, tag].rows) for tag in (7, 8)] == [100, 100]
 
 
 def test_raw_positions_are_those_of_the_locator_on_raw_ranges() -> None:
@@ -136,10 +135,10 @@ def test_raw_positions_are_those_of_the_locator_on_raw_ranges() -> None:
         scene.add_sample((row + 1, 7), Sample(time_s, raw_m, 5.5, 0.1, Status.OK))
         if (estimate := estimator.add(TagRange(round(time_s * 1e9), row, raw_m))) is not None:
             expected[time_s] = estimate.position
-    for stamp_s, *position, _ in scene.tracks["tag", TrackKind.RAW].points:
+    for _, *position, _, stamp_s in scene.tracks["tag", TrackKind.RAW].rows[:, :6].tolist():
         assert position == pytest.approx(expected[stamp_s], abs=1e-6)
     assert position[:2] == pytest.approx((5.0, 2.0), abs=0.3)
-    assert scene.pairs[2, 7].samples[-1].residual_m == pytest.approx(0.5)
+    assert scene.pairs[2, 7].columns.residual_m[-1] == pytest.approx(0.5)
 
 
 def test_hostile_positions_do_not_stop_the_stream() -> None:
@@ -163,7 +162,7 @@ def test_hostile_positions_do_not_stop_the_stream() -> None:
             range_m = float(rng.choice((*values, 4.0, 5.0, 5.0, 5.0)))
             scene.add_sample((anchor, 7), Sample(stamp_s, range_m, 5.0, 0.1, Status.OK))
         for track in scene.tracks.values():
-            assert np.isfinite(track.columns()[:, 1:3]).all()
+            assert np.isfinite(track.rows[:, 1:3]).all()
 
 
 def contrast(first: str, second: str) -> float:
@@ -181,7 +180,7 @@ def test_statuses_and_tracks_are_distinct_and_have_the_contrast_of_aa() -> None:
     assert len(looks) == len(Status)
     for part in zip(*looks, strict=True):
         assert len(set(part)) == len(Status)
-    for colour in {look.colour for look in looks} | set(TRACK_COLOURS.values()) - {None}:
+    for colour in {look.colour for look in looks} | {style[0] for style in TRACK_STYLES.values()} - {NIGHT}:
         for paper in (PAPER, NIGHT) if colour else ():
             assert contrast(colour, paper) >= 3.0, (colour, paper)
     assert contrast(PAPER, NIGHT) >= 4.5

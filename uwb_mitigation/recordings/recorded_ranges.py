@@ -25,7 +25,7 @@ CHUNK = 50_000
 """Number of rows that are collected before they are stored compactly."""
 
 KEY = [("stamp_ns", "i8"), ("tag", "u8"), ("anchor", "u8"), ("sequence", "u4")]
-_RAW = np.dtype([*KEY, ("range_m", "f8"), ("gap_db", "f8")])
+_RAW = np.dtype([*KEY, ("log_ns", "i8"), ("range_m", "f8"), ("gap_db", "f8"), ("rx_dbm", "f8")])
 _CORRECTED = np.dtype(
     [*KEY, ("log_ns", "i8"), ("status", "u1"), ("raw_m", "f8"), ("range_m", "f8"), ("variance_m2", "f8")]
 )
@@ -110,9 +110,10 @@ class RangeTable:
     corrected: Table = field(default_factory=lambda: Table(_CORRECTED))
     skipped: Counter[str] = field(default_factory=Counter)
 
-    def add_raw(self, measured: RangeMeasurement) -> None:
-        """Append a measured range."""
-        self.raw.add(*measurement_key(measured), measured.range_m, measured.cir.power_gap_db)
+    def add_raw(self, measured: RangeMeasurement, log_ns: int = 0) -> None:
+        """Append a measured range; `log_ns`: its time on the clock of the recorder."""
+        levels = measured.cir.power_gap_db, measured.cir.rx_power_dbm
+        self.raw.add(*measurement_key(measured), log_ns, measured.range_m, *levels)
 
     def add_corrected(self, key: MeasurementKey, corrected: CorrectedRange, log_ns: int = 0) -> None:
         """Append the corrected range of a measurement; `log_ns`: its time on the clock of the recorder."""

@@ -3,39 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from bokeh import models
-from bokeh.models import ColumnDataSource, DataRange1d, Range1d
+from bokeh.models import BooleanFilter, CDSView, ColumnDataSource, DataRange1d, Range1d
 from bokeh.palettes import cividis
 from bokeh.plotting import figure
-from bokeh.transform import factor_mark
+from bokeh.plotting.contour import contour_data
+from bokeh.transform import factor_cmap, factor_mark
 from numpy.typing import NDArray
 
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.preprocessing import WINDOW_LEAD
 from uwb_mitigation.types.measurement import FAULTS, Status
 from uwb_mitigation.viewer import health, palette
-from uwb_mitigation.viewer.headline import positions_of
+from uwb_mitigation.viewer.headline import Positions
 from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, NO_DATA_S
 from uwb_mitigation.viewer.palette import BLUE, GREEN, GREY, NIGHT, PAPER, VERMILLION, TrackKind
 from uwb_mitigation.viewer.scene import (
     ERROR_EDGES_M,
     Scene,
-    count_errors,
     finite_or_zero,
     plain_tag_id,
     tag_label,
     with_gaps,
 )
 from uwb_mitigation.viewer.state import PageState, drawable, new_source, set_rows
-
-TRACE_BEFORE, TRACE_AFTER = 20, 180
-"""Number of samples shown before and after the first path."""
-MAX_POINTS = 1200
-"""Maximum number of displayed points of a line."""
 
 HEADINGS = {
     "map": "Map",
@@ -48,37 +43,23 @@ HEADINGS = {
 }
 """Names and headings of the figures."""
 
-STROKES = {
-    TrackKind.RAW: (1.0, "solid"),
-    TrackKind.CORRECTED: (3.0, "solid"),
-    TrackKind.SMOOTHED: (2.0, "dotdash"),
-    TrackKind.TRUE: (2.0, "dashed"),
-}
-"""Width and dashes of the lines of each kind, in drawing order."""
-
 _COMPARED = TrackKind.RAW, TrackKind.CORRECTED
 _AGE = "time before now, s"
-HEALTH_LOOKS = {
-    health.GOOD: ("hex", GREEN),
-    health.CHECK: ("square_pin", palette.ORANGE),
-    health.BAD: ("circle_x", VERMILLION),
-    health.UNKNOWN: ("hex_dot", PAPER),
-}
-"""Marker and colour of an anchor for each state; statuses of ranges have other markers."""
 
-HEIGHT = 380
-"""So that the map is on the first screen, pixels."""
-HEADING_M = 1.0
-"""Length of the line that shows the heading of a tag."""
-MAX_LABEL = 20
-"""Maximum number of characters of a name."""
-MARGIN_M = 5.0
-"""Margin around a tag on a map without anchors."""
-RANGE_SD_M = 0.1
-"""Standard deviation for the predicted accuracy if the ranges have none."""
+MAX_POINTS = 1200  # of a line
+TRACE_BEFORE, TRACE_AFTER = 20, 180  # samples before and after the first path
+HEIGHT = 380  # of the map, pixels, so that it is on the first screen
+HEADING_M = 1.0  # length of the line that shows the heading of a tag
+MAX_LABEL = 20  # characters of a name on the map
+RING = 22.0  # diameter of the ring around the selected anchor, pixels
+MARGIN_M = 5.0  # around a tag on a map without anchors
+RANGE_SD_M = 0.1  # for the predicted accuracy if ranges have no standard deviation
 
-_SIZES = {"95 % ellipse": "width", "heading": "heading"}
-"""Columns that are NaN if a tag has none."""
+Lines = Mapping[str, Mapping[str, Any]]
+"""Styles of the lines of a figure, {column: style}."""
+
+_OPTIONAL = {"95 % ellipse": "width", "heading": "heading", "selected anchor": "ring"}
+"""Layers of the map, and their columns that are NaN where they have nothing to show."""
 
 
 class Figures:
@@ -87,6 +68,7 @@ class Figures:
     Attributes:
         map: the map.
         plots: {name: figure}, see `HEADINGS`.
+        position: mark of the position of the player.
     """
 
     def __init__(self, page: PageState) -> None:
@@ -94,20 +76,15 @@ class Figures:
         over_time = Quality(page), PositionErrors(page)
         self._charts = self.map, Strip(page), LastCir(page), *over_time, errors
         self.plots = {chart.plot.name: chart.plot for chart in (*self._charts, errors.distribution)}
-        self._position = new_source("time")
+        self.position = models.Span(dimension="height", line_color=NIGHT, line_width=2)
         if page.view.player is not None:
             for chart in over_time:
-                chart.plot.vspan("time", source=self._position, line_color=NIGHT, line_width=2)
+                chart.plot.add_layout(self.position)
 
     def draw(self, scene: Scene) -> None:
         """Draw what has changed."""
         for chart in self._charts:
             chart.draw(scene)
-
-    def show_position(self, position_s: float) -> None:
-        """Mark the position of the player."""
-        if self._position.data["time"] != [position_s]:
-            self._position.data = {"time": [position_s]}
 
 
 class Chart:
@@ -115,128 +92,113 @@ class Chart:
 
     Args:
         page: state of its page.
-        name: see `HEADINGS`.
-        x, y: titles of the axes.
-        options: of `figure`.
+        plot: the figure.
+        source: its data; the first column is that of the horizontal axis.
+        lines: its lines.
     """
 
-    def __init__(self, page: PageState, name: str, x: str, y: str, **options: Any) -> None:
-        self.page, self.name, self.plot = page, name, new_figure(name, 230, x, y, **options)
+    def __init__(self, page: PageState, plot: figure, source: ColumnDataSource, lines: Lines) -> None:
+        self.page, self.plot, self.source = page, plot, source
         self._corners = self.plot.scatter([0.0, 10.0], [0.0, 10.0], size=0, alpha=0)
         for axis in (self.plot.x_range, self.plot.y_range):
             if isinstance(axis, DataRange1d):
                 axis.only_visible = True
+        first = next(iter(source.data))
+        for column, style in lines.items():
+            self.plot.line(first, column, source=source, **{"line_width": 2.0} | dict(style))
+        finish(self.plot, *([first, *lines] if lines else []))
 
     def draw(self, scene: Scene) -> None:
         """Draw what has changed."""
         raise NotImplementedError
 
-    def show_empty(self, message: str) -> None:
-        """Set the message of a figure without data; empty: it has data."""
-        self._corners.visible = bool(message)
-        self.page.set(empty=self.page.controls.empty | {self.name: message})
-
-    def fill(self, source: ColumnDataSource, table: NDArray[np.float64], message: str = "") -> None:
-        """Set the columns of a source."""
-        if message:
-            # Before its data go: an axis needs data or corners at any moment.
-            self.show_empty(message)
+    def fill(self, table: NDArray[np.float64], message: str, source: ColumnDataSource | None = None) -> None:
+        """Set the columns of a source; a message, in place of missing data."""
+        source = source or self.source
+        # Before the data go: an axis needs data or corners at any moment.
+        self._corners.visible |= bool(message)
         source.data = dict(zip(source.data, table.T.astype(np.float32), strict=True))
-        self.show_empty(message)
-
-    def lines(self, source: ColumnDataSource, x: str, *kinds: TrackKind, suffix: str = "") -> list[str]:
-        """Add lines of a source; return their columns."""
-        names = [kind.name.lower() + suffix for kind in kinds]
-        for kind, name in zip(kinds, names, strict=True):
-            self.plot.line(x, name, source=source, legend_label=kind.value, **stroke(kind))
-        return names
+        self._corners.visible = bool(message)
+        self.page.set(empty=self.page.controls.empty | {self.plot.name: message})
 
 
 class Strip(Chart):
     """Raw, corrected and true ranges of the selected pair in the last minute, and the statuses that need attention."""
 
     def __init__(self, page: PageState) -> None:
-        super().__init__(page, "strip", _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
-        self._ranges = new_source("age", "raw", "corrected", "true")
-        self._bad = new_source("age", "corrected", "status")
-        names = self.lines(self._ranges, "age", *_COMPARED, TrackKind.TRUE)
-        self.plot.scatter(
-            "age", "corrected", source=self._bad, size=8, legend_field="status", **status_marks()
-        )
-        finish(self.plot, "age", *names)
+        lines = {kind.name.lower(): stroke(kind) for kind in (*_COMPARED, TrackKind.TRUE)}
+        source, self._bad = new_source("age", *lines), new_source("age", "corrected", "status")
+        plot = new_figure("strip", _AGE, "m", x_range=Range1d(-HISTORY_S, 0))
+        super().__init__(page, plot, source, lines)
+        self.plot.scatter("age", "corrected", source=self._bad, size=8, **status_marks())
 
     def draw(self, scene: Scene) -> None:
-        page, now_s = self.page, self.page.now_s()
+        page, now_s = self.page, scene.now_s(self.page.tag_id)
         # Also draw a pair without new data, because its ranges age.
-        if not page.changed("strip", (page.selected, now_s, scene.ranges, page.view.timeline is None)):
+        if not page.changed("strip", (page.selected, now_s, scene.ranges)):
             return
-        ranges = page.ranges(now_s - HISTORY_S, now_s)
-        columns = ranges.time_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, ranges.status
-        table = np.column_stack(columns)[ranges.time_s >= now_s - HISTORY_S]
+        ranges = page.history.columns
+        columns = ranges.stamp_s - now_s, ranges.raw_m, ranges.corrected_m, ranges.true_m, ranges.status
+        table = np.column_stack(columns)[ranges.stamp_s >= now_s - HISTORY_S]
         table[:, 1:][~(np.abs(table[:, 1:]) < MAX_RANGE_M)] = np.nan
-        message = "No range of this pair yet."
-        if page.history.samples:
-            message = f"No range of this pair in the last {HISTORY_S:.0f} s."
-        bad = table[np.isin(table[:, 4], FAULTS)]
-        rows = [
-            dict(zip(self._bad.data, (age_s, y, Status(int(s)).name), strict=True))
-            for age_s, _, y, _, s in bad
-        ]
+        faults = table[np.isin(table[:, 4], FAULTS)][:, [0, 2, 4]]
+        rows = [(age_s, range_m, Status(int(status)).name) for age_s, range_m, status in faults]
         set_rows(self._bad, rows)
-        has_data = np.isfinite(table[:, 1]).any()
-        self.fill(self._ranges, thinned(table[:, :4], page.history.max_gap_s), "" if has_data else message)
+        message = ""
+        if not np.isfinite(table[:, 1]).any():
+            interval = f" in the last {HISTORY_S:.0f} s" if len(page.history.rows) else " yet"
+            message = f"No range of this pair{interval}."
+        self.fill(thinned(table[:, :4], page.history.max_gap_s), message)
 
 
 class Quality(Chart):
     """Residual, rate and NLOS share of the selected pair: in the recording, or in the last minute."""
 
     def __init__(self, page: PageState) -> None:
-        super().__init__(page, "history", y="residual, m", **_time_axis(page))
-        plot, self._source = self.plot, new_source("age", "residual", "rate", "NLOS")
+        looks = (BLUE, "solid", "default"), (GREY, "dashed", "share"), (VERMILLION, "dotted", "share")
+        lines = {
+            name: {"line_color": colour, "line_dash": dash, "y_range_name": axis, "legend_label": name}
+            for name, (colour, dash, axis) in zip(("residual", "rate", "NLOS"), looks, strict=True)
+        }
+        plot = new_figure("history", y="residual, m", **_time_axis(page))
         plot.extra_y_ranges = {"share": Range1d(0, 100)}
         plot.add_layout(models.LinearAxis(y_range_name="share", axis_label="rate, Hz; NLOS, %"), "right")
-        for name, colour, dash, axis in (
-            ("residual", BLUE, "solid", "default"), ("rate", GREY, "dashed", "share"), ("NLOS", VERMILLION, "dotted", "share"),
-        ):  # fmt: skip
-            style = {"line_color": colour, "line_dash": dash, "line_width": 2, "y_range_name": axis}
-            plot.line("age", name, source=self._source, legend_label=name, **style)
-        plot.y_range.renderers = [line for line in plot.renderers if line.y_range_name == "default"]
-        finish(plot, "age", "residual", "rate", "NLOS")
+        super().__init__(page, plot, new_source("age", *lines), lines)
+        plot.y_range.renderers = [r for r in plot.renderers if r.y_range_name == "default"]
 
     def draw(self, scene: Scene) -> None:
         page = self.page
-        now_s = finite_or_zero(scene.now_s(page.tag_id)) if page.view.player is None else 0.0
+        now_s = scene.clock() if page.view.player is None else 0.0
         # All of it moves every second.
         if page.changed("history", (page.selected, math.floor(now_s), page.view.complete is None)):
-            table = page.ranges().quality() - (now_s, 0.0, 0.0, 0.0)
+            history = page.view.whole.pairs.get(page.selected or (-1, -1)) or page.history
+            table = history.quality() - (now_s, 0.0, 0.0, 0.0)
             message = "" if np.isfinite(table[:, 1]).any() else "No residuals of this pair yet."
-            self.fill(self._source, thinned(table, page.history.max_gap_s), message)
+            self.fill(thinned(table, page.history.max_gap_s), message)
 
 
 class PositionErrors(Chart):
     """Errors of the positions of the selected tag with and without correction, with two standard deviations."""
 
     def __init__(self, page: PageState) -> None:
-        super().__init__(page, "positions", y="m", **_time_axis(page))
-        self._corrected, self._raw = new_source("time", "error", "bound"), new_source("time", "raw")
-        style = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
-        self.plot.varea("time", 0, "bound", source=self._corrected, **style)
-        corrected = stroke(TrackKind.CORRECTED) | {"legend_label": "corrected"}
-        self.plot.line("time", "error", source=self._corrected, **corrected)
-        self.lines(self._raw, "time", TrackKind.RAW)
-        finish(self.plot, "time", "error", "bound")
+        source, self._raw = new_source("time", "error", "bound"), new_source("time", "raw")
+        plot = new_figure("positions", y="m", **_time_axis(page))
+        super().__init__(page, plot, source, {"error": stroke(TrackKind.CORRECTED)})
+        band = {"fill_color": BLUE, "fill_alpha": 0.2, "legend_label": "2 standard deviations"}
+        self.plot.varea("time", 0, "bound", source=source, **band)
+        self.plot.line("time", "raw", source=self._raw, **stroke(TrackKind.RAW))
 
     def draw(self, scene: Scene) -> None:
         page, is_live = self.page, self.page.view.player is None
         live_s = math.floor(scene.clock()) if is_live else -1
         if not page.changed("positions", (page.tag_id, page.view.complete is None, live_s)):
             return
-        positions = positions_of(page.view, page.tag_id)
+        positions = Positions(page.view, page.tag_id)
         table, raw = (positions.error_columns(kind) for kind in (TrackKind.CORRECTED, TrackKind.RAW))
         now_s = table[-1, 0] if is_live and len(table) else 0.0
         message = "" if np.isfinite(table[:, 1:]).any() else "No positions."
-        self.fill(self._corrected, thinned(table - (now_s, 0.0, 0.0), NO_DATA_S), message)
-        self.fill(self._raw, thinned(raw[:, :2] - (now_s, 0.0), NO_DATA_S), message)
+        self.fill(thinned(table - (now_s, 0.0, 0.0), NO_DATA_S), message)
+        self.fill(thinned(raw[:, :2] - (now_s, 0.0), NO_DATA_S), message, self._raw)
 
 
 class LastCir(Chart):
@@ -244,77 +206,68 @@ class LastCir(Chart):
 
     def __init__(self, page: PageState) -> None:
         x_range = Range1d(-TRACE_BEFORE, TRACE_AFTER)
-        super().__init__(page, "cir", "samples (1 ns) from the first path", "magnitude", x_range=x_range)
-        plot, self._trace = self.plot, new_source("sample", "magnitude")
-        self._marks = new_source("noise", "first", "from", "to")
+        plot = new_figure("cir", "samples (1 ns) from the first path", "magnitude", x_range=x_range)
+        line = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
+        super().__init__(page, plot, new_source("sample", "magnitude"), {"magnitude": line})
+        self._marks = source = new_source("noise", "first", "from", "to")
         style = {"fill_color": GREEN, "fill_alpha": 0.15, "line_color": None, "legend_label": "network input"}
-        plot.vstrip("from", "to", source=self._marks, **style)
-        style = {"line_color": BLUE, "line_width": 1.2, "legend_label": "CIR"}
-        plot.line("sample", "magnitude", source=self._trace, **style)
-        plot.vspan(
-            "first", source=self._marks, line_color=VERMILLION, line_width=2, legend_label="first path"
-        )
-        plot.hspan("noise", source=self._marks, line_color=GREY, line_dash="dashed", legend_label="noise")
-        finish(plot, "sample", "magnitude")
+        self.plot.vstrip("from", "to", source=source, **style)
+        style = {"line_color": VERMILLION, "line_width": 2, "legend_label": "first path"}
+        self.plot.vspan("first", source=source, **style)
+        self.plot.hspan("noise", source=source, line_color=GREY, line_dash="dashed", legend_label="noise")
 
     def draw(self, scene: Scene) -> None:
-        page, message = self.page, ""
-        trace = page.history.traces[-1] if page.history.traces else None
+        page = self.page
+        trace, player = page.trace, page.view.player
+        message = ""
         if trace is None:
             message = "No CIRs: the source sends none, or no raw ranges are received."
-            if any(other.traces for other in scene.pairs.values()):
+            if any(other.trace for other in scene.pairs.values()) or (player and player.timeline.cirs_ns):
                 message = "No CIR of this pair yet."
-        self.show_empty(message)
         # Compare the trace instead of its stamp, because stamps may be equal.
-        if not page.changed("trace", (page.selected, trace)):
+        if not page.changed("cir", (page.selected, trace, message)):
             return
-        if trace is None:
-            set_rows(self._trace, [])
-            set_rows(self._marks, [])
-            return
-        cir, magnitude = trace.cir, trace.magnitude
-        sample = np.arange(len(magnitude)) + (cir.start_index - trace.origin)
-        shown = (sample >= -TRACE_BEFORE) & (sample < TRACE_AFTER)
-        self._trace.data = {"sample": sample[shown].astype(np.float32), "magnitude": magnitude[shown]}
-        levels = {"noise": cir.noise_threshold, "first": finite_or_zero(cir.first_path_index - trace.origin)}
-        set_rows(self._marks, [levels | {"from": -WINDOW_LEAD, "to": page.view.window - WINDOW_LEAD}])
+        marks, table = [], np.zeros((0, 2))
+        if trace is not None:
+            cir = trace.cir
+            sample = np.arange(len(trace.magnitude)) + (cir.start_index - trace.origin)
+            first = finite_or_zero(cir.first_path_index - trace.origin)
+            marks = [(cir.noise_threshold, first, -WINDOW_LEAD, page.view.window - WINDOW_LEAD)]
+            is_shown = (sample >= -TRACE_BEFORE) & (sample < TRACE_AFTER)
+            table = np.column_stack([sample, trace.magnitude])[is_shown]
+        set_rows(self._marks, marks)
+        self.fill(table, message)
 
 
 class RangeErrors(Chart):
     """Histogram of the errors of the ranges with known truth; `distribution` has their cumulative shares."""
 
     def __init__(self, page: PageState) -> None:
+        shares = {f"{kind.name.lower()}_share": stroke(kind) for kind in _COMPARED}
+        source = new_source("right", "left", *(kind.name.lower() for kind in _COMPARED), *shares)
         y_range = DataRange1d(start=0.0, min_interval=1.0)
-        super().__init__(page, "errors", "range error, m", "ranges", y_range=y_range)
-        self._source = new_source("left", "right", "raw", "corrected", "raw_share", "corrected_share")
+        super().__init__(page, new_figure("errors", "range error, m", "ranges", y_range=y_range), source, {})
         low, high = int(ERROR_EDGES_M[0]), int(ERROR_EDGES_M[-1])
         self.plot.xaxis.ticker = models.FixedTicker(ticks=[low, -0.5, 0, 0.5, 1, 1.5, high])
         self.plot.xaxis.major_label_overrides = {low: f"{low} or less", high: f"{high} or more"}
         for kind, hatch in zip(_COMPARED, ("/", None), strict=True):
-            colour = palette.TRACK_COLOURS[kind]
+            colour, _, _ = palette.TRACK_STYLES[kind]
             self.plot.quad(
-                left="left", right="right", bottom=0, top=kind.name.lower(), source=self._source, color=colour, fill_alpha=0.35,
+                left="left", right="right", bottom=0, top=kind.name.lower(), source=source, color=colour, fill_alpha=0.35,
                 hatch_pattern=hatch, hatch_color=colour, hatch_scale=8, legend_label=kind.value,
             )  # fmt: skip
         finish(self.plot, "left", "right", "raw", "corrected")
-        self.distribution = Chart(
-            page, "distribution", "range error, m", "share of ranges, %",
-            x_range=Range1d(float(low), float(high)), y_range=Range1d(0, 100),
-        )  # fmt: skip
-        finish(
-            self.distribution.plot,
-            "right",
-            *self.distribution.lines(self._source, "right", *_COMPARED, suffix="_share"),
-        )
+        axes = {"x_range": Range1d(float(low), float(high)), "y_range": Range1d(0, 100)}
+        plot = new_figure("distribution", "range error, m", "share of ranges, %", **axes)
+        self.distribution = Chart(page, plot, source, shares)
 
     def draw(self, scene: Scene) -> None:
-        timeline = self.page.view.timeline
-        if not self.page.changed("errors", scene.errors if timeline is None else -1):
+        if not self.page.changed("errors", scene.errors):
             return
-        counts = scene.error_counts if timeline is None else count_errors(timeline.range_errors)
+        counts = scene.error_counts
         shares = 100.0 * np.cumsum(counts, axis=1) / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-        table = np.stack([ERROR_EDGES_M[:-1], ERROR_EDGES_M[1:], *counts, *shares], axis=1)
-        self.fill(self._source, table, "" if counts.any() else "No true ranges.")
+        table = np.stack([ERROR_EDGES_M[1:], ERROR_EDGES_M[:-1], *counts, *shares], axis=1)
+        self.fill(table, "" if counts.any() else "No true ranges.")
 
 
 class Map:
@@ -322,80 +275,66 @@ class Map:
 
     Attributes:
         plot: the figure.
-        coverage: the predicted accuracy and its legend, which are shown on request.
+        shows_accuracy: whether it shows the predicted accuracy.
     """
 
     def __init__(self, page: PageState) -> None:
+        self.shows_accuracy = False
         self._page, self._fitted = page, (False, False, False)
-        self._anchors = new_source("x", "y", "name", "id", "health", "label")
-        self._selected = new_source("x", "y")
         # Glyphs with NaN are not drawn: without a heading, for example.
-        self._tags = new_source("x", "y", "name", "colour", "label_y", "width", "height", "angle", "heading")
-        self._tracks = {kind: new_source("xs", "ys", "colour") for kind in STROKES}
-        # The script of the page fills it with the names that do not cover each other.
-        self._labels = new_source("x", "y", "text", "offset", "shift")
+        self._anchors = new_source("x", "y", "name", "id", "health", "label", "ring")
+        self._tags = new_source("x", "y", "name", "colour", "top", "width", "height", "angle", "heading")
+        self._tracks = new_source("xs", "ys", "colour", "line_width", "dash", "kind")
         self._rays = new_source("x", "y", "x0", "y0", "x1", "y1", "status")
-        self._accuracy = new_source("image", "x", "y", "dw", "dh")
+        self._accuracy = new_source("xs", "ys", "colour", "step")
         # The map shows these corners until the user changes the view; it must not follow the data.
         self._extent = new_source("x", "y")
-        self.plot = plot = new_figure(
-            "map", HEIGHT, "x, m", "y, m", "pan,wheel_zoom,reset,save", match_aspect=True
-        )
+        self.plot = plot = new_figure("map", "x, m", "y, m", HEIGHT, match_aspect=True)
         # Fixed borders: tick labels of another width would resize the frame and change the view.
         plot.min_border_left, plot.min_border_right = 70, 20
         extent = plot.scatter("x", "y", source=self._extent, size=0, alpha=0)
         plot.x_range, plot.y_range = DataRange1d(renderers=[extent]), DataRange1d(renderers=[extent])
-        clear, count = "#00000000", len(health.STEPS_M)
-        colours = models.LinearColorMapper(cividis(count), low=-0.5, high=count - 0.5, nan_color=clear)
-        labels = {step: f"\u2264 {limit_m:g}" for step, limit_m in enumerate(health.STEPS_M)}
-        bar = models.ColorBar(
-            color_mapper=colours, width=10, padding=4, title="predicted sd, m", visible=False,
-            ticker=models.FixedTicker(ticks=list(labels)), major_label_overrides=labels,
-        )  # fmt: skip
-        plot.add_layout(bar, "right")
-        image = plot.image("image", source=self._accuracy, color_mapper=colours, alpha=0.6, visible=False)
-        self.coverage = image, bar
-        items = defaultdict[str, list[Any]](list)
-        for name, glyph, source, style in self._layers():
-            items[name].append(getattr(plot, glyph)(source=source, **style))
-        del items[""]
-        named = items["anchor"] + items["tag"]
-        plot.add_tools(
-            models.HoverTool(tooltips=[("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")], renderers=named)
-        )
-        legend: dict[str, Any] = {name: name for name in items} | {"status": {"field": "status"}}
-        self._legend = {name: models.LegendItem(label=legend[name], renderers=items[name]) for name in items}
-        plot.add_layout(models.Legend(items=list(self._legend.values())), "below")
+        for glyph, source, style in self._layers():
+            getattr(plot, glyph)(source=source, **style)
+        named = [r for r in plot.renderers if isinstance(r.glyph, models.Text)]
+        tips = [("", "@name"), ("x, y", "@x{0.00}, @y{0.00} m")]
+        plot.add_tools(models.HoverTool(tooltips=tips, renderers=named))
         finish(plot)
 
-    def _layers(self) -> list[tuple[str, str, ColumnDataSource, dict[str, Any]]]:
-        """Return the layers of the map, the lowest first: entry of the legend (empty: none), glyph, source and style."""
-        marks, looks = status_marks(), HEALTH_LOOKS
-        anchor = models.CategoricalColorMapper(
-            factors=list(looks), palette=[colour for _, colour in looks.values()]
-        )
+    def _layers(self) -> list[tuple[str, ColumnDataSource, dict[str, Any]]]:
+        """Return the layers of the map, the lowest first: glyph, source and style."""
+        marks, (marker, colour) = status_marks(), marks_of("health", health.LOOKS)
         text = {
-            "text": "text", "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
-            "background_fill_color": PAPER, "background_fill_alpha": 0.8, "y_offset": "offset", "x_offset": "shift",
+            "text_align": "center", "text_font_size": "12px", "text_color": NIGHT, "level": "annotation",
+            "background_fill_color": PAPER, "background_fill_alpha": 0.8,
         }  # fmt: skip
         return [
-            ("", "segment", self._rays, {"line_color": marks["color"], "line_alpha": 0.8}),
-            *((kind.value, "multi_line", source, stroke(kind) | {"line_color": "colour"})
-              for kind, source in self._tracks.items()),
-            ("95 % ellipse", "ellipse", self._tags, {
-                "width": "width", "height": "height", "angle": "angle", "color": "colour", "fill_alpha": 0.25,
+            ("multi_polygons", self._accuracy, {
+                "fill_color": "colour", "fill_alpha": 0.6, "line_color": None, "legend_field": "step",
             }),
-            ("heading", "ray", self._tags, {"length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3}),
-            ("status", "scatter", self._rays, marks | {"size": 10, "line_width": 2}),
-            ("anchor", "scatter", self._anchors, {
-                "marker": factor_mark("health", [marker for marker, _ in looks.values()], list(looks)),
-                "size": 15, "line_color": NIGHT, "fill_color": {"field": "health", "transform": anchor},
+            ("segment", self._rays, {"line_color": marks["color"], "line_alpha": 0.8}),
+            ("multi_line", self._tracks, {
+                "line_color": "colour", "line_width": "line_width", "line_dash": "dash", "legend_field": "kind",
             }),
-            ("selected anchor", "scatter", self._selected, {
-                "marker": "circle", "size": 22, "fill_color": None, "line_color": NIGHT, "line_width": 3,
+            ("ellipse", self._tags, {
+                "width": "width", "height": "height", "angle": "angle", "color": "colour", "fill_alpha": 0.25, "legend_label": "95 % ellipse",
             }),
-            ("tag", "scatter", self._tags, {"marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT}),
-            ("", "text", self._labels, text),
+            ("ray", self._tags, {
+                "length": HEADING_M, "angle": "heading", "line_color": NIGHT, "line_width": 3, "legend_label": "heading",
+            }),
+            ("scatter", self._rays, marks | {"size": 7, "line_width": 2}),
+            ("scatter", self._anchors, {
+                "marker": marker, "size": 15, "line_color": NIGHT, "fill_color": colour, "legend_label": "anchor",
+            }),
+            ("scatter", self._anchors, {
+                "size": "ring", "fill_color": None, "line_color": NIGHT, "line_width": 3, "legend_label": "selected anchor",
+            }),
+            ("scatter", self._tags, {
+                "marker": "star", "size": 18, "fill_color": "colour", "line_color": NIGHT, "legend_label": "tag",
+            }),
+            # The script of the page hides names that cover others.
+            ("text", self._anchors, text | {"text": "label", "y_offset": -13, "view": CDSView(filter=BooleanFilter())}),
+            ("text", self._tags, text | {"text": "name", "y": "top", "y_offset": -6, "view": CDSView(filter=BooleanFilter())}),
         ]  # fmt: skip
 
     def draw(self, scene: Scene) -> None:
@@ -404,22 +343,24 @@ class Map:
         self._draw_tags(scene)
         self._draw_tracks(scene)
         self._draw_rays(scene)
-        self.draw_accuracy(scene)
-        fitted = scene.is_indexed, bool(scene.anchors), bool(scene.anchors or scene.tracks)
+        self._draw_accuracy(scene)
+        is_complete = self._page.view.complete is not None
+        fitted = is_complete, bool(scene.anchors), bool(scene.anchors or scene.tracks)
         if fitted > self._fitted or not self._extent.data["x"]:
             self._fitted = fitted
             self.fit(scene)
         # The legend shows only what the map contains.
-        for name, item in self._legend.items():
-            data = [r.data_source.data for r in item.renderers if r.visible]
-            columns = [
-                columns[_SIZES[name]] if name in _SIZES else next(iter(columns.values())) for columns in data
-            ]
-            item.visible = any(len(c) and not (name in _SIZES and np.isnan(c).all()) for c in columns)
+        for item in self.plot.legend[0].items:
+            data = item.renderers[0].data_source.data
+            column = _OPTIONAL.get(getattr(item.label, "value", ""))
+            item.visible = bool(np.isfinite(data[column]).any() if column else len(next(iter(data.values()))))
 
     def _draw_anchors(self, scene: Scene) -> None:
         page, timeline, rows = self._page, self._page.view.timeline, []
-        for identity, anchor in scene.anchors.items():
+        selected = page.selected and page.selected[0]
+        # The selected one first: its name has priority.
+        for identity in sorted(scene.anchors, key=lambda identity: identity != selected):
+            anchor = scene.anchors[identity]
             state, residual_m = page.health.get(identity, (health.UNKNOWN, math.nan))
             name = anchor.name or format_id(identity)
             label = name[:MAX_LABEL] + (f" {state[0]}" if state != health.UNKNOWN else "")
@@ -428,58 +369,44 @@ class Map:
             elif state in (health.BAD, health.CHECK) and abs(residual_m) >= health.LONG_M:
                 # Rounded, so that the map is not drawn again for every range.
                 label += f" {residual_m:+.1f} m"
-            values = *anchor.position[:2], name, str(identity), state, label
-            rows.append(dict(zip(self._anchors.data, values, strict=True)))
+            ring = RING if identity == selected else math.nan
+            rows.append((*anchor.position[:2], name, str(identity), state, label, ring))
         if page.changed("anchors", rows):
             set_rows(self._anchors, rows)
-        place = scene.anchors.get(page.selected[0]) if page.selected else None
-        if page.changed("selected", place):
-            set_rows(self._selected, [dict(zip("xy", place.position, strict=False))] if place else [])
 
     def _draw_tags(self, scene: Scene) -> None:
-        rows: list[dict[str, Any]] = []
+        rows = []
         plain_id, colours = plain_tag_id(scene.tags, scene.pairs), palette.tag_colours(scene.tags)
-        for name, pose in scene.tags.items():
-            age_s, label = scene.age_s(pose), tag_label(name, plain_id)
+        for tag, pose in scene.tags.items():
+            age_s, name, colour = scene.age_s(pose), tag_label(tag, plain_id), colours[tag]
+            if age_s > NO_DATA_S:
+                name, colour = f"{name}: no data for {age_s:.0f} s", GREY
             major, minor, angle = map(drawable, pose.ellipse)
-            half_height_m = math.hypot(major * math.sin(angle), minor * math.cos(angle))
-            is_late = age_s > NO_DATA_S
-            rows.append({
-                "x": pose.x, "y": pose.y, "label_y": pose.y + finite_or_zero(half_height_m),
-                "name": f"{label}: no data for {age_s:.0f} s" if is_late else label,
-                "colour": GREY if is_late else colours[name],
-                "width": 2 * major, "height": 2 * minor, "angle": angle, "heading": pose.heading_rad,
-            })  # fmt: skip
+            half_height_m = finite_or_zero(math.hypot(major * math.sin(angle), minor * math.cos(angle)))
+            ellipse = 2 * major, 2 * minor, angle
+            rows.append((pose.x, pose.y, name, colour, pose.y + half_height_m, *ellipse, pose.heading_rad))
         set_rows(self._tags, rows)
-
-    def show_labels(self) -> None:
-        """Show all names, for a report, which has no script."""
-        anchors, tags = self._anchors.data, self._tags.data
-        labels = [(*row, -13, 0) for row in zip(anchors["x"], anchors["y"], anchors["label"], strict=True)]
-        labels += [(*row, -4, 0) for row in zip(tags["x"], tags["label_y"], tags["name"], strict=True)]
-        set_rows(self._labels, [dict(zip(self._labels.data, row, strict=True)) for row in labels])
 
     def _draw_tracks(self, scene: Scene) -> None:
         colours = palette.tag_colours(scene.tags)
-        for kind, source in self._tracks.items():
-            tracks = {
-                name: view
-                for (name, track_kind), view in scene.tracks.items()
-                if track_kind is kind and len(view.points)
-            }
-            state = [
-                (name, len(view.points), view.points[-1][0], math.floor(scene.age_s(view)), colours.get(name))
-                for name, view in tracks.items()
-            ]
-            if self._page.changed(kind.value, state):
-                lines = [self._trail(view.columns(), scene.age_s(view)).T for view in tracks.values()]
-                colour = palette.TRACK_COLOURS[kind] or NIGHT
-                is_own = kind is TrackKind.CORRECTED
-                source.data = {
-                    "xs": [x for x, _ in lines],
-                    "ys": [y for _, y in lines],
-                    "colour": [colours.get(name, BLUE) if is_own else colour for name in tracks],
-                }
+        tracks = [
+            (kind, name, track)
+            for kind in palette.TRACK_STYLES
+            for (name, track_kind), track in scene.tracks.items()
+            if track_kind is kind and len(track.rows)
+        ]
+        state = [
+            (kind, name, len(track.rows), track.received_s, math.floor(scene.age_s(track)), colours.get(name))
+            for kind, name, track in tracks
+        ]
+        if self._page.changed("tracks", state):
+            rows = []
+            for kind, name, track in tracks:
+                colour, *style = palette.TRACK_STYLES[kind]
+                if kind is TrackKind.CORRECTED:
+                    colour = colours.get(name, BLUE)
+                rows.append((*self._trail(track.rows, scene.age_s(track)).T, colour, *style, kind.value))
+            set_rows(self._tracks, rows)
 
     def _trail(self, track: NDArray[np.float64], age_s: float) -> NDArray[np.float32]:
         """Return x and y of the displayed time of a track whose last point has an age, float32 (k, 2)."""
@@ -488,52 +415,51 @@ class Map:
 
     def _draw_rays(self, scene: Scene) -> None:
         """Draw rays with statuses from the anchors to the tag of the selected pair."""
-        rows = []
-        tag_id = self._page.tag_id
+        tag_id, rows = self._page.tag_id, []
         pose = None if tag_id is None else scene.tag_of(tag_id)
         for (anchor_id, of_tag), history, sample in scene.latest():
             place = scene.anchors.get(anchor_id)
             if of_tag == tag_id and pose and place and not scene.no_data(history):
-                (x0, y0, _), x1, y1 = place.position, pose.x, pose.y
-                values = (x0 + x1) / 2, (y0 + y1) / 2, x0, y0, x1, y1, sample.status.name
-                rows.append(dict(zip(self._rays.data, values, strict=True)))
+                x, y, _ = place.position
+                middle = (x + pose.x) / 2, (y + pose.y) / 2
+                rows.append((*middle, x, y, pose.x, pose.y, sample.status.name))
         set_rows(self._rays, rows)
 
-    def draw_accuracy(self, scene: Scene) -> None:
-        """Draw the map of the predicted accuracy if it is visible."""
-        pose = next(iter(scene.tags.values()), None)
-        if not self.coverage[0].visible or len(scene.anchors) < 2:
+    def _draw_accuracy(self, scene: Scene) -> None:
+        """Draw areas of the predicted accuracy if they are shown."""
+        inputs, rows = None, list[tuple[Any, ...]]()
+        if self.shows_accuracy and len(scene.anchors) > 1:
+            anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
+            height_m = next((finite_or_zero(pose.z) for pose in scene.tags.values()), 0.0)
+            sds_m = [sample.sigma_m for _, _, sample in scene.latest() if sample.sigma_m > 0.0]
+            inputs = anchors.tobytes(), round(height_m, 1), round(float(np.median(sds_m or [RANGE_SD_M])), 2)
+        if not self._page.changed("accuracy", inputs):
             return
-        anchors = np.nan_to_num([anchor.position for anchor in scene.anchors.values()])
-        height_m = finite_or_zero(pose.z) if pose else 0.0
-        sds_m = [sample.sigma_m for _, _, sample in scene.latest() if sample.sigma_m > 0.0]
-        sd_m = round(float(np.median(sds_m)), 2) if sds_m else RANGE_SD_M
-        if self._page.changed("accuracy", (anchors.tobytes(), round(height_m, 1), sd_m)):
-            image, low, size = health.predicted_accuracy(anchors, height_m, sd_m)
-            steps = np.searchsorted(health.STEPS_M, image).astype(np.float32)
-            steps[~(image <= health.STEPS_M[-1])] = np.nan
-            values = [steps], [low[0]], [low[1]], [size[0]], [size[1]]
-            self._accuracy.data = dict(zip(self._accuracy.data, values, strict=True))
+        if inputs is not None:
+            image = health.predicted_accuracy(anchors, height_m, inputs[-1])
+            areas = contour_data(*image, [0.0, *health.STEPS_M], want_line=False).fill_data
+            for xs, ys, limit_m in zip(areas.xs, areas.ys, areas.upper_levels, strict=True):
+                colour = cividis(len(health.STEPS_M))[health.STEPS_M.index(limit_m)]
+                rows.append((xs, ys, colour, f"sd \u2264 {limit_m:g} m"))
+        set_rows(self._accuracy, rows)
 
     def fit(self, scene: Scene) -> None:
         """Fit the view of the map to its current content."""
         places = [anchor.position[:2] for anchor in scene.anchors.values()]
         places += [(pose.x, pose.y) for pose in scene.tags.values()]
-        timeline, live = self._page.view.complete, (view.columns() for view in scene.tracks.values())
-        for track in live if timeline is None else timeline.tracks.values():
-            places += np.percentile(track[:, 1:3], (2, 98), axis=0).tolist() if len(track) else []
+        for track in list(self._page.view.whole.tracks.values()):
+            places += np.percentile(track.rows[:, 1:3], (2, 98), axis=0).tolist() if len(track.rows) else []
         corners = np.array(places or [(0.0, 0.0), (10.0, 10.0)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # A margin for ellipses and labels; without anchors, one in which the tag can move.
-        margin = 0.1 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
+        margin = 0.15 * float((high - low).max()) if scene.anchors or not places else MARGIN_M
         low, high = low - margin, high + margin
         self._extent.data = {name: [float(low[i]), float(high[i])] for i, name in enumerate("xy")}
 
 
-def new_figure(
-    name: str, height: int, x: str, y: str, tools: str = "pan,wheel_zoom,box_zoom,reset,save", **options: Any
-) -> figure:
-    """Return an empty figure with the style of the page."""
+def new_figure(name: str, x: str, y: str, height: int = 230, **options: Any) -> figure:
+    """Return an empty figure with the style of the page; `x`, `y`: titles of its axes."""
+    tools = "pan,wheel_zoom,reset,save" + ("" if options.get("match_aspect") else ",box_zoom")
     plot = figure(
         name=name, height=height, min_width=200, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, tools=tools,
         **options,
@@ -546,10 +472,8 @@ def finish(plot: figure, *columns: str) -> None:
     """Put the legend next to the plot, where it covers no data; show values of columns next to the pointer."""
     if columns:
         tips = [(name.replace("_", " "), f"@{name}{{0.000}}") for name in columns]
-        first = [
-            renderer for renderer in plot.renderers if isinstance(renderer.glyph, (models.Line, models.Quad))
-        ][:1]
-        plot.add_tools(models.HoverTool(tooltips=tips, mode="vline", renderers=first))
+        shown = next(r for r in plot.renderers if isinstance(r.glyph, (models.Line, models.Quad)))
+        plot.add_tools(models.HoverTool(tooltips=tips, mode="vline", renderers=[shown]))
     for legend in plot.legend:
         if legend in plot.center:
             plot.add_layout(legend, "above")
@@ -567,19 +491,23 @@ def _time_axis(page: PageState) -> dict[str, Any]:
 
 
 def stroke(kind: TrackKind) -> dict[str, Any]:
-    """Return the style of the lines of a kind."""
-    width, dash = STROKES[kind]
-    return {"line_color": palette.TRACK_COLOURS[kind] or NIGHT, "line_width": width, "line_dash": dash}
+    """Return style and legend of the lines of a kind."""
+    colour, width, dash = palette.TRACK_STYLES[kind]
+    return {"line_color": colour, "line_width": width, "line_dash": dash, "legend_label": kind.value}
+
+
+def marks_of(column: str, looks: Mapping[str, tuple[str, str | None]]) -> tuple[Any, Any]:
+    """Return markers and colours for the values of a column; `looks`: {value: marker and colour}."""
+    names, (markers, colours) = list(looks), zip(*looks.values(), strict=True)
+    inks = [colour or NIGHT for colour in colours]
+    return factor_mark(column, markers, names), factor_cmap(column, inks, names, nan_color=GREY)
 
 
 def status_marks() -> dict[str, Any]:
     """Return marker and colour of marks whose column `status` has the name of a status."""
-    names, looks = [status.name for status in palette.STATUS_LOOKS], palette.STATUS_LOOKS.values()
-    colours = models.CategoricalColorMapper(
-        factors=names, palette=[look.colour or NIGHT for look in looks], nan_color=GREY
-    )
-    marker = factor_mark("status", [look.marker for look in looks], names)
-    return {"marker": marker, "color": {"field": "status", "transform": colours}}
+    looks = {status.name: (look.marker, look.colour) for status, look in palette.STATUS_LOOKS.items()}
+    marker, colour = marks_of("status", looks)
+    return {"marker": marker, "color": colour, "legend_field": "status"}
 
 
 def thinned(table: NDArray[np.float64], gap_s: float) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from uwb_mitigation.positioning.track_errors import NO_ERRORS, TrackErrors, track_errors
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Track, TruePath
-from uwb_mitigation.viewer.histories import HISTORY_S, Pair
+from uwb_mitigation.viewer.histories import HISTORY_S
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, Counts, tag_label, tag_name
+from uwb_mitigation.viewer.scene import DEFAULT_TAG, Scene, tag_label, tag_name
 from uwb_mitigation.viewer.state import View
 
 if TYPE_CHECKING:
     # A live page reads no recordings.
-    from uwb_mitigation.positioning.recorded_tracks import TagTracks
+    pass
 
 WHOLE, RECENT, LIVE = "whole recording", f"last {HISTORY_S:.0f} s", "since the start"
 """Names of the intervals."""
@@ -30,77 +30,53 @@ Card = list[str]
 
 def cards(view: View, tag_id: int | None) -> list[Card]:
     """Return the figures of a tag (None: without ranges) and of all ranges."""
-    positions, timeline, scene = positions_of(view, tag_id), view.timeline, view.scene
-    if timeline is not None:
-        raw_name = "raw + same filter" if timeline.estimates else "raw + locator with default settings"
-        counts, errors_m = timeline.counts, timeline.range_errors
-        return positions.cards(-math.inf, WHOLE, raw_name, counts) + _range_cards(counts, errors_m, WHOLE)
-    if view.player is not None:
+    positions, scene = Positions(view, tag_id), view.scene
+    if view.player is None:
+        return positions.cards(scene.clock() - HISTORY_S, RECENT, "raw + locator") + _range_cards(scene, LIVE)
+    if view.timeline is None:
         return [["Reading the recording ...", "", ""]]
-    begin_s = -math.inf
-    if track := scene.tracks.get((positions.name, TrackKind.CORRECTED)):
-        begin_s = track.points[-1][0] + scene.age_s(track) - HISTORY_S
-    errors_m = scene.error_sums_m[:, None] / (scene.errors or math.nan)
-    recent = positions.cards(begin_s, RECENT, "raw + locator", scene.counts)
-    return recent + _range_cards(scene.counts, errors_m, LIVE)
+    raw_name = "raw + same filter" if view.timeline.estimates else "raw + locator with default settings"
+    return positions.cards(-math.inf, WHOLE, raw_name) + _range_cards(scene, WHOLE)
 
 
-def _range_cards(counts: Counts, errors_m: NDArray[np.float64], window: str) -> list[Card]:
-    """Return the figures of ranges; `errors_m`: raw and corrected, or their mean absolute error, float64 (2, n)."""
-    corrected, count, faults = counts
+def _range_cards(scene: Scene, window: str) -> list[Card]:
+    """Return the figures of ranges."""
+    corrected, count, faults = scene.counts
     if not count:
         return []
-    percentage = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
-    text = f"{corrected} of {count} ranges corrected" + ("" if corrected or faults else ": no CIRs")
-    share = [
-        f"Ranges corrected, {window}",
-        percentage,
-        text + (f"; {faults} need attention" if faults else ""),
-    ]
-    raw, mean = (_metres(np.abs(errors)) for errors in errors_m)
-    return [share] if mean == "-" else [share, [f"Mean absolute range error, {window}", mean, f"raw: {raw}"]]
-
-
-def positions_of(view: View, tag_id: int | None) -> Positions:
-    """Return the positions of a tag: from topics, or of a recording whose index is complete."""
-    if (timeline := view.complete) is not None:
-        return Positions(timeline.tracks, tag_id, timeline.rows, timeline.estimates)
-    tracks = view.scene.tracks.items() if view.player is None else ()
-    return Positions(
-        {key: track.columns() for key, track in tracks if len(track.points)}, tag_id, view.scene.pairs
-    )
+    share = f"{100.0 * corrected / count:.1f} %" if corrected else "none"
+    text = f"{corrected} of {count} ranges" + ("" if corrected or faults else ": no CIRs")
+    text += f"; {faults} need attention" if faults else ""
+    shown = [[f"Ranges corrected, {window}", share, text]]
+    if scene.errors:
+        raw, mean = map(_metres, scene.error_sums_m / scene.errors)
+        shown.append([f"Mean absolute range error, {window}", mean, f"raw: {raw}"])
+    return shown
 
 
 class Positions:
-    """The positions of one tag.
+    """The positions of one tag, from topics, or of a recording with complete tracks.
 
     Args:
-        tracks: {(name, kind): time (s), x, y, z and standard deviation (m), float64 (n, 5)}.
+        view: what is shown.
         tag_id: the tag; None: the first one.
-        pairs: all pairs with ranges.
-        estimates: {name: tracks that the viewer itself has estimated}.
-
-    Attributes:
-        name: name of its positions; empty: it has none.
     """
 
-    def __init__(
-        self,
-        tracks: Mapping[tuple[str, TrackKind], NDArray[np.float64]],
-        tag_id: int | None,
-        pairs: Iterable[Pair],
-        estimates: Mapping[str, TagTracks] = {},
-    ) -> None:
-        self._tracks = tracks
-        self._names = [name for name, kind in tracks if kind is TrackKind.CORRECTED]
-        self.name = next(iter(self._names), "") if tag_id is None else tag_name(tag_id, self._names, pairs)
-        self._frame = tag_label(self.name or DEFAULT_TAG, tag_id).replace(" ", "_")
-        self._estimated = estimates.get(self.name)
+    def __init__(self, view: View, tag_id: int | None) -> None:
+        is_ready = view.player is None or view.complete is not None
+        self._tracks = {key: track.rows for key, track in view.whole.tracks.items()} if is_ready else {}
+        self._names = [name for name, kind in self._tracks if kind is TrackKind.CORRECTED]
+        self._is_corrected = view.scene.corrected > 0
+        self._name = next(iter(self._names), "")
+        if tag_id is not None:
+            self._name = tag_name(tag_id, self._names, view.whole.pairs)
+        self._frame = tag_label(self._name or DEFAULT_TAG, tag_id).replace(" ", "_")
+        self._estimated = view.complete.estimates.get(self._name) if view.complete else None
 
     def track(self, kind: TrackKind) -> NDArray[np.float64] | None:
         """Return the track of a kind; a true track has the frame of the tag as name, or any name if there is only one tag."""
         if kind is not TrackKind.TRUE:
-            return self._tracks.get((self.name, kind))
+            return self._tracks.get((self._name, kind))
         true = {name: track for (name, track_kind), track in self._tracks.items() if track_kind is kind}
         is_single = len(true) == len(self._names) == 1
         return next(iter(true.values())) if is_single else true.get(self._frame)
@@ -132,14 +108,13 @@ class Positions:
             error_m = np.linalg.norm((track.position - truth.position_at(track.stamp_ns))[:, :2], axis=1)
         return np.column_stack([columns[:, 0], error_m, 2.0 * columns[:, 4]])
 
-    def cards(self, begin_s: float, window: str, raw_name: str, counts: Counts) -> list[Card]:
+    def cards(self, begin_s: float, window: str, raw_name: str) -> list[Card]:
         """Return the figures of the positions from a time on.
 
         Args:
             begin_s: this time.
             window: name of the interval.
             raw_name: name of the track of raw ranges.
-            counts: of ranges.
         """
         track = self.track(TrackKind.CORRECTED)
         if track is None:
@@ -155,25 +130,21 @@ class Positions:
         for title, name in (("Position RMSE", "rmse"), ("95 % of position errors below", "p95")):
             others = (f"{other}: {_metres(getattr(error, name))}" for other, error in errors.items())
             shown.append([f"{title}, {window}", _metres(getattr(corrected, name)), "; ".join(others)])
+        raw_m = errors[raw_name].rmse if raw_name in errors else math.nan
         # Without corrections, offsets make the difference.
-        if counts[0] and raw_name in errors and corrected.rmse + errors[raw_name].rmse > 0.0:
-            shown.append([f"Correction, {window}", *_change(corrected.rmse, errors[raw_name].rmse, raw_name)])
+        if self._is_corrected and corrected.rmse + raw_m > 0.0:
+            percent = 100.0 * (corrected.rmse / raw_m - 1.0)
+            change = f"{abs(percent):.0f} % {'more' if percent > 0.0 else 'less'} error"
+            text = f"position RMSE {corrected.rmse:.3f} m; {raw_name}: {raw_m:.3f} m"
+            shown.append([f"Correction, {window}", change if abs(percent) >= 0.5 else "no change", text])
         return shown
 
 
 def _track(columns: NDArray[np.float64]) -> Track:
-    """Return time (s), x, y, z, ..., float64 (n, 4 or more), as a track without covariances."""
+    """Return rows of `Scene.tracks` as a track without covariances."""
     n = len(columns)
-    stamp_ns = np.rint(columns[:, 0] * NS_PER_S).astype(np.int64)
+    stamp_ns = np.rint(columns[:, 5] * NS_PER_S).astype(np.int64)
     return Track(stamp_ns, columns[:, 1:4], np.zeros((n, 3)), np.full((n, 6, 6), np.nan))
-
-
-def _change(corrected_m: float, raw_m: float, raw_name: str) -> tuple[str, str]:
-    """Return what the correction changes, as texts."""
-    change_percent = 100.0 * (corrected_m / raw_m - 1.0)
-    size, direction = f"{abs(change_percent):.0f} %", "more" if change_percent > 0.0 else "less"
-    text = "no change" if abs(change_percent) < 0.5 else f"{size} {direction} error"
-    return text, f"position RMSE {corrected_m:.3f} m; {raw_name}: {raw_m:.3f} m"
 
 
 def _metres(values_m: Any, statistic: Callable[[NDArray[np.float64]], Any] = np.mean) -> str:

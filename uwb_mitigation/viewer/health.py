@@ -6,7 +6,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import format_id
 from uwb_mitigation.positioning.geometry import dop
 from uwb_mitigation.viewer.histories import NO_DATA_S, Pair
+from uwb_mitigation.viewer.palette import GREEN, ORANGE, PAPER, VERMILLION
 from uwb_mitigation.viewer.scene import Scene
 
 LONG_M, VERY_LONG_M = 0.15, 0.3
@@ -25,6 +26,13 @@ EVIDENCE = 10
 RELEASE = 0.8
 """A state ends below this share of the limit at which it begins (hysteresis)."""
 GOOD, CHECK, BAD, UNKNOWN = "\u2713 good", "! check", "\u2297 bad", "? unknown"
+LOOKS = {
+    GOOD: ("hex", GREEN),
+    CHECK: ("square_pin", ORANGE),
+    BAD: ("circle_x", VERMILLION),
+    UNKNOWN: ("hex_dot", PAPER),
+}
+"""Marker and colour of an anchor for each state; statuses of ranges have other markers."""
 STATES = (
     f"{BAD}: no ranges, or a mean residual over {VERY_LONG_M:.2f} m with line of sight. {CHECK}: a mean residual over {LONG_M:.2f} "
     f"m, {MAX_LOST:.0f} % lost, {MAX_NOT_OK:.0f} % with a status that needs attention, or {MAX_NLOS:.0f} % NLOS. {UNKNOWN}: fewer than "
@@ -44,7 +52,7 @@ HOLD_S = 2.0
 RADIUS95 = math.sqrt(5.991 / 2.0)
 """Radius of 95 % of a circular normal distribution, relative to the root of the sum of its variances in x and y."""
 CELLS = 40
-"""Width and height of the map of the predicted accuracy, cells."""
+"""Width and height of the map of the predicted accuracy, points."""
 STEPS_M = (0.1, 0.2, 0.5, 1.0, 10.0)
 """Upper limits of the colours of the map of the predicted accuracy; above the last one, it is not shown."""
 
@@ -54,21 +62,40 @@ the estimated position (m); `evidence`, number of residuals; `stopped`, age of t
 `displaced`, held-out residual (m) of an anchor whose ranges fit another position, else 0. NaN: unknown."""
 
 
+FAULTS = (
+    ("stopped", 0.0, BAD, "has not answered for {stopped:.0f} s: check its power and PAN id."),
+    ("displaced", 0.0, BAD, "is not where the anchors file says: its ranges differ by {displaced:.2f} m from the track of the others, "
+                            "and fit another position. Measure it again."),
+    # Without line of sight, ranges may be long although anchor and offset are right.
+    ("blocked", LONG_M, CHECK, "reads {size:.2f} m {direction}, with {nlos:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."),
+    ("clear", VERY_LONG_M, BAD, "reads {size:.2f} m {direction}: calibrate, or check its position."),
+    ("clear", LONG_M, CHECK, "reads {size:.2f} m {direction}: calibrate, or check its position."),
+    ("lost", MAX_LOST, CHECK, "loses {lost:.0f} % of its ranges: check distance and antenna."),
+    ("not_ok", MAX_NOT_OK, CHECK, "has {not_ok:.0f} % of ranges with a status that needs attention: see the pairs."),
+    ("nlos", MAX_NLOS, CHECK, "has no line of sight in {nlos:.0f} % of the CIRs: move it if possible."),
+)  # fmt: skip
+"""Faults of an anchor, the most important one first: mean (`blocked`, `clear`: size of the residual without and with line of
+sight), limit, state above it, and advice with means."""
+
+
+def faults(means: Means, before: str = "") -> list[tuple[str, str]]:
+    """Return state and advice for each fault of a pair or an anchor; `before`: its state until now."""
+    residual_m = means["residual"] if means["evidence"] >= EVIDENCE else math.nan
+    values: dict[str, Any] = {"blocked": 0.0, "clear": 0.0, "size": abs(residual_m), **means}
+    values["blocked" if means["nlos"] > MAX_NLOS else "clear"] = abs(residual_m)
+    values["direction"] = "long" if residual_m > 0.0 else "short"
+    return [
+        (fault, text.format(**values))
+        for name, limit, fault, text in FAULTS
+        if values[name] > limit * (RELEASE if before in (BAD, fault) else 1.0)
+    ]
+
+
 def state(means: Means, before: str = "") -> str:
     """Return the state of a pair or an anchor; `before`: its state until now."""
-    residual_m = abs(means["residual"]) if means["evidence"] >= EVIDENCE else math.nan
-    bad_m, check_m = (
-        limit_m * (RELEASE if before in states else 1.0)
-        for limit_m, states in ((VERY_LONG_M, (BAD,)), (LONG_M, (BAD, CHECK)))
-    )
-    # Without line of sight, ranges may be long although anchor and offset are right.
-    is_long = residual_m > bad_m and not means["nlos"] > MAX_NLOS
-    if means["stopped"] > 0.0 or means["displaced"] > 0.0 or is_long:
-        return BAD
-    is_suspicious = means["lost"] > MAX_LOST or means["not_ok"] > MAX_NOT_OK or means["nlos"] > MAX_NLOS
-    if is_suspicious or residual_m > check_m:
-        return CHECK
-    return GOOD if means["rate"] > 0.0 and not math.isnan(residual_m) else UNKNOWN
+    states = {fault for fault, _ in faults(means, before)}
+    is_known = means["rate"] > 0.0 and means["evidence"] >= EVIDENCE and math.isfinite(means["residual"])
+    return next((bad for bad in (BAD, CHECK) if bad in states), GOOD if is_known else UNKNOWN)
 
 
 def anchor_means(pairs: Mapping[Pair, Means]) -> dict[int, Means]:
@@ -96,7 +123,8 @@ def advice(anchors: Mapping[int, Means], names: Mapping[int, str] = {}) -> tuple
     if common:
         return common, dict.fromkeys(anchors, "")
     labels = {anchor_id: f"Anchor {names.get(anchor_id) or format_id(anchor_id)}" for anchor_id in anchors}
-    return "", {anchor_id: _anchor_advice(labels[anchor_id], means) for anchor_id, means in anchors.items()}
+    found = {anchor_id: faults(means) for anchor_id, means in anchors.items()}
+    return "", {key: f"{labels[key]} {texts[0][1]}" if texts else "" for key, texts in found.items()}
 
 
 def _common_advice(anchors: list[Means]) -> str:
@@ -116,31 +144,6 @@ def _common_advice(anchors: list[Means]) -> str:
     )
 
 
-def _anchor_advice(name: str, means: Means) -> str:
-    residual_m = means["residual"]
-    reads = f"{name} reads {abs(residual_m):.2f} m {'long' if residual_m > 0.0 else 'short'}"
-    if means["stopped"] > 0.0:
-        return f"{name} has not answered for {means['stopped']:.0f} s: check its power and PAN id."
-    if means["displaced"] > 0.0:
-        return (
-            f"{name} is not where the anchors file says: its ranges differ by {means['displaced']:.2f} m from the track of the "
-            "others, and fit another position. Measure it again."
-        )
-    if abs(residual_m) > LONG_M and means["nlos"] > MAX_NLOS:
-        return f"{reads}, with {means['nlos']:.0f} % NLOS: its line of sight is probably blocked. Move it if possible."
-    if abs(residual_m) > LONG_M:
-        return f"{reads}: calibrate, or check its position."
-    if means["lost"] > MAX_LOST:
-        return f"{name} loses {means['lost']:.0f} % of its ranges: check distance and antenna."
-    if means["not_ok"] > MAX_NOT_OK:
-        return (
-            f"{name} has {means['not_ok']:.0f} % of ranges with a status that needs attention: see the pairs."
-        )
-    if means["nlos"] > MAX_NLOS:
-        return f"{name} has no line of sight in {means['nlos']:.0f} % of the CIRs: move it if possible."
-    return ""
-
-
 class Verdict(NamedTuple):
     """A statement on a position.
 
@@ -154,61 +157,59 @@ class Verdict(NamedTuple):
     action: str = ""
     accuracy: str = ""
 
+    def headline(self, tag: str = "") -> str:
+        """Return state and reason as a sentence without its point; `tag`: " of tag 7" if there are several."""
+        statement = f"No position{tag} yet" if self.state == WAITING else f"Position{tag} {self.state}"
+        return statement + (f": {self.reason}" if self.reason else "")
+
 
 def verdict(
-    scene: Scene,
-    tag_id: int | None,
-    anchors: Mapping[int, Means],
-    states: Mapping[int, str],
-    remedy: str,
+    scene: Scene, tag_id: int | None, anchors: Mapping[int, Means], states: Mapping[int, str], remedy: str
 ) -> Verdict:
     """Return the verdict on the latest position of a tag.
 
     Args:
         scene: its data.
         tag_id: the tag; None: no ranges yet.
-        anchors: means of each anchor.
-        states: their states.
+        anchors: means of each of its anchors.
+        states: states of all anchors.
         remedy: why the position is not unique, with the remedy; empty: it is, or unknown.
     """
-    names = {anchor_id: place.name or format_id(anchor_id) for anchor_id, place in scene.anchors.items()}
-    ages_s = [scene.age_s(history) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id]
     name = "" if tag_id is None else f"tag {format_id(tag_id)}"
-    if tag_id is None and not scene.tags:
+    ages_s = [scene.age_s(history) for (_, pair_tag), history in scene.pairs.items() if pair_tag == tag_id]
+    pose = next(iter(scene.tags.values()), None) if tag_id is None else scene.tag_of(tag_id)
+    reason, action = _of_remedy(remedy)
+    if tag_id is None and pose is None:
         return Verdict(WAITING)
     if ages_s and min(ages_s) > NO_DATA_S:
         reason = f"no ranges of {name} for {min(ages_s):.0f} s"
         return Verdict(LOST, reason, "Check power of the tag, and the driver.")
-    pose = next(iter(scene.tags.values())) if tag_id is None else scene.tag_of(tag_id)
     if pose is None:
-        reason, action = _of_remedy(remedy)
-        return _verdict(UNDETERMINED, reason or f"no position of {name}", action or "See the notices below.")
+        action = _sentence(action or "See the notices below")
+        return Verdict(UNDETERMINED, reason or f"no position of {name}", action)
     if scene.age_s(pose) > NO_DATA_S:
         reason = f"no position of {name} for {scene.age_s(pose):.0f} s"
-        return _verdict(LOST, reason, remedy or "Drive into the area of the anchors.")
+        return Verdict(LOST, reason, _sentence(remedy or "Drive into the area of the anchors"))
     sd_m = pose.sd_m
     accuracy = "" if math.isnan(sd_m) else f"horizontal sd {sd_m:.2f} m, 95 % within {RADIUS95 * sd_m:.2f} m"
+    names = {anchor_id: place.name for anchor_id, place in scene.anchors.items()}
     common, texts = advice(anchors, names)
     # With a common cause, anchors that need attention are bad together.
-    wrong = {BAD, CHECK} if common else {BAD}
-    bad = [anchor_id for anchor_id, state in states.items() if state in wrong]
+    bad = [key for key in anchors if states[key] == BAD or (common and states[key] == CHECK)]
     received = sum(means["stopped"] == 0.0 for means in anchors.values())
-    reason = action = ""
-    if remedy:
-        reason, action = _of_remedy(remedy)
-    elif bad:
-        names_of_worst = ("stopped", "displaced", "residual")
-        worst = max(bad, key=lambda key: [abs(anchors[key][name]) for name in names_of_worst])
+    if not reason and bad:
+        worst = max(bad, key=lambda key: [abs(anchors[key][n]) for n in ("stopped", "displaced", "residual")])
         reason, _, action = (common or texts[worst]).partition(": ")
-    elif anchors and received < MIN_ANCHORS:
+    elif not reason and anchors and received < MIN_ANCHORS:
         reason, action = f"{received} anchors received", "Drive closer to the anchors, or add some."
-    elif math.isnan(sd_m):
+    elif not reason and math.isnan(sd_m):
         reason, action = "its standard deviation is unknown", "Publish poses with a covariance."
-    elif sd_m > MAX_SD_M:
+    elif not reason and sd_m > MAX_SD_M:
         reason, action = f"uncertain by {sd_m:.2f} m", "Add an anchor, or set height and area of the locator."
-    if not reason:
-        action = next((texts[key] for key, state in states.items() if state == CHECK), "")
-    return _verdict(DEGRADED if reason else POSITION_GOOD, reason, action, accuracy)
+    if reason:
+        return Verdict(DEGRADED, reason, _sentence(action), accuracy)
+    action = next((texts[key] for key in anchors if states[key] == CHECK), "")
+    return Verdict(POSITION_GOOD, "", action, accuracy)
 
 
 def _of_remedy(remedy: str) -> tuple[str, str]:
@@ -221,10 +222,9 @@ def _of_remedy(remedy: str) -> tuple[str, str]:
     return reason, f"{explanation}. Remedy: {action}"
 
 
-def _verdict(state: str, reason: str, action: str, accuracy: str = "") -> Verdict:
-    """Return a verdict whose action is a sentence."""
-    sentence = action[:1].upper() + action[1:]
-    return Verdict(state, reason, sentence + "." * (bool(sentence) and sentence[-1] not in ".!"), accuracy)
+def _sentence(text: str) -> str:
+    """Return a text that begins with a capital letter and ends with a point."""
+    return text[:1].upper() + text[1:] + "." * (bool(text) and text[-1] not in ".!")
 
 
 class HeldVerdict:
@@ -252,7 +252,7 @@ class HeldVerdict:
 
 def predicted_accuracy(
     anchors: NDArray[np.float64], height_m: float, sd_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the horizontal standard deviation of positions at a known height if all anchors are received.
 
     It is HDOP times the standard deviation of the ranges.
@@ -263,10 +263,10 @@ def predicted_accuracy(
         sd_m: standard deviation of a range, m.
 
     Returns:
-        The values, m, float32 (CELLS, CELLS), infinite where undetermined; lower left corner and size, float64 (2,), m.
+        x and y of the points of a grid, float64 (CELLS,), m; the values, float64 (CELLS, CELLS), m, infinite where undetermined.
     """
     margin_m = 1.0 + 0.1 * np.ptp(anchors[:, :2], axis=0)
-    low, size = anchors[:, :2].min(axis=0) - margin_m, np.ptp(anchors[:, :2], axis=0) + 2.0 * margin_m
-    x, y = low[:, None] + (np.arange(CELLS) + 0.5) / CELLS * size[:, None]
+    low, high = anchors[:, :2].min(axis=0) - margin_m, anchors[:, :2].max(axis=0) + margin_m
+    x, y = np.linspace(low, high, CELLS).T
     image = [[dop(anchors, np.array([at_x, at_y, height_m]), level=True).hdop for at_x in x] for at_y in y]
-    return (sd_m * np.array(image)).astype(np.float32), low, size
+    return x, y, sd_m * np.array(image)

@@ -1,23 +1,22 @@
-"""Ranges and CIRs of the last minute of one pair, and what they tell about it. No ROS, no page, no I/O here."""
+"""Ranges of one pair in columns, live and recorded, and what they show about it. No ROS, no page, no I/O here."""
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict, deque
+from bisect import bisect_right
+from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
-from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.types.measurement import LINE_OF_SIGHT_DB, Cir, Encoding, Status
+from uwb_mitigation.types.measurement import FAULTS, LINE_OF_SIGHT_DB, Cir, Encoding, Status
 
-MAX_SAMPLES, MAX_CIRS = 6000, 50
-"""Ranges (100 per second for a minute) and CIRs of a pair that are kept."""
+MAX_SAMPLES = 6000
+"""Number of ranges of a pair of a stream that are kept: 100 per second for a minute."""
 MAX_VALUES = 2 * 1016
 """Of a CIR: the DW1000's complete accumulator, real and imaginary."""
 MAX_RANGE_M = 10_000.0
@@ -31,9 +30,11 @@ STATISTICS, RATE_RANGES = 100, 20
 
 Pair = tuple[int, int]
 """Anchor and tag."""
+Column = NDArray[np.float64]
 
 K = TypeVar("K")
 V = TypeVar("V")
+R = TypeVar("R", bound="Rows")
 
 
 class BoundedDict(OrderedDict[K, V]):
@@ -51,54 +52,84 @@ class BoundedDict(OrderedDict[K, V]):
         return value
 
 
-class RangeColumns(NamedTuple):
-    """Ranges, each float64 (n,); NaN: unknown. See `Sample`; `time_s` is on the clock of the figures."""
+class Rows:
+    """Rows of float64 in the order in which they are added; the first column is the time of reception on the scene's clock.
 
-    time_s: NDArray[np.float64]
-    stamp_s: NDArray[np.float64]
-    raw_m: NDArray[np.float64]
-    corrected_m: NDArray[np.float64]
-    true_m: NDArray[np.float64]
-    residual_m: NDArray[np.float64]
-    interval_s: NDArray[np.float64]
-    gap_db: NDArray[np.float64]
-    status: NDArray[np.float64]
-
-    def quality(self) -> NDArray[np.float64]:
-        """Return time (s), residual (m), rate (Hz) and NLOS share (%) of one pair, float64 (n, 4)."""
-        residual_m = np.where(np.abs(self.residual_m) < MAX_RANGE_M, self.residual_m, np.nan)
-        is_nlos = np.where(np.isfinite(self.gap_db), self.gap_db >= LINE_OF_SIGHT_DB, np.nan)
-        rate_hz, nlos = 1.0 / _rolling_mean(self.interval_s), 100.0 * _rolling_mean(is_nlos)
-        return np.column_stack([self.time_s, residual_m, rate_hz, nlos])
-
-
-@dataclass(slots=True)
-class Sample:
-    """One corrected range of a pair; its truth may arrive later.
-
-    Attributes:
-        time_s: stamp.
-        raw_m, range_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
-        true_m: true range; NaN: unknown.
-        residual_m: corrected range minus the distance of the anchor from the estimated position; NaN: unknown.
-        interval_s: time since the previous range of the pair; NaN: unknown, because the viewer has dropped ranges.
-        gap_db: level of the CIR above that of its first path; NaN: unknown.
+    Args:
+        rows: float64 (n, k).
     """
 
-    time_s: float
+    def __init__(self, rows: NDArray[np.float64]) -> None:
+        self._data, self._begin, self._end = rows, 0, len(rows)
+
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """A view, float64 (n, k)."""
+        return self._data[self._begin : self._end]
+
+    @property
+    def received_s(self) -> float:
+        """Time of reception of the last row; NaN: there is none."""
+        return float(self._data[self._end - 1, 0]) if self._end > self._begin else math.nan
+
+    def append(self, row: Sequence[float], limit: int | None = None) -> None:
+        """Append a row, and remove the first ones above a limit."""
+        if self._end == len(self._data):
+            rows = self.rows
+            self._data = np.empty((2 * len(rows) + 16, rows.shape[1]))
+            self._data[: len(rows)] = rows
+            self._begin, self._end = 0, len(rows)
+        self._data[self._end] = row
+        self._end += 1
+        if limit is not None:
+            self._begin = max(self._begin, self._end - limit)
+
+    def until(self: R, end_s: float, begin_s: float = -math.inf) -> R:
+        """Return the rows that were received in an interval; at least the last one before its end."""
+        received_s = self.rows[:, 0]
+        end = bisect_right(received_s, end_s + 1e-6)
+        begin = max(min(bisect_right(received_s, begin_s), end - 1), 0)
+        return type(self)(self.rows[begin:end])
+
+
+class RangeColumns(NamedTuple):
+    """Ranges of one pair, each float64 (n,), live and recorded; NaN: unknown.
+
+    Attributes:
+        received_s: time of reception on the scene's clock.
+        residual_m: corrected range minus the distance of the anchor from the estimated position.
+        interval_s: time since the previous range of the pair; NaN: unknown, because the viewer has dropped ranges.
+        raw_m, corrected_m, sigma_m: measured and corrected range, and standard deviation of the corrected one.
+        true_m: true range, which may arrive later.
+        gap_db: level of the CIR above that of its first path. rx_dbm: its receive level.
+    """
+
+    received_s: Column
+    residual_m: Column
+    interval_s: Column
+    stamp_s: Column
+    raw_m: Column
+    corrected_m: Column
+    sigma_m: Column
+    status: Column
+    true_m: Column
+    gap_db: Column
+    rx_dbm: Column
+    sequence: Column
+
+
+class Sample(NamedTuple):
+    """One corrected range of a pair; see `RangeColumns`, whose last fields these are."""
+
+    stamp_s: float
     raw_m: float
     range_m: float
     sigma_m: float
     status: Status
     true_m: float = math.nan
-    residual_m: float = math.nan
-    interval_s: float = math.nan
     gap_db: float = math.nan
-
-
-_VALUES = attrgetter(
-    "time_s", "time_s", "raw_m", "range_m", "true_m", "residual_m", "interval_s", "gap_db", "status"
-)
+    rx_dbm: float = math.nan
+    sequence: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,69 +167,64 @@ class Trace:
         return math.floor(first) if math.isfinite(first) else self.cir.start_index
 
 
-@dataclass(slots=True)
-class History:
-    """The last minute of one pair.
+class History(Rows):
+    """Ranges of one pair: of the last minute, or of a recording.
 
     Attributes:
-        received_s: time of the last range on the scene's clock.
-        lost, received: number of missing sequence numbers, and of ranges.
+        trace: the last CIR of a stream.
+        is_interrupted: the time until the next range does not count for losses and rate: the viewer itself has dropped ranges.
     """
 
-    received_s: float = math.nan
-    lost: int = 0
-    received: int = 0
-    _sequence: int = -1
-    _is_interrupted: bool = False
-    _steps: deque[int] = field(default_factory=lambda: deque(maxlen=20))
-    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
-    traces: deque[Trace] = field(default_factory=lambda: deque(maxlen=MAX_CIRS))
+    def __init__(self, rows: NDArray[np.float64] | None = None) -> None:
+        super().__init__(np.empty((0, len(RangeColumns._fields))) if rows is None else rows)
+        self.is_interrupted = False
+        self.trace: Trace | None = None
 
-    def add(self, sample: Sample, now_s: float) -> None:
-        """Add a range, and remove ranges that are older than a minute."""
-        if self.samples and not self._is_interrupted:
-            sample.interval_s = sample.time_s - self.samples[-1].time_s
-        self._is_interrupted = False
-        self.samples.append(sample)
-        self.received += 1
-        while self.samples[0].time_s < now_s - HISTORY_S:
-            self.samples.popleft()
-
+    @property
     def columns(self) -> RangeColumns:
-        """Return the ranges; their times are the stamps."""
-        rows = np.array(list(map(_VALUES, self.samples)), np.float64).reshape(-1, len(RangeColumns._fields))
-        return RangeColumns(*rows.T)
-
-    def count_lost(self, sequence: int) -> None:
-        """Count missing ranges. Anchors are polled in turn, so the usual step is the median of the latest steps."""
-        step = (sequence - self._sequence) & 0xFFFFFFFF
-        if self._sequence >= 0 and 0 < step < 1000:
-            self._steps.append(step)
-            self.lost += max(round(step / sorted(self._steps)[len(self._steps) // 2]) - 1, 0)
-        self._sequence = sequence
-
-    def restart_count(self) -> None:
-        """Exclude the time until the next range from losses and rate: the viewer itself has dropped ranges."""
-        self._sequence, self._is_interrupted = -1, True
-
-    def statistics(self) -> dict[str, float]:
-        """Return means and shares (%) of the latest ranges and CIRs; NaN: unknown."""
-        samples = list(islice(reversed(self.samples), STATISTICS))
-        cirs = [trace.cir for trace in self.traces]
-        gap_db = _plausible_values([cir.power_gap_db for cir in cirs])
-        correction_m = _plausible_values([sample.raw_m - sample.range_m for sample in samples])
-        return {
-            "lost": 100.0 * self.lost / max(self.lost + self.received, 1),
-            "not_ok": _mean(np.array([100.0 * sample.status.is_fault for sample in samples])),
-            "nlos": _mean(100.0 * (gap_db >= LINE_OF_SIGHT_DB)),
-            "correction": _mean(correction_m),
-            "rx": _mean(_plausible_values([cir.rx_power_dbm for cir in cirs])),
-            **residual_means([sample.residual_m for sample in samples]),
-        }
+        """The ranges; a change of a value is kept."""
+        return RangeColumns(*self.rows.T)
 
     @property
     def latest(self) -> Sample | None:
-        return self.samples[-1] if self.samples else None
+        """The last range."""
+        if self._end == self._begin:
+            return None
+        sample = Sample(*self._data[self._end - 1, -len(Sample._fields) :].tolist())
+        return sample._replace(status=Status(int(sample.status)))
+
+    def add(self, sample: Sample, received_s: float, residual_m: float, limit: int | None) -> None:
+        """Add a range; see `RangeColumns` and `append`."""
+        latest = None if self.is_interrupted else self.latest
+        interval_s = math.nan if latest is None else sample.stamp_s - latest.stamp_s
+        self.is_interrupted = False
+        self.append((received_s, residual_m, interval_s, *sample), limit)
+
+    def remove_before(self, stamp_s: float) -> None:
+        """Remove ranges with earlier stamps from the beginning."""
+        while self._begin < self._end and self.columns.stamp_s[0] < stamp_s:
+            self._begin += 1
+
+    def statistics(self) -> dict[str, float]:
+        """Return means and shares (%) of the latest ranges; NaN: unknown."""
+        columns = RangeColumns(*(column[-STATISTICS:] for column in self.columns))
+        residual_m, gap_db = _plausible_values(columns.residual_m), _plausible_values(columns.gap_db)
+        return {
+            "lost": self._lost_percent(),
+            "not_ok": _mean(100.0 * np.isin(columns.status, FAULTS)),
+            "nlos": _mean(100.0 * (gap_db >= LINE_OF_SIGHT_DB)),
+            "correction": _mean(_plausible_values(columns.raw_m - columns.corrected_m)),
+            "rx": _mean(_plausible_values(columns.rx_dbm)),
+            "residual": _mean(residual_m),
+            "evidence": float(len(residual_m)),
+        }
+
+    def _lost_percent(self) -> float:
+        """Return the share of missing sequence numbers. Anchors are polled in turn: the usual step is the median of all."""
+        steps = np.diff(self.columns.sequence) % 2**32
+        steps = steps[(steps > 0) & (steps < 1000) & np.isfinite(self.columns.interval_s[1:])]
+        lost = float((np.rint(steps / np.median(steps)) - 1.0).clip(0.0).sum()) if len(steps) else 0.0
+        return 100.0 * lost / max(lost + len(self.columns.sequence), 1.0)
 
     def rate_hz(self, age_s: float = 0.0) -> float:
         """Return the rate of the last `RATE_RANGES` ranges by their stamps; NaN before the second one.
@@ -207,14 +233,13 @@ class History:
             age_s: time since the last range by stamps; the rate decreases if this is several mean intervals, unless the viewer
                 has dropped ranges since then.
         """
-        # Copy in one step: the monitor draws its table in another thread than the one that adds ranges.
-        recent = list(islice(reversed(self.samples), RATE_RANGES))
-        intervals_s = [sample.interval_s for sample in recent[:-1] if math.isfinite(sample.interval_s)]
-        span_s = sum(intervals_s)
+        intervals_s = self.columns.interval_s[-RATE_RANGES:][1:]
+        intervals_s = intervals_s[np.isfinite(intervals_s)]
+        span_s = float(intervals_s.sum())
         if not span_s > 0:
             return math.nan
         rate_hz = len(intervals_s) / span_s
-        is_recent = age_s * rate_hz <= NO_DATA_INTERVALS or self._is_interrupted
+        is_recent = age_s * rate_hz <= NO_DATA_INTERVALS or self.is_interrupted
         return rate_hz if is_recent else (len(intervals_s) + 1) / (span_s + age_s)
 
     @property
@@ -223,29 +248,24 @@ class History:
         rate_hz = self.rate_hz()
         return max(NO_DATA_S, NO_DATA_INTERVALS / rate_hz if rate_hz > 0 else 0.0)
 
+    def quality(self) -> NDArray[np.float64]:
+        """Return time of reception (s), residual (m), rate (Hz) and NLOS share (%), float64 (n, 4)."""
+        # A live page needs pandas only here: its import takes 0.4 s.
+        import pandas as pd
 
-def residual_means(residuals_m: Sequence[float]) -> dict[str, float]:
-    """Return mean and number of the known residuals of the last `STATISTICS` ranges."""
-    known_m = _plausible_values(residuals_m)
-    return {"residual": _mean(known_m), "evidence": float(len(known_m))}
+        columns = self.columns
+        residual_m = np.where(np.abs(columns.residual_m) < MAX_RANGE_M, columns.residual_m, np.nan)
+        is_nlos = np.where(np.isfinite(columns.gap_db), columns.gap_db >= LINE_OF_SIGHT_DB, np.nan)
+        latest = pd.DataFrame({"interval": columns.interval_s, "nlos": is_nlos}).rolling(
+            RATE_RANGES, min_periods=1
+        )
+        interval_s, nlos = latest.mean().to_numpy().T
+        return np.column_stack([columns.received_s, residual_m, 1.0 / interval_s, 100.0 * nlos])
 
 
-def _plausible_values(values: Sequence[float]) -> NDArray[np.float64]:
-    """Return the finite values, float64 (n,)."""
-    array = np.array(values, np.float64)
-    return array[np.abs(array) < MAX_RANGE_M]
+def _plausible_values(values: Column) -> Column:
+    return values[np.abs(values) < MAX_RANGE_M]
 
 
 def _mean(values: NDArray[Any]) -> float:
     return float(values.mean()) if len(values) else math.nan
-
-
-def _rolling_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means of the last `RATE_RANGES` known values, float64 (n,); NaN: there is none."""
-    is_known, window = np.isfinite(values), np.ones(RATE_RANGES)
-    if not len(values):
-        return values
-    sums = np.convolve(np.where(is_known, values, 0.0), window)[: len(values)]
-    counts = np.convolve(is_known.astype(np.float64), window)[: len(values)]
-    mean: NDArray[np.float64] = np.divide(sums, counts, out=np.full(len(values), np.nan), where=counts > 0.0)
-    return mean

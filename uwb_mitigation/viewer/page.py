@@ -100,7 +100,7 @@ class Page:
         """Update every model from the scene, and number the update if anything has changed."""
         self._draw_player()
         player, scene = self._player, self._view.scene
-        position = player and (player.shown_s, player.is_behind, player.timeline is None)
+        position = player and (player.shown_s, player.is_behind, self._view.timeline is None)
         with self._view.scene.lock:
             # Ages change without data; drawing them once a second is enough.
             state = scene.revision, self._state.selected, math.floor(scene.clock()), position
@@ -143,12 +143,12 @@ class Page:
         position_s = round(player.shown_s, 3)
         shown = {"playing": player.playing, "speed": player.speed, "behind": player.is_behind}
         self._state.set(player=shown | {"position": position_s, "seconds": player.seconds})
-        self._figures.show_position(position_s)
-        if (timeline := player.timeline) is not None and self._state.changed("marks", timeline.is_complete):
-            relative = timeline.log_s / max(player.seconds, 1e-9)
-            bad = np.unique(relative[timeline.bad].round(3)).tolist()
-            incidents = [time_s / max(player.seconds, 1e-9) for time_s, _ in timeline.incidents]
-            self._state.set(marks={"bad": bad, "count": timeline.counts[2], "incidents": incidents})
+        self._figures.position.location = position_s
+        timeline, seconds = self._view.timeline, max(player.seconds, 1e-9)
+        if timeline is not None and self._state.changed("marks", timeline.is_complete):
+            bad = np.unique((timeline.bad_s / seconds).round(3)).tolist()
+            incidents = [time_s / seconds for time_s, _ in sorted(timeline.scene.incidents.found)]
+            self._state.set(marks={"bad": bad, "count": timeline.scene.faults, "incidents": incidents})
 
     # Events ---------------------------------------------------------------------------------------------------
 
@@ -157,8 +157,7 @@ class Page:
         try:
             name, arguments = str(command[0]), list(command[1])
             if name == "accuracy":
-                for renderer in self._figures.map.coverage:
-                    renderer.visible = bool(arguments[0])
+                self._figures.map.shows_accuracy = bool(arguments[0])
             elif name == "select":
                 self.select((int(str(arguments[0]), 0), int(str(arguments[1]), 0)))
             elif self._player is not None:

@@ -74,13 +74,13 @@ class TrackKind(Enum):
 ATTRIBUTES = {TrackKind.RAW: "raw_live", TrackKind.CORRECTED: "live", TrackKind.SMOOTHED: "smoothed"}
 """Attributes of `TagTracks`."""
 
-TRACK_COLOURS = {
-    TrackKind.RAW: VERMILLION,
-    TrackKind.CORRECTED: BLUE,
-    TrackKind.SMOOTHED: GREEN,
-    TrackKind.TRUE: None,
+TRACK_STYLES = {
+    TrackKind.RAW: (VERMILLION, 1.0, "solid"),
+    TrackKind.CORRECTED: (BLUE, 3.0, "solid"),
+    TrackKind.SMOOTHED: (GREEN, 2.0, "dotdash"),
+    TrackKind.TRUE: (NIGHT, 2.0, "dashed"),
 }
-"""None: the ink of the page."""
+"""Colour, width and dashes of the lines of each kind, in drawing order."""
 
 TAG_COLOURS = BLUE, ORANGE, PURPLE, GREEN
 """Colours of tags and their corrected tracks; further tags have them again."""

@@ -1,17 +1,14 @@
 """A recording: its topics in one namespace, and its index with all ranges and the complete tracks of the tags.
 
-The time of a message is its stamp, or its log time if they differ by more than `MAX_STAMP_S`. The player and its marks use
-the log time, because it is the time at which a subscriber received the message.
+The times of the player, its marks and the figures are log times: the times at which a subscriber received the messages.
 """
 
 from __future__ import annotations
 
 import contextlib
 import re
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,23 +19,32 @@ from numpy.typing import NDArray
 from uwb_mitigation.errors import DatasetError, ParameterError, RecordingError, format_id
 from uwb_mitigation.mitigation.correction import Corrector
 from uwb_mitigation.positioning.config import EstimatorConfig
+from uwb_mitigation.positioning.geometry import horizontal_ellipse
 from uwb_mitigation.positioning.online.robot_estimator import live_track
 from uwb_mitigation.positioning.recorded_tracks import TagTracks, check_one_tag, track_tag
 from uwb_mitigation.recordings.bag.pose_paths import read_truth
 from uwb_mitigation.recordings.bag.reader import BagReader, check_channel
-from uwb_mitigation.recordings.recorded_ranges import KEY, RangeTable, Table, match
+from uwb_mitigation.recordings.recorded_ranges import RangeTable
 from uwb_mitigation.types.anchors import AnchorMap
-from uwb_mitigation.types.measurement import CORRECTED, FAULTS
+from uwb_mitigation.types.measurement import FAULTS
 from uwb_mitigation.types.ros import schemas, topics
 from uwb_mitigation.types.ros.codec import measurement_key
 from uwb_mitigation.types.ros.poses import tag_frame
-from uwb_mitigation.types.stamps import NS_PER_S, to_ns
+from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.types.tracks import Track, TruePath
-from uwb_mitigation.viewer.feed import DECODERS
-from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, Pair, RangeColumns
+from uwb_mitigation.viewer.feed import DECODERS, SceneUpdater
+from uwb_mitigation.viewer.histories import MAX_RANGE_M, NO_DATA_S, Pair, Trace
 from uwb_mitigation.viewer.incidents import Incidents
 from uwb_mitigation.viewer.palette import ATTRIBUTES, TrackKind
-from uwb_mitigation.viewer.scene import DEFAULT_TAG, MAX_TAGS, Counts, tag_label, tag_name
+from uwb_mitigation.viewer.scene import (
+    DEFAULT_TAG,
+    MAX_TAGS,
+    POSITION,
+    NodeStatus,
+    Scene,
+    tag_label,
+    tag_name,
+)
 
 BATCH = 64
 """Number of messages that are read ahead to correct their ranges in one call."""
@@ -54,7 +60,6 @@ class Event(NamedTuple):
     Attributes:
         time_ns: log time since the beginning of the recording.
         topic: without namespace and tag.
-        message: None: it cannot be decoded.
         tag: of a position; otherwise `DEFAULT_TAG`.
     """
 
@@ -75,6 +80,7 @@ class Recording:
         start_ns: time of the first message. seconds: duration.
         prefix: the namespace.
         contents: topics without namespace and tag.
+        damage: of the messages that were read; empty: none.
 
     Raises:
         RecordingError: the path is not an MCAP bag, or contains neither ranges nor tracks, or ranges of another version.
@@ -104,7 +110,7 @@ class Recording:
         if bounds is None or not self.contents & (RANGES | POSITIONS):
             raise _no_ranges(path, types)
         self.start_ns, self.seconds = bounds[0], (bounds[1] - bounds[0]) / 1e9
-        self.rate_hz = self._bag.message_count / max(self.seconds, 1e-9)
+        self.damage = ""
 
     @property
     def contents(self) -> set[str]:
@@ -116,44 +122,34 @@ class Recording:
         return self.contents & RANGES == {topics.RANGE_RAW}
 
     def events(self, selected: Collection[str], start_ns: int = 0) -> Iterator[Event]:
-        """Yield the messages of topics from a time since the beginning.
-
-        Raises:
-            RecordingError: the bag is damaged; every message before the damage has been yielded.
-        """
+        """Yield the messages of topics that can be decoded, from a time since the beginning until a damage of the bag."""
         names = [topic for topic, (plain, _) in self._topics.items() if plain in selected]
-        for message in self._bag.messages(names, self.start_ns + start_ns):
-            plain, tag = self._topics[message.channel.topic]
-            yield Event(message.log_time_ns - self.start_ns, plain, _decode(plain, message.data), tag)
-
-
-def corrected_events(events: Iterator[Event], backend: Corrector | None) -> Iterator[Event]:
-    """Yield events, and with a backend a corrected range after each raw one.
-
-    Raises:
-        RecordingError: the bag is damaged; every event before the damage has been yielded.
-    """
-    if backend is None:
-        yield from events
-        return
-    is_end, damage = False, None
-    while not is_end:
-        batch = list[Event]()
         try:
-            # After an error, `batch` contains the events before.
-            batch.extend(islice(events, BATCH))
+            for message in self._bag.messages(names, self.start_ns + start_ns):
+                plain, tag = self._topics[message.channel.topic]
+                if (decoded := _decode(plain, message.data)) is not None:
+                    yield Event(message.log_time_ns - self.start_ns, plain, decoded, tag)
         except RecordingError as error:
-            damage = error
-        is_end = len(batch) < BATCH
-        raw = [event for event in batch if event.topic == topics.RANGE_RAW and event.message is not None]
-        results = dict(zip(map(id, raw), backend.correct([event.message for event in raw]), strict=True))
-        for event in batch:
-            yield event
-            if (result := results.get(id(event))) is not None:
-                corrected = measurement_key(event.message), result
-                yield event._replace(topic=topics.RANGE_CORRECTED, message=corrected)
-    if damage is not None:
-        raise damage
+            self.damage = error.what
+
+    def corrected_events(self, backend: Corrector | None) -> Iterator[Event]:
+        """Yield all messages, and with a backend a corrected range after each raw one."""
+        events = self.events(self.contents)
+        while batch := list(islice(events, BATCH)):
+            raw = [event.message for event in batch if backend and event.topic == topics.RANGE_RAW]
+            results = iter(backend.correct(raw) if backend else ())
+            for event in batch:
+                yield event
+                if backend and event.topic == topics.RANGE_RAW:
+                    corrected = measurement_key(event.message), next(results)
+                    yield event._replace(topic=topics.RANGE_CORRECTED, message=corrected)
+
+    def read_trace(self, pair: Pair, log_ns: int) -> Trace | None:
+        """Return the CIR of the first range of a pair from a time on; None: it has none that can be shown."""
+        for event in self.events([topics.RANGE_RAW], log_ns):
+            if (event.message.anchor_id, event.message.tag_id) == pair:
+                return Trace.from_cir(event.message.cir)
+        return None
 
 
 def _decode(topic: str, data: bytes) -> Any:
@@ -184,257 +180,165 @@ def _no_ranges(path: Path, types: dict[str, str]) -> RecordingError:
     )
 
 
-MAX_STAMP_S = 1.0
-"""If stamp and log time of a message differ by more, its time is the log time."""
-_KINDS = {topics.ODOMETRY_TRUTH: TrackKind.TRUE, topics.POSE_SMOOTHED: TrackKind.SMOOTHED}
-_TRUTH = np.dtype([*KEY, ("true_m", "f8")])
-
-
 @dataclass
 class Timeline:
-    """Everything about a recording that does not depend on the position of the player.
+    """Content of a recording: everything that does not depend on the position of the player.
 
     Attributes:
-        log_s: log time of each range from the beginning, float64 (n,), increasing.
-        anchor, tag: ids of each range, uint64 (n,).
-        columns: all ranges; times are from the beginning.
+        scene: its ranges, positions and incidents; times are log times from the beginning.
+        read_s: time up to which it has been read. is_read: whether it has been read completely.
+        cirs_ns: {pair: log time of each raw range}.
         notices: messages for the page.
-        tracks: {(tag, kind): float64 (k, 5), time (s), x, y, z and horizontal standard deviation (m)}.
         estimates: {tag: its estimated tracks}, if the recording contains no positions.
-        incidents: (log time, text).
         displaced: {anchor whose ranges fit another position: its median held-out residual, m}.
-        is_complete: whether tracks, residuals and incidents have been added.
+        is_complete: whether tracks, residuals and all incidents have been added.
     """
 
-    log_s: NDArray[np.float64]
-    anchor: NDArray[np.uint64]
-    tag: NDArray[np.uint64]
-    columns: RangeColumns
+    scene: Scene = field(default_factory=lambda: Scene(is_whole=True))
+    read_s: float = 0.0
+    is_read: bool = False
+    cirs_ns: dict[Pair, list[int]] = field(default_factory=dict)
     notices: list[str] = field(default_factory=list)
-    tracks: dict[tuple[str, TrackKind], NDArray[np.float64]] = field(default_factory=dict)
     estimates: dict[str, TagTracks] = field(default_factory=dict)
-    incidents: list[tuple[float, str]] = field(default_factory=list)
     displaced: dict[int, float] = field(default_factory=dict)
     is_complete: bool = False
 
-    @cached_property
-    def bad(self) -> NDArray[np.bool_]:
-        """Whether the status of each range needs attention."""
-        return np.isin(self.columns.status, FAULTS)
-
-    @cached_property
-    def counts(self) -> Counts:
-        """Numbers of ranges."""
-        return int(np.isin(self.columns.status, CORRECTED).sum()), len(self.bad), int(self.bad.sum())
-
-    @cached_property
-    def rows(self) -> dict[Pair, NDArray[np.intp]]:
-        """Rows of each pair."""
-        order = np.lexsort((self.tag, self.anchor))
-        is_new = (np.diff(self.anchor[order]) != 0) | (np.diff(self.tag[order]) != 0)
-        rows_of_pairs = np.split(order, np.flatnonzero(is_new) + 1) if len(order) else []
-        return {(int(self.anchor[rows[0]]), int(self.tag[rows[0]])): rows for rows in rows_of_pairs}
-
-    def ranges(self, pair: Pair, begin_s: float = -np.inf, end_s: float = np.inf) -> RangeColumns:
-        """Return the ranges of a pair in an interval of the log time."""
-        rows = self.rows.get(pair, np.zeros(0, np.intp))
-        rows = rows[slice(*np.searchsorted(self.log_s[rows], (begin_s, end_s + 1e-6), side="right"))]
-        return RangeColumns(*(column[rows] for column in self.columns))
+    def __post_init__(self) -> None:
+        self.scene.clock = lambda: self.read_s
 
     @property
-    def range_errors(self) -> NDArray[np.float64]:
-        """Raw and corrected errors of the ranges with known truth, m, float64 (2, k)."""
-        errors = np.stack([self.columns.raw_m, self.columns.corrected_m]) - self.columns.true_m
-        return errors[:, (np.abs(errors) <= MAX_RANGE_M).all(axis=0)]
+    def bad_s(self) -> NDArray[np.float64]:
+        """Times of the ranges whose status needs attention."""
+        columns = (history.columns for history in self.scene.pairs.values())
+        times_s = [ranges.received_s[np.isin(ranges.status, FAULTS)] for ranges in columns]
+        return np.concatenate([np.zeros(0), *times_s])
 
 
-def index_recording(
-    recording: Recording,
-    config: EstimatorConfig | None,
-    backend: Corrector | None,
-    publish: Callable[[Timeline], None],
-    stamp_offset_s: float = 0.0,
-    estimated: Sequence[TagTracks] = (),
-) -> Timeline:
-    """Read a recording.
+def read_recording(recording: Recording, backend: Corrector | None, timeline: Timeline) -> RangeTable:
+    """Read the messages of a recording into a timeline; return its ranges.
 
     Args:
         recording: the bag.
-        config: of the estimators of tracks; None: the anchors are unknown.
         backend: corrects raw ranges; None: the recording contains corrected ranges.
-        publish: called with the timeline as soon as the ranges have been read; the estimation of tracks takes longer.
+        timeline: is filled; may be shown meanwhile.
+    """
+    table, feed = RangeTable(), SceneUpdater(timeline.scene)
+    for log_ns, topic, message, tag in recording.corrected_events(backend):
+        timeline.read_s = log_ns / NS_PER_S
+        if topic == topics.RANGE_RAW:
+            table.add_raw(message)
+            timeline.cirs_ns.setdefault((message.anchor_id, message.tag_id), []).append(log_ns)
+        elif topic == topics.RANGE_CORRECTED:
+            table.add_corrected(*message)
+        if topic != topics.ANCHORS:
+            feed.add(topic, message, tag)
+    with timeline.scene.lock:
+        if recording.damage:
+            damage = NodeStatus(2, f"{recording.damage}: nothing beyond can be shown")
+            timeline.scene.set_node_status("recording", damage)
+        timeline.read_s, timeline.is_read = recording.seconds, True
+        timeline.scene.incidents.check(recording.seconds)
+        _add_largest_error(timeline.scene)
+    return table
+
+
+def estimate_tracks(
+    recording: Recording,
+    timeline: Timeline,
+    table: RangeTable,
+    config: EstimatorConfig,
+    stamp_offset_s: float = 0.0,
+    estimated: Sequence[TagTracks] = (),
+) -> None:
+    """Add estimated tracks, or the tracks of raw ranges if the recording contains positions, and residuals to a timeline.
+
+    Args:
+        recording: the bag.
+        timeline: what `read_recording` has read.
+        table: its result.
+        config: of the estimators.
         stamp_offset_s: added to the stamps of the ranges.
         estimated: tracks with `config` that are known already.
     """
-    reader = _Reader(recording, backend)
-    # The player reports the damage of a bag when it reaches it.
+    truths: dict[int | None, TruePath] = {}
     with contextlib.suppress(RecordingError):
-        reader.read()
-    ranges = reader.table.corrected.array()
-    timeline = reader.timeline(ranges)
-    publish(timeline)
-    if config is not None and len(ranges):
-        truths: dict[int | None, TruePath] = {}
-        with contextlib.suppress(RecordingError):
-            truths = read_truth(recording.path, recording.prefix + topics.ODOMETRY_TRUTH)
-        recorded = reader.table.by_tag(config.anchors, stamp_offset_s, truths)
-        by_tag = {tracks.recording.tag_id: tracks for tracks in estimated}
-        has_positions = bool(recording.contents & POSITIONS)
-        names = {name for name, kind in timeline.tracks if kind is TrackKind.CORRECTED}
-        for tag in recorded.tags[:MAX_TAGS]:
-            name = tag_name(tag.tag_id, names, timeline.rows) or tag_frame(tag.tag_id)
-            tracks: dict[TrackKind, Track] = {}
-            if has_positions:
-                tracks[TrackKind.RAW] = live_track(config, tag.raw)
-            else:
-                try:
-                    check_one_tag(config, recorded.tags)
-                    estimate = by_tag.get(tag.tag_id) or track_tag(tag, config)
-                except (DatasetError, ParameterError) as error:
-                    timeline.notices.append(str(error))
-                    continue
-                timeline.estimates[name] = estimate
-                tracks = {kind: getattr(estimate, attribute) for kind, attribute in ATTRIBUTES.items()}
-                label, state = f"tag {format_id(tag.tag_id)}", str(estimate.determination)
-                timeline.notices += [
-                    f"{label}{' determination' * (text == state)}: {text}" for text in estimate.warnings
-                ]
-            rows = np.flatnonzero(ranges["tag"] == tag.tag_id)
-            rows = rows[np.argsort(ranges["stamp_ns"][rows], kind="stable")]
-            stamp_ns = ranges["stamp_ns"][rows] + round(stamp_offset_s * NS_PER_S)
-            for kind, track in tracks.items():
-                # Relative stamps: a float64 resolves nanoseconds since 1970 only to a fraction of a microsecond.
-                since_ns = track.stamp_ns - stamp_ns[0]
-                track_s = np.interp(since_ns, stamp_ns - stamp_ns[0], timeline.columns.time_s[rows])
-                sd_m = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
-                timeline.tracks[name, kind] = np.column_stack([track_s, track.position, sd_m])
-        add_residuals(timeline, config.anchors)
-    timeline.incidents = _incidents(timeline, recording.seconds)
-    timeline.is_complete = True
-    return timeline
-
-
-class _Reader:
-    """Reads ranges, truths and positions of a recording."""
-
-    def __init__(self, recording: Recording, backend: Corrector | None) -> None:
-        self._recording, self._backend = recording, backend
-        self._truths = Table(_TRUTH)
-        self._points = defaultdict[tuple[str, TrackKind], list[tuple[float, ...]]](list)
-        self._delays_s: dict[str, float] = {}
-        self.table = RangeTable()
-
-    def read(self) -> None:
-        names = {
-            topics.RANGE_RAW,
-            topics.RANGE_CORRECTED,
-            topics.RANGE_TRUTH,
-            topics.ODOMETRY_TRUTH,
-            *POSITIONS,
-        }
-        for log_ns, topic, message, tag in corrected_events(self._recording.events(names), self._backend):
-            if message is None:
-                continue
-            if topic == topics.RANGE_CORRECTED:
-                key, result = message
-                self.table.add_corrected(key, result, log_ns)
-            elif topic == topics.RANGE_RAW:
-                self.table.add_raw(message)
-            elif topic == topics.RANGE_TRUTH:
-                self._truths.add(*message[0], message[1].range_m)
-            else:
-                self._add_position(log_ns, topic, message, tag)
-
-    def _add_position(self, log_ns: int, topic: str, message: Any, tag: str) -> None:
-        kind = _KINDS.get(topic, TrackKind.CORRECTED)
-        name = str(message.child_frame_id) if kind is TrackKind.TRUE else tag
-        point, covariance = message.pose.pose.position, message.pose.covariance
-        is_new = (name, kind) not in self._points
-        if not np.isfinite([point.x, point.y]).all() or (is_new and len(self._points) >= 4 * MAX_TAGS):
-            return
-        time_s, log_s = (to_ns(message.header.stamp) - self._recording.start_ns) / NS_PER_S, log_ns / NS_PER_S
-        if abs(time_s - log_s) > MAX_STAMP_S:
-            self._delays_s.setdefault(f"the positions of {name}", time_s - log_s)
-            time_s = log_s
-        variance = covariance[0] + covariance[7]
-        sd_m = np.sqrt(variance) if variance > 0.0 else np.nan
-        self._points[name, kind].append((time_s, point.x, point.y, point.z, sd_m))
-
-    def timeline(self, ranges: NDArray[Any]) -> Timeline:
-        """Return the timeline without estimated tracks."""
-        stamp_s = (ranges["stamp_ns"] - self._recording.start_ns) / NS_PER_S
-        log_s = ranges["log_ns"] / NS_PER_S
-        delay_s = stamp_s - log_s
-        is_late = np.abs(delay_s) > MAX_STAMP_S
-        for tag in np.unique(ranges["tag"][is_late]):
-            median_s = float(np.median(delay_s[is_late & (ranges["tag"] == tag)]))
-            self._delays_s[f"the ranges of tag {format_id(int(tag))}"] = median_s
-        names = ", ".join(f"{name} by {delay:+.1f} s" for name, delay in self._delays_s.items())
-        notice = f"Stamps differ from the log time, and the log time is used: {names[:300]}." if names else ""
-        truths, measured = self._truths.array(), self.table.raw.array()
-        columns = RangeColumns(
-            time_s=np.where(is_late, log_s, stamp_s),
-            stamp_s=ranges["stamp_ns"] / NS_PER_S,
-            raw_m=ranges["raw_m"].copy(),
-            corrected_m=ranges["range_m"].copy(),
-            true_m=np.append(truths["true_m"], np.nan)[match(ranges, truths)],
-            residual_m=np.full(len(ranges), np.nan),
-            interval_s=np.full(len(ranges), np.nan),
-            gap_db=np.append(measured["gap_db"], np.nan)[match(ranges, measured)],
-            status=ranges["status"].copy(),
-        )
-        timeline = Timeline(log_s, ranges["anchor"].copy(), ranges["tag"].copy(), columns)
-        timeline.notices += [notice] if notice else []
-        for rows in timeline.rows.values():
-            columns.interval_s[rows] = np.diff(columns.stamp_s[rows], prepend=np.nan)
-        for key, points in self._points.items():
-            track = np.array(points)
-            timeline.tracks[key] = track[np.argsort(track[:, 0], kind="stable")]
-        return timeline
-
-
-def add_residuals(timeline: Timeline, anchors: AnchorMap) -> None:
-    """Set the residuals of ranges: NaN without a recent position, or if the anchor is not in the map."""
-    ranges, place = timeline.columns, {anchor.id: anchor.position for anchor in anchors.anchors}
-    tracks = {name: track for (name, kind), track in timeline.tracks.items() if kind is TrackKind.CORRECTED}
-    for tag_id in np.unique(timeline.tag):
-        track = tracks.get(tag_name(int(tag_id), tracks, timeline.rows))
-        if track is None or not len(track):
+        truths = read_truth(recording.path, recording.prefix + topics.ODOMETRY_TRUTH)
+    recorded, scene = table.by_tag(config.anchors, stamp_offset_s, truths), timeline.scene
+    by_tag = {one.recording.tag_id: one for one in estimated}
+    has_positions = bool(recording.contents & POSITIONS)
+    names = {name for name, kind in scene.tracks if kind is TrackKind.CORRECTED}
+    for tag in recorded.tags[:MAX_TAGS]:
+        of_tag = [history.rows for pair, history in scene.pairs.items() if pair[1] == tag.tag_id]
+        if not of_tag:
             continue
-        rows = np.flatnonzero(timeline.tag == tag_id)
-        time_s, at_s = ranges.time_s[rows], track[:, 0]
-        latest = np.maximum(np.searchsorted(at_s, time_s, side="right") - 1, 0)
-        ids, index = np.unique(timeline.anchor[rows], return_inverse=True)
-        anchor = np.array([place.get(int(anchor_id), (np.nan,) * 3) for anchor_id in ids])[index]
-        position = np.column_stack([np.interp(time_s, at_s, axis) for axis in track[:, 1:4].T])
-        position[:, 2] = np.nan_to_num(position[:, 2])
-        residual_m = ranges.corrected_m[rows] - np.linalg.norm(position - anchor, axis=1)
-        is_recent = np.abs(time_s - at_s[latest]) < NO_DATA_S
-        ranges.residual_m[rows] = np.where(is_recent, residual_m, np.nan)
+        name = tag_name(tag.tag_id, names, scene.pairs) or tag_frame(tag.tag_id)
+        tracks = dict[TrackKind, Track]()
+        if has_positions:
+            tracks[TrackKind.RAW] = live_track(config, tag.raw)
+        else:
+            try:
+                check_one_tag(config, recorded.tags)
+                estimate = by_tag.get(tag.tag_id) or track_tag(tag, config)
+            except (DatasetError, ParameterError) as error:
+                timeline.notices.append(str(error))
+                continue
+            timeline.estimates[name] = estimate
+            tracks = {kind: getattr(estimate, attribute) for kind, attribute in ATTRIBUTES.items()}
+            label, state = f"tag {format_id(tag.tag_id)}", str(estimate.determination)
+            timeline.notices += [
+                f"{label}{' determination' * (text == state)}: {text}" for text in estimate.warnings
+            ]
+        received_s, _, _, stamp_s, *_ = np.concatenate(of_tag).T
+        order = np.argsort(stamp_s, kind="stable")
+        for kind, track in tracks.items():
+            rows = np.full((len(track), POSITION), np.nan)
+            rows[:, 5] = track.stamp_ns / NS_PER_S - stamp_offset_s
+            rows[:, 0] = np.interp(rows[:, 5], stamp_s[order], received_s[order])
+            rows[:, 1:4] = track.position
+            rows[:, 4] = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
+            if kind is TrackKind.CORRECTED:
+                rows[:, 6:9] = [horizontal_ellipse(covariance) for covariance in track.covariance]
+                _add_incidents(scene, tag_label(name, None), rows, recording.seconds)
+            with scene.lock:
+                scene.set_track(name, kind, rows)
+    add_residuals(scene, config.anchors)
 
 
-def _incidents(timeline: Timeline, seconds: float) -> list[tuple[float, str]]:
-    """Return the incidents of ranges and positions until the end, and the largest error, in the order of their times."""
-    streams, ranges = [Incidents()], timeline.columns
-    columns = (timeline.anchor, timeline.tag, timeline.log_s, ranges.stamp_s)
-    for anchor_id, tag_id, log_s, stamp_s in zip(*(column.tolist() for column in columns), strict=True):
-        streams[0].add_range((anchor_id, tag_id), log_s, stamp_s)
-    for (name, kind), track in timeline.tracks.items():
-        if kind is TrackKind.CORRECTED:
-            streams.append(Incidents())
-            for time_s, x, y in track[:, :3].tolist():
-                streams[-1].add_position(tag_label(name, None), time_s, x, y)
-    for stream in streams:
-        stream.check(seconds)
-    found = [incident for stream in streams for incident in stream.found]
-    has_truth = bool(np.isfinite(ranges.true_m).any())
-    deviation_m = np.abs(ranges.corrected_m - (ranges.true_m if has_truth else ranges.raw_m))
-    deviation_m[~(deviation_m < MAX_RANGE_M)] = 0.0
-    if deviation_m.any():
-        row = int(deviation_m.argmax())
-        pair = f"anchor {format_id(int(timeline.anchor[row]))}, tag {format_id(int(timeline.tag[row]))}"
-        largest = (
-            f"largest {'error' if has_truth else 'correction'} of a range, {deviation_m[row]:.2f} m: {pair}"
-        )
-        found.append((float(timeline.log_s[row]), largest))
-    return sorted(found)
+def _add_incidents(scene: Scene, label: str, track: NDArray[np.float64], seconds: float) -> None:
+    """Add the incidents of an estimated track until the end of the recording."""
+    incidents = Incidents()
+    for time_s, x, y in track[:, :3].tolist():
+        incidents.add_position(label, time_s, x, y)
+    incidents.check(seconds)
+    scene.incidents.found.extend(incidents.found)
+
+
+def add_residuals(scene: Scene, anchors: AnchorMap) -> None:
+    """Set the residuals of ranges: NaN without a recent position, or if the anchor is not in the map."""
+    place = {anchor.id: anchor.position for anchor in anchors.anchors}
+    tracks = {name: track.rows for (name, kind), track in scene.tracks.items() if kind is TrackKind.CORRECTED}
+    for (anchor_id, tag_id), history in scene.pairs.items():
+        track, columns = tracks.get(tag_name(tag_id, tracks, scene.pairs)), history.columns
+        if track is None or anchor_id not in place:
+            continue
+        _, *position, _, at_s = track[np.argsort(track[:, 5], kind="stable"), :6].T
+        x, y, z = (np.interp(columns.stamp_s, at_s, axis) for axis in position)
+        distance_m = np.linalg.norm(np.column_stack([x, y, np.nan_to_num(z)]) - place[anchor_id], axis=1)
+        latest = np.maximum(np.searchsorted(at_s, columns.stamp_s, side="right") - 1, 0)
+        is_recent = np.abs(columns.stamp_s - at_s[latest]) < NO_DATA_S
+        columns.residual_m[:] = np.where(is_recent, columns.corrected_m - distance_m, np.nan)
+
+
+def _add_largest_error(scene: Scene) -> None:
+    """Add the largest error of a range to the incidents; without truth, the largest correction."""
+    name, largest = "error" if scene.errors else "correction", (0.0, 0.0, (0, 0))
+    for pair, history in scene.pairs.items():
+        columns = history.columns
+        change_m = np.abs(columns.corrected_m - (columns.true_m if scene.errors else columns.raw_m))
+        change_m[~(change_m < MAX_RANGE_M)] = 0.0
+        row = int(change_m.argmax())
+        largest = max(largest, (float(change_m[row]), -float(columns.received_s[row]), pair))
+    largest_m, time_s, (anchor_id, tag_id) = largest
+    if largest_m > 0.0:
+        text = f"largest {name} of a range, {largest_m:.2f} m: anchor {format_id(anchor_id)}, tag {format_id(tag_id)}"
+        scene.incidents.found.append((-time_s, text))

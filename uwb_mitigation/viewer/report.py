@@ -19,7 +19,7 @@ from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.recorded_tracks import TagTracks
 from uwb_mitigation.viewer.figures import HEADINGS, Figures, finish, new_figure
 from uwb_mitigation.viewer.page import TEMPLATES
-from uwb_mitigation.viewer.palette import TRACK_COLOURS, TrackKind
+from uwb_mitigation.viewer.palette import TRACK_STYLES, TrackKind
 from uwb_mitigation.viewer.playback import BagPlayer
 from uwb_mitigation.viewer.state import Controls, PageState, View
 from uwb_mitigation.viewer.texts import ANCHOR_TITLES, TAG_TITLES, Texts
@@ -54,7 +54,6 @@ def draw_scene(view: View) -> tuple[dict[str, figure], Controls]:
     figures = Figures(state)
     Texts(state).draw(view.scene)
     figures.draw(view.scene)
-    figures.map.show_labels()
     return figures.plots, state.controls
 
 
@@ -68,13 +67,13 @@ def draw_boxes(name: str, axis: str, rows: Mapping[TrackKind, Mapping[str, Itera
     """
     names = list(next(iter(rows.values())))
     height = 90 + 20 * len(rows) * len(names)
-    plot = new_figure(name, height, axis, "", y_range=FactorRange(*reversed(names)))
+    plot = new_figure(name, axis, "", height, y_range=FactorRange(*reversed(names)))
     for number, (kind, boxes) in enumerate(rows.items()):
         columns = np.array([list(box) for box in boxes.values()]).reshape(-1, len(_BOX))
         # Of each row, the first kind is the upper one.
         places = [(row, (0.5 * (len(rows) - 1) - number) / len(rows)) for row in boxes]
         source = ColumnDataSource(dict(zip(_BOX, columns.T, strict=True)) | {"row": places})
-        style = {"source": source, "color": TRACK_COLOURS[kind], "legend_label": kind.value}
+        style = {"source": source, "color": TRACK_STYLES[kind][0], "legend_label": kind.value}
         plot.segment("low", "row", "high", "row", **style)
         plot.hbar("row", right="end", left="begin", height=0.35, fill_alpha=0.35, **style)
         plot.scatter("middle", "row", marker="dash", angle=math.pi / 2, size=14, line_width=3, **style)
@@ -111,12 +110,8 @@ def write_report(
     while player.is_behind:
         player.advance()
     figures, controls = draw_scene(View(player.scene, player=player))
-    state, reason, action, facts = controls.verdict
-    lines = [
-        f"Position {state}" + (f": {reason}" if reason else "") + (f". {action}" if action else ""),
-        facts,
-        *controls.notice,
-    ]
+    _, _, action, facts = controls.verdict
+    lines = [f"{controls.headline}. {action}", facts, *controls.notice]
     sections: dict[str, Any] = {"Figures": [("", "", ""), *controls.cards]}
     sections |= {HEADINGS[name]: figures[name] for name in SHOWN}
     sections["Anchors at the end"] = [ANCHOR_TITLES, *controls.health]

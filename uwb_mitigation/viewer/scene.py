@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from bisect import bisect_right
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from threading import Lock
 
@@ -22,16 +22,17 @@ from uwb_mitigation.positioning.config import EstimatorConfig
 from uwb_mitigation.positioning.online.measurements import TagHeight, TagRange
 from uwb_mitigation.positioning.online.tag_estimator import TagEstimator
 from uwb_mitigation.types.anchors import MAX_ANCHORS, Anchor, AnchorMap
-from uwb_mitigation.types.measurement import Truth
 from uwb_mitigation.types.ros.poses import tag_frame
 from uwb_mitigation.types.stamps import NS_PER_S
 from uwb_mitigation.viewer.histories import (
     HISTORY_S,
     MAX_RANGE_M,
+    MAX_SAMPLES,
     NO_DATA_S,
     BoundedDict,
     History,
     Pair,
+    Rows,
     Sample,
     Trace,
 )
@@ -87,18 +88,9 @@ class Pose:
 
 TrackPoint = tuple[float, float, float, float, float]
 """Stamp (s), x, y, z and horizontal standard deviation (m)."""
-
-
-@dataclass(slots=True)
-class TrackView:
-    """Positions of a tag: rows like `TrackPoint`, and the time of the last one on the scene's clock."""
-
-    points: deque[TrackPoint] | NDArray[np.float64] = field(default_factory=lambda: deque(maxlen=MAX_TRACK))
-    received_s: float = math.nan
-
-    def columns(self) -> NDArray[np.float64]:
-        """Return the points as float64 (k, 5)."""
-        return np.asarray(self.points, np.float64).reshape(-1, 5)
+POSITION = 10
+"""Number of columns of a track: time of reception on the scene's clock (s), x, y, z, horizontal standard deviation (m),
+stamp (s), and of a pose ellipse and heading; NaN: unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,31 +136,34 @@ class Scene:
         ranges, corrected, faults: number of ranges, of those that were corrected, and of those with a status that needs attention.
         incidents: on the clock of the scene.
         received_s: time of the last range on the scene's clock.
+        is_whole: it keeps all data of a recording; otherwise the last minute of ranges, and as many positions as a page shows.
         dropped: number of ranges that the viewer could not read in time.
         pairs: {(anchor, tag): history of its last minute}, the latest at the end.
         tags, anchors, node_statuses: {id or name: ...}.
-        tracks: {(name, kind): positions}.
-        is_indexed: tracks are those of the index of a recording; data does not change them.
+        tracks: {(name, kind): positions, with the columns of `POSITION`}.
+        reports: (time of reception, name, diagnostics) of a recording.
+        latest_stamps: {tag: (its latest stamp, time of its reception)}.
         revision: increases with every change, so that a page draws only changes.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.lock, self.clock, self.stamp_clock = Lock(), clock, time.time
+    def __init__(self, clock: Callable[[], float] = time.monotonic, is_whole: bool = False) -> None:
+        self.lock, self.clock, self.stamp_clock, self.is_whole = Lock(), clock, time.time, is_whole
         self.anchors: dict[int, Anchor] = {}
-        self.is_indexed, self.received_s, self.revision = False, math.nan, 0
+        self.received_s, self.revision = math.nan, 0
         self.clear()
 
     def clear(self) -> None:
         """Remove everything except the anchors."""
         self.incidents = Incidents()
-        # {tag: (latest stamp, its time of reception)}: stamps of different tags may come from different clocks.
-        self._latest: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
+        # Stamps of different tags may come from different clocks.
+        self.latest_stamps: BoundedDict[int, tuple[float, float]] = BoundedDict(MAX_TAGS)
         self.ranges = self.corrected = self.faults = self.dropped = 0
         self.pairs: BoundedDict[Pair, History] = BoundedDict(MAX_PAIRS)
         self.tags: BoundedDict[str, Pose] = BoundedDict(MAX_TAGS)
         # {tag: (filter of its raw ranges, stamp of the last pose whose height it got)}
         self._raw_locators: BoundedDict[int, tuple[TagEstimator, float]] = BoundedDict(MAX_TAGS)
-        self.tracks: BoundedDict[tuple[str, TrackKind], TrackView] = BoundedDict(4 * MAX_TAGS)
+        self.tracks: BoundedDict[tuple[str, TrackKind], Rows] = BoundedDict(4 * MAX_TAGS)
+        self.reports: list[tuple[float, str, NodeStatus]] = []
         self.node_statuses: BoundedDict[str, NodeStatus] = BoundedDict(MAX_NODES)
         self.error_counts = np.zeros((2, len(ERROR_EDGES_M) - 1), np.int64)
         self.error_sums_m, self.errors = np.zeros(2), 0
@@ -181,23 +176,27 @@ class Scene:
 
     def now_s(self, tag_id: int | None = None) -> float:
         """Return the latest stamp of a tag (None: of the latest range) plus the time since then; NaN before any."""
-        entry = next(reversed(self._latest.values()), None) if tag_id is None else self._latest.get(tag_id)
+        entry = (
+            next(reversed(self.latest_stamps.values()), None)
+            if tag_id is None
+            else self.latest_stamps.get(tag_id)
+        )
         latest_s, received_s = entry or (math.nan, math.nan)
         return latest_s + max(self.clock() - received_s, 0.0)
 
     def latest_stamp_s(self, tag_id: int) -> float:
         """Return the latest stamp of a tag; NaN: none."""
-        return self._latest.get(tag_id, (math.nan, math.nan))[0]
+        return self.latest_stamps.get(tag_id, (math.nan, math.nan))[0]
 
     def stamp_age_s(self, pair: Pair) -> float:
         """Return the time from the last range of a pair to that of its tag by their stamps: 0 without other ranges.
 
         It does not depend on how fast the viewer reads them.
         """
-        latest, (tag_latest_s, _) = self.pairs[pair].latest, self._latest.get(pair[1], (-math.inf, 0.0))
-        return 0.0 if latest is None else max(tag_latest_s - latest.time_s, 0.0)
+        latest, (tag_latest_s, _) = self.pairs[pair].latest, self.latest_stamps.get(pair[1], (-math.inf, 0.0))
+        return 0.0 if latest is None else max(tag_latest_s - latest.stamp_s, 0.0)
 
-    def age_s(self, entry: History | Pose | TrackView) -> float:
+    def age_s(self, entry: Rows | Pose) -> float:
         """Return the time since the last data of a pair, tag or track."""
         return max(self.clock() - entry.received_s, 0.0)
 
@@ -216,39 +215,49 @@ class Scene:
 
         If the time of a pair jumps back by more than a second (a replay in a loop), the strips of its tag start again.
         """
-        tag_id = pair[1]
-        history = self.history(pair)
-        latest, (tag_latest_s, _) = history.latest, self._latest.get(tag_id, (-math.inf, 0.0))
-        if sample.time_s < tag_latest_s - HISTORY_S or (latest and sample.time_s < latest.time_s - 1.0):
-            self.clear_history(tag_id)
+        tag_id, stamp_s = pair[1], sample.stamp_s
+        latest, (tag_latest_s, _) = (
+            self.history(pair).latest,
+            self.latest_stamps.get(tag_id, (-math.inf, 0.0)),
+        )
+        if stamp_s < tag_latest_s - HISTORY_S or (latest and stamp_s < latest.stamp_s - 1.0):
             tag_latest_s = -math.inf
-        if not sample.time_s < tag_latest_s:
-            tag_latest_s = self._latest.add(tag_id, (sample.time_s, self.clock()))[0]
+            if not self.is_whole:
+                self.clear_history(tag_id)
+        if not stamp_s < tag_latest_s:
+            tag_latest_s = self.latest_stamps.add(tag_id, (stamp_s, self.clock()))[0]
         self.ranges += 1
         self.corrected += sample.status.is_corrected
         self.faults += sample.status.is_fault
-        self.incidents.add_range(pair, self.clock(), sample.time_s)
-        history.add(sample, tag_latest_s)
-        history.received_s = self.received_s = self.clock()
-        self._compare_with_position(pair, sample)
+        self.incidents.add_range(pair, self.clock(), stamp_s)
+        self.received_s = self.clock()
+        residual_m, history = self._compare_with_position(pair, sample), self.pairs[pair]
+        history.add(sample, self.received_s, residual_m, None if self.is_whole else MAX_SAMPLES)
+        if not self.is_whole:
+            history.remove_before(tag_latest_s - HISTORY_S)
+        self._count_error(sample.raw_m, sample.range_m, sample.true_m)
 
-    def count_error(self, sample: Sample) -> None:
+    def _count_error(self, raw_m: float, corrected_m: float, true_m: float) -> None:
         """Count a range in the histograms if its truth is known."""
-        errors_m = np.array([sample.raw_m - sample.true_m, sample.range_m - sample.true_m])
+        errors_m = np.array([raw_m - true_m, corrected_m - true_m])
         if not (np.abs(errors_m) <= MAX_RANGE_M).all():
             return
         self.error_counts += count_errors(errors_m[:, None])
         self.error_sums_m += np.abs(errors_m)
         self.errors += 1
 
-    def set_truth(self, sample: Sample, truth: Truth) -> None:
+    def set_truth(self, pair: Pair, stamp_s: float, true_m: float) -> None:
         """Set the truth of a range that was added without it."""
-        sample.true_m = truth.range_m
-        self.count_error(sample)
         self.revision += 1
+        columns = (self.pairs.get(pair) or History()).columns
+        for row in np.flatnonzero(columns.stamp_s == stamp_s):
+            columns.true_m[row] = true_m
+            self._count_error(columns.raw_m[row], columns.corrected_m[row], true_m)
 
-    def add_trace(self, pair: Pair, trace: Trace) -> None:
-        self.history(pair).traces.append(trace)
+    def set_trace(self, pair: Pair, trace: Trace) -> None:
+        """Set the last CIR of a pair; those of a recording stay in the bag."""
+        if not self.is_whole:
+            self.history(pair).trace = trace
 
     def add_pose(self, tag: str, pose: Pose) -> None:
         """Set the pose of a tag."""
@@ -262,47 +271,76 @@ class Scene:
             self.tags.add(tag[:MAX_TEXT], pose)
             self.incidents.add_position(tag_label(tag[:MAX_TEXT], None), pose.received_s, pose.x, pose.y)
             point = (pose.stamp_s, pose.x, pose.y, pose.z, pose.sd_m)
-            self.add_position(tag, TrackKind.CORRECTED, point)
+            self.add_position(tag, TrackKind.CORRECTED, point, (*pose.ellipse, pose.heading_rad))
 
-    def add_position(self, tag: str, kind: TrackKind, point: TrackPoint) -> None:
-        """Append a position to a track; `tag` is its name."""
+    def add_position(
+        self, tag: str, kind: TrackKind, point: TrackPoint, shape: tuple[float, ...] = (math.nan,) * 4
+    ) -> None:
+        """Append a position to a track; `tag` is its name, `shape` ellipse and heading of a pose."""
         self.revision += 1
-        stamp_s, x, y, z, _ = point
-        if self.is_indexed or not (_is_plausible(x, y, z) and math.isfinite(stamp_s)):
+        stamp_s, x, y, z, sd_m = point
+        if not (_is_plausible(x, y, z) and math.isfinite(stamp_s)):
             return
         key = tag[:MAX_TEXT], kind
-        track = self.tracks.add(key, self.tracks.get(key) or TrackView())
-        track.received_s = self.clock()
-        if isinstance(track.points, deque):
-            if track.points and stamp_s < track.points[-1][0] - 1.0:
-                track.points.clear()
-            step_s = stamp_s - track.points[-1][0] if track.points else math.inf
-            step_m = math.dist(track.points[-1][1:3], (x, y)) if track.points else math.inf
-            if step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S):
-                track.points.append(point)
+        track = self.tracks.add(key, self.tracks.get(key) or Rows(np.empty((0, POSITION))))
+        row = self.clock(), x, y, z, sd_m, stamp_s, *shape
+        if self.is_whole:
+            track.append(row)
+            return
+        latest = track.rows[-1].tolist() if len(track.rows) else [-math.inf] * POSITION
+        step_s, step_m = stamp_s - latest[5], math.dist(latest[1:3], (x, y))
+        if step_s < -1.0:
+            self.set_track(tag, kind, np.array([row]))
+        elif step_s >= STEP_S and (step_m >= STEP_M or step_s >= 5 * STEP_S):
+            track.append(row, MAX_TRACK)
 
-    def set_track(self, tag: str, kind: TrackKind, points: NDArray[np.float64]) -> None:
-        """Replace a track, float64 (k, 5), on the scene's clock."""
-        received_s = float(points[-1, 0]) if len(points) else math.nan
-        self.tracks.add((tag[:MAX_TEXT], kind), TrackView(points, received_s))
+    def set_track(self, tag: str, kind: TrackKind, rows: NDArray[np.float64]) -> None:
+        """Replace a track, float64 (k, `POSITION`)."""
+        self.tracks.add((tag[:MAX_TEXT], kind), Rows(rows))
         self.revision += 1
 
-    def _compare_with_position(self, pair: Pair, sample: Sample) -> None:
-        """Compute what a range and the position of its tag yield together: residual, raw position."""
+    def show(self, whole: Scene, now_s: float) -> None:
+        """Show the minute before a time of a recording, and its tracks until then; counts are those of all its ranges."""
+        self.clear()
+        self.ranges, self.corrected, self.faults = whole.ranges, whole.corrected, whole.faults
+        self.errors, self.error_counts, self.error_sums_m = (
+            whole.errors,
+            whole.error_counts,
+            whole.error_sums_m,
+        )
+        histories = {pair: history.until(now_s, now_s - HISTORY_S) for pair, history in whole.pairs.items()}
+        for pair, history in sorted(histories.items(), key=lambda item: item[1].received_s):
+            if (latest := history.latest) is not None:
+                self.pairs.add(pair, history)
+                self.latest_stamps.add(pair[1], (latest.stamp_s, history.received_s))
+                self.received_s = history.received_s
+        for (name, kind), track in whole.tracks.items():
+            rows = track.until(now_s).rows
+            if len(rows):
+                self.set_track(name, kind, rows)
+            if len(rows) and kind is TrackKind.CORRECTED:
+                received_s, x, y, z, sd_m, stamp_s, *ellipse, heading_rad = rows[-1].tolist()
+                self.tags.add(name, Pose(x, y, z, tuple(ellipse), heading_rad, stamp_s, sd_m, received_s))
+        begin, end = (bisect_right(whole.reports, (at_s,)) for at_s in (now_s - HISTORY_S, now_s + 1e-6))
+        for _, name, report in whole.reports[begin:end]:
+            self.set_node_status(name, report)
+
+    def _compare_with_position(self, pair: Pair, sample: Sample) -> float:
+        """Estimate a position from raw ranges; return the residual of a range, NaN without a recent position of its tag."""
         anchor, pose = self.anchors.get(pair[0]), self.tag_of(pair[1])
         if pose is None or anchor is None or self.age_s(pose) > NO_DATA_S:
-            return
-        # On a busy computer, positions arrive late.
-        if not abs(pose.stamp_s - sample.time_s) * pose.speed > MAX_MOVED_M:
-            x, y, z = anchor.position
-            distance_m = math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
-            sample.residual_m = sample.range_m - distance_m
-        if not self.is_indexed:
+            return math.nan
+        if not self.is_whole:
             self._locate_raw(pair, pose, sample)
+        # On a busy computer, positions arrive late.
+        if abs(pose.stamp_s - sample.stamp_s) * pose.speed > MAX_MOVED_M:
+            return math.nan
+        x, y, z = anchor.position
+        return sample.range_m - math.hypot(pose.x - x, pose.y - y, finite_or_zero(pose.z - z))
 
     def _locate_raw(self, pair: Pair, pose: Pose, sample: Sample) -> None:
         """Filter the raw ranges of a tag as the locator filters the corrected ones, at the height of the locator."""
-        if not (0.0 <= sample.raw_m < MAX_RANGE_M and math.isfinite(sample.time_s)):
+        if not (0.0 <= sample.raw_m < MAX_RANGE_M and math.isfinite(sample.stamp_s)):
             return
         if pair[1] not in self._raw_locators:
             self._raw_locators.add(pair[1], (TagEstimator(EstimatorConfig(self._anchor_map)), math.nan))
@@ -311,10 +349,10 @@ class Scene:
             self._raw_locators[pair[1]] = estimator, pose.stamp_s
             estimator.add(TagHeight(pose.z, HEIGHT_VARIANCE_M2))
         row = self._anchor_map.index[pair[0]]
-        estimate = estimator.add(TagRange(round(sample.time_s * NS_PER_S), row, sample.raw_m))
+        estimate = estimator.add(TagRange(round(sample.stamp_s * NS_PER_S), row, sample.raw_m))
         if estimate is not None:
             name = tag_frame(pair[1])
-            point = (sample.time_s, *estimate.position.tolist(), math.nan)
+            point = (sample.stamp_s, *estimate.position.tolist(), math.nan)
             self.add_position(name if name in self.tags else DEFAULT_TAG, TrackKind.RAW, point)
 
     def set_anchors(self, anchors: Iterable[Anchor]) -> None:
@@ -331,22 +369,22 @@ class Scene:
             self._raw_locators.clear()
 
     def set_node_status(self, name: str, report: NodeStatus) -> None:
-        self.node_statuses.add(name[:MAX_TEXT], replace(report, message=report.message[:MAX_TEXT]))
+        report = replace(report, message=report.message[:MAX_TEXT])
+        self.node_statuses.add(name[:MAX_TEXT], report)
+        if self.is_whole:
+            self.reports.append((self.clock(), name, report))
         self.revision += 1
 
     def count_dropped(self, number: int) -> None:
         """Count ranges that the viewer itself has dropped; they do not count as lost."""
         self.dropped += number
         for history in self.pairs.values():
-            history.restart_count()
+            history.is_interrupted = True
 
     def clear_history(self, tag_id: int) -> None:
         """Remove the last minute of the pairs of a tag, but not the counts."""
-        self._latest.pop(tag_id, None)
-        for (_, pair_tag), history in self.pairs.items():
-            if pair_tag == tag_id:
-                history.samples.clear()
-                history.traces.clear()
+        self.latest_stamps.pop(tag_id, None)
+        self.pairs.update({pair: History() for pair in self.pairs if pair[1] == tag_id})
 
     def latest(self) -> Iterator[tuple[Pair, History, Sample]]:
         """Yield every pair with its last range, by anchor and tag; also pairs that have stopped."""

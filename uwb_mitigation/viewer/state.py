@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ from bokeh.core.properties import Any as AnyValue
 from bokeh.model import DataModel
 from bokeh.models import ColumnDataSource
 
-from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair, RangeColumns
+from uwb_mitigation.viewer.histories import HISTORY_S, MAX_RANGE_M, History, Pair, Trace
 from uwb_mitigation.viewer.scene import MissingData, Scene
 
 if TYPE_CHECKING:
@@ -43,13 +44,18 @@ class View:
 
     @property
     def timeline(self) -> Timeline | None:
-        """The index of the recording; None: live, or not ready."""
-        return None if self.player is None else self.player.timeline
+        """The content of the recording; None: live, or not read completely."""
+        return self.player.timeline if self.player is not None and self.player.timeline.is_read else None
 
     @property
     def complete(self) -> Timeline | None:
-        """The index of the recording with its tracks; None: live, or not ready."""
+        """The content of the recording with its tracks; None: live, or not ready."""
         return self.timeline if self.timeline is not None and self.timeline.is_complete else None
+
+    @property
+    def whole(self) -> Scene:
+        """All data: of the recording as soon as it has been read, else those of the scene."""
+        return self.scene if self.timeline is None else self.timeline.scene
 
 
 class Controls(DataModel):  # type: ignore[misc]
@@ -60,7 +66,7 @@ class Controls(DataModel):  # type: ignore[misc]
         update: set by the server after each update: its number, how long the previous one took, and the age of the
             latest range by its reception and by its stamp, s; the age is negative if there are no recent ranges.
         acknowledged: set by the script to the number of the last update that it has drawn.
-        verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
+        headline, verdict, notice, nodes, health, tag_rows, incidents, cards, player, selected, marks: set by the server.
         available: set by the server: whether a control has an effect, {id: bool}.
         empty: set by the server: messages of figures without data, {name: message}.
     """
@@ -70,6 +76,7 @@ class Controls(DataModel):  # type: ignore[misc]
     acknowledged = AnyValue(default=0)
     health = AnyValue(default=[])
     cards = AnyValue(default=[])
+    headline = AnyValue(default="")
     verdict = AnyValue(default=[])
     tag_rows = AnyValue(default=[])
     incidents = AnyValue(default=[])
@@ -113,18 +120,11 @@ class PageState:
         """The last minute of the selected pair; empty without one."""
         return self.view.scene.pairs.get(self.selected or (-1, -1)) or History()
 
-    def now_s(self) -> float:
-        """Return the current time of `ranges`."""
+    @property
+    def trace(self) -> Trace | None:
+        """The last CIR of the selected pair."""
         player = self.view.player
-        is_indexed = player is not None and player.timeline is not None
-        return player.shown_s if player and is_indexed else self.view.scene.now_s(self.tag_id)
-
-    def ranges(self, begin_s: float = -math.inf, end_s: float = math.inf) -> RangeColumns:
-        """Return the ranges of the selected pair: in an interval of an indexed recording, else those of the scene."""
-        timeline = self.view.timeline
-        if timeline is None:
-            return self.history.columns()
-        return timeline.ranges(self.selected or (-1, -1), begin_s, end_s)
+        return player.read_trace(self.selected) if player and self.selected else self.history.trace
 
     def changed(self, name: str, value: object) -> bool:
         """Return whether a value differs from that of the last call."""
@@ -149,10 +149,11 @@ def new_source(*columns: str, **options: Any) -> ColumnDataSource:
     return ColumnDataSource({column: [] for column in columns}, **options)
 
 
-def set_rows(source: ColumnDataSource, rows: list[dict[str, Any]]) -> None:
+def set_rows(source: ColumnDataSource, rows: Sequence[Sequence[Any]]) -> None:
     """Set the rows of a source, unless it is and remains empty."""
     if rows or any(map(len, source.data.values())):
-        source.data = {column: [row[column] for row in rows] for column in source.data}
+        columns = map(list, zip(*rows, strict=True)) if rows else ([] for _ in source.data)
+        source.data = dict(zip(source.data, columns, strict=True))
 
 
 def drawable(value_m: float) -> float:

@@ -15,12 +15,10 @@ from uwb_mitigation.viewer.headline import Card, cards
 from uwb_mitigation.viewer.health import HeldVerdict, Means, Verdict
 from uwb_mitigation.viewer.histories import (
     HISTORY_S,
-    MAX_CIRS,
     NO_DATA_S,
     RATE_RANGES,
     STATISTICS,
     Pair,
-    residual_means,
 )
 from uwb_mitigation.viewer.scene import Scene, plain_tag_id, tag_label, tag_name
 from uwb_mitigation.viewer.state import PageState, new_source, set_rows
@@ -28,7 +26,7 @@ from uwb_mitigation.viewer.state import PageState, new_source, set_rows
 LEVELS = ("OK", "WARN", "ERROR", "STALE")
 """Texts of the diagnostic levels."""
 
-_RANGES, _CIRS = f"last {STATISTICS} ranges", f"last {MAX_CIRS} CIRs"
+_RANGES = f"last {STATISTICS} ranges"
 
 COLUMNS = {
     "state": ("state", "", health.STATES),
@@ -39,10 +37,10 @@ COLUMNS = {
     "correction": ("correction, m", _RANGES, "mean of raw minus corrected range"),
     "residual": ("residual, m", _RANGES, "mean of corrected range minus distance to the estimated position"),
     "not_ok": ("not OK, %", _RANGES, "share of ranges whose status is not OK"),
-    "nlos": ("NLOS, %", _CIRS, "share of CIRs without line of sight: first path 6 dB below the total"),
-    "rx": ("RX, dBm", _CIRS, "mean receive level"),
+    "nlos": ("NLOS, %", _RANGES, "share of CIRs without line of sight: first path 6 dB below the total"),
+    "rx": ("RX, dBm", _RANGES, "mean receive level"),
     "rate": ("rate, Hz", f"last {RATE_RANGES} ranges", "ranges per second"),
-    "lost": ("lost, %", "all; in a recording: since the minute before", "share of missing sequence numbers"),
+    "lost": ("lost, %", f"last {HISTORY_S:.0f} s", "share of missing sequence numbers"),
 }
 """Columns of the table of pairs after anchor and tag: {field: (title, interval, description)}."""
 
@@ -81,16 +79,21 @@ class Texts:
         page.health = {key: (state, anchors[key]["residual"]) for key, state in states.items()}
         names = {anchor_id: place.name for anchor_id, place in scene.anchors.items() if place.name}
         notices = self._notices(scene)
+        of_tags: dict[int | None, dict[int, Means]] = {page.tag_id: {}}
+        for (anchor_id, of_tag), means in pairs.items():
+            of_tags.setdefault(of_tag, {})[anchor_id] = means
         verdicts = {
-            tag_id: self._verdict(scene, tag_id, pairs, states, notices)
-            for tag_id in {page.tag_id, *(tag_id for _, tag_id in pairs)}
+            tag_id: self._verdict(scene, tag_id, means_of, states, notices)
+            for tag_id, means_of in of_tags.items()
         }
         for tag_id in self._verdicts.keys() - verdicts.keys():
             del self._verdicts[tag_id]
         shown = verdicts[page.tag_id]
+        tag = f" of tag {format_id(page.tag_id or 0)}" if len(verdicts) > 1 else ""
         reports = sorted((name, report.aged(scene.clock())) for name, report in scene.node_statuses.items())
         page.set(
-            verdict=[shown.state, shown.reason, shown.action, self._facts(scene, shown.accuracy)],
+            headline=shown.headline(tag),
+            verdict=[*shown[:3], self._facts(scene, shown.accuracy)],
             health=_anchor_rows(anchors, states, names),
             tag_rows=_tag_rows(scene, pairs, verdicts),
             incidents=self._incidents(scene),
@@ -105,8 +108,8 @@ class Texts:
 
     def _pairs(self, scene: Scene) -> dict[Pair, Means]:
         """Write the table of pairs; return their means."""
-        timeline, now_s = self._view.timeline, self._page.now_s()
-        rows, pairs = list[dict[str, Any]](), dict[Pair, Means]()
+        timeline = self._view.timeline
+        rows, pairs = list[tuple[Any, ...]](), dict[Pair, Means]()
         for pair, history, sample in scene.latest():
             missing, age_s = scene.no_data(history), scene.age_s(history)
             means = history.statistics() | {
@@ -114,18 +117,15 @@ class Texts:
                 "stopped": age_s if missing else 0.0,
                 "displaced": 0.0 if timeline is None else timeline.displaced.get(pair[0], 0.0),
             }
-            if timeline is not None:
-                residuals_m = timeline.ranges(pair, now_s - HISTORY_S, now_s).residual_m
+            if timeline is not None and timeline.displaced and pair[0] not in timeline.displaced:
                 # A displaced anchor bends the track with which the others are compared.
-                is_judged = not timeline.displaced or pair[0] in timeline.displaced
-                means |= residual_means(residuals_m[-STATISTICS:].tolist() if is_judged else [])
+                means |= {"residual": math.nan, "evidence": 0.0}
             pairs[pair] = means
-            rows.append(means | {
-                "anchor": format_id(pair[0]), "tag": format_id(pair[1]), "state": self._health(pair, means),
-                "status": missing or sample.status.name, "no_data": bool(missing), "raw": sample.raw_m,
-                "corrected": sample.range_m, "sigma": sample.sigma_m,
-            })  # fmt: skip
-        self._page.has_data = any(not row["no_data"] for row in rows)
+            status, ids = missing or sample.status.name, map(format_id, pair)
+            measured = sample.raw_m, sample.range_m, sample.sigma_m
+            shown = (means[name] for name in list(COLUMNS)[5:])
+            rows.append((*ids, bool(missing), self._health(pair, means), status, *measured, *shown))
+        self._page.has_data = any(means["stopped"] == 0.0 for means in pairs.values())
         set_rows(self.pairs, rows)
         return pairs
 
@@ -133,7 +133,7 @@ class Texts:
         self,
         scene: Scene,
         tag_id: int | None,
-        pairs: dict[Pair, Means],
+        anchors: dict[int, Means],
         states: dict[int, str],
         notices: list[str],
     ) -> Verdict:
@@ -141,11 +141,9 @@ class Texts:
         tag = f"tag {'' if tag_id is None else format_id(tag_id)}"
         texts = (f"{tag} determination: ", f"{tag}: {UNKNOWN_POSITION} ")
         remedies = (line.partition(text)[2] for text in texts for line in notices if text in line)
-        of_tag = {anchor_id: means for (anchor_id, pair_tag), means in pairs.items() if pair_tag == tag_id}
-        states_of_tag = {key: states[key] for key in of_tag}
-        verdict = health.verdict(scene, tag_id, of_tag, states_of_tag, next(remedies, ""))
+        verdict = health.verdict(scene, tag_id, anchors, states, next(remedies, ""))
         is_read = self._view.player is None or self._view.complete is not None
-        if verdict.state == health.UNDETERMINED and not is_read:
+        if verdict.state in (health.UNDETERMINED, health.WAITING) and not is_read:
             verdict = Verdict(health.WAITING, "the recording is being read")
         return self._verdicts[tag_id].update(verdict, scene.clock())
 
@@ -154,17 +152,10 @@ class Texts:
         tag_id, texts = self._page.tag_id, [accuracy] if accuracy else []
         if tag_id is not None and math.isfinite(stamp_s := scene.latest_stamp_s(tag_id)):
             texts.append(f"last range {scene.stamp_clock() - stamp_s:.1f} s old by stamp")
-        if scene.ranges:
-            corrected, count, faults = (self._view.timeline or scene).counts
-            not_corrected = "no range corrected" + ("" if faults else ": no CIRs")
-            texts.append(
-                f"{100.0 * corrected / count:.0f} % of ranges corrected" if corrected else not_corrected
-            )
-            texts += [
-                f"{title.lower()}: {value} ({text})"
-                for title, value, text in self._cards
-                if title.startswith("Correction")
-            ]
+        for title, value, text in self._cards:
+            name, _, _ = title.lower().partition(",")
+            if name in ("ranges corrected", "correction"):
+                texts.append(f"{name}: {value} ({text})")
         if scene.dropped:
             texts.append(f"{scene.dropped} ranges dropped by the viewer")
         return " \u00b7 ".join(texts)
@@ -189,7 +180,7 @@ class Texts:
     def _incidents(self, scene: Scene) -> list[tuple[float | None, str]]:
         """Return the incidents: time in the recording, None if they are live; text."""
         if self._view.player is not None:
-            return [] if self._view.timeline is None else list(self._view.timeline.incidents)
+            return [] if self._view.timeline is None else sorted(self._view.whole.incidents.found)
         scene.incidents.check(now_s := scene.clock())
         latest = list(scene.incidents.found)[-MAX_SHOWN_EVENTS:]
         return [(None, f"{now_s - time_s:.0f} s ago: {text}") for time_s, text in latest]

@@ -15,7 +15,7 @@ from uwb_mitigation.errors import format_id
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.viewer.palette import TrackKind
 from uwb_mitigation.viewer.report import draw_boxes, draw_scene, render_report
-from uwb_mitigation.viewer.scene import Pose, Scene, count_errors
+from uwb_mitigation.viewer.scene import POSITION, Pose, Scene, count_errors
 from uwb_mitigation.viewer.state import View
 
 PERCENTILES = (5, 25, 50, 75, 95)
@@ -101,7 +101,9 @@ def _view(calibration: SiteCalibration, errors_m: np.ndarray[Any, Any]) -> View:
     scene.set_anchors(calibration.site.anchors.anchors)
     for segment in np.unique(solution.track_of):
         places = solution.track[(solution.track_of == segment) & np.isfinite(solution.track).all(axis=1)]
-        columns = np.column_stack([np.zeros(len(places)), places, np.full(len(places), math.nan)])
+        columns = np.column_stack(
+            [np.zeros(len(places)), places, np.full((len(places), POSITION - 4), math.nan)]
+        )
         scene.set_track(f"segment {segment}", TrackKind.CORRECTED, columns)
         if len(places) == 1:
             # A stationary tag.

@@ -6,7 +6,7 @@ window.WebSocket = class extends WebSocket {
 };
 addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); });
 
-const DIGITS = {rate: 1, not_ok: 0, nlos: 0, lost: 0, rx: 1, fp: 1};
+const DIGITS = {rate: 1, not_ok: 0, nlos: 0, lost: 0, rx: 1};
 const number = (value, digits = 3) => value == null || Number.isNaN(value) ? "-"
   : Math.abs(value) < 1e5 ? value.toFixed(digits) : value.toExponential(1);
 const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
@@ -49,12 +49,12 @@ function start(doc) {
   });
   texts("notice", "notice", (text) => element("div", text));
   texts("cards", "cards", (lines) => element("div", lines.map((text, i) => element(i === 1 ? "strong" : "span", text))));
-  for (const name of ["verdict", "selected", "tag_rows"]) on(name, () => {
-    const [state, reason, action, facts] = controls.verdict, box = $("verdict");
-    if (!state) return;
-    const tag = controls.tag_rows.length > 1 && controls.selected ? ` of tag ${controls.selected[1]}` : "";
-    box.className = state;
-    [`Position${tag} ${state}${reason ? `: ${reason}` : ""}`, action, facts].forEach((text, i) => setText(box.children[i], text));
+  const [headline, action, facts] = $("verdict").children;
+  on("headline", () => setText(headline, controls.headline));
+  on("verdict", () => {
+    const [state, , ...texts] = controls.verdict;
+    $("verdict").className = state ?? "";
+    [action, facts].forEach((element, i) => setText(element, texts[i] ?? ""));
   });
   on("available", () => { for (const [id, is] of Object.entries(controls.available)) if ($(id)) $(id).disabled = !is; });
 
@@ -94,46 +94,34 @@ function start(doc) {
   });
   on("empty", () => { for (const [name, message] of Object.entries(controls.empty)) $(name).dataset.empty = message; });
   // Map.
-  const map = model("map"), ranges = () => [map.x_range, map.y_range];
+  const map = model("map");
   const fit = () => Bokeh.index.find_one(map).reset();
   const pan = (x, y, zoom = 1) => {
     const view = Bokeh.index.find_one(map);
-    const moved = ranges().map((range, axis) => {
-      const middle = (range.start + range.end) / 2 + [x, y][axis] * (range.end - range.start);
-      const half = (range.end - range.start) / 2 * zoom;
-      return [range, {start: middle - half, end: middle + half}];
-    });
-    view.update_range({xrs: new Map([moved[0]]), yrs: new Map([moved[1]])}, {panning: zoom === 1, scrolling: zoom !== 1});
-  };
-  // A name that would cover another one is hidden: tags come first, then the selected anchor.
-  const [tags, anchors, labels] = ["label_y", "id", "offset"].map((column) => map.renderers.map((r) => r.data_source).find((s) => column in s.data));
-  const placeLabels = () => {
-    const {x_scale, y_scale, bbox} = Bokeh.index.find_one(map).frame, boxes = [], shown = {x: [], y: [], text: [], offset: [], shift: []};
-    // Above the marker, or below it where it would leave the frame or cover another one.
-    const place = (x, y, text, ...offsets) => {
-      const half = 3.5 * text.length + 2, px = x_scale.compute(x), py = y_scale.compute(y);
-      const shift = Math.max(bbox.left - px + half, 0) + Math.min(bbox.right - px - half, 0);
-      for (const offset of offsets) {
-        const bottom = py + offset, box = [px - half + shift, bottom - 15, px + half + shift, bottom];
-        if (box[1] < bbox.top || boxes.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
-        boxes.push(box);
-        for (const [name, value] of Object.entries({x, y, text, offset, shift})) shown[name].push(value);
-        return;
-      }
+    const moved = ({start, end}, share) => {
+      const middle = (start + end) / 2 + share * (end - start), half = (end - start) / 2 * zoom;
+      return {start: middle - half, end: middle + half};
     };
-    tags.data.x.forEach((x, i) => {
-      const [px, py] = [x_scale.compute(x), y_scale.compute(tags.data.y[i])];
-      boxes.push([px - 8, py - 3, px + 8, py + 8]);
-    });
-    tags.data.name.forEach((name, i) => place(tags.data.x[i], tags.data.label_y[i], name, -4, 2 * (y_scale.compute(tags.data.y[i]) - y_scale.compute(tags.data.label_y[i])) + 28));
-    const isSelected = (i) => controls.selected && BigInt(controls.selected[0]) == anchors.data.id[i];
-    const order = [...anchors.data.name.keys()].sort((a, b) => isSelected(b) - isSelected(a));
-    for (const i of order) place(anchors.data.x[i], anchors.data.y[i], anchors.data.label[i], isSelected(i) ? -16 : -13, 28);
-    if (JSON.stringify(shown) !== JSON.stringify(labels.data)) labels.setv({data: shown}, {sync: false});
+    const xrs = new Map([[map.x_range, moved(map.x_range, x)]]), yrs = new Map([[map.y_range, moved(map.y_range, y)]]);
+    view.update_range({xrs, yrs}, {panning: zoom === 1, scrolling: zoom !== 1});
   };
-  tags.properties.data.change.connect(placeLabels);
-  // The view and the size of the map change without a common event.
-  setInterval(placeLabels, 200);
+  // A name that would cover a tag or another name is hidden: tags come first, then the selected anchor.
+  const names = map.renderers.filter(({glyph}) => glyph.text).reverse();
+  const placeNames = () => {
+    const {x_scale, y_scale} = Bokeh.index.find_one(map).frame, {x, y} = names[0].data_source.data;
+    const boxes = x.map((_, i) => [9, x_scale.compute(x[i]), y_scale.compute(y[i]) + 10]);
+    for (const {view, glyph, data_source: {data}} of names) {
+      const booleans = data[glyph.text.field].map((text, i) => {
+        const box = [3.5 * text.length + 2, x_scale.compute(data.x[i]), y_scale.compute(data[glyph.y.field][i]) + glyph.y_offset.value];
+        const isFree = boxes.every(([half, x, y]) => Math.abs(x - box[1]) > half + box[0] || Math.abs(y - box[2]) > 14);
+        if (isFree) boxes.push(box);
+        return isFree;
+      });
+      if (String(booleans) !== String(view.filter.booleans)) view.filter.setv({booleans}, {sync: false});
+    }
+  };
+  // Data, view and size of the map change without a common event.
+  setInterval(placeNames, 200);
   $("fit").addEventListener("click", fit);
   $("accuracy").addEventListener("change", (event) => send("accuracy", event.target.checked));
   const keys = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1], "+": [0, 0, 0.8], "-": [0, 0, 1.25]};
@@ -148,11 +136,11 @@ function start(doc) {
 
   const legend = (figure) => [...figure.above, ...figure.below].find((part) => part.items);
   for (const figure of figures) if (legend(figure)) new ResizeObserver(([{contentRect: {width}}]) => {
-    legend(figure).ncols = Math.max(2, Math.floor(width / (figure === map ? 125 : 110)));
+    legend(figure).ncols = Math.max(2, Math.floor((width - 40) / 110));
   }).observe($(figure.name));
 
   $("map").addEventListener("click", (event) => {
-    const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = anchors.data;
+    const view = Bokeh.index.find_one(map), box = view.el.getBoundingClientRect(), {x_scale, y_scale} = view.frame, {x, y, id} = names[1].data_source.data;
     const i = id.findIndex((_, i) => Math.hypot(x_scale.compute(x[i]) - event.clientX + box.left, y_scale.compute(y[i]) - event.clientY + box.top) < 15);
     const {anchor, tag} = source.data, own = [...anchor.keys()].filter((pair) => BigInt(anchor[pair]) == id[i]);
     const pair = own.find((pair) => tag[pair] === controls.selected[1]) ?? own[0];
@@ -162,12 +150,11 @@ function start(doc) {
   // Recording.
   let held = false, savedMs = 0;
   const saveUrl = (isPosition) => {
-    const [anchor, tag] = controls.selected ?? [], at = controls.player?.position;
-    const parts = {anchor, tag, t: position && at != null ? at.toFixed(2) : undefined};
-    const text = Object.entries(parts).filter(([, value]) => value !== undefined).map(([name, value]) => `${name}=${encodeURIComponent(value)}`);
     // Browsers limit how often a page changes its URL.
     if (isPosition && controls.player?.playing && performance.now() < savedMs + 500) return;
-    history.replaceState(null, "", "#" + text.join("&"));
+    const [anchor, tag] = controls.selected ?? [], parts = new URLSearchParams(controls.selected ? {anchor, tag} : {});
+    if (position && controls.player) parts.set("t", controls.player.position.toFixed(2));
+    history.replaceState(null, "", `#${parts}`);
     savedMs = performance.now();
   };
   const wanted = new URLSearchParams(location.hash.slice(1));
@@ -183,13 +170,6 @@ function start(doc) {
   if (position) {
     position.addEventListener("input", () => { held = true; $("time").textContent = `${Number(position.value).toFixed(1)} s`; });
     position.addEventListener("change", () => { held = false; send("seek", Number(position.value)); });
-    const steps = {ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1, PageDown: -10, PageUp: 10};
-    position.addEventListener("keydown", (event) => {
-      if (!steps[event.key]) return;
-      event.preventDefault();
-      position.value = Number(position.value) + steps[event.key];
-      send("seek", Number(position.value));
-    });
     $("speed").addEventListener("change", (event) => send("speed", Number(event.target.value)));
     on("marks", () => {
       if (!controls.marks) return;
