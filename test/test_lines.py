@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import socket
 import time
@@ -287,6 +288,15 @@ def test_a_capture_replays_the_ranges_also_with_another_mapping(tmp_path: Path):
     path.write_text('# uwb_mitigation lines capture 1\nboard 0 {"mapping": 3}\n')
     with pytest.raises(DamagedRecordingError):
         list(lines.open_capture(path, value_of()))
+
+
+def test_a_full_disk_ends_the_capture_but_not_the_ranges(tmp_path: Path):
+    boards = TextBoards(links=tmp_path / "b", rate_hz=50.0)
+    with boards, open_board(tmp_path / "b0", "pans", capture=Path("/dev/full")) as events:
+        (message,) = events.wait_for(lambda event: "capture" in getattr(event, "text", ""))
+        assert (message.level, message.text) == (logging.ERROR, "the capture has ended: No space left on device")
+        events.wait_for(RangeMeasurement, 3)
+        assert events.port.openings == 1
 
 
 # The driver ------------------------------------------------------------------------------------------------------
