@@ -294,7 +294,10 @@ def test_a_full_disk_ends_the_capture_but_not_the_ranges(tmp_path: Path):
     boards = TextBoards(links=tmp_path / "b", rate_hz=50.0)
     with boards, open_board(tmp_path / "b0", "pans", capture=Path("/dev/full")) as events:
         (message,) = events.wait_for(lambda event: "capture" in getattr(event, "text", ""))
-        assert (message.level, message.text) == (logging.ERROR, "the capture has ended: No space left on device")
+        assert (message.level, message.text) == (
+            logging.ERROR,
+            "the capture has ended: No space left on device",
+        )
         events.wait_for(RangeMeasurement, 3)
         assert events.port.openings == 1
 

@@ -28,7 +28,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import mitigator as mitigator_node
-from uwb_mitigation.nodes.support.parameter_tables import DAMAGED
+from uwb_mitigation.nodes.support.parameter_tables import CRASHED, DAMAGED
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -100,13 +100,32 @@ def test_stamps_are_on_the_nodes_clock_and_spaced_as_recorded(ros: Ros, bag: Pat
 
 @pytest.mark.parametrize(
     ("parameters", "named"),
-    [(("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"), (("rate:=.nan",), "rate")],
+    [
+        (("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"),
+        (("rate:=.nan",), "rate"),
+        (("source:=topic", "map:=string_json", "topic:=bad--x"), "bad--x"),
+    ],
 )
 def test_driver_without_a_source_exits_with_an_error(ros: Ros, parameters: tuple[str, ...], named: str):
     driver = ros.start("driver", *parameters)
     assert driver.wait() == 1
     assert named in driver.output
     assert "Traceback" not in driver.output
+
+
+@pytest.mark.parametrize("step", ["open", "__init__"])
+def test_error_of_ros_at_the_start_is_a_crash_after_which_the_node_is_respawned(ros: Ros, step: str):
+    code = (
+        "from uwb_mitigation.nodes import driver\n"
+        "from uwb_mitigation.nodes.support import spinning\n"
+        "def fail(*arguments):\n"
+        "    raise RuntimeError('failed to create publisher')\n"
+        f"driver.Driver.{step} = fail\n"
+        "spinning.run_node('driver')\n"
+    )
+    driver = ros.run([sys.executable, "-c", code])
+    assert driver.wait() == CRASHED
+    assert "failed to create publisher" in driver.output
 
 
 def test_damaged_bag_is_replayed_up_to_the_damage(ros: Ros, bag: Path, tmp_path: Path):

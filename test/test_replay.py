@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import signal
 import threading
 import time
 from collections import Counter
@@ -15,6 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bag_material import write_records
+from port_events import wait_until
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
@@ -33,7 +35,7 @@ from uwb_mitigation_msgs.msg import RangeCir
 from uwb_mitigation.errors import DamagedRecordingError, UwbMitigationError
 from uwb_mitigation.nodes.feeds.replay import ReplayFeed
 from uwb_mitigation.nodes.feeds.replay_clock import ReplayClock
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER, RESPAWN_FOLDER
 from uwb_mitigation.recordings.bag.writer import BagWriter
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -363,6 +365,25 @@ def test_driver_records_its_ranges_and_never_replaces_a_file(ros: Ros, tmp_path:
     second = ros.start("driver", *options, "count:=1")
     assert second.wait() == 1
     assert "the file exists" in second.output
+
+
+@pytest.mark.ros
+def test_respawned_driver_records_to_a_new_file_and_does_not_repeat_a_recording_that_ended(
+    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "respawn").mkdir()
+    monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path / "respawn"))
+    options = ("wait_for_subscribers:=0", "start_delay:=0.0", f"record:={tmp_path / 'live.mcap'}")
+    crashed = ros.start("driver", *options)
+    wait_until(lambda: (tmp_path / "live.mcap.part").exists())
+    crashed.signal(signal.SIGKILL)
+    assert ros.start("driver", *options, "count:=40").wait() == 0
+    again = ros.start("driver", *options, "count:=40")
+    assert again.wait() == 0
+    assert "replaying" not in again.output
+    assert {file.name for file in tmp_path.glob("live*")} == {"live.mcap.part", "live_2.mcap"}
+    with McapRecording(tmp_path / "live_2.mcap") as recording:
+        assert len(list(recording)) == 40
 
 
 def test_time_to_open_a_source_does_not_make_its_first_records_late():

@@ -39,18 +39,25 @@ class RangePublisher:
     Args:
         node: the driver.
         consumer: in-process consumer of measurements; `/uwb/range_raw` is then published only if it has subscribers.
+        record: path of a bag for the raw ranges; empty: none.
         corrections: the source may deliver ranges that a board has corrected.
         recording: the source delivers ground truth.
     """
 
     def __init__(
-        self, node: ManagedNode, consumer: Mitigator | None, *, corrections: bool, recording: bool
+        self,
+        node: ManagedNode,
+        consumer: Mitigator | None,
+        record: str,
+        *,
+        corrections: bool,
+        recording: bool,
     ) -> None:
         self._node = node
         self._consumer = consumer
         self._frame_id: str = node.value("frame_id")
         self._ranges = node.publisher(RangeCir, topics.RANGE_RAW)
-        self._bag = self._open_bag() if node.value("record") else None
+        self._bag = self._open_bag(Path(record).expanduser()) if record else None
         if corrections:
             self._corrected = node.publisher(RangeCorrected, topics.RANGE_CORRECTED)
             self._sensor_ranges = SensorRanges(node)
@@ -114,11 +121,11 @@ class RangePublisher:
         if self._consumer is not None:
             self._consumer.wait_for_all_acked(timeout)
 
-    def _open_bag(self) -> BagWriter:
+    def _open_bag(self, path: Path) -> BagWriter:
         # Import here: other drivers need no writer of bags.
         from uwb_mitigation.recordings.bag.writer import BagWriter
 
-        path, source = Path(self._node.value("record")).expanduser(), self._node.value("source")
+        source = self._node.value("source")
         if os.path.lexists(path):
             raise ParameterError(f"parameter record = {path}: the file exists", valid="another path")
         origin = {"source": f"driver, source {source}"}

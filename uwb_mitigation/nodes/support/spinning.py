@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -136,14 +135,11 @@ def _run(name: str) -> int:
     code_of_errors = REFUSED
     try:
         _initialise()
-        try:
-            # Load before the handlers are installed: until then a signal terminates the process immediately.
-            make_nodes = load_node(name)
-            stop = stop_event()
-            # If one cannot be made, the list contains those before it.
-            nodes.extend(make_nodes(stop))
-        except (RuntimeError, NameValidationException) as error:  # rcl's errors are RuntimeErrors
-            raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
+        # Load before the handlers are installed: until then a signal terminates the process immediately.
+        make_nodes = load_node(name)
+        stop = stop_event()
+        # If one cannot be made, the list contains those before it.
+        nodes.extend(make_nodes(stop))
         code_of_errors = CRASHED
         spin(nodes, stop)
     except ImportError as error:
@@ -171,13 +167,10 @@ def _initialise() -> None:
     try:
         rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        raise ParameterError(_first_line(error), valid="check what follows --ros-args") from error
+        # Without positions in the source files of ROS.
+        first_line = str(error).strip().splitlines()[0].split(", at /")[0]
+        raise ParameterError(first_line, valid="check what follows --ros-args") from error
     if unknown := remove_ros_args(words)[1:]:
         raise ParameterError(
             f"arguments {' '.join(unknown)!r}", valid="parameters follow --ros-args, as in -p name:=value"
         )
-
-
-def _first_line(error: Exception) -> str:
-    """Return the first line of a ROS error without positions in ROS's source files."""
-    return str(error).strip().splitlines()[0].split(", at /")[0]
