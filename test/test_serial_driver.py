@@ -29,9 +29,11 @@ from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
-from uwb_mitigation.radios.serial import SerialSettings
+from uwb_mitigation.radios.serial import BoardPort, SerialSettings
+from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
+from uwb_mitigation.radios.wire.events import Disconnected, Loss
 from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION
-from uwb_mitigation.radios.wire.messages import Hello
+from uwb_mitigation.radios.wire.messages import Hello, RadioConfigured
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import CorrectedBy, RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
@@ -295,3 +297,30 @@ def test_port_without_permission_is_reported_with_the_remedy(tmp_path: Path, mon
         wait_until(lambda: "cannot be opened" in events.port.problem)
         assert "Permission denied" in events.port.problem
         assert "usermod -aG dialout" in events.port.problem
+
+
+@pytest.mark.parametrize(
+    ("radio", "is_warning"),
+    [
+        (None, True),
+        (RadioSettings(), True),
+        (RadioSettings(Role.ANCHOR), False),
+        (RadioSettings(Role.ANCHOR, report=True), True),
+    ],
+)
+def test_board_without_ranges_causes_a_warning_unless_it_is_an_anchor(
+    radio: RadioSettings | None, is_warning: bool
+):
+    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
+    port._observed([RadioConfigured(radio)] if radio is not None else [])
+    assert port.report().warning == ("connected; no range yet" if is_warning else "")
+
+
+def test_loss_of_a_board_is_logged_unless_its_port_is_closed():
+    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
+    assert [type(event) for event in port._observed([Disconnected(Loss.RESET)])] == [
+        Disconnected,
+        PortMessage,
+    ]
+    port.request_close()
+    assert [type(event) for event in port._observed([Disconnected(Loss.CLOSED)])] == [Disconnected]
