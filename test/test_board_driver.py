@@ -1,63 +1,22 @@
-"""A board on a real pseudo-terminal: connect, disconnect, reconnect, close."""
+"""Ports of boards: addresses, and ports that are absent or in use."""
 
 from __future__ import annotations
 
-import itertools
 import os
 import subprocess
 import sys
-from collections import Counter
-from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 from queue import SimpleQueue
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from port_events import TIMEOUT_S, PortEvents, terminal, wait_until
 
-from benchmarks.equipment.emulated_board import EmulatedBoard
-from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import LinkError
 from uwb_mitigation.radios import serial
 from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import SerialSettings
-from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
-
-
-class Recording:
-    """A source of numbered measurements."""
-
-    name = "recording"
-    simulated = True
-
-    def __init__(self) -> None:
-        self.skipped: Counter[str] = Counter()
-
-    def __iter__(self) -> Iterator[Record]:
-        for i in itertools.count():
-            samples = np.full(314, i % 100, np.int16)
-            yield Record(RangeMeasurement(0, 1, 2, i, i * 7, 4.0, Cir(samples, preamble_count=9)))
-
-
-def test_faulty_channel_delivers_only_sent_messages(tmp_path: Path):
-    faults, link = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05), tmp_path / "board"
-    with (
-        EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4),
-        PortEvents(serial, SerialSettings(PortAddress(str(link)))) as events,
-    ):
-        received = events.wait_for(RangeMeasurement, 300)
-        counts = events.port.session.totals()
-
-    sequences = [event.sequence for event in received]
-    assert all(event.cir.samples.tolist() == [event.sequence % 100] * 314 for event in received)
-    assert len(set(sequences)) == len(sequences)
-    assert sequences == sorted(sequences)
-    assert counts["lost"] > 0
-    assert counts["corrupt"] > 0
-    assert counts["stale"] > 0
 
 
 def test_absent_port_is_logged_with_the_second_attempt(monkeypatch: pytest.MonkeyPatch):
