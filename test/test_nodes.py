@@ -220,31 +220,22 @@ def test_duplicate_node_names_are_reported_except_for_a_killed_node(
 PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", *PAUSED)
 
 
-def test_ranges_of_a_pipeline_are_those_of_the_library_to_the_bit(ros: Ros):
+def test_pipelines_in_two_namespaces_give_the_ranges_of_the_library_to_the_bit(ros: Ros):
     mitigation = Mitigation(load_bundle(default_model_path()))
     source = SimulatedSource(seed=1, count=200, rate_hz=400.0)
     expected = [mitigation.correct([record.measurement])[0] for record in source]
-    received = ros.collect(RangeCorrected, CORRECTED)
-    pipeline = ros.start("pipeline", *PLAY)
-    ros.play()
-    assert pipeline.wait() == 0, pipeline.output
-    ros.spin_until(lambda: len(received) == 200)
-    assert [m.sequence for m in received] == list(range(200))
-    assert [m.range for m in received] == [np.float32(e.range_m) for e in expected]
-    assert [m.variance for m in received] == [np.float32(e.variance_m2) for e in expected]
-    assert "unknown" not in pipeline.output
-
-
-def test_several_pipelines_do_not_interfere(ros: Ros):
     received = {name: ros.collect(RangeCorrected, f"/{name}{CORRECTED}") for name in ("left", "right")}
     pipelines = [ros.start("pipeline", *PLAY, arguments=("-r", f"__ns:=/{name}")) for name in received]
     for name in received:
         ros.play(f"{name}/driver")
     for pipeline in pipelines:
         assert pipeline.wait() == 0, pipeline.output
+        assert "unknown" not in pipeline.output
     ros.spin_until(lambda: all(len(messages) == 200 for messages in received.values()))
     for messages in received.values():
         assert [m.sequence for m in messages] == list(range(200))
+        assert [m.range for m in messages] == [np.float32(e.range_m) for e in expected]
+        assert [m.variance for m in messages] == [np.float32(e.variance_m2) for e in expected]
 
 
 @pytest.mark.parametrize("model", ["universal", "universal_amplitude", "evk1000_apartment", "dw3000_sts"])
