@@ -125,10 +125,12 @@ def test_viewer_starts_if_requested(generate):
     assert "viewer" not in [node.executable for node in nodes]
 
 
-def test_displays_start_on_request(generate):
-    rviz, bridge = launch(generate, "uwb.launch.py", rviz="true", foxglove="True")
-    assert (rviz.executable, bridge.executable) == ("rviz2", "foxglove_bridge")
+def test_displays_and_the_locator_start_without_a_source(generate):
+    given = {"locate": "true", "anchors": "anchors.yaml", "rviz": "true", "foxglove": "True"}
+    rviz, bridge, locator = launch(generate, "uwb.launch.py", **given)
+    assert (rviz.executable, bridge.executable, locator.executable) == ("rviz2", "foxglove_bridge", "locator")
     assert rviz.arguments == ["-d", ["share/uwb_mitigation", "rviz", "uwb.rviz"]]
+    assert settings(locator)["anchors"] == "anchors.yaml"
 
 
 @pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
@@ -152,18 +154,10 @@ def test_only_a_crashed_node_is_respawned(generate, file: str, code: int, kinds:
         assert (event.kind, event.process_matcher) == ("shutdown of a process", node)
 
 
-@pytest.mark.parametrize("text", ["0xdeca010203040506", "'0xdeca010203040506'"])
-def test_64_bit_address_reaches_the_driver_as_a_string(generate, text: str):
-    overrides = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
-    driver, _ = launch(generate, "uwb.launch.py", **overrides)
-    for name in ("radio.address", "radio.anchors"):
-        assert settings(driver)[name] == "0xdeca010203040506"
-
-
 def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
     overrides = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
     arguments, _ = described(generate, "uwb.launch.py")
-    examples = {"frame_id": "1234", "radio.address": "34", "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True",
+    examples = {"frame_id": "1234", "radio.address": "34", "radio.anchors": "'0xdeca010203040506'", "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True",
                 "viewer_port": "8080", "locator_rate": "20", "rate": "2", "radio.pan": "7", "area": "0,0,0,9,9,3"}  # fmt: skip
     assert set(examples) <= set(arguments)
     for node, table in TABLES.items():
@@ -172,7 +166,7 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
     started = launch(generate, "uwb.launch.py", **overrides, **examples)
     nodes = {node.executable: settings(node) for node in started}
     assert nodes["driver"]["frame_id"] == "1234", "a text stays a string"
-    radio = {"radio.address": "34", "radio.pan": 7}
+    radio = {"radio.address": "34", "radio.anchors": "0xdeca010203040506", "radio.pan": 7}
     expected = {
         "driver": radio | {"offsets": "0.25", "rate": 2.0, "port": "usb:2341:805a"},
         "mitigator": {"offsets": "0.25"},
@@ -243,12 +237,6 @@ def test_one_file_configures_all_nodes(generate, tmp_path: Path):
     assert settings(nodes[3])["port"] == 5006
     (pipeline,) = launch(generate, "uwb.launch.py", params=str(robot), one_process="true")
     assert pipeline.parameters[2] == str(robot)
-
-
-def test_only_the_locator_starts_without_a_source(generate):
-    (locator,) = launch(generate, "uwb.launch.py", locate="true", anchors="anchors.yaml")
-    assert locator.executable == "locator"
-    assert settings(locator)["anchors"] == "anchors.yaml"
 
 
 def test_simulation_starts_only_on_request(generate, tmp_path: Path):

@@ -22,7 +22,7 @@ from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER, RESPAWN_FOLDER
 from uwb_mitigation.radios import lines, uci
 from uwb_mitigation.radios.lines import LineSession, LineSettings, UdpAddress
 from uwb_mitigation.radios.port import PortAddress
@@ -306,7 +306,13 @@ def test_a_full_disk_ends_the_capture_but_not_the_ranges(tmp_path: Path):
 
 
 @pytest.mark.ros
-def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_path: Path):
+def test_driver_publishes_the_ranges_of_two_dwm1001s(
+    ros: ros_harness.Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # The driver was respawned, and must not replace the capture of the crash.
+    monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path))
+    for name in ("driver.run", "c.txt"):
+        (tmp_path / name).touch()
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     with TextBoards(boards=2, links=tmp_path / "b") as boards:
         began = time.time()
@@ -322,7 +328,7 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
         assert node.output.count("DWM1001 PANS at /") == 2
         assert node.signal(signal.SIGINT) == 0, node.output
     raw.clear()
-    ros.start("driver", "source:=pans", f"path:={tmp_path}/c.txt", "rate:=20.0")
+    ros.start("driver", "source:=pans", f"path:={tmp_path}/c_2.txt", "rate:=20.0")
     ros.spin_until(lambda: len(raw) > 40)
 
 

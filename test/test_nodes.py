@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import shutil
-import signal
 import sys
 import time
 from array import array
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
-from ros_harness import PAUSED, Process, Ros, set_expiry
+from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import DamagedRecordingError
@@ -28,6 +28,7 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import mitigator as mitigator_node
+from uwb_mitigation.nodes.support.lifecycle import DUPLICATE_NAME_DELAY_S, ManagedNode
 from uwb_mitigation.nodes.support.parameter_tables import CRASHED, DAMAGED
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
@@ -185,34 +186,21 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         assert math.isinf(answer.variance) == math.isnan(message.range)
 
 
-FAST_MITIGATOR = """
-from uwb_mitigation.nodes.support import lifecycle, spinning
-lifecycle.DUPLICATE_NAME_DELAY_S /= 5
-spinning.run_node("mitigator")
-"""
-
-
-def test_duplicate_node_names_are_reported_except_for_a_killed_node(
-    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    set_expiry(monkeypatch, tmp_path, 2)
-
-    def start() -> Process:
-        return ros.run([sys.executable, "-c", FAST_MITIGATOR])
-
-    def named() -> int:
-        return ros.node.get_node_names_and_namespaces().count(("mitigator", "/"))
-
-    killed = start()
-    first = start()
-    ros.spin_until(lambda: named() == 2)
-    killed.signal(signal.SIGKILL)
-    ros.spin_until(lambda: named() == 1)
-    assert "another node has the name" not in first.output
-    second = start()
-    ros.diagnosis("mitigator", lambda status: "another node has the name" in status.message)
-    for process in (first, second):
-        process.wait_for_output("another node has the name /mitigator")
+def test_duplicate_node_names_are_reported_except_for_a_killed_node():
+    names = [("mitigator", "/left")]
+    node = SimpleNamespace(
+        get_name=lambda: "mitigator",
+        get_namespace=lambda: "/left",
+        get_fully_qualified_name=lambda: "/left/mitigator",
+        get_node_names_and_namespaces=lambda: names,
+        _last_unique_s=0.0,
+    )
+    assert ManagedNode._duplicate_name_warnings(node) == []
+    names *= 2
+    assert ManagedNode._duplicate_name_warnings(node) == [], "a killed node stays in the graph for a while"
+    node._last_unique_s -= DUPLICATE_NAME_DELAY_S
+    (warning,) = ManagedNode._duplicate_name_warnings(node)
+    assert "another node has the name /left/mitigator" in warning
 
 
 # Driver and mitigator in one process ------------------------------------------------------------------------------
