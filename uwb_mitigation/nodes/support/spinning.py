@@ -93,11 +93,9 @@ def load_node(name: str) -> Callable[[threading.Event], Iterator[Node]]:
     has subscribers. Names, topics, parameters and diagnostics are the same as of separate nodes.
     """
     names = ("mitigator", "driver", "locator") if name == "pipeline" else (name,)
-    modules = {
-        module_name: importlib.import_module(f"uwb_mitigation.nodes.{module_name}") for module_name in names
-    }
     classes = {
-        module_name: getattr(module, module_name.capitalize()) for module_name, module in modules.items()
+        node: getattr(importlib.import_module(f"uwb_mitigation.nodes.{node}"), node.capitalize())
+        for node in names
     }
 
     def make_nodes(stop: threading.Event) -> Iterator[Node]:
@@ -142,13 +140,11 @@ def _run(name: str) -> int:
         nodes.extend(make_nodes(stop))
         code_of_errors = CRASHED
         spin(nodes, stop)
-    except ImportError as error:
-        if (absent := missing_dependency(error)) is None:
+    except (ImportError, UwbMitigationError) as error:
+        problem = missing_dependency(error) if isinstance(error, ImportError) else error
+        if problem is None:
             raise
-        print(f"error: {absent}", file=sys.stderr)
-        return code_of_errors
-    except UwbMitigationError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {problem}", file=sys.stderr)
         return code_of_errors
     finally:
         for node in reversed(nodes):
