@@ -192,7 +192,7 @@ def test_flags_and_log_level_have_choices_which_launch_checks(generate, file: st
     assert chosen["log_level"] == launching.LOG_LEVELS
 
 
-@pytest.mark.parametrize("name", ["simulated_rate", "sensor_ranges", "seed"])
+@pytest.mark.parametrize("name", ["simulated_rate", "loop", "seed"])
 def test_text_of_another_type_reaches_the_node_which_refuses_it(generate, name: str):
     driver, _ = launch(generate, "uwb.launch.py", source="simulated", **{name: "maybe"})
     assert settings(driver)[name] == "maybe"
