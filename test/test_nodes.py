@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-import time
 from array import array
 from dataclasses import replace
 from pathlib import Path
@@ -64,11 +63,15 @@ def replay_through_both(ros: Ros, count: int, *driver: str) -> tuple[list[RangeC
     return raw, corrected
 
 
-def test_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Path):
+def test_subscriber_receives_every_corrected_range_of_a_bag_and_its_truth(ros: Ros, bag: Path):
+    truths = ros.collect(RangeTruth, "/uwb/range_truth")
     raw, corrected = replay_through_both(ros, 300, "source:=mcap", f"path:={bag}", "rate:=10.0")
     assert len(corrected) == 300
     sent = [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range) for m in raw]
     assert [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range_raw) for m in corrected] == sent
+    ros.spin_until(lambda: len(truths) == 300)
+    assert [t.header for t in truths] == [m.header for m in raw]
+    assert all(t.range > 0 for t in truths)
 
 
 def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
@@ -82,21 +85,6 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     assert [m.variance for m in corrected] == [np.float32(item.variance_m2) for item in expected]
     assert [m.status for m in corrected] == [int(item.status) for item in expected]
     assert {m.model_id for m in corrected} == {mitigation.bundle.model_id}
-
-
-def test_stamps_are_on_the_nodes_clock_and_spaced_as_recorded(ros: Ros, bag: Path):
-    truths, received = ros.collect(RangeTruth, "/uwb/range_truth"), ros.collect(RangeCir, RAW)
-    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=10.0", *PAUSED)
-    ros.play()
-    ros.spin_until(lambda: len(received) == 300 and len(truths) == 300)
-    assert [t.header for t in truths] == [m.header for m in received]
-    assert all(t.range > 0 for t in truths)
-    with open_recording(bag) as source:
-        recorded = [record.measurement.stamp_ns for record in source]
-    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in received]
-    assert abs(time.time_ns() - stamps[-1]) < 60e9
-    spacing = np.diff(stamps) * 10
-    assert np.abs(spacing - np.diff(recorded)).max() <= 10
 
 
 @pytest.mark.parametrize(

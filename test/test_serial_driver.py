@@ -19,7 +19,6 @@ from port_events import PortEvents, wait_until
 from ros_harness import Process, Ros, diagnostic_values, stamped_after
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from benchmarks.equipment.board import Board
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
 from uwb_mitigation.errors import ParameterError
@@ -32,7 +31,7 @@ from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
 from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
 from uwb_mitigation.radios.wire.events import Disconnected, Loss
-from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION
+from uwb_mitigation.radios.wire.framing import FrameEncoder
 from uwb_mitigation.radios.wire.messages import Hello, RadioConfigured
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import CorrectedBy, RangeMeasurement
@@ -48,23 +47,11 @@ FLOOD_BYTES = 4096
 
 
 class FaultyBoard(EmulatedBoard):
-    """An emulated board whose firmware fails: it hangs, sends noise, or speaks another version of the protocol.
+    """An emulated board whose firmware sends noise; `boot_noise`: bytes of it before each HELLO."""
 
-    Args:
-        version: protocol version that the board speaks.
-        boot_noise: bytes of noise before each HELLO.
-    """
-
-    def __init__(self, *arguments, version: int = PROTOCOL_VERSION, boot_noise: int = 0, **options) -> None:
-        self._version, self._boot_noise = version, boot_noise
-        self._mute_until = self._flood_until = 0.0
+    def __init__(self, *arguments, boot_noise: int = 0, **options) -> None:
+        self._boot_noise, self._flood_until = boot_noise, 0.0
         super().__init__(*arguments, **options)
-
-    def mute(self, seconds: float) -> None:
-        """Send nothing for a while, as firmware that hangs."""
-        with self._lock:
-            self._mute_until = time.monotonic() + seconds
-            self._backlog.clear()
 
     def flood(self, seconds: float) -> None:
         """Send noise as fast as the port accepts it."""
@@ -77,20 +64,11 @@ class FaultyBoard(EmulatedBoard):
             super().reset()
             self._backlog[:0] = self._random.bytes(self._boot_noise)
 
-    def _create_board(self) -> Board:
-        return Board(
-            self._identity, self._corrector, mode=self._mode, boot_id=self._boots, version=self._version
-        )
-
     def _exchange(self, timeout_s: float) -> None:
         with self._lock:
             if time.monotonic() < self._flood_until and len(self._backlog) < FLOOD_BYTES:
                 self._backlog += self._random.bytes(FLOOD_BYTES)
         super()._exchange(timeout_s)
-
-    def _transmit(self, data: bytes) -> None:
-        if time.monotonic() >= self._mute_until:
-            super()._transmit(data)
 
 
 @pytest.fixture
@@ -164,15 +142,6 @@ def test_mode_changes_without_a_restart(ros: Ros, link: Path):
     assert len(set(keys)) == len(keys)
 
 
-def test_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
-    with board(link, version=9):
-        driver = drive(ros, link)
-        status = ros.diagnosis("driver", lambda s: "version" in s.message)
-    assert status.level == DiagnosticStatus.ERROR
-    assert "9" in status.message
-    assert driver.signal(signal.SIGTERM) == 0
-
-
 def open_files_and_threads(driver: Process) -> tuple[int, int]:
     process = Path("/proc", str(driver.pid))
     return len(os.listdir(process / "fd")), len(os.listdir(process / "task"))
@@ -215,14 +184,12 @@ def test_driver_survives_resets_noise_and_damage(ros: Ros, link: Path):
     assert "Traceback" not in driver.output
 
 
-@pytest.mark.parametrize("state", ["silent", "flooding", "measuring"])
+@pytest.mark.parametrize("state", ["flooding", "measuring"])
 def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, state: str):
     """`test_unusable_port_is_logged_once` ends it without a board."""
-    with board(link) if state != "silent" else FaultyBoard(None, link=link) as device:
+    with board(link) as device:
         driver = drive(ros, link)
         ros.diagnosis("driver", lambda s: True)
-        if state == "silent":
-            device.mute(60)
         if state == "flooding":
             device.flood(60)
         ros.spin_for(0.3)
@@ -314,6 +281,14 @@ def test_board_without_ranges_causes_a_warning_unless_it_is_an_anchor(
     port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
     port._observed([RadioConfigured(radio)] if radio is not None else [])
     assert port.report().warning == ("connected; no range yet" if is_warning else "")
+
+
+def test_board_of_another_protocol_version_is_a_problem_that_names_it():
+    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
+    port._lost = ""
+    port._received(FrameEncoder(version=9).encode(1, b""), 0, 0)
+    port._received(b"", 4 * 10**9, 0)
+    assert port.report().problem == "the board uses another protocol version: 9"
 
 
 def test_loss_of_a_board_is_logged_unless_its_port_is_closed():

@@ -112,12 +112,6 @@ def test_anchors_are_markers_or_poses():
 
 
 @pytest.mark.ros
-def test_driver_reports_a_type_that_is_not_installed(ros: Ros):
-    driver = ros.start("driver", "source:=topic", "map:=gtec_ranging")
-    driver.wait_for_output("the message type gtec_msgs/msg/Ranging is not installed")
-
-
-@pytest.mark.ros
 def test_driver_counts_messages_that_do_not_fit_and_goes_on(ros: Ros):
     received = ros.collect(RangeCir, "/uwb/range_raw")
     ros.start("driver", "source:=topic", "map:=string_json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import struct
 import subprocess
 import sys
@@ -486,6 +487,12 @@ def test_ranges_without_cir_are_explained_by_damages_and_rejected_parameters(kee
         report.values["rejected parameters"] == "BLOCK_STRIDE_LENGTH (0x2d): invalid parameter (status 0x04)"
     )
     assert report.warning.endswith(report.values["rejected parameters"])
+    started, logged = port._received(b"", run.now_ns, run.now_ns)
+    assert "157 taps" in started.text
+    assert (logged.level, logged.text) == (
+        logging.WARNING,
+        f"ranging without the parameters that the board rejected: {report.values['rejected parameters']}",
+    )
 
 
 # Sessions --------------------------------------------------------------------------------------------------------

@@ -93,19 +93,6 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
 
 
-@pytest.mark.ros
-@pytest.mark.parametrize(("tag", "name"), [(0x1B, "SLOTS_PER_RR"), (0x2D, "BLOCK_STRIDE_LENGTH")])
-def test_rejected_parameters_are_in_log_and_diagnostics(
-    ros: ros_harness.Ros, tmp_path: Path, tag: int, name: str
-):
-    text = f"{name} (0x{tag:02x}): invalid parameter (status 0x04)"
-    with EmulatedUciBoards(links=tmp_path / "uci", rejects=frozenset([tag])):
-        node = ros.start("driver", "source:=uci", f"port:={tmp_path}/uci0,{tmp_path}/uci1")
-        status = ros.diagnosis("driver", lambda status: text in status.message)
-        assert diagnostic_values(status)["radio 0: rejected parameters"] == text
-        node.wait_for_output(text)
-
-
 def test_a_tag_without_ranges_is_a_warning_and_closing_restores_the_calibration(
     boards: EmulatedUciBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
