@@ -113,10 +113,8 @@ class Driver(ManagedNode):
         return lambda: ReplayFeed(source, clock, self.value, self.get_logger(), output, self._finish, robot)
 
     def _create_publisher(self, *, corrections: bool = False, recording: bool = False) -> RangePublisher:
-        path = self._file_value("record")
-        self._output = RangePublisher(
-            self, self._consumer, path, corrections=corrections, recording=recording
-        )
+        record = self._file_value("record")
+        self._output = RangePublisher(self, self._consumer, record, corrections, recording)
         return self._output
 
     def _file_value(self, name: str) -> Any:

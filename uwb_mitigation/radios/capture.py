@@ -67,9 +67,8 @@ class CaptureWriter:
 
     def take_problem(self) -> str:
         """Return, once, why the file could not be written to its end; empty: it is complete until now."""
-        with self._lock:
-            problem, self._problem = self._problem, ""
-            return problem
+        problem, self._problem = self._problem, ""
+        return problem
 
     def close(self) -> None:
         """Close the file for one board."""

@@ -44,13 +44,7 @@ class RangePublisher:
     """
 
     def __init__(
-        self,
-        node: ManagedNode,
-        consumer: Mitigator | None,
-        record: str,
-        *,
-        corrections: bool,
-        recording: bool,
+        self, node: ManagedNode, consumer: Mitigator | None, record: str, corrections: bool, recording: bool
     ) -> None:
         self._node = node
         self._consumer = consumer

@@ -34,18 +34,13 @@ class ReplayClock:
         """
         if self._simulated:
             return replay_ns
-        if self._offset_ns is None:
-            self._offset_ns = self._measure_offset_ns()
-        return replay_ns + self._offset_ns
-
-    def _measure_offset_ns(self) -> int:
-        """Return the offset of the node's clock to the steady clock."""
-        while True:
+        while self._offset_ns is None:
             before_ns = time.monotonic_ns()
             offset_ns = self._stamp_now_ns() - before_ns
             # The process may be interrupted between the two readings.
             if time.monotonic_ns() - before_ns <= MAX_INTERRUPTION_NS:
-                return offset_ns
+                self._offset_ns = offset_ns
+        return replay_ns + self._offset_ns
 
     @property
     def _simulated(self) -> bool:

@@ -40,10 +40,10 @@ class RespawnState:
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
-        self.is_respawned = path is not None and path.is_file()
-        text = path.read_text(encoding="ascii") if path is not None and self.is_respawned else ""
+        text = path.read_text(encoding="ascii") if path is not None and path.is_file() else None
+        self.is_respawned = text is not None
         self.exit_code = int(text) if text else None
-        self._write(text)
+        self._write(text or "")
 
     def save_exit_code(self, code: int) -> None:
         """Let a process that replaces this one end with the same exit code."""
