@@ -157,7 +157,8 @@ def test_only_a_crashed_node_is_respawned(generate, file: str, code: int, kinds:
 def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
     overrides = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
     arguments, _ = described(generate, "uwb.launch.py")
-    examples = {"frame_id": "1234", "radio.address": "34", "radio.anchors": "'0xdeca010203040506'", "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True",
+    examples = {"frame_id": "1234", "radio.address": "34", "radio.anchors": "'0xdeca010203040506'", "seed": "maybe",
+                "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True", "loop": "maybe", "start_delay": "maybe",
                 "viewer_port": "8080", "locator_rate": "20", "rate": "2", "radio.pan": "7", "area": "0,0,0,9,9,3"}  # fmt: skip
     assert set(examples) <= set(arguments)
     for node, table in TABLES.items():
@@ -166,9 +167,11 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
     started = launch(generate, "uwb.launch.py", **overrides, **examples)
     nodes = {node.executable: settings(node) for node in started}
     assert nodes["driver"]["frame_id"] == "1234", "a text stays a string"
-    radio = {"radio.address": "34", "radio.anchors": "0xdeca010203040506", "radio.pan": 7}
+    radio = {"radio.address": "34", "radio.anchors": "0xdeca010203040506", "radio.pan": 7, "offsets": "0.25"}
+    radio |= {"rate": 2.0, "port": "usb:2341:805a"}
     expected = {
-        "driver": radio | {"offsets": "0.25", "rate": 2.0, "port": "usb:2341:805a"},
+        # The node refuses texts of another type.
+        "driver": radio | dict.fromkeys(("seed", "loop", "start_delay"), "maybe"),
         "mitigator": {"offsets": "0.25"},
         "locator": {"level": True, "height": 0.1, "publish_tf": True, "rate": 20.0, "area": "0,0,0,9,9,3"},
         "viewer": {"port": 8080},
@@ -190,12 +193,6 @@ def test_flags_and_log_level_have_choices_which_launch_checks(generate, file: st
     }
     assert {name for name, choices in chosen.items() if choices == launching.BOOLEANS} == flags
     assert chosen["log_level"] == launching.LOG_LEVELS
-
-
-@pytest.mark.parametrize("name", ["simulated_rate", "loop", "seed"])
-def test_text_of_another_type_reaches_the_node_which_refuses_it(generate, name: str):
-    driver, _ = launch(generate, "uwb.launch.py", source="simulated", **{name: "maybe"})
-    assert settings(driver)[name] == "maybe"
 
 
 def test_argument_of_a_node_that_is_not_started_stops_the_launch(generate):

@@ -8,12 +8,12 @@ import signal
 import socket
 import time
 import zipfile
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 import ros_harness
-from port_events import PortEvents, wait_until
+from port_events import PortEvents, driver_values, wait_until
 from ros_harness import diagnostic_values
 from typer.testing import CliRunner
 from uwb_mitigation_msgs.msg import Cir, RangeCir
@@ -22,7 +22,7 @@ from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
 from uwb_mitigation.commands import cli
 from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER, RESPAWN_FOLDER
+from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.radios import lines, uci
 from uwb_mitigation.radios.lines import LineSession, LineSettings, UdpAddress
 from uwb_mitigation.radios.port import PortAddress
@@ -35,12 +35,8 @@ MAPPINGS = {"pans": "dwm1001_pans", "at": "string_at", "json": "string_json", "c
 LEC = "DIST,2,AN0,022E,7.94,8.03,0.00,3.44,AN1,9280,7.95,0.00,-1.20,15.68,POS,6.95,5.37,-1.97,52"
 LES = "022E[7.94,8.03,0.00]=3.44 9280[7.95,0.00,-1.20]=15.68 le_us=3082 est[6.97,5.17,-1.77,53]"
 GOOD = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}'
-DEFAULTS = {row.name: row.default for row in DRIVER}
 S = 10**9
-
-
-def value_of(**changes: object) -> Callable[[str], object]:
-    return (DEFAULTS | {"source": "lines"} | changes).__getitem__
+value_of = partial(driver_values, source="lines")
 
 
 def read(session: LineSession, text: str | bytes, stamp_ns: int = 5) -> list[tuple[int, int, float]]:

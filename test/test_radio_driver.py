@@ -10,13 +10,13 @@ import pytest
 import ros_harness
 from compilers import NEEDS_CC
 from diagnostic_msgs.msg import DiagnosticStatus
+from port_events import driver_values
 from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import Cir, RangeCir
 
 from benchmarks.equipment.dw1000_model.evb1000 import EmulatedEvb1000s
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from uwb_mitigation.errors import ParameterError, format_id
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios.settings import (
     AGE_UNKNOWN_MS,
     AnchorStatus,
@@ -28,8 +28,6 @@ from uwb_mitigation.radios.settings import (
 from uwb_mitigation.simulation.simulated import SimulatedSource
 
 pytestmark = [pytest.mark.ros, NEEDS_CC]
-
-DEFAULTS = {row.name: row.default for row in DRIVER}
 
 
 @pytest.fixture
@@ -80,16 +78,16 @@ def test_tag_ranges_with_two_anchors_and_settings_are_applied_live(
 )
 def test_unsupported_setting_is_refused_and_named(name: str, value: object, named: str):
     with pytest.raises(ParameterError, match=named):
-        read_radio(lambda key: value if key == name else DEFAULTS[key])
+        read_radio(driver_values(**{name: value}))
 
 
 @pytest.mark.parametrize("address", [34, 0xDECA010203040506])
 def test_address_is_read_as_it_is_printed(address: int):
-    values = DEFAULTS | {"radio.address": format_id(address), "radio.anchors": f"7, {format_id(address)}"}
-    settings = read_radio(values.__getitem__)
+    text = format_id(address)
+    settings = read_radio(driver_values(radio__address=text, radio__anchors=f"7, {text}"))
     assert (settings.address, settings.anchors) == (address, (7, address))
     if address < 1 << 16:
-        assert read_radio((values | {"radio.address": address}).__getitem__).address == address
+        assert read_radio(driver_values(radio__address=address)).address == address
 
 
 def test_anchor_that_never_answered_has_no_last_seen_time():
@@ -100,7 +98,7 @@ def test_anchor_that_never_answered_has_no_last_seen_time():
 
 
 def test_default_parameters_do_not_change_the_radio_of_a_board():
-    assert read_radio(DEFAULTS.__getitem__) == RadioSettings()
+    assert read_radio(driver_values()) == RadioSettings()
 
 
 def test_board_without_radio_support_is_reported_and_keeps_running(ros: ros_harness.Ros, tmp_path: Path):

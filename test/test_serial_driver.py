@@ -15,7 +15,7 @@ import serial
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from port_events import PortEvents, wait_until
+from port_events import PortEvents, driver_values, wait_until
 from ros_harness import Process, Ros, diagnostic_values, stamped_after
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
@@ -25,7 +25,6 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import BoardPort, SerialSettings
@@ -208,9 +207,8 @@ def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, s
 )
 def test_malformed_port_is_refused(name: str, value: object, named: str):
     """`test_nodes` shows that the driver exits with the error."""
-    values = {row.name: row.default for row in DRIVER} | {"port": "/dev/ttyACM0", name: value}
     with pytest.raises(ParameterError, match=named):
-        serial_source.read_settings(values.__getitem__)
+        serial_source.read_settings(driver_values(**{"port": "/dev/ttyACM0", name: value}))
 
 
 def test_board_corrects_as_the_host_with_the_offsets_of_the_driver(ros: Ros, link: Path):
