@@ -87,21 +87,6 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     assert {m.model_id for m in corrected} == {mitigation.bundle.model_id}
 
 
-@pytest.mark.parametrize(
-    ("parameters", "named"),
-    [
-        (("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"),
-        (("rate:=.nan",), "rate"),
-        (("source:=topic", "map:=string_json", "topic:=bad--x"), "bad--x"),
-    ],
-)
-def test_driver_without_a_source_exits_with_an_error(ros: Ros, parameters: tuple[str, ...], named: str):
-    driver = ros.start("driver", *parameters)
-    assert driver.wait() == 1
-    assert named in driver.output
-    assert "Traceback" not in driver.output
-
-
 @pytest.mark.parametrize("step", ["open", "__init__"])
 def test_error_of_ros_at_the_start_is_a_crash_after_which_the_node_is_respawned(ros: Ros, step: str):
     code = (

@@ -206,7 +206,7 @@ def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, s
     ],
 )
 def test_malformed_port_is_refused(name: str, value: object, named: str):
-    """`test_nodes` shows that the driver exits with the error."""
+    """`test_parameters` shows that the driver exits with the error."""
     with pytest.raises(ParameterError, match=named):
         serial_source.read_settings(driver_values(**{"port": "/dev/ttyACM0", name: value}))
 
