@@ -21,7 +21,7 @@ from uwb_mitigation_msgs.msg import Cir, RangeCir
 from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
 from uwb_mitigation.commands import cli
-from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.radios import lines, uci
 from uwb_mitigation.radios.lines import LineSession, LineSettings, UdpAddress
@@ -154,23 +154,6 @@ def test_settings():
     assert str(second.address) == "udp:10.0.0.1:8000"
     (board,) = lines.read_settings(value_of(source="pans", port="/dev/a"))
     assert board.mapping.name == "DWM1001 PANS"
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"port": "/dev/a"}, "parameter map is empty"),
-        ({"port": "", "map": "string_at"}, "parameter port is empty"),
-        ({"port": "udp:x", "map": "string_at"}, "udp:ADDRESS:PORT"),
-        ({"port": "udp:70000", "map": "string_at"}, "udp:ADDRESS:PORT"),
-        ({"port": "/dev/a", "map": "ewine"}, "is for recordings or topics"),
-        ({"port": "/dev/a", "map": "string_at", "baud": 3}, "parameter baud = 3"),
-        ({"port": "/dev/a", "map": "string_aT"}, "did you mean 'string_at'"),
-    ],
-)
-def test_invalid_settings_are_refused(changes: dict[str, object], message: str):
-    with pytest.raises(ParameterError, match=message):
-        lines.read_settings(value_of(**changes))
 
 
 # Ports -----------------------------------------------------------------------------------------------------------

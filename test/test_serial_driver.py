@@ -15,13 +15,12 @@ import serial
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from port_events import PortEvents, driver_values, wait_until
+from port_events import PortEvents, wait_until
 from ros_harness import Process, Ros, diagnostic_values, stamped_after
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
@@ -194,21 +193,6 @@ def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, s
         ros.spin_for(0.3)
         assert driver.signal(signal.SIGTERM) == 0, driver.output
         assert "Traceback" not in driver.output
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "named"),
-    [
-        ("port", "", "port"),
-        ("port", "COM1", "usb:VENDOR:PRODUCT"),
-        ("board_model", "xyz", "eight hexadecimal digits"),
-        ("baud", 3, "baud"),
-    ],
-)
-def test_malformed_port_is_refused(name: str, value: object, named: str):
-    """`test_parameters` shows that the driver exits with the error."""
-    with pytest.raises(ParameterError, match=named):
-        serial_source.read_settings(driver_values(**{"port": "/dev/ttyACM0", name: value}))
 
 
 def test_board_corrects_as_the_host_with_the_offsets_of_the_driver(ros: Ros, link: Path):

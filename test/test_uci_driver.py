@@ -15,7 +15,6 @@ from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import Cir, RangeCir, RangeCorrected
 
 from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
@@ -143,21 +142,3 @@ def test_boards_at_two_computers_have_matching_settings():
     assert tag.session_id(2) == anchor.session_id(1)
     assert tag.effective_interval_ms == anchor.effective_interval_ms == 88
     assert (anchor.address, anchor.peers) == (2, (1,))
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"radio__channel": 2},
-        {"radio__address": "0x12345"},
-        {"radio__anchors": "x"},
-        {"radio__window": 1016},
-        {"radio__address": 2, "radio__anchors": "2"},
-        {"radio__preamble_code": 3},
-        {"radio__rate": 200.0},
-        {"radio__role": "anchor", "port": "/dev/a,/dev/b"},
-    ],
-)
-def test_settings_that_no_board_can_have_are_refused(bad: dict):
-    with pytest.raises(ParameterError, match=r"radio\."):
-        uci_settings(driver_values(**{"port": "/dev/a"} | bad))
