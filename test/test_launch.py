@@ -195,9 +195,24 @@ def test_flags_and_log_level_have_choices_which_launch_checks(generate, file: st
     assert chosen["log_level"] == launching.LOG_LEVELS
 
 
-def test_argument_of_a_node_that_is_not_started_stops_the_launch(generate):
-    with pytest.raises(ParameterError, match=r"height:=1.0.*locate:=true"):
-        launch(generate, "uwb.launch.py", source="simulated", height="1.0")
+@pytest.mark.parametrize(
+    ("file", "given", "error", "message"),
+    [
+        ("uwb", {}, RuntimeError, r"source:=serial.*source:=simulated"),
+        ("uwb", {"source": "simulated", "height": "1.0"}, ParameterError, r"height:=1.0.*locate:=true"),
+        ("uwb", {"source": "serial", "params": "absent.yaml"}, FileNotFoundError, r"absent\.yaml"),
+        ("boards", {"boards": "left=/dev/x", "params": "absent.yaml"}, FileNotFoundError, r"absent\.yaml"),
+        *(
+            ("boards", {"boards": text}, ValueError, "NAME=PORT")
+            for text in ("/dev/ttyACM0", "left=", "1=/dev/x", "=/dev/x")
+        ),
+    ],
+)
+def test_arguments_that_cannot_be_used_stop_the_launch(
+    generate, file: str, given: dict[str, str], error: type[Exception], message: str
+):
+    with pytest.raises(error, match=message):
+        launch(generate, f"{file}.launch.py", **given)
 
 
 class Context(dict):
@@ -236,22 +251,11 @@ def test_one_file_configures_all_nodes(generate, tmp_path: Path):
     assert pipeline.parameters[2] == str(robot)
 
 
-def test_simulation_starts_only_on_request(generate, tmp_path: Path):
-    with pytest.raises(RuntimeError, match=r"source:=serial.*source:=simulated"):
-        launch(generate, "uwb.launch.py")
+def test_file_of_the_driver_sets_its_source(generate, tmp_path: Path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(f"driver:\n  ros__parameters:\n    source: mcap\n    path: {tmp_path}\n")
     driver, _ = launch(generate, "uwb.launch.py", driver_params=str(mine))
     assert settings(driver) == {"use_sim_time": False}
-
-
-@pytest.mark.parametrize(
-    ("file", "options"),
-    [("uwb.launch.py", {"source": "serial"}), ("boards.launch.py", {"boards": "left=/dev/x"})],
-)
-def test_missing_parameter_file_stops_the_launch(generate, file: str, options: dict[str, str]):
-    with pytest.raises(FileNotFoundError, match=r"absent\.yaml"):
-        launch(generate, file, **options, params="absent.yaml")
 
 
 def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate):
@@ -262,12 +266,6 @@ def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate
     given = {"source": "serial", "port": "usb:2341:805a:3C4D", "mode": "device", "use_sim_time": False}
     assert settings(nodes[2]) == given | {"frame_id": "right_uwb_antenna"}
     assert all(node.respawn for node in nodes)
-
-
-@pytest.mark.parametrize("text", ["/dev/ttyACM0", "left=", "1=/dev/ttyACM0", "=/dev/ttyACM0"])
-def test_malformed_board_is_refused(generate, text: str):
-    with pytest.raises(ValueError, match="NAME=PORT"):
-        launch(generate, "boards.launch.py", boards=text)
 
 
 @pytest.mark.parametrize(
