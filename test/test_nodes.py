@@ -87,12 +87,12 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     assert {m.model_id for m in corrected} == {mitigation.bundle.model_id}
 
 
-@pytest.mark.parametrize("step", ["open", "__init__"])
+@pytest.mark.parametrize("step", ["open", "__init__", "create_lifecycle_publisher"])
 def test_error_of_ros_at_the_start_is_a_crash_after_which_the_node_is_respawned(ros: Ros, step: str):
     code = (
         "from uwb_mitigation.nodes import driver\n"
         "from uwb_mitigation.nodes.support import spinning\n"
-        "def fail(*arguments):\n"
+        "def fail(*arguments, **options):\n"
         "    raise RuntimeError('failed to create publisher')\n"
         f"driver.Driver.{step} = fail\n"
         "spinning.run_node('driver')\n"
