@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -98,6 +97,15 @@ def test_without_round_trips_the_fastest_arrivals_give_the_offset(drift):
     assert np.quantile(np.abs(errors[1000:]), 0.99) < 1.5e-3
 
 
+def test_stamps_do_not_go_back_with_the_estimate():
+    clock = DeviceClock()
+    late = clock.stamp(0, EPOCH + 50_000_000)
+    clock.exchange(EPOCH + 60_000_000, 60_000, 60_000, EPOCH + 60_000_000)
+
+    assert clock.stamp(10_000, EPOCH + 70_000_000) > late
+    assert clock.stamp(70_000, EPOCH + 71_000_000) == pytest.approx(EPOCH + 70_000_000, abs=1e6)
+
+
 def test_late_stamps_do_not_pass_their_successors():
     clock = DeviceClock()
     clock.stamp(0, EPOCH)
@@ -113,6 +121,18 @@ def test_single_late_arrival_does_not_move_the_estimate():
     clock.stamp(10_000, EPOCH + 3 * SECOND)
 
     assert clock.stamp(20_000, EPOCH + 3 * SECOND) == pytest.approx(EPOCH + 20_000_000, abs=1e6)
+
+
+def test_same_ticks_give_the_same_stamp_after_the_estimate_has_moved():
+    link = JitteryLink(np.random.default_rng(7))
+    clock = DeviceClock()
+    list(run(link, clock, 0, 2))
+    first = clock.stamp(link.ticks(2.0), link.ns(2.005))
+
+    for step in range(5):
+        link.exchange(clock, 2.01 + step / 100)
+
+    assert clock.stamp(link.ticks(2.0), link.ns(2.07)) == first
 
 
 @pytest.mark.parametrize("step_s", [-3600, 3600])
@@ -142,24 +162,6 @@ def test_round_trip_that_contradicts_itself_is_ignored():
     clock.exchange(EPOCH, 1000, 2000, EPOCH + 500_000)
 
     assert not clock.synchronised
-
-
-steps = st.tuples(st.integers(0, 2_000_000), st.integers(0, 40_000), st.booleans())
-
-
-@given(st.lists(steps, min_size=2, max_size=30))
-def test_stamps_are_in_the_order_of_the_board_and_never_change(steps):
-    clock, now_us, stamps = DeviceClock(), 0, {}
-    for pause_us, delay_us, is_round_trip in steps:
-        now_us += pause_us
-        now_ns, delay_ns = EPOCH + 1000 * now_us, 1000 * delay_us
-        if is_round_trip:
-            clock.exchange(now_ns - delay_ns, now_us, now_us, now_ns)
-        uptime_us = max(now_us - delay_us, 0)
-        stamp_ns = clock.stamp(uptime_us, now_ns)
-        assert stamps.setdefault(uptime_us, stamp_ns) == stamp_ns
-    in_order = [stamps[uptime_us] for uptime_us in sorted(stamps)]
-    assert all(before < after for before, after in pairwise(in_order))
 
 
 times = st.integers(0, 2**64 - 1)
