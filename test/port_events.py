@@ -1,4 +1,4 @@
-"""The events of a port that tests wait for, and pseudo-terminals in place of boards."""
+"""Parameters of a driver, the events of a port that tests wait for, and pseudo-terminals in place of boards."""
 
 from __future__ import annotations
 
@@ -12,10 +12,17 @@ from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios.port import RadioPort
 
 TIMEOUT_S = 240.0
 """Timeout for expected events."""
+
+
+def driver_values(**changes: object) -> Callable[[str], Any]:
+    """Return the parameters of a driver: the defaults, and changes in whose names `__` replaces a dot."""
+    values: dict[str, object] = {row.name: row.default for row in DRIVER}
+    return (values | {name.replace("__", "."): value for name, value in changes.items()}).__getitem__
 
 
 class PortEvents:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rclpy
@@ -186,45 +187,44 @@ class Ros:
         self.wait_until_active(driver)
         assert self.set_parameter(driver, "paused", False).successful
 
-    def call(self, kind: type, name: str, request: object) -> object:
+    def call(self, kind: type, name: str, request: object, was_done: Callable[[], bool] | None = None) -> Any:
+        """Return the response of a service.
+
+        The middleware drops a response while it does not know the client yet: then the call is repeated, or if `was_done`
+        is given and becomes true, the result is None.
+        """
         client = self.node.create_client(kind, name)
         self.spin_until(client.service_is_ready)
         futures = [client.call_async(request)]
-        sent = time.monotonic()
+        checked = time.monotonic()
 
         def is_answered() -> bool:
-            nonlocal sent
-            # The middleware drops a response while it does not know the client yet.
-            if time.monotonic() > sent + RESPONSE_TIMEOUT_S:
+            nonlocal checked
+            if time.monotonic() > checked + RESPONSE_TIMEOUT_S:
+                checked = time.monotonic()
+                if was_done is not None:
+                    return was_done()
                 futures.append(client.call_async(request))
-                sent = time.monotonic()
             return any(future.done() for future in futures)
 
         self.spin_until(is_answered)
         self.node.destroy_client(client)
-        return next(future.result() for future in futures if future.done())
+        return next((future.result() for future in futures if future.done()), None)
 
     def state_of(self, node: str) -> str:
         return self.call(GetState, f"/{node}/get_state", GetState.Request()).current_state.label
 
     def change_state(self, node: str, transition: int) -> bool:
-        """Send a transition once; if its response is dropped (see `call`), the state of the node shows its success."""
+        """Send a transition once."""
         request = ChangeState.Request()
         request.transition.id = transition
-        client = self.node.create_client(ChangeState, f"/{node}/change_state")
-        self.spin_until(client.service_is_ready)
-        future, checked = client.call_async(request), time.monotonic()
-
-        def is_answered() -> bool:
-            nonlocal checked
-            if not future.done() and time.monotonic() > checked + RESPONSE_TIMEOUT_S:
-                checked = time.monotonic()
-                return self.state_of(node) == STATE_AFTER[transition]
-            return future.done()
-
-        self.spin_until(is_answered)
-        self.node.destroy_client(client)
-        return future.result().success if future.done() else True
+        response = self.call(
+            ChangeState,
+            f"/{node}/change_state",
+            request,
+            lambda: self.state_of(node) == STATE_AFTER[transition],
+        )
+        return response is None or response.success
 
     def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
         """Set a parameter by its service."""

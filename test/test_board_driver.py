@@ -1,63 +1,22 @@
-"""A board on a real pseudo-terminal: connect, disconnect, reconnect, close."""
+"""Ports and settings of boards: addresses, ports that are absent or in use, settings that are refused."""
 
 from __future__ import annotations
 
-import itertools
 import os
 import subprocess
 import sys
-from collections import Counter
-from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 from queue import SimpleQueue
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
-from port_events import TIMEOUT_S, PortEvents, terminal, wait_until
+from port_events import TIMEOUT_S, PortEvents, driver_values, terminal, wait_until
 
-from benchmarks.equipment.emulated_board import EmulatedBoard
-from benchmarks.equipment.faults import Faults
-from uwb_mitigation.errors import LinkError
-from uwb_mitigation.radios import serial
+from uwb_mitigation.errors import LinkError, ParameterError
+from uwb_mitigation.radios import lines, serial, uci
 from uwb_mitigation.radios.evb1000 import Evb1000Bus
 from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.serial import SerialSettings
-from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
-
-
-class Recording:
-    """A source of numbered measurements."""
-
-    name = "recording"
-    simulated = True
-
-    def __init__(self) -> None:
-        self.skipped: Counter[str] = Counter()
-
-    def __iter__(self) -> Iterator[Record]:
-        for i in itertools.count():
-            samples = np.full(314, i % 100, np.int16)
-            yield Record(RangeMeasurement(0, 1, 2, i, i * 7, 4.0, Cir(samples, preamble_count=9)))
-
-
-def test_faulty_channel_delivers_only_sent_messages(tmp_path: Path):
-    faults, link = Faults(2e-4, 2e-4, 2e-4, lose=0.05, duplicate=0.05), tmp_path / "board"
-    with (
-        EmulatedBoard(Recording(), rate_hz=1000, faults=faults, link=link, seed=4),
-        PortEvents(serial, SerialSettings(PortAddress(str(link)))) as events,
-    ):
-        received = events.wait_for(RangeMeasurement, 300)
-        counts = events.port.session.totals()
-
-    sequences = [event.sequence for event in received]
-    assert all(event.cir.samples.tolist() == [event.sequence % 100] * 314 for event in received)
-    assert len(set(sequences)) == len(sequences)
-    assert sequences == sorted(sequences)
-    assert counts["lost"] > 0
-    assert counts["corrupt"] > 0
-    assert counts["stale"] > 0
 
 
 def test_absent_port_is_logged_with_the_second_attempt(monkeypatch: pytest.MonkeyPatch):
@@ -125,3 +84,43 @@ def test_usb_device_unplugged_during_listing_is_awaited(monkeypatch, error: Exce
 
     with pytest.raises(LinkError):
         PortAddress.parse("usb:2341:805a").open()
+
+
+@pytest.mark.parametrize(
+    ("source", "changes", "message"),
+    [
+        ("serial", {"port": ""}, "no port is given"),
+        ("serial", {"port": "COM1"}, "usb:VENDOR:PRODUCT"),
+        ("serial", {"board_model": "xyz"}, "eight hexadecimal digits"),
+        ("serial", {"baud": 3}, "baud"),
+        ("serial", {"radio__channel": 6}, "channel"),
+        ("serial", {"radio__prf": 32}, "prf"),
+        ("serial", {"radio__preamble": 100}, "preamble"),
+        ("serial", {"radio__data_rate": 111}, "rate"),
+        ("serial", {"radio__anchors": "12,xyz"}, "radio.anchors"),
+        *(
+            ("serial", {"radio__address": text}, "radio.address")
+            for text in ("0", "12e4", "1122334455667788")
+        ),
+        ("serial", {"radio__preamble_code": 3}, "preamble_code"),
+        ("lines", {}, "parameter map is empty"),
+        ("lines", {"port": "", "map": "string_at"}, "parameter port is empty"),
+        ("lines", {"port": "udp:x", "map": "string_at"}, "udp:ADDRESS:PORT"),
+        ("lines", {"port": "udp:70000", "map": "string_at"}, "udp:ADDRESS:PORT"),
+        ("lines", {"map": "ewine"}, "is for recordings or topics"),
+        ("lines", {"map": "string_at", "baud": 3}, "parameter baud = 3"),
+        ("lines", {"map": "string_aT"}, "did you mean 'string_at'"),
+        ("uci", {"radio__channel": 2}, r"radio\..*channel"),
+        ("uci", {"radio__address": "0x12345"}, r"radio\.address"),
+        ("uci", {"radio__anchors": "x"}, r"radio\.anchors"),
+        ("uci", {"radio__window": 1016}, r"radio\..*window"),
+        ("uci", {"radio__address": 2, "radio__anchors": "2"}, r"radio\..*peers"),
+        ("uci", {"radio__preamble_code": 3}, r"radio\..*preamble_code"),
+        ("uci", {"radio__rate": 200.0}, r"radio\..*interval_ms"),
+        ("uci", {"radio__role": "anchor", "port": "/dev/a,/dev/b"}, r"radio\.role"),
+    ],
+)
+def test_settings_that_no_board_can_have_are_refused(source: str, changes: dict[str, object], message: str):
+    values = driver_values(**{"source": source, "port": "/dev/a"} | changes)
+    with pytest.raises(ParameterError, match=message):
+        {"serial": serial, "lines": lines, "uci": uci}[source].read_settings(values)

@@ -75,3 +75,21 @@ def test_signal_during_an_import_ends_the_process(
     process.send_signal(number)
     output, _ = process.communicate(timeout=240)
     assert (process.returncode, output) == (128 + number, "")
+
+
+def test_interrupted_exec_keeps_the_exit_code(tmp_path: Path):
+    """Python libraries declare classes with exec() of a text; `python -m` then ends with the signal."""
+    (tmp_path / "program.py").write_text(
+        "import os, signal, sys, time\n"
+        "def main():\n"
+        "    try:\n"
+        "        exec('os.kill(os.getpid(), signal.SIGINT); time.sleep(30)')\n"
+        "    except KeyboardInterrupt:\n"
+        "        sys.exit(130)\n"
+        "if __name__ == '__main__':\n"
+        "    from uwb_mitigation.commands.entry import run_program\n"
+        "    run_program('program', 'main')\n"
+    )
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{REPOSITORY}"}
+    done = subprocess.run([sys.executable, "-m", "program"], env=environment, timeout=240, check=False)
+    assert done.returncode == 130

@@ -125,10 +125,12 @@ def test_viewer_starts_if_requested(generate):
     assert "viewer" not in [node.executable for node in nodes]
 
 
-def test_displays_start_on_request(generate):
-    rviz, bridge = launch(generate, "uwb.launch.py", rviz="true", foxglove="True")
-    assert (rviz.executable, bridge.executable) == ("rviz2", "foxglove_bridge")
+def test_displays_and_the_locator_start_without_a_source(generate):
+    given = {"locate": "true", "anchors": "anchors.yaml", "rviz": "true", "foxglove": "True"}
+    rviz, bridge, locator = launch(generate, "uwb.launch.py", **given)
+    assert (rviz.executable, bridge.executable, locator.executable) == ("rviz2", "foxglove_bridge", "locator")
     assert rviz.arguments == ["-d", ["share/uwb_mitigation", "rviz", "uwb.rviz"]]
+    assert settings(locator)["anchors"] == "anchors.yaml"
 
 
 @pytest.mark.parametrize("file", ["uwb.launch.py", "boards.launch.py"])
@@ -152,18 +154,11 @@ def test_only_a_crashed_node_is_respawned(generate, file: str, code: int, kinds:
         assert (event.kind, event.process_matcher) == ("shutdown of a process", node)
 
 
-@pytest.mark.parametrize("text", ["0xdeca010203040506", "'0xdeca010203040506'"])
-def test_64_bit_address_reaches_the_driver_as_a_string(generate, text: str):
-    overrides = {"source": "evb1000", "port": "/dev/ttyACM0", "radio.address": text, "radio.anchors": text}
-    driver, _ = launch(generate, "uwb.launch.py", **overrides)
-    for name in ("radio.address", "radio.anchors"):
-        assert settings(driver)[name] == "0xdeca010203040506"
-
-
 def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(generate):
     overrides = {"source": "serial", "port": "usb:2341:805a", "locate": "true", "viewer": "true"}
     arguments, _ = described(generate, "uwb.launch.py")
-    examples = {"frame_id": "1234", "radio.address": "34", "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True",
+    examples = {"frame_id": "1234", "radio.address": "34", "radio.anchors": "'0xdeca010203040506'", "seed": "maybe",
+                "offsets": "0.25", "level": "true", "height": "1e-1", "publish_tf": "True", "loop": "maybe", "start_delay": "maybe",
                 "viewer_port": "8080", "locator_rate": "20", "rate": "2", "radio.pan": "7", "area": "0,0,0,9,9,3"}  # fmt: skip
     assert set(examples) <= set(arguments)
     for node, table in TABLES.items():
@@ -172,9 +167,11 @@ def test_every_parameter_is_an_argument_and_reaches_its_node_with_its_type(gener
     started = launch(generate, "uwb.launch.py", **overrides, **examples)
     nodes = {node.executable: settings(node) for node in started}
     assert nodes["driver"]["frame_id"] == "1234", "a text stays a string"
-    radio = {"radio.address": "34", "radio.pan": 7}
+    radio = {"radio.address": "34", "radio.anchors": "0xdeca010203040506", "radio.pan": 7, "offsets": "0.25"}
+    radio |= {"rate": 2.0, "port": "usb:2341:805a"}
     expected = {
-        "driver": radio | {"offsets": "0.25", "rate": 2.0, "port": "usb:2341:805a"},
+        # The node refuses texts of another type.
+        "driver": radio | dict.fromkeys(("seed", "loop", "start_delay"), "maybe"),
         "mitigator": {"offsets": "0.25"},
         "locator": {"level": True, "height": 0.1, "publish_tf": True, "rate": 20.0, "area": "0,0,0,9,9,3"},
         "viewer": {"port": 8080},
@@ -198,15 +195,24 @@ def test_flags_and_log_level_have_choices_which_launch_checks(generate, file: st
     assert chosen["log_level"] == launching.LOG_LEVELS
 
 
-@pytest.mark.parametrize("name", ["simulated_rate", "sensor_ranges", "seed"])
-def test_text_of_another_type_reaches_the_node_which_refuses_it(generate, name: str):
-    driver, _ = launch(generate, "uwb.launch.py", source="simulated", **{name: "maybe"})
-    assert settings(driver)[name] == "maybe"
-
-
-def test_argument_of_a_node_that_is_not_started_stops_the_launch(generate):
-    with pytest.raises(ParameterError, match=r"height:=1.0.*locate:=true"):
-        launch(generate, "uwb.launch.py", source="simulated", height="1.0")
+@pytest.mark.parametrize(
+    ("file", "given", "error", "message"),
+    [
+        ("uwb", {}, RuntimeError, r"source:=serial.*source:=simulated"),
+        ("uwb", {"source": "simulated", "height": "1.0"}, ParameterError, r"height:=1.0.*locate:=true"),
+        ("uwb", {"source": "serial", "params": "absent.yaml"}, FileNotFoundError, r"absent\.yaml"),
+        ("boards", {"boards": "left=/dev/x", "params": "absent.yaml"}, FileNotFoundError, r"absent\.yaml"),
+        *(
+            ("boards", {"boards": text}, ValueError, "NAME=PORT")
+            for text in ("/dev/ttyACM0", "left=", "1=/dev/x", "=/dev/x")
+        ),
+    ],
+)
+def test_arguments_that_cannot_be_used_stop_the_launch(
+    generate, file: str, given: dict[str, str], error: type[Exception], message: str
+):
+    with pytest.raises(error, match=message):
+        launch(generate, f"{file}.launch.py", **given)
 
 
 class Context(dict):
@@ -245,28 +251,11 @@ def test_one_file_configures_all_nodes(generate, tmp_path: Path):
     assert pipeline.parameters[2] == str(robot)
 
 
-def test_only_the_locator_starts_without_a_source(generate):
-    (locator,) = launch(generate, "uwb.launch.py", locate="true", anchors="anchors.yaml")
-    assert locator.executable == "locator"
-    assert settings(locator)["anchors"] == "anchors.yaml"
-
-
-def test_simulation_starts_only_on_request(generate, tmp_path: Path):
-    with pytest.raises(RuntimeError, match=r"source:=serial.*source:=simulated"):
-        launch(generate, "uwb.launch.py")
+def test_file_of_the_driver_sets_its_source(generate, tmp_path: Path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(f"driver:\n  ros__parameters:\n    source: mcap\n    path: {tmp_path}\n")
     driver, _ = launch(generate, "uwb.launch.py", driver_params=str(mine))
     assert settings(driver) == {"use_sim_time": False}
-
-
-@pytest.mark.parametrize(
-    ("file", "options"),
-    [("uwb.launch.py", {"source": "serial"}), ("boards.launch.py", {"boards": "left=/dev/x"})],
-)
-def test_missing_parameter_file_stops_the_launch(generate, file: str, options: dict[str, str]):
-    with pytest.raises(FileNotFoundError, match=r"absent\.yaml"):
-        launch(generate, file, **options, params="absent.yaml")
 
 
 def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate):
@@ -277,12 +266,6 @@ def test_every_board_gets_a_driver_and_a_mitigator_in_its_own_namespace(generate
     given = {"source": "serial", "port": "usb:2341:805a:3C4D", "mode": "device", "use_sim_time": False}
     assert settings(nodes[2]) == given | {"frame_id": "right_uwb_antenna"}
     assert all(node.respawn for node in nodes)
-
-
-@pytest.mark.parametrize("text", ["/dev/ttyACM0", "left=", "1=/dev/ttyACM0", "=/dev/ttyACM0"])
-def test_malformed_board_is_refused(generate, text: str):
-    with pytest.raises(ValueError, match="NAME=PORT"):
-        launch(generate, "boards.launch.py", boards=text)
 
 
 @pytest.mark.parametrize(

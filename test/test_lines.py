@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import socket
 import time
 import zipfile
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 import ros_harness
-from port_events import PortEvents, wait_until
+from port_events import PortEvents, driver_values, wait_until
 from ros_harness import diagnostic_values
 from typer.testing import CliRunner
 from uwb_mitigation_msgs.msg import Cir, RangeCir
@@ -20,8 +21,8 @@ from uwb_mitigation_msgs.msg import Cir, RangeCir
 from benchmarks.equipment.emulated_board import PseudoTerminal
 from benchmarks.equipment.text_board import KINDS, PansShell, TextBoards
 from uwb_mitigation.commands import cli
-from uwb_mitigation.errors import DamagedRecordingError, ParameterError, RecordingError
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER
+from uwb_mitigation.errors import DamagedRecordingError, RecordingError
+from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER
 from uwb_mitigation.radios import lines, uci
 from uwb_mitigation.radios.lines import LineSession, LineSettings, UdpAddress
 from uwb_mitigation.radios.port import PortAddress
@@ -34,12 +35,8 @@ MAPPINGS = {"pans": "dwm1001_pans", "at": "string_at", "json": "string_json", "c
 LEC = "DIST,2,AN0,022E,7.94,8.03,0.00,3.44,AN1,9280,7.95,0.00,-1.20,15.68,POS,6.95,5.37,-1.97,52"
 LES = "022E[7.94,8.03,0.00]=3.44 9280[7.95,0.00,-1.20]=15.68 le_us=3082 est[6.97,5.17,-1.77,53]"
 GOOD = '{"tag": 7, "ranges": [{"anchor": 1, "range_m": 4.31}]}'
-DEFAULTS = {row.name: row.default for row in DRIVER}
 S = 10**9
-
-
-def value_of(**changes: object) -> Callable[[str], object]:
-    return (DEFAULTS | {"source": "lines"} | changes).__getitem__
+value_of = partial(driver_values, source="lines")
 
 
 def read(session: LineSession, text: str | bytes, stamp_ns: int = 5) -> list[tuple[int, int, float]]:
@@ -159,23 +156,6 @@ def test_settings():
     assert board.mapping.name == "DWM1001 PANS"
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"port": "/dev/a"}, "parameter map is empty"),
-        ({"port": "", "map": "string_at"}, "parameter port is empty"),
-        ({"port": "udp:x", "map": "string_at"}, "udp:ADDRESS:PORT"),
-        ({"port": "udp:70000", "map": "string_at"}, "udp:ADDRESS:PORT"),
-        ({"port": "/dev/a", "map": "ewine"}, "is for recordings or topics"),
-        ({"port": "/dev/a", "map": "string_at", "baud": 3}, "parameter baud = 3"),
-        ({"port": "/dev/a", "map": "string_aT"}, "did you mean 'string_at'"),
-    ],
-)
-def test_invalid_settings_are_refused(changes: dict[str, object], message: str):
-    with pytest.raises(ParameterError, match=message):
-        lines.read_settings(value_of(**changes))
-
-
 # Ports -----------------------------------------------------------------------------------------------------------
 
 
@@ -289,11 +269,29 @@ def test_a_capture_replays_the_ranges_also_with_another_mapping(tmp_path: Path):
         list(lines.open_capture(path, value_of()))
 
 
+def test_a_full_disk_ends_the_capture_but_not_the_ranges(tmp_path: Path):
+    boards = TextBoards(links=tmp_path / "b", rate_hz=50.0)
+    with boards, open_board(tmp_path / "b0", "pans", capture=Path("/dev/full")) as events:
+        (message,) = events.wait_for(lambda event: "capture" in getattr(event, "text", ""))
+        assert (message.level, message.text) == (
+            logging.ERROR,
+            "the capture has ended: No space left on device",
+        )
+        events.wait_for(RangeMeasurement, 3)
+        assert events.port.openings == 1
+
+
 # The driver ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.ros
-def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_path: Path):
+def test_driver_publishes_the_ranges_of_two_dwm1001s(
+    ros: ros_harness.Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # The driver was respawned, and must not replace the capture of the crash.
+    monkeypatch.setenv(RESPAWN_FOLDER, str(tmp_path))
+    for name in ("driver.run", "c.txt"):
+        (tmp_path / name).touch()
     raw = ros.collect(RangeCir, "/uwb/range_raw")
     with TextBoards(boards=2, links=tmp_path / "b") as boards:
         began = time.time()
@@ -309,7 +307,7 @@ def test_driver_publishes_the_ranges_of_two_dwm1001s(ros: ros_harness.Ros, tmp_p
         assert node.output.count("DWM1001 PANS at /") == 2
         assert node.signal(signal.SIGINT) == 0, node.output
     raw.clear()
-    ros.start("driver", "source:=pans", f"path:={tmp_path}/c.txt", "rate:=20.0")
+    ros.start("driver", "source:=pans", f"path:={tmp_path}/c_2.txt", "rate:=20.0")
     ros.spin_until(lambda: len(raw) > 40)
 
 

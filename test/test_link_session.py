@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.equipment.board import Board
-from uwb_mitigation.radios.settings import PortMessage
+from uwb_mitigation.radios.settings import PortMessage, RadioSettings
 from uwb_mitigation.radios.wire import messages
 from uwb_mitigation.radios.wire.events import Connected, Disconnected, Event, LinkState, Loss
 from uwb_mitigation.radios.wire.framing import FrameDecoder, FrameEncoder, WireFrame, encode_frame
@@ -288,10 +288,14 @@ def test_send_queue_is_bounded():
 
 def test_reopening_the_port_ends_the_connection_and_discards_a_partial_frame():
     bench = connected()
+    kind, payload = messages.encode(messages.RadioConfigured(RadioSettings()))
+    bench.host_hears(bench.board._encoder.encode(kind, payload))
+    assert bench.session.radio is not None
     data = bench.board.measure(measurement(1), bench.uptime_us)
     bench.host_hears(data[:100])
 
     assert bench.session.opened(bench.now) == [Disconnected(Loss.CLOSED)]
+    assert bench.session.radio is None
     assert bench.host_hears(data[100:]) == []
     assert bench.session.counts["withheld"] == 0
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import shutil
-import signal
 import sys
-import time
 from array import array
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.serialization import deserialize_message
-from ros_harness import PAUSED, Process, Ros, set_expiry
+from ros_harness import PAUSED, Ros
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import DamagedRecordingError
@@ -28,7 +27,8 @@ from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.nodes import mitigator as mitigator_node
-from uwb_mitigation.nodes.support.parameter_tables import DAMAGED
+from uwb_mitigation.nodes.support.lifecycle import DUPLICATE_NAME_DELAY_S, ManagedNode
+from uwb_mitigation.nodes.support.parameter_tables import CRASHED, DAMAGED
 from uwb_mitigation.recordings.decaranging import open_decaranging
 from uwb_mitigation.recordings.formats import open_recording
 from uwb_mitigation.simulation.simulated import SimulatedSource
@@ -63,11 +63,15 @@ def replay_through_both(ros: Ros, count: int, *driver: str) -> tuple[list[RangeC
     return raw, corrected
 
 
-def test_subscriber_receives_every_corrected_range_of_a_bag(ros: Ros, bag: Path):
+def test_subscriber_receives_every_corrected_range_of_a_bag_and_its_truth(ros: Ros, bag: Path):
+    truths = ros.collect(RangeTruth, "/uwb/range_truth")
     raw, corrected = replay_through_both(ros, 300, "source:=mcap", f"path:={bag}", "rate:=10.0")
     assert len(corrected) == 300
     sent = [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range) for m in raw]
     assert [(m.header, m.sequence, m.anchor_id, m.tag_id, m.range_raw) for m in corrected] == sent
+    ros.spin_until(lambda: len(truths) == 300)
+    assert [t.header for t in truths] == [m.header for m in raw]
+    assert all(t.range > 0 for t in truths)
 
 
 def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
@@ -83,30 +87,19 @@ def test_nodes_equal_the_library_on_a_real_log(ros: Ros, apartment: Path):
     assert {m.model_id for m in corrected} == {mitigation.bundle.model_id}
 
 
-def test_stamps_are_on_the_nodes_clock_and_spaced_as_recorded(ros: Ros, bag: Path):
-    truths, received = ros.collect(RangeTruth, "/uwb/range_truth"), ros.collect(RangeCir, RAW)
-    ros.start("driver", "source:=mcap", f"path:={bag}", "rate:=10.0", *PAUSED)
-    ros.play()
-    ros.spin_until(lambda: len(received) == 300 and len(truths) == 300)
-    assert [t.header for t in truths] == [m.header for m in received]
-    assert all(t.range > 0 for t in truths)
-    with open_recording(bag) as source:
-        recorded = [record.measurement.stamp_ns for record in source]
-    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in received]
-    assert abs(time.time_ns() - stamps[-1]) < 60e9
-    spacing = np.diff(stamps) * 10
-    assert np.abs(spacing - np.diff(recorded)).max() <= 10
-
-
-@pytest.mark.parametrize(
-    ("parameters", "named"),
-    [(("source:=mcap", "path:=/nonexistent/bag.mcap"), "/nonexistent/bag.mcap"), (("rate:=.nan",), "rate")],
-)
-def test_driver_without_a_source_exits_with_an_error(ros: Ros, parameters: tuple[str, ...], named: str):
-    driver = ros.start("driver", *parameters)
-    assert driver.wait() == 1
-    assert named in driver.output
-    assert "Traceback" not in driver.output
+@pytest.mark.parametrize("step", ["open", "__init__", "create_lifecycle_publisher"])
+def test_error_of_ros_at_the_start_is_a_crash_after_which_the_node_is_respawned(ros: Ros, step: str):
+    code = (
+        "from uwb_mitigation.nodes import driver\n"
+        "from uwb_mitigation.nodes.support import spinning\n"
+        "def fail(*arguments, **options):\n"
+        "    raise RuntimeError('failed to create publisher')\n"
+        f"driver.Driver.{step} = fail\n"
+        "spinning.run_node('driver')\n"
+    )
+    driver = ros.run([sys.executable, "-c", code])
+    assert driver.wait() == CRASHED
+    assert "failed to create publisher" in driver.output
 
 
 def test_damaged_bag_is_replayed_up_to_the_damage(ros: Ros, bag: Path, tmp_path: Path):
@@ -166,34 +159,21 @@ def test_ranges_that_cannot_be_corrected_pass_through(ros: Ros):
         assert math.isinf(answer.variance) == math.isnan(message.range)
 
 
-FAST_MITIGATOR = """
-from uwb_mitigation.nodes.support import lifecycle, spinning
-lifecycle.DUPLICATE_NAME_DELAY_S /= 5
-spinning.run_node("mitigator")
-"""
-
-
-def test_duplicate_node_names_are_reported_except_for_a_killed_node(
-    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    set_expiry(monkeypatch, tmp_path, 2)
-
-    def start() -> Process:
-        return ros.run([sys.executable, "-c", FAST_MITIGATOR])
-
-    def named() -> int:
-        return ros.node.get_node_names_and_namespaces().count(("mitigator", "/"))
-
-    killed = start()
-    first = start()
-    ros.spin_until(lambda: named() == 2)
-    killed.signal(signal.SIGKILL)
-    ros.spin_until(lambda: named() == 1)
-    assert "another node has the name" not in first.output
-    second = start()
-    ros.diagnosis("mitigator", lambda status: "another node has the name" in status.message)
-    for process in (first, second):
-        process.wait_for_output("another node has the name /mitigator")
+def test_duplicate_node_names_are_reported_except_for_a_killed_node():
+    names = [("mitigator", "/left")]
+    node = SimpleNamespace(
+        get_name=lambda: "mitigator",
+        get_namespace=lambda: "/left",
+        get_fully_qualified_name=lambda: "/left/mitigator",
+        get_node_names_and_namespaces=lambda: names,
+        _last_unique_s=0.0,
+    )
+    assert ManagedNode._duplicate_name_warnings(node) == []
+    names *= 2
+    assert ManagedNode._duplicate_name_warnings(node) == [], "a killed node stays in the graph for a while"
+    node._last_unique_s -= DUPLICATE_NAME_DELAY_S
+    (warning,) = ManagedNode._duplicate_name_warnings(node)
+    assert "another node has the name /left/mitigator" in warning
 
 
 # Driver and mitigator in one process ------------------------------------------------------------------------------
@@ -201,31 +181,22 @@ def test_duplicate_node_names_are_reported_except_for_a_killed_node(
 PLAY = ("count:=200", "seed:=1", "simulated_rate:=400.0", *PAUSED)
 
 
-def test_ranges_of_a_pipeline_are_those_of_the_library_to_the_bit(ros: Ros):
+def test_pipelines_in_two_namespaces_give_the_ranges_of_the_library_to_the_bit(ros: Ros):
     mitigation = Mitigation(load_bundle(default_model_path()))
     source = SimulatedSource(seed=1, count=200, rate_hz=400.0)
     expected = [mitigation.correct([record.measurement])[0] for record in source]
-    received = ros.collect(RangeCorrected, CORRECTED)
-    pipeline = ros.start("pipeline", *PLAY)
-    ros.play()
-    assert pipeline.wait() == 0, pipeline.output
-    ros.spin_until(lambda: len(received) == 200)
-    assert [m.sequence for m in received] == list(range(200))
-    assert [m.range for m in received] == [np.float32(e.range_m) for e in expected]
-    assert [m.variance for m in received] == [np.float32(e.variance_m2) for e in expected]
-    assert "unknown" not in pipeline.output
-
-
-def test_several_pipelines_do_not_interfere(ros: Ros):
     received = {name: ros.collect(RangeCorrected, f"/{name}{CORRECTED}") for name in ("left", "right")}
     pipelines = [ros.start("pipeline", *PLAY, arguments=("-r", f"__ns:=/{name}")) for name in received]
     for name in received:
         ros.play(f"{name}/driver")
     for pipeline in pipelines:
         assert pipeline.wait() == 0, pipeline.output
+        assert "unknown" not in pipeline.output
     ros.spin_until(lambda: all(len(messages) == 200 for messages in received.values()))
     for messages in received.values():
         assert [m.sequence for m in messages] == list(range(200))
+        assert [m.range for m in messages] == [np.float32(e.range_m) for e in expected]
+        assert [m.variance for m in messages] == [np.float32(e.variance_m2) for e in expected]
 
 
 @pytest.mark.parametrize("model", ["universal", "universal_amplitude", "evk1000_apartment", "dw3000_sts"])

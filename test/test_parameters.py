@@ -18,7 +18,7 @@ from ros_harness import PAUSED, Ros, diagnostic_values, domain
 from uwb_mitigation_msgs.msg import RangeCir
 
 from uwb_mitigation.nodes.support.parameter_tables import RESPAWN_FOLDER, TABLES, Parameter
-from uwb_mitigation.nodes.support.respawn import StateFile
+from uwb_mitigation.nodes.support.respawn import StateFile, unused_path
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import Record
 
@@ -53,18 +53,28 @@ def test_invalid_value_is_refused_with_range(replaying: Ros, name: str, value: o
     assert all(word in result.reason for word in excerpt or ()), result.reason
 
 
-def test_unknown_parameter_is_refused_with_a_suggestion(ros: Ros, tmp_path: Path):
-    file = tmp_path / "parameters.yaml"
-    file.write_text("/**:\n  ros__parameters:\n    sorce: mcap\n")
-    for node, words, excerpt in (
-        ("driver", ("--params-file", str(file)), "unknown parameter 'sorce'; did you mean 'source'?"),
-        ("pipeline", ("-p", "raet:=2.0"), "unknown parameter 'raet'; did you mean 'rate'"),
-        ("mitigator", ("-p", "wholly_else:=1"), "unknown parameter 'wholly_else' ("),
-    ):
-        process = ros.start(node, arguments=words)
-        assert process.wait() == 1
-        assert excerpt in process.output
-        assert "Traceback" not in process.output
+QOS = "-p qos_overrides./uwb/range_raw.subscription"
+
+
+@pytest.mark.parametrize(
+    ("words", "excerpt"),
+    [
+        ("driver -p sorce:=mcap", "unknown parameter 'sorce'; did you mean 'source'?"),
+        ("pipeline -p raet:=2.0", "unknown parameter 'raet'; did you mean 'rate'"),
+        ("mitigator -p wholly_else:=1", "unknown parameter 'wholly_else' ("),
+        (f"mitigator {QOS}.reliability:=perhaps", "qos_overrides of /uwb/range_raw"),
+        (f"mitigator {QOS}.depth:=deep", "qos_overrides of /uwb/range_raw"),
+        ("driver -p source:=mcap -p path:=/nonexistent/bag.mcap", "/nonexistent/bag.mcap"),
+        ("driver -p rate:=.nan", "rate"),
+        ("driver -p source:=topic -p map:=string_json -p topic:=bad--x", "bad--x"),
+    ],
+)
+def test_node_refuses_a_parameter_at_its_start(ros: Ros, words: str, excerpt: str):
+    node, *arguments = words.split()
+    process = ros.start(node, arguments=arguments)
+    assert process.wait() == 1
+    assert excerpt in process.output
+    assert "Traceback" not in process.output
 
 
 def test_parameters_of_other_nodes_in_a_shared_file_are_logged_in_one_line(ros: Ros, tmp_path: Path):
@@ -116,12 +126,11 @@ def test_state_of_a_crashed_node_is_loaded_once_and_only_if_it_is_new_and_valid(
     assert StateFile(None, logger).load(30.0, dict) is None
 
 
-@pytest.mark.parametrize("value", ["reliability:=perhaps", "depth:=deep"])
-def test_invalid_qos_override_is_refused(ros: Ros, value: str):
-    mitigator = ros.start("mitigator", f"qos_overrides./uwb/range_raw.subscription.{value}")
-    assert mitigator.wait() == 1
-    assert "qos_overrides of /uwb/range_raw" in mitigator.output
-    assert "Traceback" not in mitigator.output
+def test_file_after_a_crash_replaces_no_complete_or_partial_one(tmp_path: Path):
+    assert unused_path(tmp_path / "drive.mcap") == tmp_path / "drive.mcap"
+    for name in ("drive.mcap", "drive_2.mcap.part"):
+        (tmp_path / name).touch()
+    assert unused_path(tmp_path / "drive.mcap").name == "drive_3.mcap"
 
 
 def test_topics_can_be_remapped_and_the_frame_is_a_parameter(ros: Ros, tmp_path: Path):

@@ -233,6 +233,13 @@ def test_statement_of_each_state_names_remedies_for_its_layout(
     assert found.is_unique == (not found.remedy)
 
 
+def test_time_begins_with_the_first_range_and_again_after_a_restart():
+    locator = TagEstimator(EstimatorConfig(SQUARE))
+    assert [locator.seconds(stamp_s * NANOSECONDS) for stamp_s in (5, 7)] == [0.0, 2.0]
+    locator.restart()
+    assert [locator.seconds(stamp_s * NANOSECONDS) for stamp_s in (8, 11)] == [0.0, 3.0]
+
+
 @pytest.mark.parametrize("is_swapped", [False, True])
 def test_swapped_anchors_are_reported_and_not_drives_past_right_ones(is_swapped):
     ranges, _ = drive()

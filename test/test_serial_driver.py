@@ -19,19 +19,18 @@ from port_events import PortEvents, wait_until
 from ros_harness import Process, Ros, diagnostic_values, stamped_after
 from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected
 
-from benchmarks.equipment.board import Board
 from benchmarks.equipment.emulated_board import EmulatedBoard
 from benchmarks.equipment.faults import Faults
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.correction import Mitigation
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
-from uwb_mitigation.nodes.support.parameter_tables import DRIVER
 from uwb_mitigation.radios import serial as serial_source
 from uwb_mitigation.radios.port import PortAddress
-from uwb_mitigation.radios.serial import SerialSettings
-from uwb_mitigation.radios.wire.layout import PROTOCOL_VERSION
-from uwb_mitigation.radios.wire.messages import Hello
+from uwb_mitigation.radios.serial import BoardPort, SerialSettings
+from uwb_mitigation.radios.settings import PortMessage, RadioSettings, Role
+from uwb_mitigation.radios.wire.events import Disconnected, Loss
+from uwb_mitigation.radios.wire.framing import FrameEncoder
+from uwb_mitigation.radios.wire.messages import Hello, RadioConfigured
 from uwb_mitigation.simulation.simulated import SimulatedSource
 from uwb_mitigation.types.measurement import CorrectedBy, RangeMeasurement
 from uwb_mitigation.types.offsets import Offsets
@@ -46,23 +45,11 @@ FLOOD_BYTES = 4096
 
 
 class FaultyBoard(EmulatedBoard):
-    """An emulated board whose firmware fails: it hangs, sends noise, or speaks another version of the protocol.
+    """An emulated board whose firmware sends noise; `boot_noise`: bytes of it before each HELLO."""
 
-    Args:
-        version: protocol version that the board speaks.
-        boot_noise: bytes of noise before each HELLO.
-    """
-
-    def __init__(self, *arguments, version: int = PROTOCOL_VERSION, boot_noise: int = 0, **options) -> None:
-        self._version, self._boot_noise = version, boot_noise
-        self._mute_until = self._flood_until = 0.0
+    def __init__(self, *arguments, boot_noise: int = 0, **options) -> None:
+        self._boot_noise, self._flood_until = boot_noise, 0.0
         super().__init__(*arguments, **options)
-
-    def mute(self, seconds: float) -> None:
-        """Send nothing for a while, as firmware that hangs."""
-        with self._lock:
-            self._mute_until = time.monotonic() + seconds
-            self._backlog.clear()
 
     def flood(self, seconds: float) -> None:
         """Send noise as fast as the port accepts it."""
@@ -75,20 +62,11 @@ class FaultyBoard(EmulatedBoard):
             super().reset()
             self._backlog[:0] = self._random.bytes(self._boot_noise)
 
-    def _create_board(self) -> Board:
-        return Board(
-            self._identity, self._corrector, mode=self._mode, boot_id=self._boots, version=self._version
-        )
-
     def _exchange(self, timeout_s: float) -> None:
         with self._lock:
             if time.monotonic() < self._flood_until and len(self._backlog) < FLOOD_BYTES:
                 self._backlog += self._random.bytes(FLOOD_BYTES)
         super()._exchange(timeout_s)
-
-    def _transmit(self, data: bytes) -> None:
-        if time.monotonic() >= self._mute_until:
-            super()._transmit(data)
 
 
 @pytest.fixture
@@ -162,15 +140,6 @@ def test_mode_changes_without_a_restart(ros: Ros, link: Path):
     assert len(set(keys)) == len(keys)
 
 
-def test_board_of_another_protocol_version_is_named(ros: Ros, link: Path):
-    with board(link, version=9):
-        driver = drive(ros, link)
-        status = ros.diagnosis("driver", lambda s: "version" in s.message)
-    assert status.level == DiagnosticStatus.ERROR
-    assert "9" in status.message
-    assert driver.signal(signal.SIGTERM) == 0
-
-
 def open_files_and_threads(driver: Process) -> tuple[int, int]:
     process = Path("/proc", str(driver.pid))
     return len(os.listdir(process / "fd")), len(os.listdir(process / "task"))
@@ -213,35 +182,17 @@ def test_driver_survives_resets_noise_and_damage(ros: Ros, link: Path):
     assert "Traceback" not in driver.output
 
 
-@pytest.mark.parametrize("state", ["silent", "flooding", "measuring"])
+@pytest.mark.parametrize("state", ["flooding", "measuring"])
 def test_signal_ends_the_driver_immediately_in_any_state(ros: Ros, link: Path, state: str):
     """`test_unusable_port_is_logged_once` ends it without a board."""
-    with board(link) if state != "silent" else FaultyBoard(None, link=link) as device:
+    with board(link) as device:
         driver = drive(ros, link)
         ros.diagnosis("driver", lambda s: True)
-        if state == "silent":
-            device.mute(60)
         if state == "flooding":
             device.flood(60)
         ros.spin_for(0.3)
         assert driver.signal(signal.SIGTERM) == 0, driver.output
         assert "Traceback" not in driver.output
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "named"),
-    [
-        ("port", "", "port"),
-        ("port", "COM1", "usb:VENDOR:PRODUCT"),
-        ("board_model", "xyz", "eight hexadecimal digits"),
-        ("baud", 3, "baud"),
-    ],
-)
-def test_malformed_port_is_refused(name: str, value: object, named: str):
-    """`test_nodes` shows that the driver exits with the error."""
-    values = {row.name: row.default for row in DRIVER} | {"port": "/dev/ttyACM0", name: value}
-    with pytest.raises(ParameterError, match=named):
-        serial_source.read_settings(values.__getitem__)
 
 
 def test_board_corrects_as_the_host_with_the_offsets_of_the_driver(ros: Ros, link: Path):
@@ -295,3 +246,38 @@ def test_port_without_permission_is_reported_with_the_remedy(tmp_path: Path, mon
         wait_until(lambda: "cannot be opened" in events.port.problem)
         assert "Permission denied" in events.port.problem
         assert "usermod -aG dialout" in events.port.problem
+
+
+@pytest.mark.parametrize(
+    ("radio", "is_warning"),
+    [
+        (None, True),
+        (RadioSettings(), True),
+        (RadioSettings(Role.ANCHOR), False),
+        (RadioSettings(Role.ANCHOR, report=True), True),
+    ],
+)
+def test_board_without_ranges_causes_a_warning_unless_it_is_an_anchor(
+    radio: RadioSettings | None, is_warning: bool
+):
+    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
+    port._observed([RadioConfigured(radio)] if radio is not None else [])
+    assert port.report().warning == ("connected; no range yet" if is_warning else "")
+
+
+def test_board_of_another_protocol_version_is_a_problem_that_names_it():
+    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
+    port._lost = ""
+    port._received(FrameEncoder(version=9).encode(1, b""), 0, 0)
+    port._received(b"", 4 * 10**9, 0)
+    assert port.report().problem == "the board uses another protocol version: 9"
+
+
+def test_loss_of_a_board_is_logged_unless_its_port_is_closed():
+    port = BoardPort(SerialSettings(PortAddress("/dev/no")), (0, None, print, time.time_ns))
+    assert [type(event) for event in port._observed([Disconnected(Loss.RESET)])] == [
+        Disconnected,
+        PortMessage,
+    ]
+    port.request_close()
+    assert [type(event) for event in port._observed([Disconnected(Loss.CLOSED)])] == [Disconnected]

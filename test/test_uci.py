@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import struct
 import subprocess
 import sys
@@ -171,6 +172,19 @@ def test_a_range_notification_of_a_real_board_is_parsed():
 def test_a_failed_or_invalid_range_has_no_distance(position: int, value: bytes):
     data = RANGE[:position] + value + RANGE[position + 2 :]
     assert np.isnan(messages.parse_ranges(data).records[0].range_m)
+
+
+def test_the_levels_of_each_segment_are_parsed():
+    numbers = (
+        (8, -80, 256 * 80, 739, 256 * 84, 64 * 739 + 16, 740, 0, 0),
+        (1, -80, 0, 362, 0, 64 * 362, 363, 0, 0),
+    )
+    data = b"".join(struct.pack("<BhHHHHHHH", *row) for row in numbers)
+    report = struct.pack("<IIBBBBBBH", 1, 7, 1, 2, 0, 0, 1, 6, len(data)) + data
+    first, second = messages.parse_diagnostics(report).frames[0].metrics
+    assert first == SegmentMetrics(0, 0, True, -80.0, -84.0, 739, 739.25, 740)
+    assert (second.segment, second.primary, second.first_path, second.peak_index) == (1, False, 362.0, 363)
+    assert np.isnan([second.rx_dbm, second.first_path_dbm]).all()
 
 
 def test_the_settings_of_a_session_are_those_that_worked_on_a_real_board():
@@ -473,6 +487,12 @@ def test_ranges_without_cir_are_explained_by_damages_and_rejected_parameters(kee
         report.values["rejected parameters"] == "BLOCK_STRIDE_LENGTH (0x2d): invalid parameter (status 0x04)"
     )
     assert report.warning.endswith(report.values["rejected parameters"])
+    started, logged = port._received(b"", run.now_ns, run.now_ns)
+    assert "157 taps" in started.text
+    assert (logged.level, logged.text) == (
+        logging.WARNING,
+        f"ranging without the parameters that the board rejected: {report.values['rejected parameters']}",
+    )
 
 
 # Sessions --------------------------------------------------------------------------------------------------------
@@ -594,22 +614,12 @@ def test_an_anchor_without_its_tag_waits_if_the_board_cannot_report_its_state():
     assert run.exchange(1).wait(10.0).session.starts == 2
 
 
-@pytest.mark.parametrize(
-    ("tag", "texts"),
-    [
-        (
-            0x06,
-            [
-                "refuses SET_APP_CONFIG",
-                "it rejects DEVICE_MAC_ADDRESS (0x06): invalid parameter (status 0x04)",
-            ],
-        ),
-        (0x1B, ["a parameter is missing (status 0x15)", "it rejects SLOTS_PER_RR (0x1b): invalid parameter"]),
-    ],
-)
-def test_a_parameter_without_which_a_board_does_not_range_is_named(tag: int, texts: list[str]):
-    state = Bench(UciBoardModel(rejects=frozenset([tag]))).wait_for(texts[0])
-    assert all(text in state for text in texts)
+@pytest.mark.parametrize("tag", [0x00, 0x06, 0x07, 0x11, 0x1B])
+def test_a_parameter_without_which_a_board_does_not_range_is_named(tag: int):
+    problem = "a parameter is missing (status 0x15)" if tag == 0x1B else "refuses SET_APP_CONFIG"
+    state = Bench(UciBoardModel(rejects=frozenset([tag]))).wait_for(problem)
+    assert problem in state
+    assert f"it rejects {codes.parameter_name(tag)}: invalid parameter (status 0x04)" in state
 
 
 def test_a_second_session_that_is_refused_is_not_explained_by_parameters():

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 import ros_harness
-from port_events import PortEvents, wait_until
+from port_events import PortEvents, driver_values, wait_until
 from ros_harness import diagnostic_values
 from uwb_mitigation_msgs.msg import Cir, RangeCir, RangeCorrected
 
 from benchmarks.equipment.uci_board import EmulatedUciBoards, UciFaults
-from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.model.bundle import load_bundle
 from uwb_mitigation.mitigation.model.shipped import shipped_model_path
 from uwb_mitigation.nodes.support.parameter_tables import DRIVER
@@ -25,8 +24,6 @@ from uwb_mitigation.radios.port import PortAddress
 from uwb_mitigation.radios.settings import Role
 from uwb_mitigation.radios.uci import UciPortSettings, read_settings
 from uwb_mitigation.types.measurement import RangeMeasurement
-
-DEFAULTS = {row.name: row.default for row in DRIVER}
 
 
 @pytest.fixture
@@ -93,19 +90,6 @@ def test_two_anchors_range_through_a_capture_and_an_unplugged_cable(
     assert all(measured.get((m.anchor_id, m.sequence), m.range) == m.range for m in raw)
 
 
-@pytest.mark.ros
-@pytest.mark.parametrize(("tag", "name"), [(0x1B, "SLOTS_PER_RR"), (0x2D, "BLOCK_STRIDE_LENGTH")])
-def test_rejected_parameters_are_in_log_and_diagnostics(
-    ros: ros_harness.Ros, tmp_path: Path, tag: int, name: str
-):
-    text = f"{name} (0x{tag:02x}): invalid parameter (status 0x04)"
-    with EmulatedUciBoards(links=tmp_path / "uci", rejects=frozenset([tag])):
-        node = ros.start("driver", "source:=uci", f"port:={tmp_path}/uci0,{tmp_path}/uci1")
-        status = ros.diagnosis("driver", lambda status: text in status.message)
-        assert diagnostic_values(status)["radio 0: rejected parameters"] == text
-        node.wait_for_output(text)
-
-
 def test_a_tag_without_ranges_is_a_warning_and_closing_restores_the_calibration(
     boards: EmulatedUciBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -132,17 +116,12 @@ def test_a_tag_without_ranges_is_a_warning_and_closing_restores_the_calibration(
     assert not boards._models[0].sessions
 
 
-def value_of(**changes: object):
-    values = DEFAULTS | {name.replace("__", "."): value for name, value in changes.items()}
-    return values.__getitem__
-
-
 def uci_settings(value):
     return [settings.board for settings in read_settings(value)]
 
 
 def test_the_first_board_is_the_tag_of_the_others():
-    tag, anchor, second_anchor = uci_settings(value_of(port="/dev/a,/dev/b,/dev/c", radio__rate=20.0))
+    tag, anchor, second_anchor = uci_settings(driver_values(port="/dev/a,/dev/b,/dev/c", radio__rate=20.0))
     assert (tag.role, tag.address, tag.peers, tag.channel) == (Role.TAG, 1, (2, 3), 9)
     assert (second_anchor.role, second_anchor.address, second_anchor.peers) == (Role.ANCHOR, 3, (1,))
     assert tag.effective_interval_ms == anchor.effective_interval_ms == 100
@@ -153,31 +132,13 @@ def test_the_first_board_is_the_tag_of_the_others():
 def test_anchors_are_a_list_or_a_text(anchors: object):
     row = next(row for row in DRIVER if row.name == "radio.anchors")
     row.check(anchors)
-    (tag,) = uci_settings(value_of(port="/dev/a", radio__anchors=anchors))
+    (tag,) = uci_settings(driver_values(port="/dev/a", radio__anchors=anchors))
     assert tag.peers == (3, 4)
 
 
 def test_boards_at_two_computers_have_matching_settings():
-    (tag,) = uci_settings(value_of(port="/dev/a"))
-    (anchor,) = uci_settings(value_of(port="/dev/a", radio__role="anchor"))
+    (tag,) = uci_settings(driver_values(port="/dev/a"))
+    (anchor,) = uci_settings(driver_values(port="/dev/a", radio__role="anchor"))
     assert tag.session_id(2) == anchor.session_id(1)
     assert tag.effective_interval_ms == anchor.effective_interval_ms == 88
     assert (anchor.address, anchor.peers) == (2, (1,))
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"radio__channel": 2},
-        {"radio__address": "0x12345"},
-        {"radio__anchors": "x"},
-        {"radio__window": 1016},
-        {"radio__address": 2, "radio__anchors": "2"},
-        {"radio__preamble_code": 3},
-        {"radio__rate": 200.0},
-        {"radio__role": "anchor", "port": "/dev/a,/dev/b"},
-    ],
-)
-def test_settings_that_no_board_can_have_are_refused(bad: dict):
-    with pytest.raises(ParameterError, match=r"radio\."):
-        uci_settings(value_of(**{"port": "/dev/a"} | bad))

@@ -38,7 +38,12 @@ def run_program(module: str, function: str) -> None:
     sys.unraisablehook = _raise_again
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    run()
+    try:
+        run()
+    finally:
+        # If a signal interrupted exec() of a text, as in the declaration of a class, `python -m` ends with this signal
+        # instead of the exit code, unless a later text was executed completely.
+        exec("")
 
 
 def _raise_again(unraisable: Any) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock, ClockType
@@ -19,6 +20,7 @@ from uwb_mitigation.nodes.support import diagnostics
 from uwb_mitigation.nodes.support.diagnostics import Description
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
 from uwb_mitigation.nodes.support.parameter_tables import DAMAGED, DRIVER
+from uwb_mitigation.nodes.support.respawn import RespawnState, unused_path
 from uwb_mitigation.types.measurement import RangeMeasurement
 
 if TYPE_CHECKING:
@@ -46,6 +48,10 @@ class Driver(ManagedNode):
         self._make_feed: Callable[[], radios.SourceHandle] | None = None
         self._feed: radios.SourceHandle | None = None
         self._output: RangePublisher
+        self._respawn_state = RespawnState(self.respawn_file("run"))
+        if (code := self._respawn_state.exit_code) is not None:
+            self._end_process(code)
+            return
         refuse_errors(self, self._check)
         self.add_post_set_parameters_callback(self._apply)
         self.autostart()
@@ -79,9 +85,8 @@ class Driver(ManagedNode):
     def _prepare_radios(self) -> Callable[[], radios.SourceHandle]:
         source = radios.radio_source(self.value("source"))
         source.read_settings(self.value)
-        corrections = self.value("source") == "serial"
-        self._output = output = RangePublisher(self, self._consumer, corrections=corrections, recording=False)
-        return lambda: radios.RadioFeed(source, self.value, output, self.now_ns, self.get_logger())
+        output = self._create_publisher(corrections=self.value("source") == "serial")
+        return lambda: radios.RadioFeed(source, self._file_value, output, self.now_ns, self.get_logger())
 
     def _prepare_topics(self) -> Callable[[], radios.SourceHandle]:
         # Mapping files need pandas and pydantic, which the other sources do not.
@@ -89,13 +94,13 @@ class Driver(ManagedNode):
         from uwb_mitigation.recordings.mapping.mapping import load_mapping
 
         mapping = load_mapping(self.value("map"))
-        self._output = RangePublisher(self, self._consumer, corrections=False, recording=False)
+        self._create_publisher()
         feed = TopicFeed(self, mapping, self.value("topic"), self._publish_topic_range, self.now_ns)
         return lambda: feed
 
     def _prepare_replay(self) -> Callable[[], radios.SourceHandle]:
         source = self.destroy_at_close(open_source(self.value), lambda source: source.close())
-        self._output = output = RangePublisher(self, self._consumer, corrections=False, recording=True)
+        output = self._create_publisher(recording=True)
         robot = None
         if self.value("source") == "mcap":
             # Other sources do not need the readers of bags.
@@ -106,6 +111,18 @@ class Driver(ManagedNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         clock = steady if self.value("publish_clock") else self.get_clock()
         return lambda: ReplayFeed(source, clock, self.value, self.get_logger(), output, self._finish, robot)
+
+    def _create_publisher(self, *, corrections: bool = False, recording: bool = False) -> RangePublisher:
+        record = self._file_value("record")
+        self._output = RangePublisher(self, self._consumer, record, corrections, recording)
+        return self._output
+
+    def _file_value(self, name: str) -> Any:
+        """Return a parameter; a file that is written is a new one after a crash, so that the earlier one is kept."""
+        value = self.value(name)
+        if name in ("record", "capture") and value and self._respawn_state.is_respawned:
+            return str(unused_path(Path(value).expanduser()))
+        return value
 
     def _check(self, values: Mapping[str, Any]) -> None:
         """Raise for settings of radios that contradict each other, and for offsets that cannot be read."""
@@ -132,5 +149,10 @@ class Driver(ManagedNode):
         self.error = error
         if error is not None:
             self.get_logger().error(str(error))
-            self.exit_code = DAMAGED
+        code = 0 if error is None else DAMAGED
+        self._respawn_state.save_exit_code(code)
+        self._end_process(code)
+
+    def _end_process(self, code: int) -> None:
+        self.exit_code = code
         self._ended.set()

@@ -6,6 +6,7 @@ The first line is `# uwb_mitigation KIND capture 1`. Lines `board N {JSON settin
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -38,18 +39,19 @@ class CaptureWriter:
         limit_bytes: size after which nothing more is written.
 
     Raises:
-        ParameterError: the file cannot be written.
+        ParameterError: the file cannot be created.
     """
 
     def __init__(self, path: Path, kind: str = "UCI", boards: int = 1, limit_bytes: int = 1 << 30) -> None:
         try:
-            self._file: IO[str] = path.open("w", encoding="ascii")
+            self._file: IO[str] = path.open("w", encoding="ascii", buffering=1)
         except OSError as error:
             raise ParameterError(
                 f"the capture cannot be written: {error.strerror}", where=str(path)
             ) from error
         self._free_bytes, self._users = limit_bytes, boards
         self._lock = threading.Lock()
+        self._problem = ""
         self._began_ns = time.monotonic_ns()
         self._write(first_line(kind))
 
@@ -63,6 +65,11 @@ class CaptureWriter:
             seconds = (time.monotonic_ns() - self._began_ns) / NS_PER_S
             self._write(f"{seconds:.6f} {number} {'>' if sent else '<'} {data.hex()}")
 
+    def take_problem(self) -> str:
+        """Return, once, why the file could not be written to its end; empty: it is complete until now."""
+        problem, self._problem = self._problem, ""
+        return problem
+
     def close(self) -> None:
         """Close the file for one board."""
         with self._lock:
@@ -73,9 +80,14 @@ class CaptureWriter:
     def _write(self, line: str) -> None:
         with self._lock:
             self._free_bytes -= len(line) + 1
-            if self._free_bytes >= 0 and not self._file.closed:
+            if self._free_bytes < 0 or self._file.closed:
+                return
+            try:
                 self._file.write(line + "\n")
-                self._file.flush()
+            except OSError as error:  # such as a full disk, which must not end the ranges
+                self._problem = f"the capture has ended: {error.strerror}"
+                with contextlib.suppress(OSError):
+                    self._file.close()
 
 
 class Session(Protocol):

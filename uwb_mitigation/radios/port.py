@@ -206,7 +206,7 @@ class RadioPort(ABC):
 
     @abstractmethod
     def _open(self) -> Any:
-        """Open the hardware and start the radio; return what `close` closes.
+        """Open the hardware and set `device`; return what is closed after a loss.
 
         Raises:
             UwbMitigationError: it cannot be opened.
@@ -220,6 +220,10 @@ class RadioPort(ABC):
             UwbMitigationError, OSError: the hardware was lost, or must be opened again.
         """
 
+    def _opened(self, now_ns: int) -> list[Any]:
+        """Start the state of the radio, with the lock held, after the hardware was opened; return events."""
+        return []
+
     def _is_stopped(self, now_ns: int) -> bool:
         """Return whether the hardware may be closed; called after `close`, until it returns true."""
         return True
@@ -232,6 +236,10 @@ class RadioPort(ABC):
         """Open the hardware and serve it until the port is closed; raise UwbMitigationError if that fails."""
         hardware = self._open()
         try:
+            with self._lock:
+                self.openings += 1
+                events = self._opened(time.monotonic_ns())
+            self._emit(events)
             while not (self.closed and self._is_stopped(time.monotonic_ns())):
                 self._emit(self._serve(hardware))
                 self._log_problem()
@@ -337,10 +345,6 @@ class StreamPort(RadioPort):
         self._empty_read_is_loss = True
 
     @abstractmethod
-    def _opened(self, now_ns: int) -> list[Any]:
-        """Start the session, with the lock held; return events."""
-
-    @abstractmethod
     def _received(self, data: bytes, now_ns: int, stamp_ns: int) -> list[Any]:
         """Pass bytes and the time to the session, with the lock held; return events.
 
@@ -370,9 +374,6 @@ class StreamPort(RadioPort):
         self._outgoing.clear()
         with self._lock:
             self.device, self._lost = getattr(port, "port", self._name), ""
-            self.openings += 1
-            events = self._opened(time.monotonic_ns())
-        self._emit(events)
         return port
 
     def _serve(self, hardware: Any) -> list[Any]:
@@ -393,6 +394,8 @@ class StreamPort(RadioPort):
                 written = os.write(fd, self._outgoing)
                 self._add_to_capture(bytes(self._outgoing[:written]), sent=True)
                 del self._outgoing[:written]
+        if self._capture is not None and (problem := self._capture.take_problem()):
+            events.append(PortMessage(logging.ERROR, problem))
         return events
 
 

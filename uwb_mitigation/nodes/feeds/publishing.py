@@ -17,7 +17,6 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
-from uwb_mitigation.nodes.support.sensor_ranges import SensorRanges
 from uwb_mitigation.radios.wire.messages import Correction
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros import topics
@@ -39,21 +38,21 @@ class RangePublisher:
     Args:
         node: the driver.
         consumer: in-process consumer of measurements; `/uwb/range_raw` is then published only if it has subscribers.
+        record: path of a bag for the raw ranges; empty: none.
         corrections: the source may deliver ranges that a board has corrected.
         recording: the source delivers ground truth.
     """
 
     def __init__(
-        self, node: ManagedNode, consumer: Mitigator | None, *, corrections: bool, recording: bool
+        self, node: ManagedNode, consumer: Mitigator | None, record: str, corrections: bool, recording: bool
     ) -> None:
         self._node = node
         self._consumer = consumer
         self._frame_id: str = node.value("frame_id")
         self._ranges = node.publisher(RangeCir, topics.RANGE_RAW)
-        self._bag = self._open_bag() if node.value("record") else None
+        self._bag = self._open_bag(Path(record).expanduser()) if record else None
         if corrections:
             self._corrected = node.publisher(RangeCorrected, topics.RANGE_CORRECTED)
-            self._sensor_ranges = SensorRanges(node)
         if recording:
             prepare_encoders()
             self._truths = node.publisher(RangeTruth, topics.RANGE_TRUTH)
@@ -83,7 +82,6 @@ class RangePublisher:
             c.stamp_ns, c.tag_id, c.anchor_id, c.sequence, c.device_time, raw_m, _NO_CIR, self._frame_id
         )
         self._corrected.publish(encode_corrected(measurement, c.corrected))
-        self._sensor_ranges.publish(c.anchor_id, c.stamp_ns, self._frame_id, c.corrected)
 
     def publish_records(self, records: Sequence[tuple[Record, int]]) -> None:
         """Publish records of a recording, [(record, stamp_ns), ...], with their ground truth."""
@@ -114,11 +112,11 @@ class RangePublisher:
         if self._consumer is not None:
             self._consumer.wait_for_all_acked(timeout)
 
-    def _open_bag(self) -> BagWriter:
+    def _open_bag(self, path: Path) -> BagWriter:
         # Import here: other drivers need no writer of bags.
         from uwb_mitigation.recordings.bag.writer import BagWriter
 
-        path, source = Path(self._node.value("record")).expanduser(), self._node.value("source")
+        source = self._node.value("source")
         if os.path.lexists(path):
             raise ParameterError(f"parameter record = {path}: the file exists", valid="another path")
         origin = {"source": f"driver, source {source}"}

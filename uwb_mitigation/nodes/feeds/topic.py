@@ -9,6 +9,7 @@ from typing import Any
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.validate_topic_name import validate_topic_name
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support import diagnostics, endpoints
@@ -41,6 +42,7 @@ class TopicFeed:
 
     Raises:
         ParameterError: The mapping has no topics or no type, or needs a whole recording.
+        InvalidTopicNameException: A name is invalid.
         MissingDependencyError: The message type is not installed.
     """
 
@@ -56,6 +58,8 @@ class TopicFeed:
         if not (self._names and mapping.type):
             valid = "for topics: a mapping with topics and type"
             raise ParameterError(f"the mapping {mapping.name} is for recordings or lines", valid=valid)
+        for name in self._names:
+            validate_topic_name(name)
         self._converter = LiveConverter(mapping, "topics")
         self.counts = self._converter.counts
         self._ranges = 0

@@ -172,7 +172,12 @@ def _translate_qos_errors(node: LifecycleNode, topic: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError, ParameterException) as error:
+        name = node.resolve_topic_name(topic)
+        prefix = f"qos_overrides.{name}."
+        if not any(given.startswith(prefix) for given in getattr(node, "given_parameters", ())):
+            # An error of ROS, which may be transient.
+            raise
         raise ParameterError(
-            f"qos_overrides of {node.resolve_topic_name(topic)}: {error}",
+            f"qos_overrides of {name}: {error}",
             valid="history keep_last or keep_all, depth a whole number, reliability reliable or best_effort",
         ) from error

@@ -35,6 +35,8 @@ _OWN_LAUNCH_FILES = ("uwb.launch.py", "boards.launch.py")
 def on_exit(event: Any, context: object) -> list[Any]:
     """Handle the exit of a node during its `respawn_delay`, so that only a crashed node is respawned.
 
+    If the launch process stalls for longer than the delay, `RespawnState` lets a driver end again.
+
     Args:
         event: `ProcessExited`. Code 0 or `DAMAGED`: the node ended, for example after a recording.
         context: unused.

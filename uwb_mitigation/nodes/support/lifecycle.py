@@ -15,7 +15,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    NameValidationException,
+)
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -69,6 +73,7 @@ class ManagedNode(LifecycleNode):
         self.given_parameters: dict[str, Any] = self._take_given_parameters()
         self._declare({row.name: row for row in ALL_TABLES[name]})
         self.error: UwbMitigationError | None = None
+        self._unexpected: Exception | None = None
         self._state = "unconfigured"
         self.now_ns = clock_reader(self.get_clock())
         self._last_unique_s = time.monotonic()
@@ -138,13 +143,15 @@ class ManagedNode(LifecycleNode):
 
         Raises:
             UwbMitigationError: configure failed.
+            Exception: configure failed with an error that the code does not expect: a bug, or an error of ROS that may
+                be transient.
         """
         if not self.value("autostart"):
             return
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
         elif self.error is not None:
-            raise self.error
+            raise self._unexpected or self.error
 
     def value(self, name: str) -> Any:
         """Return the value of a parameter."""
@@ -197,13 +204,17 @@ class ManagedNode(LifecycleNode):
         self, state: str, step: Callable[[], None], on_failure: Callable[[], None] | None = None
     ) -> TransitionCallbackReturn:
         """Run a step; after success the node is in `state`."""
+        self._unexpected = None
         try:
             step()
         except UwbMitigationError as error:
             self.error = error
+        except NameValidationException as error:
+            self.error = ParameterError(str(error), valid="the rules of ROS for names")
         except Exception as error:
             self.error = missing_dependency(error) if isinstance(error, ImportError) else None
             if self.error is None:
+                self._unexpected = error
                 self.get_logger().error(traceback.format_exc())
                 self.error = UwbMitigationError(
                     f"{type(error).__name__}: {error}", valid="this is a bug: see the log"

@@ -83,12 +83,6 @@ class Parameter:
             )
 
 
-_SENSOR_RANGES = Parameter(
-    "sensor_ranges", False, "Publish corrected ranges as sensor_msgs/Range as well, on uwb/range_corrected/anchor_ID; "
-    "an invalid range is +Inf. The driver publishes ranges that the board has corrected.",
-)  # fmt: skip
-
-
 def _radio(name: str, default: ParameterValue, description: str, **options: Any) -> Parameter:
     sources = "serial, evb1000, spi, uci" if name in _UCI else "serial, evb1000, spi"
     return Parameter(f"radio.{name}", default, f"{description} ({sources}).", live=True, **options)
@@ -177,12 +171,12 @@ DRIVER = (
     *RADIO,
     Parameter("radio.tags", "", "Addresses of the tags of an anchor, separated by commas; empty: 1 (uci).",
               live=True, or_number=True, or_array=True),
-    Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced. Empty: none (uci, lines, pans)."),
+    Parameter("capture", "", "File for the raw bytes of the boards, which `path` replays; an existing file is replaced, but after a crash "
+              "the driver continues in NAME_2. Empty: none (uci, lines, pans)."),
     Parameter("record", "", "MCAP bag to which the raw ranges are written, completed when the node ends or is cleaned up; an "
-              "existing file is refused. Empty: none."),
+              "existing file is refused, but after a crash the driver continues in NAME_2. Empty: none."),
     Parameter("radio.reset", "", "Reset line of the chip, such as gpiochip0:25; empty: not connected (spi)."),
     Parameter("frame_id", "uwb_antenna", "Frame id of the receiving antenna, if the source contains none."),
-    _SENSOR_RANGES,
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
@@ -196,7 +190,6 @@ MITIGATOR = (
               "the previous ones stay in use.", live=True, or_number=True),
     Parameter("backend", "onnxruntime", "Inference engine: ONNX Runtime, or the firmware's C, compiled for this "
               "computer at activation (bit-identical).", choices=("onnxruntime", "firmware")),
-    _SENSOR_RANGES,
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
@@ -270,7 +263,7 @@ PX4 = (
 
 RESPAWN_FOLDER = "UWB_MITIGATION_RESPAWN_FOLDER"
 """Environment variable with a folder that exists while a launch file runs. A respawned node finds there the parameters
-that were set at run time, and the locator also its latest state."""
+that were set at run time, the locator also its latest state, and the driver whether its recording has ended."""
 
 REFUSED = 1
 """Exit code of a node that refuses a parameter, a file or a name at its start. A node that crashes has another one, with

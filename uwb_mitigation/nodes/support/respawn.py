@@ -1,18 +1,21 @@
-"""The state with which a node continues after a crash, in a JSON file.
+"""What a node leaves for the process that replaces it after a crash.
 
-The file has the keys `format` (`FORMAT`), `saved_s` (Unix time) and `state`, whose keys the node defines.
+The file of a `StateFile` has the keys `format` (`FORMAT`), `saved_s` (Unix time) and `state`, whose keys the node defines.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import time
 from collections.abc import Callable
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
 
 from uwb_mitigation.errors import UwbMitigationError
-from uwb_mitigation.files import read_bounded, write_atomically
+from uwb_mitigation.files import partial_path, read_bounded, write_atomically
 
 FORMAT, MAX_BYTES = 1, 1 << 16
 SAVE_PERIOD_S = 0.2
@@ -21,6 +24,43 @@ TRIAL_S = 5.0
 """A process with a loaded state saves nothing for this time: a state that leads to a crash becomes too old."""
 
 State = TypeVar("State")
+
+
+class RespawnState:
+    """Whether an earlier process of a driver was started or ended, in a file that contains its exit code.
+
+    Args:
+        path: in the folder of a running launch file; None: the driver is not respawned.
+
+    Attributes:
+        is_respawned: this process replaces an earlier one.
+        exit_code: the exit code with which the earlier process has ended a recording; None: it has not. The launch
+            file may respawn the driver before it handles its exit.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        text = path.read_text(encoding="ascii") if path is not None and path.is_file() else None
+        self.is_respawned = text is not None
+        self.exit_code = int(text) if text else None
+        self._write(text or "")
+
+    def save_exit_code(self, code: int) -> None:
+        """Let a process that replaces this one end with the same exit code."""
+        self._write(str(code))
+
+    def _write(self, text: str) -> None:
+        if self._path is not None:
+            # Without the file, a respawned driver only starts from scratch.
+            with contextlib.suppress(OSError):
+                self._path.write_text(text, encoding="ascii")
+
+
+def unused_path(path: Path) -> Path:
+    """Return the first of NAME, NAME_2, NAME_3 ... that does not exist and is not a partly written file."""
+    names = chain([path.name], (f"{path.stem}_{number}{path.suffix}" for number in count(2)))
+    paths = map(path.with_name, names)
+    return next(path for path in paths if not (os.path.lexists(path) or partial_path(path).exists()))
 
 
 class StateFile:

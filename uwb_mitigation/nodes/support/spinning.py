@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -94,11 +93,9 @@ def load_node(name: str) -> Callable[[threading.Event], Iterator[Node]]:
     has subscribers. Names, topics, parameters and diagnostics are the same as of separate nodes.
     """
     names = ("mitigator", "driver", "locator") if name == "pipeline" else (name,)
-    modules = {
-        module_name: importlib.import_module(f"uwb_mitigation.nodes.{module_name}") for module_name in names
-    }
     classes = {
-        module_name: getattr(module, module_name.capitalize()) for module_name, module in modules.items()
+        node: getattr(importlib.import_module(f"uwb_mitigation.nodes.{node}"), node.capitalize())
+        for node in names
     }
 
     def make_nodes(stop: threading.Event) -> Iterator[Node]:
@@ -136,23 +133,18 @@ def _run(name: str) -> int:
     code_of_errors = REFUSED
     try:
         _initialise()
-        try:
-            # Load before the handlers are installed: until then a signal terminates the process immediately.
-            make_nodes = load_node(name)
-            stop = stop_event()
-            # If one cannot be made, the list contains those before it.
-            nodes.extend(make_nodes(stop))
-        except (RuntimeError, NameValidationException) as error:  # rcl's errors are RuntimeErrors
-            raise ParameterError(_first_line(error), valid="check the names given to --ros-args") from error
+        # Load before the handlers are installed: until then a signal terminates the process immediately.
+        make_nodes = load_node(name)
+        stop = stop_event()
+        # If one cannot be made, the list contains those before it.
+        nodes.extend(make_nodes(stop))
         code_of_errors = CRASHED
         spin(nodes, stop)
-    except ImportError as error:
-        if (absent := missing_dependency(error)) is None:
+    except (ImportError, UwbMitigationError) as error:
+        problem = missing_dependency(error) if isinstance(error, ImportError) else error
+        if problem is None:
             raise
-        print(f"error: {absent}", file=sys.stderr)
-        return code_of_errors
-    except UwbMitigationError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {problem}", file=sys.stderr)
         return code_of_errors
     finally:
         for node in reversed(nodes):
@@ -171,13 +163,10 @@ def _initialise() -> None:
     try:
         rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        raise ParameterError(_first_line(error), valid="check what follows --ros-args") from error
+        # Without positions in the source files of ROS.
+        first_line = str(error).strip().splitlines()[0].split(", at /")[0]
+        raise ParameterError(first_line, valid="check what follows --ros-args") from error
     if unknown := remove_ros_args(words)[1:]:
         raise ParameterError(
             f"arguments {' '.join(unknown)!r}", valid="parameters follow --ros-args, as in -p name:=value"
         )
-
-
-def _first_line(error: Exception) -> str:
-    """Return the first line of a ROS error without positions in ROS's source files."""
-    return str(error).strip().splitlines()[0].split(", at /")[0]

@@ -148,9 +148,7 @@ class ChipPort(RadioPort):
             self._radio = NativeRadio(bus, self._requested_settings, stamp_clock=self._stamp_clock)
         self._radio.use(bus)
         self._is_started, self._status_due_s, self._sensors_due_s = False, 0.0, 0.0
-        with self._lock:
-            self.device = bus.name
-            self.openings += 1
+        self.device = bus.name
         return bus
 
     def _serve(self, hardware: Bus) -> list[Any]:

@@ -80,7 +80,22 @@ class DeviceClock:
 
     def arrival(self, uptime_us: int, arrived_ns: int) -> None:
         """Add a frame that reports an event at `uptime_us` and arrived at `arrived_ns`."""
-        self._arrival(1000 * uptime_us, arrived_ns)
+        board_ns = 1000 * uptime_us
+        late_ns = 0 if self._origin is None else arrived_ns - self._predict_ns(board_ns)
+        if late_ns > _MAX_AGE_NS:
+            self.reset()
+        if self._origin is None:
+            self._origin = arrived_ns - board_ns
+            self._updated_ns = board_ns
+            self._p_offset = _FIRST_ARRIVAL_NS**2
+            return
+        high = float(arrived_ns - board_ns - self._origin)
+        if late_ns < 0:
+            self._update(board_ns, high, _FLOOR_NS**2)
+            self._clip(board_ns, float("-inf"), high)
+        elif not self._is_bounded:
+            # A late arrival has a small weight, so that a stall of seconds does not change the offset.
+            self._update(board_ns, high, _LATE_ARRIVAL_NS**2 + late_ns**2)
 
     def exchange(self, sent_ns: int, received_us: int, replied_us: int, arrived_ns: int) -> None:
         """Add a round trip: the host sends, the board receives and replies, the host receives the reply.
@@ -110,7 +125,7 @@ class DeviceClock:
         arrival. Stamps move back only after a clock was set or a board was reset.
         """
         board_ns = 1000 * uptime_us
-        self._arrival(board_ns, arrived_ns)
+        self.arrival(uptime_us, arrived_ns)
         index = bisect.bisect_left(self._times, board_ns)
         if index < len(self._times) and self._times[index] == board_ns:
             return self._stamps[index]
@@ -127,23 +142,6 @@ class DeviceClock:
     def _predict_ns(self, board_ns: int) -> int:
         origin = self._origin or 0
         return board_ns + origin + round(self._offset + self._drift * (board_ns - self._updated_ns))
-
-    def _arrival(self, board_ns: int, arrived_ns: int) -> None:
-        late_ns = 0 if self._origin is None else arrived_ns - self._predict_ns(board_ns)
-        if late_ns > _MAX_AGE_NS:
-            self.reset()
-        if self._origin is None:
-            self._origin = arrived_ns - board_ns
-            self._updated_ns = board_ns
-            self._p_offset = _FIRST_ARRIVAL_NS**2
-            return
-        high = float(arrived_ns - board_ns - self._origin)
-        if late_ns < 0:
-            self._update(board_ns, high, _FLOOR_NS**2)
-            self._clip(board_ns, float("-inf"), high)
-        elif not self._is_bounded:
-            # A late arrival has a small weight, so that a stall of seconds does not change the offset.
-            self._update(board_ns, high, _LATE_ARRIVAL_NS**2 + late_ns**2)
 
     def _update(self, board_ns: int, offset: float, variance: float) -> None:
         """Update the filter with a measured `offset` at board time `board_ns`."""
