@@ -28,6 +28,7 @@ from uwb_mitigation.nodes.support import diagnostics, endpoints
 from uwb_mitigation.nodes.support.diagnostics import MitigatorHealth
 from uwb_mitigation.nodes.support.endpoints import BATCH
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode, refuse_errors
+from uwb_mitigation.nodes.support.sensor_ranges import SensorRanges
 from uwb_mitigation.types.measurement import (
     LINE_OF_SIGHT_DB,
     Cir,
@@ -95,6 +96,7 @@ class Mitigator(ManagedNode):
         self._subscribe = subscribe
         self._raw: Subscription | None = None
         self._corrected: Publisher | None = None
+        self._sensor_ranges: SensorRanges
         self._mitigation: Corrector | None = None
         self._prepared: tuple[str, Corrector] | None = None
         self._shipped: tuple[Bundle, ...] = ()
@@ -110,6 +112,7 @@ class Mitigator(ManagedNode):
 
     def open(self) -> None:
         self._corrected = self.publisher(RangeCorrected, topics.RANGE_CORRECTED)
+        self._sensor_ranges = SensorRanges(self)
         if self._subscribe:
             # Subscribe to serialised messages: decoding them here takes a third of the time of rclpy.
             name = topics.relative(topics.RANGE_RAW)
@@ -138,6 +141,8 @@ class Mitigator(ManagedNode):
             results = mitigation.correct(measurements)
             for measurement, corrected in zip(measurements, results, strict=True):
                 publisher.publish(encode_corrected(measurement, corrected))
+                m = measurement
+                self._sensor_ranges.publish(m.anchor_id, m.stamp_ns, m.frame_id, corrected)
             now_ns = self.now_ns()
             self.health.add_time(time.perf_counter_ns() - began_ns)
             pairs = [m.tag_id for m in measurements], [m.anchor_id for m in measurements]

@@ -17,6 +17,7 @@ from uwb_mitigation_msgs.msg import RangeCir, RangeCorrected, RangeTruth
 
 from uwb_mitigation.errors import ParameterError, RecordingError
 from uwb_mitigation.nodes.support.lifecycle import ManagedNode
+from uwb_mitigation.nodes.support.sensor_ranges import SensorRanges
 from uwb_mitigation.radios.wire.messages import Correction
 from uwb_mitigation.types.measurement import Cir, RangeMeasurement, Record
 from uwb_mitigation.types.ros import topics
@@ -53,6 +54,7 @@ class RangePublisher:
         self._bag = self._open_bag(Path(record).expanduser()) if record else None
         if corrections:
             self._corrected = node.publisher(RangeCorrected, topics.RANGE_CORRECTED)
+            self._sensor_ranges = SensorRanges(node)
         if recording:
             prepare_encoders()
             self._truths = node.publisher(RangeTruth, topics.RANGE_TRUTH)
@@ -82,6 +84,7 @@ class RangePublisher:
             c.stamp_ns, c.tag_id, c.anchor_id, c.sequence, c.device_time, raw_m, _NO_CIR, self._frame_id
         )
         self._corrected.publish(encode_corrected(measurement, c.corrected))
+        self._sensor_ranges.publish(c.anchor_id, c.stamp_ns, self._frame_id, c.corrected)
 
     def publish_records(self, records: Sequence[tuple[Record, int]]) -> None:
         """Publish records of a recording, [(record, stamp_ns), ...], with their ground truth."""

@@ -83,6 +83,12 @@ class Parameter:
             )
 
 
+_SENSOR_RANGES = Parameter(
+    "sensor_ranges", False, "Publish corrected ranges as sensor_msgs/Range as well, on uwb/range_corrected/anchor_ID; "
+    "an invalid range is +Inf. The driver publishes ranges that the board has corrected.",
+)  # fmt: skip
+
+
 def _radio(name: str, default: ParameterValue, description: str, **options: Any) -> Parameter:
     sources = "serial, evb1000, spi, uci" if name in _UCI else "serial, evb1000, spi"
     return Parameter(f"radio.{name}", default, f"{description} ({sources}).", live=True, **options)
@@ -177,6 +183,7 @@ DRIVER = (
               "existing file is refused, but after a crash the driver continues in NAME_2. Empty: none."),
     Parameter("radio.reset", "", "Reset line of the chip, such as gpiochip0:25; empty: not connected (spi)."),
     Parameter("frame_id", "uwb_antenna", "Frame id of the receiving antenna, if the source contains none."),
+    _SENSOR_RANGES,
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
@@ -190,6 +197,7 @@ MITIGATOR = (
               "the previous ones stay in use.", live=True, or_number=True),
     Parameter("backend", "onnxruntime", "Inference engine: ONNX Runtime, or the firmware's C, compiled for this "
               "computer at activation (bit-identical).", choices=("onnxruntime", "firmware")),
+    _SENSOR_RANGES,
     Parameter("autostart", True, "Configure and activate without a lifecycle manager."),
 )  # fmt: skip
 
