@@ -1,12 +1,15 @@
-"""The node `px4` in this process: its messages must have the fields and types of px4_msgs."""
+"""The node `px4`, with a stand-in for px4_msgs that is built like the message package of this project."""
 
 from __future__ import annotations
 
+import itertools
+import json
 import math
-import struct
+import os
+import signal
+import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,16 +20,15 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not set up: run make setup")
 
-import rclpy
 from builtin_interfaces.msg import Time
+from conftest import REPOSITORY
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, PoseWithCovarianceStamped
-from ros_harness import Ros
+from ros_harness import Process, Ros, diagnostic_values
 from std_msgs.msg import Header
 from uwb_mitigation_msgs.msg import RangeCorrected
 
 from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.nodes import px4
-from uwb_mitigation.nodes.px4 import Px4
 from uwb_mitigation.positioning.geodetic import parse_origin, to_geodetic
 from uwb_mitigation.types.anchors import Anchor, AnchorMap, dump_anchors
 
@@ -46,94 +48,145 @@ MESSAGES = {
 }
 """{message: fields, with several of a type in one place}."""
 
-CODES = {"bool": "?", "int8": "b", "uint8": "B", "uint16": "H", "uint32": "I", "uint64": "Q", "float32": "f", "float64": "d"}  # fmt: skip
+CLIENT = """
+import json, time, rclpy
+from px4_msgs.msg import *
+from rclpy.qos import qos_profile_sensor_data
+rclpy.init()
+node = rclpy.create_node("fmu")
+"""
+
+RECEIVER = f"""{CLIENT}
+def show(message):
+    values = {{name: getattr(message, name) for name in message.get_fields_and_field_types()}}
+    print(json.dumps({{name: v if isinstance(v, (int, float)) else [float(x) for x in v] for name, v in values.items()}}))
+node.create_subscription(RangingBeacon, "/fmu/in/ranging_beacon", show, 10)
+node.create_subscription(VehicleOdometry, "/fmu/in/vehicle_visual_odometry", show, 10)
+rclpy.spin(node)
+"""
+
+LOCAL_PUBLISHER = f"""{CLIENT}
+publisher = node.create_publisher(VehicleLocalPosition, "/fmu/out/vehicle_local_position_v1", qos_profile_sensor_data)
+while True:
+    publisher.publish(VehicleLocalPosition(xy_global=True, z_global=True, ref_lat=47.397742, ref_lon=8.545594, ref_alt=488.0))
+    time.sleep(0.1)
+"""
 
 
-def message_class(text: str) -> type:
-    """Return a class with the fields and constants of a message, which refuses values of other types and sizes."""
-    constants: dict[str, int] = {}
-    codes: dict[str, str] = {}
-    for kind, *names in (field.split() for field in text.split(";")):
-        element, _, size = kind.rstrip("]").partition("[")
-        codes |= {name: size + CODES[element] for name in names if "=" not in name}
-        constants |= {name: int(value) for name, _, value in (n.partition("=") for n in names) if value}
+def build_messages(folder: Path) -> dict[str, str]:
+    """Generate and compile px4_msgs as in a user's workspace; return the environment of a process that uses it."""
+    source, build = folder / "source", folder / "build"
+    (source / "msg").mkdir(parents=True)
+    for message, text in MESSAGES.items():
+        kinds = (field.split() for field in text.split(";"))
+        lines = [f"{kind} {name}\n" for kind, *names in kinds for name in names]
+        (source / "msg" / f"{message}.msg").write_text("".join(lines))
+    files = " ".join(f'"msg/{message}.msg"' for message in MESSAGES)
+    (source / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nproject(px4_msgs)\nfind_package(ament_cmake REQUIRED)\n"
+        "find_package(rosidl_default_generators REQUIRED)\n"
+        f"rosidl_generate_interfaces(${{PROJECT_NAME}} {files})\nament_package()\n"
+    )
+    (source / "package.xml").write_text(
+        '<package format="3"><name>px4_msgs</name><version>0.0.0</version><description>test</description>'
+        '<maintainer email="a@example.com">a</maintainer><license>none</license>'
+        "<buildtool_depend>rosidl_default_generators</buildtool_depend>"
+        "<member_of_group>rosidl_interface_packages</member_of_group></package>"
+    )
+    environment = os.environ | {
+        "AMENT_PREFIX_PATH": os.environ.get("AMENT_PREFIX_PATH", sys.prefix),
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+    }
+    include = f"-DCMAKE_PROJECT_INCLUDE={REPOSITORY / 'cmake' / 'ros_wheels.cmake'}"
+    options = [f"-DPython3_EXECUTABLE={sys.executable}", include, "-DBUILD_TESTING=OFF"]
+    # What Python needs; of the rest, only what these depend on.
+    targets = ["px4_msgs_s__rosidl_typesupport_c", "px4_msgs__rosidl_typesupport_fastrtps_c"]
+    for command in (
+        ["cmake", "-S", str(source), "-B", str(build), *options],
+        ["cmake", "--build", str(build), "--parallel", "2", "--target", *targets],
+    ):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    found = {"PYTHONPATH": build / "rosidl_generator_py", "LD_LIBRARY_PATH": build}
+    return {name: f"{path}:{os.environ.get(name, '')}".rstrip(":") for name, path in found.items()}
 
-    def check(message: object, **values: Any) -> None:
-        for name, value in values.items():
-            struct.pack(codes[name], *np.atleast_1d(value).tolist())
-            setattr(message, name, value)
 
-    return type("Message", (), constants | dict.fromkeys(codes, 0) | {"__init__": check})
-
-
-Start = Callable[..., tuple[Px4, list[Any]]]
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    return build_messages(tmp_path_factory.mktemp("px4"))
 
 
 @pytest.fixture
-def start(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
-    """Return a function that starts the node with parameters, and returns it with the messages that it will send."""
-    messages = SimpleNamespace(**{name: message_class(text) for name, text in MESSAGES.items()})
-    monkeypatch.setitem(sys.modules, "px4_msgs", SimpleNamespace(msg=messages))
-    monkeypatch.setitem(sys.modules, "px4_msgs.msg", messages)
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros.domain))
-    sent: list[Any] = []
-
-    def endpoint(node: Px4, kind: type, topic: str, *_: object) -> SimpleNamespace:
-        vars(node).setdefault("topics", []).append(topic)
-        return SimpleNamespace(publish=sent.append, topic_name=topic)
-
-    monkeypatch.setattr(Px4, "publisher", endpoint)
-    monkeypatch.setattr(Px4, "subscription", endpoint)
-    nodes: list[Px4] = []
-
-    def start(*parameters: str) -> tuple[Px4, list[Any]]:
-        options = [word for parameter in parameters for word in ("-p", parameter)]
-        rclpy.init(args=["--ros-args", *options])
-        nodes.append(Px4())
-        return nodes[0], sent
-
-    yield start
-    for node in nodes:
-        node.destroy_node()
-    rclpy.try_shutdown()
+def px4_msgs(built: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Use a message package that has the name and the fields of px4_msgs."""
+    for name, value in built.items():
+        monkeypatch.setenv(name, value)
 
 
-def stamp(seconds: float) -> Time:
-    return Time(sec=math.floor(seconds), nanosec=round(seconds % 1 * 1e9))
+def messages_of(receiver: Process) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in receiver.output.splitlines() if line.startswith("{")]
 
 
 def pose(seconds: float, x: float, variance: float = 0.04) -> PoseWithCovarianceStamped:
     covariance = [0.0] * 36
     covariance[0], covariance[7], covariance[14], covariance[35] = variance, 0.09, 0.25, 1e6
-    enu = PoseWithCovariance(pose=Pose(position=Point(x=x, y=2.0, z=0.5)), covariance=covariance)
-    return PoseWithCovarianceStamped(header=Header(frame_id="map", stamp=stamp(seconds)), pose=enu)
+    pose_enu = Pose(position=Point(x=x, y=2.0, z=0.5))
+    stamp = Time(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
+    return PoseWithCovarianceStamped(
+        header=Header(frame_id="map", stamp=stamp),
+        pose=PoseWithCovariance(pose=pose_enu, covariance=covariance),
+    )
 
 
-def test_positions_are_sent_in_ned_without_orientation_and_velocity(start: Start):
-    node, sent = start()
+@pytest.mark.slow
+def test_positions_are_sent_in_ned_without_orientation_and_velocity(ros: Ros, px4_msgs: None):
+    node, receiver = ros.start("px4"), ros.run([sys.executable, "-c", RECEIVER])
+    publisher = ros.node.create_publisher(PoseWithCovarianceStamped, "/uwb/pose", 10)
+    ros.wait_for_subscribers("/uwb/pose", 1)
+    ros.wait_for_subscribers("/fmu/in/vehicle_visual_odometry", 1)
+    stamps = itertools.count(100, 10)
+
+    def arrived(stamp: float) -> bool:
+        return f'"timestamp_sample": {stamp * 1e6:.0f}' in receiver.output
+
+    def any_arrived() -> bool:
+        # Positions before the two have found each other are lost.
+        publisher.publish(pose(next(stamps), 1.0))
+        ros.spin_for(0.2)
+        return "timestamp_sample" in receiver.output
+
+    ros.spin_until(any_arrived)
+    start = next(stamps) - 10.0
+    ros.spin_until(lambda: arrived(start))
+    publisher.publish(pose(start + 0.05, 1.1))
+    ros.spin_until(lambda: arrived(start + 0.05))
     # Repeated and negative stamps, positions that are not finite, and variances that are not positive are not sent.
+    # The queue of the node is not longer.
     for seconds, x, variance in (
-        *((100.0, 1.0, 0.04), (100.05, 1.1, 0.04), (100.05, 9.9, 0.04)),
-        *((100.1, x, 0.04) for x in (math.nan, 1e39)),
-        *((100.1, 1.2, variance) for variance in (0.0, -0.01, math.nan, math.inf)),
-        *((-100.0, 1.2, 0.04), (103.0, 5.0, 0.04), (91.0, 4.0, 0.04)),
+        (0.05, 9.9, 0.04),
+        *((0.1, x, 0.04) for x in (math.nan, 1e39)),
+        *((0.1, 1.2, variance) for variance in (0.0, -0.01, math.nan, math.inf)),
+        (-2.0 * start, 1.2, 0.04),
+        (3.0, 5.0, 0.04),
+        (-9.0, 4.0, 0.04),
     ):
-        node._on_pose(pose(seconds, x, variance))
-    assert node.topics == ["/fmu/in/vehicle_visual_odometry", "uwb/pose"]
-    first, second, third, again = sent
-    assert first.timestamp_sample == 100_000_000
-    assert first.timestamp > 1_700_000_000_000_000
-    assert (first.pose_frame, first.position) == (1, [2.0, 1.0, -0.5])
-    assert first.position_variance == pytest.approx([0.09, 0.04, 0.25])
+        publisher.publish(pose(start + seconds, x, variance))
+    ros.spin_until(lambda: arrived(start - 9.0))
+    first, second, third, again = messages_of(receiver)[-4:]
+    assert first["timestamp_sample"] == start * 1e6
+    assert first["timestamp"] > 1_700_000_000_000_000
+    assert (first["pose_frame"], first["position"]) == (1, [2.0, 1.0, -0.5])
+    assert first["position_variance"] == pytest.approx([0.09, 0.04, 0.25])
     for name in ("q", "velocity", "angular_velocity", "orientation_variance", "velocity_variance"):
-        assert all(map(math.isnan, getattr(first, name))), name
+        assert all(map(math.isnan, first[name])), name
     # Twenty correlated positions a second: each has twenty times the variance.
-    assert second.position_variance == pytest.approx([1.8, 0.8, 5.0])
-    assert third.position == [2.0, 5.0, -0.5]
-    assert third.position_variance == pytest.approx([0.09, 0.04, 0.25])
-    assert again.position == [2.0, 4.0, -0.5], "a replay starts again"
-    assert [message.reset_counter for message in sent] == [0, 0, 1, 2]
-    assert node.describe()[2] == "sending"
+    assert second["position_variance"] == pytest.approx([1.8, 0.8, 5.0])
+    assert third["position"] == [2.0, 5.0, -0.5]
+    assert third["position_variance"] == pytest.approx([0.09, 0.04, 0.25])
+    assert again["position"] == [2.0, 4.0, -0.5], "a replay starts again"
+    resets = [message["reset_counter"] - first["reset_counter"] for message in (second, third, again)]
+    assert resets == [0, 1, 2]
+    assert node.signal(signal.SIGINT) == 0, node.output
 
 
 @pytest.mark.skipif(find_spec("px4_msgs") is not None, reason="px4_msgs is installed")
@@ -182,59 +235,75 @@ def test_invalid_origins_are_refused(text: str):
         parse_origin(text)
 
 
-def corrected(seconds: float = 100.0, **fields: Any) -> RangeCorrected:
-    fields = {"tag_id": 1, "anchor_id": 0x022E, "range": 1.0, "variance": 0.01} | fields
-    return RangeCorrected(header=Header(stamp=stamp(seconds)), **fields)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("has_origin", [True, False])
-def test_ranges_are_sent_as_ekf2_accepts_them(start: Start, anchors: Path, has_origin: bool):
-    anchors.write_text(dump_anchors(AnchorMap([Anchor(key, place, 0.03) for key, place in ANCHORS.items()])))
-    origin = [f"origin:={','.join(map(str, ZURICH))}"] if has_origin else []
-    node, sent = start("mode:=ranges", f"anchors:={anchors}", *origin)
+def test_ranges_are_sent_as_ekf2_accepts_them(ros: Ros, px4_msgs: None, tmp_path: Path, has_origin: bool):
+    path = tmp_path / "anchors.yaml"
+    path.write_text(dump_anchors(AnchorMap([Anchor(key, place, 0.03) for key, place in ANCHORS.items()])))
+    # Best-effort messages can be lost under load.
+    reliable = "qos_overrides./uwb/range_corrected.subscription.reliability:=reliable"
+    options = ["mode:=ranges", f"anchors:={path}", reliable]
+    options += [f"origin:={','.join(map(str, ZURICH))}"] if has_origin else []
+    node, receiver = ros.start("px4", *options), ros.run([sys.executable, "-c", RECEIVER])
+    publisher = ros.node.create_publisher(RangeCorrected, "/uwb/range_corrected", 100)
+    ros.wait_for_subscribers("/uwb/range_corrected", 1)
+    ros.wait_for_subscribers("/fmu/in/ranging_beacon", 1)
     if not has_origin:
-        assert node.topics[0].endswith("fmu/out/vehicle_local_position_v1")
-        node._on_range(corrected())
-        node._send_range()
-        assert "the origin of PX4 is unknown" in node.describe()[2]
-        latitude, longitude, altitude = ZURICH
-        fields = {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
-        node._on_local_position(SimpleNamespace(xy_global=True, z_global=True, **fields))
-        node._waiting.clear()
-    tag = (3.0, 2.0, 0.4)
-    for number in range(1000, 1012):
-        # Ranges of four anchors with the same stamp, as a DWM1001 with PANS, ten times a second.
-        node.now_ns = lambda number=number: number * 10**8
-        for anchor, place in ANCHORS.items():
-            fields = {"anchor_id": anchor, "range": math.dist(tag, place), "sequence": number}
-            node._on_range(corrected(number / 10, **fields))
-        for _ in range(6):
-            node._send_range()
-    assert node.topics[-2:] == ["/fmu/in/ranging_beacon", "uwb/range_corrected"]
+        ros.diagnosis("px4", lambda status: "the origin of PX4 is unknown" in status.message)
+        ros.run([sys.executable, "-c", LOCAL_PUBLISHER])
+    tag, rounds = (3.0, 2.0, 0.4), itertools.count(100)
+
+    def send_round() -> None:
+        """Publish ranges of four anchors with the same stamp, as a DWM1001 with PANS, and invalid ones."""
+        number, before = next(rounds), len(received())
+        for anchor, place in [*ANCHORS.items(), (7, (0, 0, 0))]:
+            true_m = math.dist(tag, place)
+            for range_m, variance in ((math.nan, 0.01), (-1.0, 0.01), (1.0, math.inf), (true_m, 0.01)):
+                stamp = Time(sec=number // 10, nanosec=number % 10 * 10**8)
+                fields = {"header": Header(frame_id="uwb", stamp=stamp), "tag_id": 1, "anchor_id": anchor}
+                fields |= {"sequence": number, "range": range_m, "variance": variance}
+                publisher.publish(RangeCorrected(**fields))
+        # Rounds that wait for a busy node would change the variances.
+        if before:
+            ros.spin_until(lambda: len(received()) > before)
+        ros.spin_for(0.1)
+
+    def received() -> list[dict[str, float]]:
+        return [message for message in messages_of(receiver) if "beacon_id" in message]
+
+    ros.spin_until(lambda: send_round() or len(received()) > 40)
+    messages = received()
     vehicle = ecef(*to_geodetic([tag], ZURICH)[0])
-    stamps = [message.timestamp_sample for message in sent]
-    assert len(stamps) == 48
+    stamps = [message["timestamp_sample"] for message in messages]
     assert min(np.diff(stamps)) >= MIN_INTERVAL_US
     assert max(stamp % 100_000 for stamp in stamps) <= 60_000
-    assert {message.beacon_id for message in sent} == {1, 2, 3, 4}, "ids above 255 are numbered"
-    for message in sent:
-        assert message.alt_type == 1
-        beacon = ecef(message.lat, message.lon, message.alt)
-        assert math.dist(beacon, vehicle) == pytest.approx(message.range, abs=1e-3)
+    assert {message["beacon_id"] for message in messages} == {1, 2, 3, 4}, "ids above 255 are numbered"
+    for message in messages:
+        assert message["alt_type"] == 1
+        beacon = ecef(message["lat"], message["lon"], message["alt"])
+        assert math.dist(beacon, vehicle) == pytest.approx(message["range"], abs=1e-3)
     # Ten correlated ranges a second from each anchor: each has ten times the variance.
-    assert {round(message.range_accuracy**2, 4) for message in sent[4:]} == {0.1}
-    node._on_range(corrected(anchor_id=7))
-    assert "anchors that are not in the file: 7" in node.describe()[2]
-    node.now_ns = lambda: 200 * 10**9
-    node._on_range(corrected(200.0, variance=1e-6))
-    node._send_range()
-    assert sent[-1].range_accuracy == pytest.approx(0.1), "EKF2 uses no smaller standard deviation"
+    assert {round(message["range_accuracy"] ** 2, 4) for message in messages[8:]} <= {0.1, 0.05}
+    status = ros.diagnosis("px4", lambda status: "anchors that are not in the file: 7" in status.message)
+    counts = diagnostic_values(status)
+    assert all(
+        int(counts[f"ranges {reason}"]) > 10 for reason in (px4.NO_RANGE, px4.NO_VARIANCE, px4.UNKNOWN_ANCHOR)
+    )
+    # EKF2 uses no smaller standard deviation.
+    stamp, before = Time(sec=next(rounds)), len(received())
+    fields = {"tag_id": 1, "anchor_id": 0x022E, "range": 1.0, "variance": 1e-6}
+    publisher.publish(RangeCorrected(header=Header(stamp=stamp), **fields))
+    ros.spin_until(lambda: len(received()) > before)
+    assert received()[-1]["range_accuracy"] == pytest.approx(0.1)
     # Which of two tags is on the vehicle is not known.
-    for tag_id in (9, 1):
-        node._on_range(corrected(200.0, tag_id=tag_id))
-    node._send_range()
-    assert len(sent) == 49
-    assert "set parameter tag to that of the vehicle (1, 9)" in node.describe()[2]
+    publisher.publish(RangeCorrected(tag_id=9))
+    ros.diagnosis("px4", lambda status: "set parameter tag to that of the vehicle (1, 9)" in status.message)
+    before = len(received())
+    for _ in range(5):
+        publisher.publish(RangeCorrected(tag_id=1, anchor_id=0x022E, range=1.0, variance=0.1))
+        ros.spin_for(0.1)
+    assert len(received()) == before
+    assert node.signal(signal.SIGINT) == 0, node.output
 
 
 @pytest.mark.parametrize(
@@ -252,14 +321,12 @@ def test_ranges_are_sent_as_ekf2_accepts_them(start: Start, anchors: Path, has_o
 def test_each_range_that_ekf2_cannot_use_has_a_reason(changes: dict[str, float], reason: str, is_late: bool):
     anchors = AnchorMap([Anchor(key, place) for key, place in ANCHORS.items()])
     node = SimpleNamespace(_anchors=anchors, _unknown=set(), _counts=Counter(), now_ns=lambda: 100 * 10**9)
-    fields = {"age_s": 0.1} | changes
+    fields = {"anchor_id": 0x022E, "range": 1.0, "variance": 0.01, "age_s": 0.1} | changes
     stamp_ns = 100 * 10**9 - round(fields.pop("age_s") * 1e9)
-    assert Px4._reason_to_drop(node, corrected(**fields), stamp_ns) == reason
+    assert px4.Px4._reason_to_drop(node, RangeCorrected(**fields), stamp_ns) == reason
     assert node._counts == (Counter({px4.LATE: 1}) if is_late else Counter())
-    assert node._unknown == {fields["anchor_id"]} if reason == px4.UNKNOWN_ANCHOR else not node._unknown
 
 
-def test_missing_anchors_are_named(start: Start):
-    node, _ = start("mode:=ranges", "autostart:=false")
-    with pytest.raises(ParameterError, match="parameter anchors is empty"):
-        node.open()
+def test_invalid_settings_of_ranges_are_named(ros: Ros, px4_msgs: None):
+    ros.start("px4", "mode:=ranges").wait_for_output("parameter anchors is empty")
+    ros.start("px4", "mode:=range").wait_for_output("mode = 'range'")
