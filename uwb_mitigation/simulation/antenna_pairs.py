@@ -67,6 +67,7 @@ class AntennaPairs:
                 environment,
                 field.take(field_rows),
                 fading,
+                path.channel,
                 rng,
             )
             delay[rows], gain[rows] = received.delay_ns, received.gain

@@ -28,10 +28,8 @@ from uwb_mitigation.types.measurement import (
     DEVICE_TICK_HZ,
     DEVICE_TIME_WRAP,
     Cir,
-    RadioType,
     RangeMeasurement,
     Record,
-    Segment,
     Truth,
 )
 from uwb_mitigation.types.source import Source
@@ -107,7 +105,7 @@ class Simulated(Source):
                 sequence=sequence & 0xFFFFFFFF,
                 device_time=round(stamp_ns * DEVICE_TICK_HZ / 1e9) % DEVICE_TIME_WRAP,
                 range_m=float(distance[i] + reception.error_m[i]),
-                cir=_cir(reception, i),
+                cir=_cir(reception, i, self._radio),
                 frame_id=f"simulated_anchor_{anchor_id}" if exchanges.tag_yaw is None else ROBOT_FRAME,
             )
             condition = label(bool(pairs.path.crossings[i]), bool(reception.direct_above_threshold[i]))
@@ -209,7 +207,7 @@ class SimulatedSource(Simulated):
         ]
         pair = tag * len(self._anchors) + anchor
         anchors, positions = self._anchors[anchor], along_route(self._route, travelled)
-        path = self._plan.direct_path(anchors, positions)
+        path = self._plan.direct_path(anchors, positions, self._radio.channel)
         return TwrBatch(
             sequence,
             anchor_id,
@@ -272,7 +270,7 @@ class SimulatedBuildings(Simulated):
         )
 
 
-def _cir(reception: Reception, i: int) -> Cir:
+def _cir(reception: Reception, i: int, radio: Receiver) -> Cir:
     return Cir(
         samples=reception.samples[i].copy(),
         first_path_index=float(reception.first_path_index[i]),
@@ -280,10 +278,10 @@ def _cir(reception: Reception, i: int) -> Cir:
         noise_threshold=int(reception.noise_threshold[i]),
         rx_power_dbm=float(reception.rx_power_dbm[i]),
         first_path_power_dbm=float(reception.first_path_power_dbm[i]),
-        channel=2,
+        channel=radio.channel.number,
         prf_mhz=64,
-        radio=RadioType.DW1000,
-        segment=Segment.IPATOV,
+        radio=radio.kind,
+        segment=radio.segment,
     )
 
 
