@@ -159,6 +159,36 @@ class DiffuseField:
         """Return the placements at `index`, in that order."""
         return DiffuseField(*(getattr(self, field.name)[index] for field in fields(self)))
 
+    def moved(
+        self, other: DiffuseField, progress: NDArray[np.float64], changes_at: NDArray[np.float64]
+    ) -> DiffuseField:
+        """Return fields on the way to `other`, with the same distributions.
+
+        The rays of `other` replace those of this field one by one. All other properties change continuously.
+
+        Args:
+            other: fields at the end of the way.
+            progress: share of the way, 0 to 1, float64 (n,).
+            changes_at: share of the way at which each ray is replaced, float64 (n, rays).
+        """
+        is_replaced = progress[:, None] > changes_at
+        near, far = np.maximum(1.0 - progress, 1e-9), np.maximum(progress, 1e-9)
+        # The first ray of the first cluster is at its start. The minimum of exponential variables is exponential.
+        first, other_first = self.delay_ns[:, :1], other.delay_ns[:, :1]
+        first_delay = np.minimum(first / near[:, None], other_first / far[:, None])
+        delay = first_delay + np.where(is_replaced, other.delay_ns - other_first, self.delay_ns - first)
+        power = np.where(is_replaced, other.mean_power, self.mean_power)
+        mean_loss = math.prod(PATTERN_LOSS_DB)
+        # The sum of squares of both weights is 1, so that variances stay the same.
+        near, far = np.sqrt(near), np.sqrt(far)
+        return DiffuseField(
+            delay,
+            power / power.sum(axis=1, keepdims=True),
+            np.where(is_replaced, other.nakagami_m, self.nakagami_m),
+            near * self.shadowing_db + far * other.shadowing_db,
+            mean_loss + near * (self.pattern_loss_db - mean_loss) + far * (other.pattern_loss_db - mean_loss),
+        )
+
     def fade(self, rng: np.random.Generator) -> NDArray[np.complex128]:
         """Draw the rays' gains, complex128 (n, rays): Nakagami magnitude, uniform phase.
 
