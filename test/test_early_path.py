@@ -15,7 +15,8 @@ from uwb_mitigation.mitigation.early_path import TAP_M, early_path_error_m
 from uwb_mitigation.mitigation.embedded.compiled import FirmwareMitigation
 from uwb_mitigation.mitigation.model.bundle import Bundle
 from uwb_mitigation.mitigation.model.linear_bias import LinearBiasModel
-from uwb_mitigation.simulation.radio import EDGE_LEAD_TAPS, pulse
+from uwb_mitigation.simulation.channel import CHANNEL_2
+from uwb_mitigation.simulation.radio import pulse
 from uwb_mitigation.types.measurement import Cir, RangeColumns, RangeMeasurement, Status
 
 SAMPLES = 32
@@ -29,7 +30,7 @@ def received(early: float, before: float = 15.0, seed: int = 0, **changes: objec
     samples = random.normal(0.0, 5.0, (400, 2))
     for position, amplitude in ((REPORTED, 1200.0), (REPORTED - before, early)):
         phase = random.uniform(0.0, 2 * np.pi)
-        shape = amplitude * pulse(taps - position - EDGE_LEAD_TAPS) / pulse(np.zeros(1))[0]
+        shape = amplitude * pulse(taps - position - CHANNEL_2.pulse_taps / 2.0) / pulse(np.zeros(1))[0]
         samples += shape[:, None] * (np.cos(phase), np.sin(phase))
     cir = Cir(
         np.rint(samples).astype(np.int16).ravel(),

@@ -17,6 +17,7 @@ from uwb_mitigation.errors import ParameterError
 from uwb_mitigation.mitigation.preprocessing import Preprocessing
 from uwb_mitigation.recordings.mcap import McapRecording
 from uwb_mitigation.simulation.buildings import PLACEMENTS, block_of
+from uwb_mitigation.simulation.channel import RESIDENTIAL_NLOS, DiffuseField, draw_diffuse_field
 from uwb_mitigation.simulation.radio import Receiver
 from uwb_mitigation.simulation.scene import ROUTE, along_route
 from uwb_mitigation.simulation.simulated import (
@@ -203,3 +204,35 @@ def test_nlos_delay_grows_with_the_distance(distance_m: tuple[float, float]) -> 
     assert np.mean(first[here] / expected) == pytest.approx(1.0, abs=4.0 / np.sqrt(here.sum()))
     los = np.concatenate([block.pairs.fields[0].delay_ns[:, 0] for block in blocks])
     assert (los == 0.0).all()
+
+
+@pytest.fixture(scope="module")
+def moved() -> list[DiffuseField]:
+    """Fields of 2,000 pairs behind obstacles: first at the start of a segment, then one per cent, and one half of it later."""
+    start, end = (draw_diffuse_field(RESIDENTIAL_NLOS, 2000, np.random.default_rng(n)) for n in (0, 1))
+    changes_at = np.random.default_rng(2).random(start.delay_ns.shape)
+    return [start.moved(end, np.full(2000, progress), changes_at) for progress in (0.0, 0.01, 0.5)]
+
+
+def test_fields_change_gradually_along_a_drive(moved: list[DiffuseField]) -> None:
+    start, later, half = (field.delay_ns[:, 0] for field in moved)
+    assert np.corrcoef(start, later)[0, 1] > 0.95
+    assert np.mean(moved[0].nakagami_m == moved[1].nakagami_m) == pytest.approx(0.99, abs=0.001)
+    assert np.corrcoef(start, half)[0, 1] < 0.7
+
+
+def test_fields_in_motion_have_the_distributions_of_placements(moved: list[DiffuseField]) -> None:
+    start, _, half = moved
+    quantiles = (10, 50, 90)
+    for name in ("shadowing_db", "pattern_loss_db", "delay_ns"):
+        expected, found = (
+            np.percentile(getattr(field, name).reshape(2000, -1)[:, 0], quantiles) for field in (start, half)
+        )
+        np.testing.assert_allclose(found, expected, rtol=0.15, atol=0.15)
+
+
+def test_fields_of_two_anchors_change_independently() -> None:
+    source = SimulatedSource(seed=4, count=4000, rate_hz=400.0, anchors=((1.0, 1.0), (1.0, 1.0)))
+    loss = np.concatenate([batch.pairs.fields[1].shadowing_db for batch, _ in source._batches()])
+    assert np.abs(np.diff(loss[::2])).max() < 0.5
+    assert np.abs(loss[::2] - loss[1::2]).max() > 1.0

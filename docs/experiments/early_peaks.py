@@ -6,7 +6,7 @@ several limits. Development seed: no model was trained in these buildings, and n
 """
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +16,7 @@ from uwb_mitigation.mitigation.model.bundle import Session, load_bundle
 from uwb_mitigation.mitigation.model.shipped import default_model_path
 from uwb_mitigation.simulation.buildings import RADIO, WIDE_SHARE
 from uwb_mitigation.simulation.channel import SPEED_OF_LIGHT_M_PER_NS
-from uwb_mitigation.simulation.radio import NOISE_TAPS, PULSE_PEAK, TAP_NS, Receiver, Reception, place_paths
+from uwb_mitigation.simulation.radio import NOISE_TAPS, TAP_NS, Receiver, Reception, place_paths
 from uwb_mitigation.training.data.dataset import Dataset
 from uwb_mitigation.training.data.simulated import block_dataset
 
@@ -40,10 +40,14 @@ class FalsePeaks(Receiver):
         lead = samples.reshape(len(samples), -1, 2)[:, NOISE_TAPS].astype(float)
         noise = (lead**2).sum(axis=2).mean(axis=1)
         early_m = rng.uniform(*FALSE_PEAK_M, len(place))
-        amplitude = np.sqrt(noise * 10.0 ** (rng.uniform(*FALSE_PEAK_DB, len(place)) / 10.0)) / PULSE_PEAK
+        amplitude = (
+            np.sqrt(noise * 10.0 ** (rng.uniform(*FALSE_PEAK_DB, len(place)) / 10.0)) / self.pulse_peak
+        )
         amplitude *= rng.random(len(place)) < self.share
         gain = amplitude * np.exp(1j * rng.uniform(0.0, 2.0 * math.pi, len(place)))
-        taps = place_paths((place - early_m / (SPEED_OF_LIGHT_M_PER_NS * TAP_NS))[:, None], gain[:, None])
+        taps = place_paths(
+            (place - early_m / (SPEED_OF_LIGHT_M_PER_NS * TAP_NS))[:, None], gain[:, None], self.channel
+        )
         samples = np.clip(np.rint(samples + taps.view(np.float32)), -32768, 32767).astype(np.int16)
         return super().report(samples, count, direct, place, above, boards, rng)
 
@@ -52,7 +56,7 @@ if __name__ == "__main__":
     early_path.SEARCH_TAPS = LONGEST_TAPS
     bundle = load_bundle(default_model_path())
     for share in FALSE_SHARES:
-        radio = FalsePeaks(**asdict(RADIO), share=share)
+        radio = FalsePeaks(*(getattr(RADIO, field.name) for field in fields(RADIO)), share=share)
         blocks = [block_dataset(SEED, bundle.preprocessing, radio, WIDE_SHARE, n) for n in range(BLOCKS)]
         data = Dataset.joined(blocks)
         network_m = Session(bundle).predict_m(data.inputs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,20 @@ class AntennaPairs:
         path = self.path.take(pairs)
         return AntennaPairs(*ends, path, self.environments, drawn, field_of, self.stationary)
 
+    def moved(
+        self,
+        fields: tuple[channel.DiffuseField, channel.DiffuseField],
+        progress: NDArray[np.float64],
+        changes_at: NDArray[np.float64],
+    ) -> AntennaPairs:
+        """Return the pairs on the way from their fields to other ones in the same rows; see `DiffuseField.moved`."""
+        row = self.field_of
+        los, nlos = (
+            old.take(row).moved(new.take(row), progress, changes_at[row])
+            for old, new in zip(self.fields, fields, strict=True)
+        )
+        return replace(self, fields=(los, nlos), field_of=np.arange(len(row)))
+
     def multipath(self, rng: np.random.Generator) -> channel.Multipath:
         """Return the received paths of each link; a link without obstacles uses the LOS environment."""
         path, distance = self.path, self.distance_m
@@ -67,6 +81,7 @@ class AntennaPairs:
                 environment,
                 field.take(field_rows),
                 fading,
+                path.channel,
                 rng,
             )
             delay[rows], gain[rows] = received.delay_ns, received.gain

@@ -247,7 +247,10 @@ def block_of(
         environments = tuple(_with_decay(environment, factor) for environment in environments)
     places = [place(plan.size, per_building, rng) for plan in plans]
     path = DirectPath.joined(
-        [plan.direct_path(anchor, tag) for plan, (anchor, tag) in zip(plans, places, strict=True)]
+        [
+            plan.direct_path(anchor, tag, radio.channel)
+            for plan, (anchor, tag) in zip(plans, places, strict=True)
+        ]
     )
     anchor, tag = (np.concatenate(ends) for ends in zip(*places, strict=True))
     boards = draw_boards(len(anchor), rng, wide=wide, radio=radio)
@@ -297,7 +300,7 @@ def mean_level_dbm(
 ) -> NDArray[np.float64]:
     """Return the mean receive level, dBm (n,), from `mean_powers_db`."""
     power = 10.0 ** (direct_db / 10.0) + 10.0 ** (diffuse_db / 10.0)
-    level: NDArray[np.float64] = radio.tx_power_dbm + boards.gain_db + 10.0 * np.log10(power)
+    level: NDArray[np.float64] = radio.sent_dbm + boards.gain_db + 10.0 * np.log10(power)
     return level
 
 
@@ -306,8 +309,12 @@ def mean_powers_db(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the mean power of the direct path and of all others relative to the transmit power, dB (n,), for antennas at (n, 2) in m."""
     distance = np.hypot(*(tag - anchor).T)
-    direct = channel.direct_power_db(distance, path.loss_db + math.prod(channel.PATTERN_LOSS_DB))
-    diffuse = -np.where(path.crossings > 0, *(e.path_loss_db(distance) for e in environments[::-1]))
+    direct = channel.direct_power_db(
+        distance, path.loss_db + math.prod(channel.PATTERN_LOSS_DB), path.channel
+    )
+    diffuse = -np.where(
+        path.crossings > 0, *(e.path_loss_db(distance, path.channel) for e in environments[::-1])
+    )
     return direct, diffuse
 
 

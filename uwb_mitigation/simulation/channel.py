@@ -16,13 +16,47 @@ from uwb_mitigation.errors import ParameterError
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 
-CENTRE_FREQUENCY_HZ = 3993.6e6
-"""Channel 2 (IEEE 802.15.4-2015, UWB PHY)."""
 
-WAVELENGTH_M = SPEED_OF_LIGHT_M_PER_NS * 1e9 / CENTRE_FREQUENCY_HZ
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A UWB channel of a DW1000.
 
-FREE_SPACE_LOSS_1M_DB = 20.0 * math.log10(4.0 * math.pi / WAVELENGTH_M)
-"""Free-space loss at 1 m (Friis, isotropic antennas)."""
+    Attributes:
+        number: of the channel. centre_hz: centre frequency. bandwidth_hz: of the receiver, for paths.
+        pulse_taps: full width at half amplitude of a single path in the accumulator.
+    """
+
+    number: int
+    centre_hz: float
+    bandwidth_hz: float = 499.2e6
+    pulse_taps: float = 2.4
+
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength at the centre frequency, m."""
+        return SPEED_OF_LIGHT_M_PER_NS * 1e9 / self.centre_hz
+
+    @property
+    def free_space_loss_1m_db(self) -> float:
+        """Free-space loss at 1 m, dB (Friis, isotropic antennas)."""
+        return 20.0 * math.log10(4.0 * math.pi / self.wavelength_m)
+
+
+CHANNELS = {
+    channel.number: channel
+    for channel in (
+        Channel(1, 3494.4e6),
+        Channel(2, 3993.6e6),
+        Channel(3, 4492.8e6),
+        Channel(4, 3993.6e6, 900e6, 1.8),
+        Channel(5, 6489.6e6),
+        Channel(7, 6489.6e6, 900e6, 1.8),
+    )
+}
+"""IEEE 802.15.4-2015, UWB PHY; a DW1000 receives at most 900 MHz (user manual, section 10.5). The pulse of the LOS EVK1000 logs
+(channel 2) is about the inverse of the bandwidth. The inverse of 900 MHz would be 1.33 taps: 1.8 is the shortest pulse that samples resolve."""
+
+CHANNEL_2 = CHANNELS[2]
 
 PATTERN_LOSS_DB = (4.0, 1.0)
 """Shape and scale of the gamma-distributed loss that two small antennas' patterns add to the direct
@@ -70,12 +104,12 @@ class Environment:
     first_cluster_delay_ns: float
     ray_decay_growth: float = 0.0
 
-    def path_loss_db(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean path loss at channel 2 in dB (section II-A of the report).
+    def path_loss_db(self, distance_m: NDArray[np.float64], channel: Channel) -> NDArray[np.float64]:
+        """Return the mean path loss in dB (section II-A of the report).
 
         It is a power law in distance and in frequency, with a factor of 1/2 for objects close to an antenna.
         """
-        frequency = 20.0 * (self.frequency_exponent + 1.0) * math.log10(CENTRE_FREQUENCY_HZ / 5e9)
+        frequency = 20.0 * (self.frequency_exponent + 1.0) * math.log10(channel.centre_hz / 5e9)
         at_1m = self.path_loss_1m_db + frequency + 10.0 * math.log10(2.0)
         return at_1m + 10.0 * self.path_loss_exponent * np.log10(distance_m)
 
@@ -124,6 +158,36 @@ class DiffuseField:
     def take(self, index: NDArray[np.intp]) -> DiffuseField:
         """Return the placements at `index`, in that order."""
         return DiffuseField(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def moved(
+        self, other: DiffuseField, progress: NDArray[np.float64], changes_at: NDArray[np.float64]
+    ) -> DiffuseField:
+        """Return fields on the way to `other`, with the same distributions.
+
+        The rays of `other` replace those of this field one by one. All other properties change continuously.
+
+        Args:
+            other: fields at the end of the way.
+            progress: share of the way, 0 to 1, float64 (n,).
+            changes_at: share of the way at which each ray is replaced, float64 (n, rays).
+        """
+        is_replaced = progress[:, None] > changes_at
+        near, far = np.maximum(1.0 - progress, 1e-9), np.maximum(progress, 1e-9)
+        # The first ray of the first cluster is at its start. The minimum of exponential variables is exponential.
+        first, other_first = self.delay_ns[:, :1], other.delay_ns[:, :1]
+        first_delay = np.minimum(first / near[:, None], other_first / far[:, None])
+        delay = first_delay + np.where(is_replaced, other.delay_ns - other_first, self.delay_ns - first)
+        power = np.where(is_replaced, other.mean_power, self.mean_power)
+        mean_loss = math.prod(PATTERN_LOSS_DB)
+        # The sum of squares of both weights is 1, so that variances stay the same.
+        near, far = np.sqrt(near), np.sqrt(far)
+        return DiffuseField(
+            delay,
+            power / power.sum(axis=1, keepdims=True),
+            np.where(is_replaced, other.nakagami_m, self.nakagami_m),
+            near * self.shadowing_db + far * other.shadowing_db,
+            mean_loss + near * (self.pattern_loss_db - mean_loss) + far * (other.pattern_loss_db - mean_loss),
+        )
 
     def fade(self, rng: np.random.Generator) -> NDArray[np.complex128]:
         """Draw the rays' gains, complex128 (n, rays): Nakagami magnitude, uniform phase.
@@ -189,9 +253,11 @@ class Multipath:
     gain: NDArray[np.complex128]
 
 
-def direct_power_db(distance_m: NDArray[np.float64], loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
+def direct_power_db(
+    distance_m: NDArray[np.float64], loss_db: NDArray[np.float64], channel: Channel
+) -> NDArray[np.float64]:
     """Return the power of the direct path relative to the transmit power, dB: Friis minus obstacle loss."""
-    return -FREE_SPACE_LOSS_1M_DB - 20.0 * np.log10(distance_m) - loss_db
+    return -channel.free_space_loss_1m_db - 20.0 * np.log10(distance_m) - loss_db
 
 
 def propagate(
@@ -201,6 +267,7 @@ def propagate(
     environment: Environment,
     field: DiffuseField,
     fading: NDArray[np.complex128],
+    channel: Channel,
     rng: np.random.Generator,
 ) -> Multipath:
     """Join the direct path and the diffuse field of n pairs.
@@ -216,6 +283,7 @@ def propagate(
         environment: environment of all pairs.
         field: diffuse fields of n pairs; see `draw_diffuse_field`.
         fading: gains of the rays, complex128 (n, rays).
+        channel: UWB channel.
         rng: source of the phase of the direct path.
 
     Raises:
@@ -223,8 +291,8 @@ def propagate(
     """
     if not bool(np.all(np.isfinite(distance_m) & (distance_m > 0))):
         raise ParameterError("distance that is not finite and positive", where="channel", valid="> 0 m")
-    direct = 10.0 ** (direct_power_db(distance_m, loss_db + field.pattern_loss_db) / 10.0)
-    diffuse = 10.0 ** (-environment.path_loss_db(distance_m) / 10.0)
+    direct = 10.0 ** (direct_power_db(distance_m, loss_db + field.pattern_loss_db, channel) / 10.0)
+    diffuse = 10.0 ** (-environment.path_loss_db(distance_m, channel) / 10.0)
     if environment.first_cluster_delay_ns == 0.0:
         diffuse = np.maximum(diffuse - direct, 0.05 * diffuse)
     diffuse = diffuse * 10.0 ** (field.shadowing_db / 10.0)

@@ -1,6 +1,6 @@
 """DW1000-like receiver: accumulator, first path and diagnostics from multipath.
 
-Channel 2, PRF 64 MHz. The range error is not drawn from a distribution: it is the difference between the first path of
+PRF 64 MHz. The range error is not drawn from a distribution: it is the difference between the first path of
 the leading-edge detector and the straight-line path. docs/background/how_it_works.md describes the parameters that
 were fitted to the EVK1000 logs, and the quality of the fit. `DW3000_STS` is a variant with assumed parameters.
 """
@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.simulation.channel import SPEED_OF_LIGHT_M_PER_NS, Multipath
+from uwb_mitigation.simulation.channel import CHANNEL_2, SPEED_OF_LIGHT_M_PER_NS, Channel, Multipath
 from uwb_mitigation.types.measurement import SAMPLE_PERIOD_S, RadioType, Segment
 
 TAPS = 1016
@@ -27,9 +28,6 @@ SYMBOL_S = TAPS * SAMPLE_PERIOD_S
 BOLTZMANN_290K_DBM_HZ = -173.98
 INDEX_STEPS = 64
 """The detector reports the first path in 1/64 of a tap (FP_INDEX, section 7.2.22)."""
-
-PULSE_WIDTH_TAPS = 2.4
-"""Full width at half amplitude of a single path, about the inverse of the 499.2 MHz bandwidth."""
 
 PLACE = (739.0, 751.0)
 """Accumulator indices of the straight-line path: the middle 90 % of the logs' first paths."""
@@ -54,21 +52,19 @@ _EDGE_TAPS = (-3, 5)
 _KERNEL_REACH = 10
 
 
-def pulse(taps: NDArray[np.float64]) -> NDArray[np.float64]:
+def pulse(taps: NDArray[np.float64], channel: Channel = CHANNEL_2) -> NDArray[np.float64]:
     """Return the accumulator's response to a single path, at `taps` from its peak; unit energy over the taps.
 
     A Gaussian with the width of the first path in the LOS EVK1000 logs, whose edges it matches. The raised cosine of
     the standard's reference pulse would have sidelobes of 12 %, which the logs do not contain and which the detector
     would detect as paths.
     """
-    x = np.asarray(taps, np.float64) / PULSE_WIDTH_TAPS
+    x = np.asarray(taps, np.float64) / channel.pulse_taps
     shape: NDArray[np.float64] = np.exp(-4.0 * math.log(2.0) * x * x)
-    return shape / math.sqrt(PULSE_WIDTH_TAPS * math.sqrt(math.pi / (8.0 * math.log(2.0))))
+    return shape / math.sqrt(channel.pulse_taps * math.sqrt(math.pi / (8.0 * math.log(2.0))))
 
 
-PULSE_PEAK = float(pulse(np.zeros(1))[0])
 _OFFSETS = np.arange(1 - _SPAN, _SPAN + 1)
-_PULSE_TABLE = pulse(_OFFSETS[None, :] - np.arange(_PHASES)[:, None] / _PHASES)
 _FINE_TAPS = np.arange(_EDGE_TAPS[0], _EDGE_TAPS[1], 1.0 / _EDGE_STEPS)
 _EDGE_WINDOW = np.arange(_EDGE_TAPS[0] - _KERNEL_REACH, _EDGE_TAPS[1] + _KERNEL_REACH)
 _OFFSET_FROM_TAP = _EDGE_WINDOW[:, None] - _FINE_TAPS[None, :]
@@ -81,15 +77,6 @@ _INTERPOLATE = (
         0.0,
     )
 ).astype(np.float32)
-
-
-def _half_amplitude_lead() -> float:
-    """Return the taps from the leading edge's half-amplitude point to the peak of a single pulse."""
-    lead = np.linspace(0.0, 2.0, 20001)
-    return float(np.interp(-0.5, -pulse(lead) / PULSE_PEAK, lead))
-
-
-EDGE_LEAD_TAPS = _half_amplitude_lead()
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +130,7 @@ class Receiver:
     """A receiver and its transmitter.
 
     Attributes:
-        tx_power_dbm: -41.3 dBm/MHz over 500 MHz.
+        tx_power_dbm: -41.3 dBm/MHz over 500 MHz; regulations allow more on the wider channels (`sent_dbm`).
         noise_figure_db: receiver noise and implementation loss together; gives the logs' tap noise.
         compression_dbm: level towards which the receiver's gain control compresses strong signals
             (see the manual's section 4.7.1).
@@ -159,6 +146,7 @@ class Receiver:
         pulses_per_symbol: pulses of a pseudo-random sequence, whose correlation has side lobes at multiples of
             `PULSE_SPACING_TAPS`; 0: a preamble, whose periodic correlation is perfect.
         kind, segment: source of the CIRs.
+        channel: UWB channel.
     """
 
     tx_power_dbm: float = -14.3
@@ -175,20 +163,30 @@ class Receiver:
     pulses_per_symbol: int = 0
     kind: RadioType = RadioType.DW1000
     segment: Segment = Segment.IPATOV
+    channel: Channel = CHANNEL_2
+
+    @property
+    def sent_dbm(self) -> float:
+        """Transmit power on the channel: the limit is that of the power per MHz."""
+        return self.tx_power_dbm + 10.0 * math.log10(self.channel.bandwidth_hz / CHANNEL_2.bandwidth_hz)
+
+    @property
+    def pulse_peak(self) -> float:
+        """Peak of `pulse`."""
+        return float(pulse(np.zeros(1), self.channel)[0])
 
     def boards(self, n: int) -> Boards:
         """Return the properties of n pairs between identical boards."""
         values = (self.noise_figure_db, self.preamble_symbols, self.self_noise_db, self.noise_multiplier)
         return Boards(np.zeros(n), *(np.full(n, float(value)) for value in values))
 
-    @staticmethod
-    def noise_level_dbm(noise_figure_db: NDArray[np.float64]) -> NDArray[np.float64]:
+    def noise_level_dbm(self, noise_figure_db: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the thermal noise of one tap over one symbol, on the scale of the paths' powers.
 
         A matched filter's peak has a signal-to-noise ratio of P T / (k T0 F); the peak tap of a single path
         contains pulse(0)^2 of its power.
         """
-        per_symbol = BOLTZMANN_290K_DBM_HZ - 10.0 * math.log10(SYMBOL_S) + 20.0 * math.log10(PULSE_PEAK)
+        per_symbol = BOLTZMANN_290K_DBM_HZ - 10.0 * math.log10(SYMBOL_S) + 20.0 * math.log10(self.pulse_peak)
         return per_symbol + noise_figure_db
 
     def sensitivities_dbm(self, boards: Boards) -> NDArray[np.float64]:
@@ -215,20 +213,20 @@ class Receiver:
         Returns:
             Level above the threshold in dB, float64 (n,).
         """
-        sent = self.tx_power_dbm + boards.gain_db + POWER_CONSTANT_DB
+        sent = self.sent_dbm + boards.gain_db + POWER_CONSTANT_DB
         direct, diffuse = (10.0 ** ((sent + power) / 10.0) for power in (direct_db, diffuse_db))
         power = direct + diffuse
         # The strongest of the other paths has about a tenth of their power.
         strongest = np.maximum(direct, 0.1 * diffuse)
-        peak = PULSE_PEAK * np.sqrt(strongest) * self.compression(power)
+        peak = self.pulse_peak * np.sqrt(strongest) * self.compression(power)
         count = np.minimum(self.accumulator_limit / np.maximum(peak, 1e-9), boards.preamble_symbols)
         thermal = 10.0 ** ((self.noise_level_dbm(boards.noise_figure_db) + POWER_CONSTANT_DB) / 10.0)
         noise = thermal / np.maximum(count, 1.0) + power * 10.0 ** (boards.self_noise_db / 10.0)
         threshold = boards.noise_multiplier**2 * RAYLEIGH_VARIANCE * noise
         if self.pulses_per_symbol:
-            side_lobes = PULSE_PEAK**2 * strongest / (self.pulses_per_symbol * np.maximum(count, 1.0))
+            side_lobes = self.pulse_peak**2 * strongest / (self.pulses_per_symbol * np.maximum(count, 1.0))
             threshold = np.maximum(threshold, SIDE_LOBE_SIGMAS**2 * side_lobes)
-        margin: NDArray[np.float64] = 10.0 * np.log10(PULSE_PEAK**2 * direct / threshold)
+        margin: NDArray[np.float64] = 10.0 * np.log10(self.pulse_peak**2 * direct / threshold)
         return margin
 
     def receive(
@@ -241,8 +239,8 @@ class Receiver:
         """
         boards = boards or self.boards(len(multipath.delay_ns))
         place = rng.uniform(*PLACE, len(multipath.delay_ns))
-        symbol = place_paths(place[:, None] + multipath.delay_ns / TAP_NS, multipath.gain)
-        scale = 10.0 ** ((self.tx_power_dbm + boards.gain_db + POWER_CONSTANT_DB) / 20.0)
+        symbol = place_paths(place[:, None] + multipath.delay_ns / TAP_NS, multipath.gain, self.channel)
+        scale = 10.0 ** ((self.sent_dbm + boards.gain_db + POWER_CONSTANT_DB) / 20.0)
         symbol *= scale.astype(np.float32)[:, None]
 
         components = symbol.view(np.float32)
@@ -266,7 +264,7 @@ class Receiver:
         accumulator *= np.sqrt(noise / 2.0).astype(np.float32)[:, None]
         accumulator += components * count.astype(np.float32)[:, None]
         samples = np.clip(np.rint(accumulator), -32768, 32767).astype(np.int16)
-        direct = np.abs(multipath.gain[:, 0]) * scale * gain * count * PULSE_PEAK
+        direct = np.abs(multipath.gain[:, 0]) * scale * gain * count * self.pulse_peak
         return self.report(samples, count, direct, place, above_sensitivity, boards, rng)
 
     def report(
@@ -289,7 +287,7 @@ class Receiver:
             threshold = np.maximum(threshold, np.rint(SIDE_LOBE_SIGMAS * side_lobe).astype(np.int64))
         index = np.where(above_sensitivity, detect_first_path(taps, magnitude, threshold), np.nan)
         rx_power, first_path_power = power_levels(magnitude, index, count)
-        error = (index + EDGE_LEAD_TAPS - place) * TAP_NS * SPEED_OF_LIGHT_M_PER_NS
+        error = (index + self.channel.pulse_taps / 2.0 - place) * TAP_NS * SPEED_OF_LIGHT_M_PER_NS
         error += self.range_offset_m + rng.normal(0.0, self.timestamp_std_m, len(error))
         return Reception(
             samples, index, count, threshold, rx_power, first_path_power, direct >= threshold, error
@@ -307,7 +305,7 @@ DW3000_STS = Receiver(
     kind=RadioType.DW3000,
     segment=Segment.STS,
 )
-"""STS of a DW3000. Assumed: 5 dB more path loss than on channel 2, and pulse, noise figure, compression and first-path
+"""STS of a DW3000 on channel 5. Assumed: channel 2 with 5 dB more path loss, and pulse, noise figure, compression and first-path
 detector of the DW1000. No real recording was available (models/dw3000_sts.md)."""
 
 
@@ -323,14 +321,22 @@ def _side_lobes(
     return np.fft.ifft(np.fft.fft(symbol) * np.fft.fft(kernel)).astype(np.complex64)
 
 
-def place_paths(position: NDArray[np.float64], gain: NDArray[np.complex128]) -> NDArray[np.complex64]:
+@cache
+def _pulse_table(channel: Channel) -> NDArray[np.float64]:
+    """Return pulses at all phases of a tap, float64 (_PHASES, 2 _SPAN)."""
+    return pulse(_OFFSETS[None, :] - np.arange(_PHASES)[:, None] / _PHASES, channel)
+
+
+def place_paths(
+    position: NDArray[np.float64], gain: NDArray[np.complex128], channel: Channel
+) -> NDArray[np.complex64]:
     """Sum pulses at fractional tap positions (n, paths) into complex64 (n, TAPS)."""
     n = len(position)
     step = np.rint(position * _PHASES).astype(np.int64)
     tap, phase = step // _PHASES, step % _PHASES
     row, path = np.nonzero((tap < TAPS - _SPAN) & (gain != 0))
     where = ((row * TAPS + tap[row, path])[:, None] + _OFFSETS).ravel()
-    shape = _PULSE_TABLE[phase[row, path]]
+    shape = _pulse_table(channel)[phase[row, path]]
     value = gain[row, path]
     result = np.empty((n, TAPS), np.complex64)
     for component, weight in ((result.real, value.real), (result.imag, value.imag)):

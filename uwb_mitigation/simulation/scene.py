@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uwb_mitigation.simulation.channel import CENTRE_FREQUENCY_HZ, WAVELENGTH_M
+from uwb_mitigation.simulation.channel import CHANNEL_2, Channel
 
 Point = tuple[float, float]
 
@@ -22,23 +22,24 @@ FREE_SPACE_IMPEDANCE_OHM = 376.73
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """A building material: relative permittivity, and conductivity in S/m at the centre frequency."""
+    """A building material: relative permittivity, and conductivity c f^d in S/m with the frequency f in GHz."""
 
     name: str
     permittivity: float
-    conductivity: float
+    c: float
+    d: float = 0.0
+
+    def conductivity(self, channel: Channel) -> float:
+        """Return the conductivity at the centre frequency of a channel, S/m."""
+        return self.c * float((channel.centre_hz / 1e9) ** self.d)
 
 
-def _at_centre(c: float, d: float) -> float:
-    return c * float((CENTRE_FREQUENCY_HZ / 1e9) ** d)
-
-
-# ITU-R P.2040-1, table 3: permittivity a, conductivity c f^d with f in GHz.
-PLASTERBOARD = Material("plasterboard", 2.94, _at_centre(0.0116, 0.7076))
-BRICK = Material("brick", 3.75, _at_centre(0.038, 0.0))
-CONCRETE = Material("concrete", 5.31, _at_centre(0.0326, 0.8095))
-WOOD = Material("wood", 1.99, _at_centre(0.0047, 1.0718))
-GLASS = Material("glass", 6.27, _at_centre(0.0043, 1.1925))
+# ITU-R P.2040-1, table 3.
+PLASTERBOARD = Material("plasterboard", 2.94, 0.0116, 0.7076)
+BRICK = Material("brick", 3.75, 0.038)
+CONCRETE = Material("concrete", 5.31, 0.0326, 0.8095)
+WOOD = Material("wood", 1.99, 0.0047, 1.0718)
+GLASS = Material("glass", 6.27, 0.0043, 1.1925)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ class Screen:
 
 @dataclass(frozen=True, slots=True)
 class DirectPath:
-    """Effects of obstacles on n direct paths, arrays of shape (n,).
+    """Effects of obstacles on n direct paths on a UWB channel, arrays of shape (n,).
 
     Contains the loss in dB and the extra optical length in m as float64, and the number of crossed obstacles as int64.
     """
@@ -70,16 +71,17 @@ class DirectPath:
     loss_db: NDArray[np.float64]
     excess_m: NDArray[np.float64]
     crossings: NDArray[np.int64]
+    channel: Channel
 
     def take(self, index: NDArray[np.intp]) -> DirectPath:
         """Return the paths at `index`, in that order."""
-        return DirectPath(self.loss_db[index], self.excess_m[index], self.crossings[index])
+        return DirectPath(self.loss_db[index], self.excess_m[index], self.crossings[index], self.channel)
 
     @classmethod
     def joined(cls, paths: Sequence[DirectPath]) -> DirectPath:
-        """Concatenate `paths`, one or more."""
+        """Concatenate `paths`, one or more, on the same channel."""
         loss, excess, crossings = zip(*((p.loss_db, p.excess_m, p.crossings) for p in paths), strict=True)
-        return cls(np.concatenate(loss), np.concatenate(excess), np.concatenate(crossings))
+        return cls(np.concatenate(loss), np.concatenate(excess), np.concatenate(crossings), paths[0].channel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,26 +92,30 @@ class Building:
     walls: tuple[Wall, ...] = ()
     screens: tuple[Screen, ...] = ()
 
-    def direct_path(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> DirectPath:
+    def direct_path(
+        self, a: NDArray[np.float64], b: NDArray[np.float64], channel: Channel = CHANNEL_2
+    ) -> DirectPath:
         """Return the obstacles on straight lines between antennas at `a` and `b`, float64 (n, 2) in m."""
         loss, excess = np.zeros(len(a)), np.zeros(len(a))
         crossings = np.zeros(len(a), np.int64)
         for wall in self.walls:
             hit = _crosses(a, b, wall.start, wall.end)
-            lost, longer = through_slab(wall, _incidence_cosine(a, b, wall))
+            lost, longer = through_slab(wall, _incidence_cosine(a, b, wall), channel)
             loss += np.where(hit, lost, 0.0)
             excess += np.where(hit, longer, 0.0)
             crossings += hit
         for screen in self.screens:
             hit = _crosses(a, b, screen.start, screen.end)
             detour = np.minimum(_detour(a, b, screen.start), _detour(a, b, screen.end))
-            loss += np.where(hit, knife_edge_loss_db(detour), 0.0)
+            loss += np.where(hit, knife_edge_loss_db(detour, channel), 0.0)
             excess += np.where(hit, detour, 0.0)
             crossings += hit
-        return DirectPath(loss, excess, crossings)
+        return DirectPath(loss, excess, crossings, channel)
 
 
-def through_slab(wall: Wall, cosine: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def through_slab(
+    wall: Wall, cosine: NDArray[np.float64], channel: Channel
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return loss (dB) and extra optical length (m) of a path through a slab; `cosine`: of the angle of incidence.
 
     The loss is the absorption along the refracted path plus the reflection of both faces at normal incidence. The length
@@ -120,18 +126,18 @@ def through_slab(wall: Wall, cosine: NDArray[np.float64]) -> tuple[NDArray[np.fl
     sine_squared = 1.0 - cosine * cosine
     inside = np.sqrt(1.0 - sine_squared / wall.material.permittivity)
     # 4.343 dB per neper of power, sigma Z0 / sqrt(eps) nepers of power per metre.
-    per_metre = 4.343 * wall.material.conductivity * FREE_SPACE_IMPEDANCE_OHM / root
+    per_metre = 4.343 * wall.material.conductivity(channel) * FREE_SPACE_IMPEDANCE_OHM / root
     reflected = ((root - 1.0) / (root + 1.0)) ** 2
     loss = per_metre * wall.thickness_m / inside - 20.0 * math.log10(1.0 - reflected)
     return loss, wall.thickness_m * (root * inside - cosine)
 
 
-def knife_edge_loss_db(detour_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def knife_edge_loss_db(detour_m: NDArray[np.float64], channel: Channel) -> NDArray[np.float64]:
     """Return the diffraction loss in dB at an edge that lengthens the path by `detour_m`.
 
     ITU-R P.526-15, section 4.1, with v = 2 sqrt(detour / wavelength).
     """
-    v = 2.0 * np.sqrt(np.maximum(detour_m, 0.0) / WAVELENGTH_M) - 0.1
+    v = 2.0 * np.sqrt(np.maximum(detour_m, 0.0) / channel.wavelength_m) - 0.1
     loss: NDArray[np.float64] = 6.9 + 20.0 * np.log10(np.sqrt(v * v + 1.0) + v)
     return loss
 

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count as counting
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +29,8 @@ from uwb_mitigation.types.measurement import (
     DEVICE_TICK_HZ,
     DEVICE_TIME_WRAP,
     Cir,
-    RadioType,
     RangeMeasurement,
     Record,
-    Segment,
     Truth,
 )
 from uwb_mitigation.types.source import Source
@@ -39,9 +38,10 @@ from uwb_mitigation.types.source import Source
 BATCH = 256
 """Exchanges per batch: large enough for vectorisation, small enough for the cache."""
 
-SEGMENT_S = 2.0
+SEGMENT_S = 4.0
 SPEED_M_PER_S = 0.5
-"""A segment is a metre of the route: clusters stay the same within it, fading changes."""
+"""A segment is two metres of the route, in which all rays are replaced one after another; fading changes with each exchange. The errors of
+ranges then stay similar over about a metre, as in the Hanyang recordings (docs/experiments/simulator_against_logs.py)."""
 
 ROBOT_FRAME = "base_link"
 """Frame of the ranges of a robot: its antenna is at its origin."""
@@ -107,7 +107,7 @@ class Simulated(Source):
                 sequence=sequence & 0xFFFFFFFF,
                 device_time=round(stamp_ns * DEVICE_TICK_HZ / 1e9) % DEVICE_TIME_WRAP,
                 range_m=float(distance[i] + reception.error_m[i]),
-                cir=_cir(reception, i),
+                cir=_cir(reception, i, self._radio),
                 frame_id=f"simulated_anchor_{anchor_id}" if exchanges.tag_yaw is None else ROBOT_FRAME,
             )
             condition = label(bool(pairs.path.crossings[i]), bool(reception.direct_above_threshold[i]))
@@ -120,8 +120,8 @@ class Simulated(Source):
 class SimulatedSource(Simulated):
     """Tags on a robot's route through a flat, ranging to fixed anchors in turn; a `Source`.
 
-    Each metre of the route is a separate configuration for each pair, "simulated seed 1/tag 101/
-    anchor 3/segment 7": within it the clusters of the diffuse field stay the same and the fading changes.
+    Every two metres of the route are a separate configuration for each pair, "simulated seed 1/tag 101/
+    anchor 3/segment 7". The diffuse field of each pair changes continuously, and the fading with each exchange.
 
     Args:
         seed: 0 to 2^32 - 1.
@@ -185,16 +185,20 @@ class SimulatedSource(Simulated):
 
     def _batches(self) -> Iterator[tuple[TwrBatch, np.random.Generator]]:
         pairs = self._tags * len(self._anchors)
-        for segment in counting():
+        generators = (np.random.default_rng([self._seed, segment, 0]) for segment in counting())
+        knots = ((draw_fields(self._environments, pairs, rng), rng) for rng in generators)
+        for segment, ((fields, rng), (next_fields, _)) in enumerate(pairwise(knots)):
             first, stop = (math.ceil(s * SEGMENT_S * self._rate_hz) for s in (segment, segment + 1))
             if self._count and first >= self._count:
                 return
-            rng = np.random.default_rng([self._seed, segment, 0])
-            fields = draw_fields(self._environments, pairs, rng)
+            changes_at = rng.random(fields[0].delay_ns.shape)
             for batch, start in enumerate(range(first, stop, BATCH)):
                 sequence = np.arange(start, min(start + BATCH, stop))
+                progress = sequence / (SEGMENT_S * self._rate_hz) - segment
+                exchanges = self._exchanges(sequence, segment, fields)
+                moved = exchanges.pairs.moved(next_fields, progress, changes_at)
                 rng = np.random.default_rng([self._seed, segment, 1 + batch])
-                yield self._exchanges(sequence, segment, fields), rng
+                yield replace(exchanges, pairs=moved), rng
 
     def _exchanges(
         self, sequence: NDArray[np.int64], segment: int, fields: tuple[DiffuseField, DiffuseField]
@@ -209,7 +213,7 @@ class SimulatedSource(Simulated):
         ]
         pair = tag * len(self._anchors) + anchor
         anchors, positions = self._anchors[anchor], along_route(self._route, travelled)
-        path = self._plan.direct_path(anchors, positions)
+        path = self._plan.direct_path(anchors, positions, self._radio.channel)
         return TwrBatch(
             sequence,
             anchor_id,
@@ -272,7 +276,7 @@ class SimulatedBuildings(Simulated):
         )
 
 
-def _cir(reception: Reception, i: int) -> Cir:
+def _cir(reception: Reception, i: int, radio: Receiver) -> Cir:
     return Cir(
         samples=reception.samples[i].copy(),
         first_path_index=float(reception.first_path_index[i]),
@@ -280,10 +284,10 @@ def _cir(reception: Reception, i: int) -> Cir:
         noise_threshold=int(reception.noise_threshold[i]),
         rx_power_dbm=float(reception.rx_power_dbm[i]),
         first_path_power_dbm=float(reception.first_path_power_dbm[i]),
-        channel=2,
+        channel=radio.channel.number,
         prf_mhz=64,
-        radio=RadioType.DW1000,
-        segment=Segment.IPATOV,
+        radio=radio.kind,
+        segment=radio.segment,
     )
 
 
